@@ -1,0 +1,61 @@
+"""What is seen: a camera, a view (camera, time, image), a scene (views by split, background, extent)."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera in OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
+
+    viewmat: Tensor  # [4, 4] world to camera, rigid
+    K: Tensor  # [3, 3] intrinsics in pixels
+    width: int
+    height: int
+
+    @property
+    def center(self) -> Tensor:
+        """The camera's position in the world, [3]."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def to(self, device: str) -> "Camera":
+        """The same camera with its tensors on `device`."""
+        return Camera(self.viewmat.to(device), self.K.to(device), self.width, self.height)
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph: where from, when, and what was seen."""
+
+    name: str  # as the data set calls it: "train/r_000"
+    camera: Camera
+    time: float | None  # in [0, 1]; None where the data set has no time
+    image: Tensor  # [H, W, 3] float32 in [0, 1], composited over the scene's background
+
+
+@dataclass(frozen=True)
+class Points:
+    """Initial points, given by the data set or drawn at random."""
+
+    means: Tensor  # [P, 3]
+    colors: Tensor  # [P, 3] in [0, 1]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything a model is fitted to and measured on."""
+
+    name: str
+    train: list[View]
+    val: list[View]
+    test: list[View]
+    background: tuple[float, float, float]  # the colour every image was composited over
+    extent: float  # 1.1 x the radius of the training cameras around their mean (3DGS, getNerfppNorm)
+    points: Points | None  # None: the data set gives none
+    fingerprint: str  # sha256 over the files read, so that a record says which data it saw
+
+    @property
+    def has_time(self) -> bool:
+        """Whether every training view carries a time."""
+        return all(view.time is not None for view in self.train)
