@@ -1,0 +1,58 @@
+"""The machine room: compiled kernels as torch operations, with their gradients, for tensors on the CPU.
+
+The extension `_native` is optional. Where it was not built, importing this package still works, `available()` is False
+and every operation raises `InputError`; the reference backend does the same work in torch.
+"""
+
+import importlib
+import importlib.util
+import os
+from types import ModuleType
+
+import torch
+
+from gsbench.errors import InputError, did_you_mean
+
+_native: ModuleType | None = None
+if importlib.util.find_spec("gsbench.kernels._native") is not None:  # an extension that is there but broken raises
+    _native = importlib.import_module("gsbench.kernels._native")
+
+
+def available() -> bool:
+    """Whether the compiled kernels are part of this installation."""
+    return _native is not None
+
+
+def native() -> ModuleType:
+    """The compiled extension.
+
+    Raises:
+        InputError: it was not built.
+    """
+    if _native is None:
+        raise InputError("the native kernels are not built in this installation: reinstall with a C++20 compiler, "
+                         "or go on with raster.backend=reference")  # fmt: skip
+    return _native
+
+
+def use_instruction_set(name: str) -> None:
+    """Run the kernels built for one instruction set (`v2`, `v3`, `v4`: x86-64 levels); the best one is the default.
+
+    The environment variable GSBENCH_ISA does the same from outside.
+
+    Raises:
+        InputError: it is not built, or this machine does not run it.
+    """
+    known = native().instruction_sets()
+    if name not in known:
+        raise InputError(f"instruction set '{name}' is not built or does not run here. {did_you_mean(name, known)}")
+    native().use(name)
+
+
+def threads() -> int:
+    """How many threads the kernels use: as many as torch does."""
+    return torch.get_num_threads()
+
+
+if _native is not None and os.environ.get("GSBENCH_ISA"):
+    use_instruction_set(os.environ["GSBENCH_ISA"])

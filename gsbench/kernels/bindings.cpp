@@ -1,0 +1,178 @@
+// The door between Python and the kernels: arrays cross by DLPack without a copy. A wrong dtype, rank, layout or device
+// raises TypeError here, sizes that contradict each other ValueError; gsbench/kernels/__init__.py says it in words.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <stdexcept>
+
+#include "cpu/dispatch.h"
+
+namespace nb = nanobind;
+
+namespace {
+
+template <class T, nb::ssize_t... extents>
+using Array = nb::ndarray<T, nb::shape<extents...>, nb::c_contig, nb::device::cpu>;
+template <nb::ssize_t... extents>
+using In = Array<const float, extents...>;
+template <nb::ssize_t... extents>
+using Out = Array<float, extents...>;
+
+const gsb::Kernels* active = nullptr;
+
+int64_t size(size_t n) { return static_cast<int64_t>(n); }
+
+template <class... Sizes>
+void expect_all(int64_t expected, const char* what, Sizes... sizes) {
+    if (((static_cast<int64_t>(sizes) != expected) || ...)) {
+        throw std::invalid_argument(std::string("arrays disagree on ") + what);
+    }
+}
+
+struct Frame {
+    int width, height, threads;
+
+    Frame(int width, int height, int threads) : width(width), height(height), threads(threads) {
+        if (width < 1 || height < 1 || threads < 1) throw std::invalid_argument("expected positive sizes and threads");
+    }
+};
+
+gsb::ProjectArgs project_args(const In<-1, 3>& means, const In<-1, 3, 3>& factors, const In<-1>& opacities,
+                              const In<-1, 4, 4>& viewmats, const In<-1, 3, 3>& Ks, int width, int height, double near,
+                              double far, double eps2d, bool antialias, int threads) {
+    const Frame frame(width, height, threads);
+    const int64_t N = size(means.shape(0)), C = size(viewmats.shape(0));
+    expect_all(N, "N", factors.shape(0), opacities.shape(0));
+    expect_all(C, "C", Ks.shape(0));
+    return {N, C, means.data(), factors.data(), opacities.data(), viewmats.data(), Ks.data(), width, height,
+            static_cast<float>(near), static_cast<float>(far), static_cast<float>(eps2d), antialias, threads};
+}
+
+void project(In<-1, 3> means, In<-1, 3, 3> factors, In<-1> opacities, In<-1, 4, 4> viewmats, In<-1, 3, 3> Ks, int width,
+             int height, double near, double far, double eps2d, bool antialias, int threads, Out<-1, -1, 2> means2d,
+             Out<-1, -1, 3> roots, Out<-1, -1> out_opacities, Out<-1, -1> depths, Out<-1, -1, 2> half_sizes) {
+    const auto args = project_args(means, factors, opacities, viewmats, Ks, width, height, near, far, eps2d, antialias,
+                                   threads);
+    expect_all(args.C * args.N, "C x N", means2d.size() / 2, roots.size() / 3, out_opacities.size(), depths.size(),
+               half_sizes.size() / 2);
+    nb::gil_scoped_release release;
+    active->project(args, {means2d.data(), roots.data(), out_opacities.data(), depths.data(), half_sizes.data()});
+}
+
+void project_backward(In<-1, 3> means, In<-1, 3, 3> factors, In<-1> opacities, In<-1, 4, 4> viewmats, In<-1, 3, 3> Ks,
+                      int width, int height, double near, double far, double eps2d, bool antialias, int threads,
+                      In<-1, -1, 2> g_means2d, In<-1, -1, 3> g_roots, In<-1, -1> g_opacities, In<-1, -1> g_depths,
+                      Out<-1, 3> out_means, Out<-1, 3, 3> out_factors, Out<-1> out_opacities,
+                      Out<-1, 4, 4> out_viewmats) {
+    const auto args = project_args(means, factors, opacities, viewmats, Ks, width, height, near, far, eps2d, antialias,
+                                   threads);
+    expect_all(args.C * args.N, "C x N", g_means2d.size() / 2, g_roots.size() / 3, g_opacities.size(), g_depths.size());
+    expect_all(args.N, "N", out_means.shape(0), out_factors.shape(0), out_opacities.shape(0));
+    const bool cameras = out_viewmats.shape(0) > 0;
+    if (cameras) expect_all(args.C, "C", out_viewmats.shape(0));
+    const auto mutable_of = [](const auto& array) { return const_cast<float*>(array.data()); };
+    nb::gil_scoped_release release;
+    active->project_backward(
+        args, {mutable_of(g_means2d), mutable_of(g_roots), mutable_of(g_opacities), mutable_of(g_depths), nullptr},
+        {out_means.data(), out_factors.data(), out_opacities.data(), cameras ? out_viewmats.data() : nullptr});
+}
+
+gsb::BinArgs bin_args(const In<-1, -1, 2>& means2d, const In<-1, -1>& depths, const In<-1, -1, 2>& half_sizes,
+                      const Array<int64_t, -1>& offsets, int width, int height, int threads) {
+    const Frame frame(width, height, threads);
+    const int64_t C = size(means2d.shape(0)), N = size(means2d.shape(1));
+    expect_all(C * N, "C x N", depths.size(), half_sizes.size() / 2);
+    expect_all(C * gsb::tiles_along(width) * gsb::tiles_along(height) + 1, "the number of tiles", offsets.size());
+    return {N, C, means2d.data(), depths.data(), half_sizes.data(), width, height, threads};
+}
+
+int64_t count_tiles(In<-1, -1, 2> means2d, In<-1, -1> depths, In<-1, -1, 2> half_sizes, int width, int height,
+                    int threads, Array<int64_t, -1> offsets) {
+    const auto args = bin_args(means2d, depths, half_sizes, offsets, width, height, threads);
+    nb::gil_scoped_release release;
+    return active->count_tiles(args, offsets.data());
+}
+
+void fill_tiles(In<-1, -1, 2> means2d, In<-1, -1> depths, In<-1, -1, 2> half_sizes, int width, int height, int threads,
+                Array<int64_t, -1> offsets, Array<int32_t, -1> ids) {
+    const auto args = bin_args(means2d, depths, half_sizes, offsets, width, height, threads);
+    expect_all(offsets.data()[offsets.size() - 1], "the number of pairs", ids.size());
+    nb::gil_scoped_release release;
+    active->fill_tiles(args, offsets.data(), ids.data());
+}
+
+gsb::BlendArgs blend_args(const In<-1, -1, 2>& means2d, const In<-1, -1, 3>& roots, const In<-1, -1>& opacities,
+                          const In<-1, -1, 2>& half_sizes, const In<-1, -1, -1>& colors, const In<-1>& background,
+                          const Array<const int64_t, -1>& offsets, const Array<const int32_t, -1>& ids, int width,
+                          int height, int threads) {
+    const Frame frame(width, height, threads);
+    const int64_t C = size(means2d.shape(0)), N = size(means2d.shape(1)), D = size(colors.shape(2));
+    expect_all(C * N, "C x N", roots.size() / 3, opacities.size(), half_sizes.size() / 2);
+    expect_all(N, "N", colors.shape(1));
+    expect_all(D, "D", background.size());
+    if (size(colors.shape(0)) != 1) expect_all(C, "C", colors.shape(0));
+    expect_all(C * gsb::tiles_along(width) * gsb::tiles_along(height) + 1, "the number of tiles", offsets.size());
+    expect_all(offsets.data()[offsets.size() - 1], "the number of pairs", ids.size());
+    return {N, C, static_cast<int>(D), C > 1 && size(colors.shape(0)) == C, means2d.data(), roots.data(),
+            opacities.data(), half_sizes.data(), colors.data(), background.data(), offsets.data(), ids.data(), width,
+            height, threads};
+}
+
+void expect_state(const gsb::BlendArgs& args, size_t transmittance, size_t stop) {
+    const int64_t tiles = args.C * gsb::tiles_along(args.width) * gsb::tiles_along(args.height);
+    expect_all(tiles * gsb::TILE * gsb::TILE, "the tiles' state", transmittance, stop);
+}
+
+void blend(In<-1, -1, 2> means2d, In<-1, -1, 3> roots, In<-1, -1> opacities, In<-1, -1, 2> half_sizes,
+           In<-1, -1, -1> colors, In<-1> background, Array<const int64_t, -1> offsets, Array<const int32_t, -1> ids,
+           int width, int height, int threads, Out<-1, -1, -1, -1> image, Out<-1, -1, -1, 1> alpha,
+           Out<-1> transmittance, Out<-1> stop) {
+    const auto args = blend_args(means2d, roots, opacities, half_sizes, colors, background, offsets, ids, width, height,
+                                 threads);
+    expect_all(args.C * height * width, "the picture", image.size() / background.size(), alpha.size());
+    expect_state(args, transmittance.size(), stop.size());
+    nb::gil_scoped_release release;
+    active->blend(args, {image.data(), alpha.data(), transmittance.data(), stop.data()});
+}
+
+void blend_backward(In<-1, -1, 2> means2d, In<-1, -1, 3> roots, In<-1, -1> opacities, In<-1, -1, 2> half_sizes,
+                    In<-1, -1, -1> colors, In<-1> background, Array<const int64_t, -1> offsets,
+                    Array<const int32_t, -1> ids, int width, int height, int threads, Out<-1> transmittance,
+                    Out<-1> stop, In<-1, -1, -1, -1> g_image, In<-1, -1, -1, 1> g_alpha, Out<-1, -1, 2> out_means2d,
+                    Out<-1, -1, 3> out_roots, Out<-1, -1> out_opacities, Out<-1, -1, -1> out_colors,
+                    Out<-1> out_background) {
+    const auto args = blend_args(means2d, roots, opacities, half_sizes, colors, background, offsets, ids, width, height,
+                                 threads);
+    expect_all(args.C * height * width, "the picture", g_image.size() / background.size(), g_alpha.size());
+    expect_all(args.C * args.N, "C x N", out_means2d.size() / 2, out_roots.size() / 3, out_opacities.size());
+    expect_all(size(colors.size()), "the colours", out_colors.size());
+    expect_all(args.D, "D", out_background.size());
+    expect_state(args, transmittance.size(), stop.size());
+    nb::gil_scoped_release release;
+    active->blend_backward(args, {nullptr, nullptr, transmittance.data(), stop.data()},
+                           {g_image.data(), g_alpha.data(), out_means2d.data(), out_roots.data(), out_opacities.data(),
+                            out_colors.data(), out_background.data()});
+}
+
+// Binds f so that no argument is converted or copied: what does not fit is refused.
+template <class... Args>
+void define(nb::module_& m, const char* name, void (*f)(Args...)) {
+    m.def(name, f, (static_cast<void>(sizeof(Args)), nb::arg().noconvert())...);
+}
+
+}  // namespace
+
+NB_MODULE(_native, m) {
+    active = &gsb::kernels_of(gsb::instruction_sets().back());
+    m.def("instruction_sets", &gsb::instruction_sets, "Those built in that run on this machine, the best last.");
+    m.def("use", [](const std::string& isa) { active = &gsb::kernels_of(isa); }, "Switch to an instruction set.");
+    m.def("active", [] { return std::string(active->isa); }, "The instruction set in use.");
+    define(m, "project", project);
+    define(m, "project_backward", project_backward);
+    m.def("count_tiles", count_tiles);
+    define(m, "fill_tiles", fill_tiles);
+    define(m, "blend", blend);
+    define(m, "blend_backward", blend_backward);
+}

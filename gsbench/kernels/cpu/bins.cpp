@@ -1,0 +1,119 @@
+// Which splats each tile sees, front to back: sort by depth once, then deal out to tiles in that order.
+#include "bins.h"
+
+#include <cstring>
+
+#include "buffer.h"
+#include "isa.h"
+
+namespace gsb {
+inline namespace GSB_ISA {
+namespace {
+
+constexpr int DIGIT_BITS = 11;
+constexpr uint32_t DIGITS = 1u << DIGIT_BITS;
+
+struct Key {
+    uint32_t depth;  // the bits of a positive float sort as the float does
+    int32_t id;
+};
+
+// Stable radix sort by depth, least digit first; a digit that all keys share is skipped. Returns where the result is.
+Key* radix_sort(Key* keys, Key* spare, int64_t n) {
+    for (int shift = 0; shift < 32; shift += DIGIT_BITS) {
+        int64_t starts[DIGITS] = {};
+        for (int64_t i = 0; i < n; ++i) ++starts[(keys[i].depth >> shift) & (DIGITS - 1)];
+        if (n == 0 || starts[(keys[0].depth >> shift) & (DIGITS - 1)] == n) continue;
+        int64_t total = 0;
+        for (auto& start : starts) {
+            const int64_t count = start;
+            start = total;
+            total += count;
+        }
+        for (int64_t i = 0; i < n; ++i) spare[starts[(keys[i].depth >> shift) & (DIGITS - 1)]++] = keys[i];
+        Key* swap = keys;
+        keys = spare;
+        spare = swap;
+    }
+    return keys;
+}
+
+}  // namespace
+
+// offsets [C * tiles + 1]: where each tile's list starts. Returns the length of all lists.
+int64_t count_tiles(const BinArgs& a, int64_t* offsets) {
+    const int across = tiles_along(a.width), down = tiles_along(a.height);
+    const int64_t tiles = static_cast<int64_t>(across) * down;
+    std::memset(offsets, 0, sizeof(int64_t) * static_cast<size_t>(a.C * tiles + 1));
+    // Four additions a splat, whatever its size: differences first, summed up along both axes after.
+    Buffer<int64_t> corners(static_cast<size_t>(across + 1) * (down + 1));
+    for (int64_t c = 0; c < a.C; ++c) {
+        corners.zero();
+        for (int64_t i = c * a.N; i < (c + 1) * a.N; ++i) {
+            const TileRect r = tile_rect(a.means2d + i * 2, a.half_sizes + i * 2, a.width, a.height);
+            if (r.count() == 0) continue;
+            ++corners[static_cast<size_t>(r.y0) * (across + 1) + r.x0];
+            --corners[static_cast<size_t>(r.y0) * (across + 1) + r.x1];
+            --corners[static_cast<size_t>(r.y1) * (across + 1) + r.x0];
+            ++corners[static_cast<size_t>(r.y1) * (across + 1) + r.x1];
+        }
+        for (int y = 0; y < down; ++y) {
+            int64_t row = 0;
+            for (int x = 0; x < across; ++x) {
+                const size_t i = static_cast<size_t>(y) * (across + 1) + x;
+                row += corners[i];
+                const int64_t above = y > 0 ? offsets[c * tiles + (y - 1) * across + x + 1] : 0;
+                offsets[c * tiles + static_cast<int64_t>(y) * across + x + 1] = above + row;
+            }
+        }
+    }
+    for (int64_t t = 0; t < a.C * tiles; ++t) offsets[t + 1] += offsets[t];
+    return offsets[a.C * tiles];
+}
+
+void fill_tiles(const BinArgs& a, const int64_t* offsets, int32_t* ids) {
+    const int across = tiles_along(a.width), down = tiles_along(a.height);
+    const int64_t tiles = static_cast<int64_t>(across) * down;
+    Buffer<Key> keys(static_cast<size_t>(a.N)), spare(static_cast<size_t>(a.N));
+    Buffer<int64_t> cursors(static_cast<size_t>(tiles));
+    Buffer<TileRect> rects(static_cast<size_t>(a.N));
+    for (int64_t c = 0; c < a.C; ++c) {
+        const float *means2d = a.means2d + c * a.N * 2, *half_sizes = a.half_sizes + c * a.N * 2;
+        const int64_t* begin = offsets + c * tiles;
+        int64_t n = 0;
+        for (int64_t i = 0; i < a.N; ++i) {
+            if (tile_rect(means2d + i * 2, half_sizes + i * 2, a.width, a.height).count() == 0) continue;
+            std::memcpy(&keys[static_cast<size_t>(n)].depth, a.depths + c * a.N + i, sizeof(float));
+            keys[static_cast<size_t>(n++)].id = static_cast<int32_t>(i);
+        }
+        const Key* sorted = radix_sort(keys.data(), spare.data(), n);
+        for (int64_t k = 0; k < n; ++k) {
+            const int64_t i = sorted[k].id;
+            rects[static_cast<size_t>(k)] = tile_rect(means2d + i * 2, half_sizes + i * 2, a.width, a.height);
+        }
+        std::memcpy(cursors.data(), begin, sizeof(int64_t) * static_cast<size_t>(tiles));
+        // A task walks all splats but deals to its own rows of tiles, so that every list keeps the depth order.
+        const int tasks = a.threads < down ? a.threads : down;
+#pragma omp parallel for num_threads(a.threads) schedule(static, 1)
+        for (int task = 0; task < tasks; ++task) {
+            const auto first_row = [&](int t) {  // rows that hold an equal share of the pairs
+                const int64_t share = begin[0] + (begin[tiles] - begin[0]) * t / tasks;
+                int y = 0;
+                while (y < down && begin[static_cast<int64_t>(y) * across] < share) ++y;
+                return t == tasks ? down : y;
+            };
+            const int low = first_row(task), high = first_row(task + 1);
+            for (int64_t k = 0; k < n; ++k) {
+                const TileRect r = rects[static_cast<size_t>(k)];
+                const int y0 = r.y0 > low ? r.y0 : low, y1 = r.y1 < high ? r.y1 : high;
+                for (int y = y0; y < y1; ++y) {
+                    int64_t* row = &cursors[static_cast<size_t>(y) * across];
+                    for (int x = r.x0; x < r.x1; ++x) ids[row[x]++] = sorted[k].id;
+                }
+            }
+        }
+    }
+}
+
+}  // namespace GSB_ISA
+}  // namespace gsb

@@ -1,0 +1,101 @@
+// Blending splats into pictures, front to back, tile by tile.
+#include "isa.h"
+#include "tile.h"
+
+namespace gsb {
+inline namespace GSB_ISA {
+namespace {
+
+struct TileJob {
+    const BlendArgs& args;
+    const Picture& out;
+    const Record* records;
+    const float* colors;  // of the camera, where there are not three channels
+    int64_t tile;         // of all cameras' tiles
+    int64_t camera;
+    int tx, ty;
+    float* color;  // scratch, [D][256]
+};
+
+// D channels, 0: as many as the arguments say. A pixel that is done, or outside, has transmittance <= 0.
+template <int D>
+void blend_tile(const TileJob& job) {
+    const BlendArgs& a = job.args;
+    const int channels = D ? D : a.D;
+    const TileGrid grid(job.tx, job.ty, a.width, a.height);
+    const int32_t* ids = a.ids + a.offsets[job.tile];
+    const int64_t count = a.offsets[job.tile + 1] - a.offsets[job.tile];
+    float *T = job.out.transmittance + job.tile * TILE_PIXELS, *stop = job.out.stop + job.tile * TILE_PIXELS;
+    float* color = job.color;
+    for (int k = 0; k < channels * TILE_PIXELS; ++k) color[k] = 0.0f;
+    const Vec right(static_cast<float>(a.width)), bottom(static_cast<float>(a.height)), zero(0.0f);
+    uint32_t alive = 0;
+    for (int b = 0; b < BLOCKS; ++b) {
+        const Mask inside = (grid.lane_x[b & 3] < right) & (grid.lane_y[b >> 2] < bottom);
+        select(inside, Vec(1.0f), zero).store(T + b * LANES);
+        Vec(static_cast<float>(count)).store(stop + b * LANES);
+        alive |= static_cast<uint32_t>(any(inside)) << b;
+    }
+
+    for (int64_t i = 0; i < count && alive; ++i) {
+        const Record& s = job.records[ids[i]];
+        const float* c = D == 3 ? s.color : job.colors + static_cast<int64_t>(ids[i]) * channels;
+        for (uint32_t blocks = grid.touched(s) & alive; blocks; blocks &= blocks - 1) {
+            const int b = __builtin_ctz(blocks), at = b * LANES;
+            const Falloff<Vec> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s.p, s.q, s.r, s.opacity);
+            const Vec before = Vec::load(T + at), after = before - before * f.alpha;
+            const Mask seen = f.alpha >= Vec(ALPHA_MIN), enough = after >= Vec(TRANSMITTANCE_MIN);
+            const Mask blended = seen & enough;
+            const Vec weight = select(blended, before * f.alpha, zero);
+            for (int k = 0; k < channels; ++k) {
+                float* sums = color + k * TILE_PIXELS + at;
+                (Vec::load(sums) + weight * c[k]).store(sums);
+            }
+            Vec left = select(blended, after, before);
+            const Mask ends = seen & !enough & (before > zero);
+            if (any(ends)) {
+                left = select(ends, -before, left);
+                select(ends, Vec(static_cast<float>(i)), Vec::load(stop + at)).store(stop + at);
+                if (!any(left > zero)) alive &= ~(1u << b);
+            }
+            left.store(T + at);
+        }
+    }
+
+    for (int b = 0; b < BLOCKS; ++b) {
+        const Vec left = Vec::load(T + b * LANES);
+        max(left, -left).store(T + b * LANES);
+    }
+    for (int y = 0; y < grid.height; ++y) {
+        const int64_t row = (job.camera * a.height + grid.top + y) * a.width + grid.left;
+        for (int x = 0; x < grid.width; ++x) {
+            const int at = TileGrid::lane_of(x, y);
+            job.out.alpha[row + x] = 1.0f - T[at];
+            for (int k = 0; k < channels; ++k) {
+                job.out.image[(row + x) * channels + k] = color[k * TILE_PIXELS + at] + T[at] * a.background[k];
+            }
+        }
+    }
+}
+
+}  // namespace
+
+void blend(const BlendArgs& a, const Picture& out) {
+    const int across = tiles_along(a.width), tiles = across * tiles_along(a.height);
+    Buffer<Record> records(static_cast<size_t>(a.N));
+    const size_t scratch_size = static_cast<size_t>(a.D) * TILE_PIXELS;
+    Buffer<float> scratch(scratch_size * static_cast<size_t>(a.threads));
+    for (int64_t c = 0; c < a.C; ++c) {
+        make_records(a, c, records.data());
+        const float* colors = a.colors + (a.color_per_camera ? c * a.N * a.D : 0);
+#pragma omp parallel for num_threads(a.threads) schedule(dynamic, 4)
+        for (int tile = 0; tile < tiles; ++tile) {
+            const TileJob job{a, out, records.data(), colors, c * tiles + tile, c, tile % across, tile / across,
+                              scratch.data() + scratch_size * static_cast<size_t>(thread_index())};
+            a.D == 3 ? blend_tile<3>(job) : blend_tile<0>(job);
+        }
+    }
+}
+
+}  // namespace GSB_ISA
+}  // namespace gsb

@@ -1,0 +1,35 @@
+// Scratch memory, aligned to cache lines; std::vector would be shared between the instruction sets by the linker.
+#pragma once
+
+#include <cstddef>
+#include <cstdlib>
+#include <new>
+
+#include "../math/scalar.h"
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+template <class T>
+class Buffer {
+public:
+    explicit Buffer(size_t size) : size_(size) {
+        const size_t bytes = (size * sizeof(T) + 63) / 64 * 64;
+        data_ = static_cast<T*>(std::aligned_alloc(64, bytes ? bytes : 64));
+        if (!data_) throw std::bad_alloc();
+    }
+    ~Buffer() { std::free(data_); }
+    Buffer(const Buffer&) = delete;
+    Buffer& operator=(const Buffer&) = delete;
+
+    void zero() { __builtin_memset(data_, 0, size_ * sizeof(T)); }
+    T* data() { return data_; }
+    T& operator[](size_t i) { return data_[i]; }
+
+private:
+    T* data_;
+    size_t size_;
+};
+
+}  // namespace GSB_ISA
+}  // namespace gsb

@@ -1,0 +1,18 @@
+// The kernels of one instruction set, which its own namespace keeps apart from the others'.
+#pragma once
+
+#include "../math/scalar.h"
+#include "kernels.h"
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+void project(const ProjectArgs&, const Splats&);
+void project_backward(const ProjectArgs&, const Splats& grads, const ProjectGrads&);
+int64_t count_tiles(const BinArgs&, int64_t* offsets);
+void fill_tiles(const BinArgs&, const int64_t* offsets, int32_t* ids);
+void blend(const BlendArgs&, const Picture&);
+void blend_backward(const BlendArgs&, const Picture&, const BlendGrads&);
+
+}  // namespace GSB_ISA
+}  // namespace gsb

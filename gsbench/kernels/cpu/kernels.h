@@ -1,0 +1,77 @@
+// What the CPU kernels take: plain arrays, row-major and contiguous; and the table that each instruction set fills.
+#pragma once
+
+#include <cstdint>
+
+namespace gsb {
+
+// Gaussians before cameras. N Gaussians, C cameras; gradients are named grad_ and may be null where said so.
+struct ProjectArgs {
+    int64_t N, C;
+    const float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
+    const float *viewmats, *Ks;                // [C, 4, 4] [C, 3, 3]
+    int width, height;
+    float near, far, eps2d;
+    bool antialias;
+    int threads;
+};
+
+struct Splats {
+    float *means2d, *roots, *opacities, *depths, *half_sizes;  // [C, N, 2] [C, N, 3] [C, N] [C, N] [C, N, 2]
+};
+
+struct ProjectGrads {
+    float *means, *factors, *opacities;
+    float* viewmats;  // null: not wanted
+};
+
+struct BinArgs {
+    int64_t N, C;
+    const float *means2d, *depths, *half_sizes;
+    int width, height;
+    int threads;
+};
+
+struct BlendArgs {
+    int64_t N, C;
+    int D;
+    bool color_per_camera;  // colors are [C, N, D], else [N, D]
+    const float *means2d, *roots, *opacities, *half_sizes, *colors, *background;
+    const int64_t* offsets;  // [C * tiles + 1]
+    const int32_t* ids;      // [pairs] the Gaussians of a tile, front to back
+    int width, height;
+    int threads;
+};
+
+struct Picture {
+    float *image, *alpha;         // [C, H, W, D] [C, H, W]
+    float *transmittance, *stop;  // [C, tiles, 256], 4x4 blocks of pixels: what is left; how far into the tile's list
+};
+
+struct BlendGrads {
+    const float *image, *alpha;  // of the picture
+    float *means2d, *roots, *opacities, *colors, *background;
+};
+
+struct SimilarityArgs {
+    int height, width;
+    const float *image, *target;  // [H, W, 3]
+    float ssim_weight;
+    float* grad;  // [H, W, 3], null: not wanted
+    int threads;
+};
+
+struct Kernels {
+    const char* isa;
+    void (*project)(const ProjectArgs&, const Splats&);
+    void (*project_backward)(const ProjectArgs&, const Splats& grads, const ProjectGrads&);
+    int64_t (*count_tiles)(const BinArgs&, int64_t* offsets);
+    void (*fill_tiles)(const BinArgs&, const int64_t* offsets, int32_t* ids);
+    void (*blend)(const BlendArgs&, const Picture&);
+    void (*blend_backward)(const BlendArgs&, const Picture&, const BlendGrads&);
+};
+
+constexpr int TILE = 16;  // pixels a side
+inline int tiles_along(int pixels) { return (pixels + TILE - 1) / TILE; }
+
+}  // namespace gsb

@@ -1,0 +1,14 @@
+// The table of one instruction set's kernels, which dispatch.cpp chooses from.
+#include "isa.h"
+
+#define GSB_TEXT_(x) #x
+#define GSB_TEXT(x) GSB_TEXT_(x)
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+extern const Kernels table;
+const Kernels table{GSB_TEXT(GSB_ISA), project, project_backward, count_tiles, fill_tiles, blend, blend_backward};
+
+}  // namespace GSB_ISA
+}  // namespace gsb

@@ -1,0 +1,110 @@
+// A tile of 16x16 pixels as sixteen blocks of 4x4, one SIMD vector each: small splats waste few lanes on them.
+#pragma once
+
+#include "../math/blending.h"
+#include "bins.h"
+#include "buffer.h"
+#include "simd.h"
+
+#if defined(_OPENMP)
+#include <omp.h>
+#endif
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+constexpr int BLOCKS = 16, BLOCK = 4;
+constexpr int TILE_PIXELS = TILE * TILE;
+
+// Of a lane in its block, and of a block in its tile.
+alignas(64) constexpr float COLUMN[LANES] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
+alignas(64) constexpr float ROW[LANES] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
+
+inline int thread_index() {
+#if defined(_OPENMP)
+    return omp_get_thread_num();
+#else
+    return 0;
+#endif
+}
+
+// A splat as blending reads it: one cache line.
+struct alignas(64) Record {
+    float x, y, p, q, r, opacity;
+    float color[3];        // where there are three channels
+    float reach;           // alpha < 1/255 where power is greater
+    float foot_x, foot_y;  // see least_power
+    int32_t first_pair;    // of its pairs (its tiles by rows) in the order of splats
+    int32_t tile_x, tile_y, columns;
+
+    int32_t pair(int tx, int ty) const { return first_pair + (ty - tile_y) * columns + (tx - tile_x); }
+};
+
+// The records of one camera's splats; returns the number of pairs.
+inline int64_t make_records(const BlendArgs& a, int64_t camera, Record* records) {
+    const int64_t base = camera * a.N;
+#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > 1024)
+    for (int64_t i = 0; i < a.N; ++i) {
+        const float *mean = a.means2d + (base + i) * 2, *root = a.roots + (base + i) * 3;
+        const float* half = a.half_sizes + (base + i) * 2;
+        const TileRect rect = tile_rect(mean, half, a.width, a.height);
+        Record& s = records[i];
+        s.x = mean[0];
+        s.y = mean[1];
+        s.p = root[0];
+        s.q = root[1];
+        s.r = root[2];
+        s.opacity = a.opacities[base + i];
+        const float reach = half[0] * s.p;
+        s.reach = reach * reach;
+        s.foot_x = -s.q * s.r / (s.p * s.p + s.q * s.q);
+        s.foot_y = -s.q / s.r;
+        s.first_pair = static_cast<int32_t>(rect.count());
+        s.tile_x = rect.x0;
+        s.tile_y = rect.y0;
+        s.columns = rect.x1 - rect.x0;
+        if (a.D == 3) {
+            const float* color = a.colors + ((a.color_per_camera ? base : 0) + i) * 3;
+            for (int k = 0; k < 3; ++k) s.color[k] = color[k];
+        }
+    }
+    int64_t pairs = 0;
+    for (int64_t i = 0; i < a.N; ++i) {
+        const int32_t count = records[i].first_pair;
+        records[i].first_pair = static_cast<int32_t>(pairs);
+        pairs += count;
+    }
+    return pairs;
+}
+
+// Where the pixels and blocks of one tile are.
+struct TileGrid {
+    int left, top, width, height;  // of the tile; of the part of it that is in the picture
+    Vec lane_x[4], lane_y[4];      // pixel centres of the block columns and rows
+    Vec block_x, block_y;          // first pixel centres of the sixteen blocks
+
+    TileGrid(int tx, int ty, int picture_width, int picture_height) : left(tx * TILE), top(ty * TILE) {
+        width = picture_width - left < TILE ? picture_width - left : TILE;
+        height = picture_height - top < TILE ? picture_height - top : TILE;
+        const Vec column = Vec::load(COLUMN), row = Vec::load(ROW);
+        for (int b = 0; b < 4; ++b) {
+            lane_x[b] = column + (static_cast<float>(left + b * BLOCK) + 0.5f);
+            lane_y[b] = row + (static_cast<float>(top + b * BLOCK) + 0.5f);
+        }
+        block_x = column * BLOCK + (static_cast<float>(left) + 0.5f);
+        block_y = row * BLOCK + (static_cast<float>(top) + 0.5f);
+    }
+
+    // Which blocks have a pixel that the splat may reach, one bit each.
+    uint32_t touched(const Record& s) const {
+        const Vec x0 = block_x - s.x, y0 = block_y - s.y;
+        const Vec power = least_power<Vec>(x0, x0 + (BLOCK - 1), y0, y0 + (BLOCK - 1), s.p, s.q, s.r, s.foot_x, s.foot_y);
+        return bits(power <= Vec(s.reach));
+    }
+
+    // Position of a pixel of the tile in the order of blocks and lanes.
+    static int lane_of(int x, int y) { return ((y >> 2) * 4 + (x >> 2)) * LANES + (y & 3) * 4 + (x & 3); }
+};
+
+}  // namespace GSB_ISA
+}  // namespace gsb

@@ -1,0 +1,62 @@
+// What the mathematics needs of its number type T, here for `float`; cpu/simd.h has the same for vectors.
+#pragma once
+
+#include <cmath>
+
+#ifdef __CUDACC__
+#define GSB_HD __host__ __device__
+#else
+#define GSB_HD
+#endif
+
+// The same sources are compiled once for each instruction set: a namespace each, so that the linker keeps them apart.
+#ifndef GSB_ISA
+#define GSB_ISA portable
+#endif
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+GSB_HD inline float select(bool mask, float yes, float no) { return mask ? yes : no; }
+GSB_HD inline float min(float a, float b) { return a < b ? a : b; }
+GSB_HD inline float max(float a, float b) { return a > b ? a : b; }
+GSB_HD inline float sqrt(float x) { return ::sqrtf(x); }
+GSB_HD inline float exp2(float x) { return ::exp2f(x); }
+GSB_HD inline float log2(float x) { return ::log2f(x); }
+GSB_HD inline float reciprocal(float x) { return 1.0f / x; }
+
+constexpr float LOG2_E = 1.44269504f;
+constexpr float LN_2 = 0.693147181f;
+
+template <class T>
+GSB_HD inline T exp(T x) {
+    return exp2(x * LOG2_E);
+}
+
+template <class T>
+GSB_HD inline T clamp(T x, T low, T high) {
+    return min(max(x, low), high);
+}
+
+template <class T>
+struct Vec3 {
+    T x, y, z;
+
+    GSB_HD Vec3 operator+(const Vec3& o) const { return {x + o.x, y + o.y, z + o.z}; }
+    GSB_HD Vec3 operator-(const Vec3& o) const { return {x - o.x, y - o.y, z - o.z}; }
+    GSB_HD Vec3 operator*(T s) const { return {x * s, y * s, z * s}; }
+    GSB_HD Vec3& operator+=(const Vec3& o) { return *this = *this + o; }
+};
+
+template <class T>
+GSB_HD inline T dot(const Vec3<T>& a, const Vec3<T>& b) {
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+template <class T>
+GSB_HD inline Vec3<T> cross(const Vec3<T>& a, const Vec3<T>& b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+
+}  // namespace GSB_ISA
+}  // namespace gsb

@@ -1,0 +1,35 @@
+"""Whether a request fits into memory, asked before it is made: the kernel's OOM killer gives no message."""
+
+from pathlib import Path
+
+from gsbench.errors import InputError
+
+
+def require(size: int, what: str) -> None:
+    """Raise InputError if `size` bytes for `what` are more than this process can still get."""
+    free = available()
+    if size > (1 << 24) and free is not None and size > free:
+        raise InputError(f"{what} need {size / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are available: "
+                         "use a smaller picture, fewer cameras at once or fewer Gaussians")  # fmt: skip
+
+
+def available() -> int | None:
+    """Bytes this process can still get, by the system and by its control group; None where neither says."""
+    limits = [x for x in (_system(), _control_group()) if x is not None]
+    return min(limits, default=None)
+
+
+def _system() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def _control_group() -> int | None:
+    folder = Path("/sys/fs/cgroup")
+    try:
+        return int((folder / "memory.max").read_text()) - int((folder / "memory.current").read_text())
+    except (OSError, ValueError):  # no control group, or no limit ("max")
+        return None
