@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-SH_C0 = 0.28209479177387814  # Y_00; a colour rgb is stored as (rgb - 0.5) / SH_C0
+from gsbench.scenes.points import SH_C0  # Y_00
 
 # Constants of the real spherical harmonics of degree 1 to 3, in 3DGS' order and signs.
 _C1 = 0.4886025119029199

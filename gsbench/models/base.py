@@ -13,9 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from gsbench.errors import InputError, did_you_mean
-from gsbench.models.appearance import SH_C0, sh_colors
+from gsbench.models.appearance import sh_colors
 from gsbench.models.refinement import Refinement
-from gsbench.scenes.points import nearest_distances
+from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
 
 Raw = dict[str, Tensor]  # raw parameters by name, N rows each
@@ -254,7 +254,9 @@ def build(name: str, **options: Any) -> GaussianModel:
     if name not in _REGISTRY:
         raise InputError(f"model '{name}' is not known. {did_you_mean(name, _REGISTRY)}")
     model = _REGISTRY[name]
-    known = list(inspect.signature(model).parameters)
+    # A constructor passes on what it does not name itself: its options are those of all classes it stands on.
+    signatures = [inspect.signature(cls.__init__) for cls in model.__mro__ if issubclass(cls, GaussianModel)]
+    known = [p.name for s in signatures for p in s.parameters.values() if p.kind is p.KEYWORD_ONLY]
     for option in options:
         if option not in known:
             raise InputError(f"model '{name}' has no option '{option}'. {did_you_mean(option, known)}")
