@@ -53,7 +53,7 @@ def project_backward(
     g_means2d: Tensor, g_roots: Tensor, g_opacities: Tensor, g_depths: Tensor, cameras: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of means, factors, opacities and, if `cameras`, viewmats (else empty)."""
-    out = (torch.empty_like(means), torch.empty_like(factors), torch.empty_like(opacities),
+    out = (_rows_like(means), _rows_like(factors), _rows_like(opacities),
            viewmats.new_empty(len(viewmats) if cameras else 0, 4, 4))  # fmt: skip
     native().project_backward(
         *_plain(means, factors, opacities, viewmats, Ks), width, height, near, far, eps2d, antialias, threads(),
@@ -65,7 +65,7 @@ def project_backward(
 @project_backward.register_fake
 def _(means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, *rest: Any) -> tuple[Tensor, ...]:
     cameras = viewmats.new_empty(len(viewmats) if rest[-1] else 0, 4, 4)
-    return torch.empty_like(means), torch.empty_like(factors), torch.empty_like(opacities), cameras
+    return _rows_like(means), _rows_like(factors), _rows_like(opacities), cameras
 
 
 def _project_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -78,7 +78,7 @@ def _project_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ..
 def _project_gradient(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
     means, factors, opacities, viewmats, Ks = ctx.saved_tensors
     C, N = len(viewmats), len(means)
-    given = [means.new_zeros(shape) if g is None else g.contiguous()
+    given = [means.new_zeros(shape) if g is None else g
              for g, shape in zip(grads[:4], ((C, N, 2), (C, N, 3), (C, N), (C, N)), strict=True)]  # fmt: skip
     cameras = ctx.needs_input_grad[3]
     out = project_backward(means, factors, opacities, viewmats, Ks, *ctx.rest, *given, cameras)
@@ -145,7 +145,7 @@ def blend_backward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of means2d, roots, opacities, colors and background."""
     inputs = means2d, roots, opacities, colors, background
-    out = tuple(torch.empty_like(x) for x in inputs)
+    out = tuple(_rows_like(x) for x in inputs)
     require(4 * len(ids) * (6 + colors.shape[-1]), f"the gradients of {len(ids)} pairs of a tile and a Gaussian")
     native().blend_backward(*_plain(means2d, roots, opacities, half_sizes, colors, background), offsets, ids,
                             width, height, threads(), *_plain(transmittance, stop, g_image, g_alpha), *out)  # fmt: skip
@@ -155,7 +155,7 @@ def blend_backward(
 @blend_backward.register_fake
 def _(means2d: Tensor, roots: Tensor, opacities: Tensor, _half: Tensor, colors: Tensor, background: Tensor,
       *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
-    return tuple(torch.empty_like(x) for x in (means2d, roots, opacities, colors, background))
+    return tuple(_rows_like(x) for x in (means2d, roots, opacities, colors, background))
 
 
 def _blend_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -168,7 +168,7 @@ def _blend_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]
 
 def _blend_gradient(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
     *inputs, transmittance, stop = ctx.saved_tensors
-    given = [inputs[0].new_zeros(shape) if g is None else g.contiguous()
+    given = [inputs[0].new_zeros(shape) if g is None else g
              for g, shape in zip(grads[:2], ctx.shapes, strict=True)]  # fmt: skip
     g = blend_backward(*inputs, *ctx.size, transmittance, stop, *given)
     return g[0], g[1], g[2], None, g[3], g[4], None, None, None, None
@@ -178,5 +178,10 @@ blend.register_autograd(_blend_gradient, setup_context=_blend_context)
 
 
 def _plain(*tensors: Tensor) -> tuple[Tensor, ...]:
-    """The same values without their graph, which may not cross DLPack."""
-    return tuple(t.detach() for t in tensors)
+    """The same values in rows, without their graph, which may not cross DLPack."""
+    return tuple(t.detach().contiguous() for t in tensors)
+
+
+def _rows_like(tensor: Tensor) -> Tensor:
+    """Memory of the same shape, row by row whatever the strides of `tensor`."""
+    return tensor.new_empty(tensor.shape)

@@ -33,11 +33,10 @@ def draw(
 
     shared = C == 1 or colors.stride(0) == 0  # one set of colours, seen by every camera
     means2d, roots, opacities, depths, half_sizes = project(
-        means.contiguous(), factors.contiguous(), opacities.contiguous(), viewmats.contiguous(), Ks.contiguous(),
-        width, height, near, far, eps2d, antialias,
-    )  # fmt: skip
+        means, factors, opacities, viewmats, Ks, width, height, near, far, eps2d, antialias
+    )
     offsets, ids = bin_tiles(means2d, depths, half_sizes, width, height)
-    image, alpha, _, _ = blend(means2d, roots, opacities, half_sizes, (colors[:1] if shared else colors).contiguous(),
-                               background.contiguous(), offsets, ids, width, height)  # fmt: skip
+    image, alpha, _, _ = blend(means2d, roots, opacities, half_sizes, colors[:1] if shared else colors, background,
+                               offsets, ids, width, height)  # fmt: skip
     radii = half_sizes.amax(-1).ceil_().int()
     return RasterOutput(image, alpha, RasterInfo(radii, means2d, depths, len(ids)))

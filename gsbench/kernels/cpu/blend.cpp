@@ -17,6 +17,39 @@ struct TileJob {
     float* color;  // scratch, [D][256]
 };
 
+// The tile's colours over the background, from planes in the order of blocks to the rows of the picture.
+template <int D>
+void write_picture(const TileJob& job, const TileGrid& grid) {
+    const BlendArgs& a = job.args;
+    const int channels = D ? D : a.D;
+    float* T = job.out.transmittance + job.tile * TILE_PIXELS;
+    alignas(64) float alpha[TILE_PIXELS];
+    for (int at = 0; at < TILE_PIXELS; at += LANES) {
+        const Vec signed_left = Vec::load(T + at), left = max(signed_left, -signed_left);
+        left.store(T + at);
+        (Vec(1.0f) - left).store(alpha + at);
+        for (int k = 0; k < channels; ++k) {
+            float* color = job.color + k * TILE_PIXELS + at;
+            (Vec::load(color) + left * a.background[k]).store(color);
+        }
+    }
+    each_row(grid, [&](int at, int x, int y, int n) {
+        const int64_t pixel = (job.camera * a.height + y) * a.width + x;
+        float* image = job.out.image + pixel * channels;
+        if (D && n == BLOCK) {  // the same as below, unrolled
+            for (int i = 0; i < BLOCK; ++i) {
+                job.out.alpha[pixel + i] = alpha[at + i];
+                for (int k = 0; k < D; ++k) image[i * D + k] = job.color[k * TILE_PIXELS + at + i];
+            }
+            return;
+        }
+        for (int i = 0; i < n; ++i) {
+            job.out.alpha[pixel + i] = alpha[at + i];
+            for (int k = 0; k < channels; ++k) image[i * channels + k] = job.color[k * TILE_PIXELS + at + i];
+        }
+    });
+}
+
 // D channels, 0: as many as the arguments say. A pixel that is done, or outside, has transmittance <= 0.
 template <int D>
 void blend_tile(const TileJob& job) {
@@ -39,6 +72,7 @@ void blend_tile(const TileJob& job) {
 
     for (int64_t i = 0; i < count && alive; ++i) {
         const Record& s = job.records[ids[i]];
+        __builtin_prefetch(job.records + ids[i + AHEAD < count ? i + AHEAD : i]);
         const float* c = D == 3 ? s.color : job.colors + static_cast<int64_t>(ids[i]) * channels;
         for (uint32_t blocks = grid.touched(s) & alive; blocks; blocks &= blocks - 1) {
             const int b = __builtin_ctz(blocks), at = b * LANES;
@@ -62,20 +96,7 @@ void blend_tile(const TileJob& job) {
         }
     }
 
-    for (int b = 0; b < BLOCKS; ++b) {
-        const Vec left = Vec::load(T + b * LANES);
-        max(left, -left).store(T + b * LANES);
-    }
-    for (int y = 0; y < grid.height; ++y) {
-        const int64_t row = (job.camera * a.height + grid.top + y) * a.width + grid.left;
-        for (int x = 0; x < grid.width; ++x) {
-            const int at = TileGrid::lane_of(x, y);
-            job.out.alpha[row + x] = 1.0f - T[at];
-            for (int k = 0; k < channels; ++k) {
-                job.out.image[(row + x) * channels + k] = color[k * TILE_PIXELS + at] + T[at] * a.background[k];
-            }
-        }
-    }
+    write_picture<D>(job, grid);
 }
 
 }  // namespace

@@ -24,7 +24,7 @@ struct TileJob {
     float* color_sums;  // scratch, [D][16] or more
     float* pair_sums;   // [pairs][6 + D]
     uint8_t* pair_seen;
-    double* background;  // [D] of this tile
+    float* background;   // [D] of this tile
 };
 
 // The picture's gradient in the order of blocks, and what lies behind everything: the background's share of it.
@@ -35,20 +35,30 @@ void load_gradient(const TileJob& job, const TileGrid& grid, float* behind) {
     const float* T = job.picture.transmittance + job.tile * TILE_PIXELS;
     for (int k = 0; k < channels * TILE_PIXELS; ++k) job.g_color[k] = 0.0f;
     for (int k = 0; k < TILE_PIXELS; ++k) behind[k] = 0.0f;
-    for (int k = 0; k < channels; ++k) job.background[k] = 0.0;
-    for (int y = 0; y < grid.height; ++y) {
-        const int64_t row = (job.camera * a.height + grid.top + y) * a.width + grid.left;
-        for (int x = 0; x < grid.width; ++x) {
-            const int at = TileGrid::lane_of(x, y);
-            float sum = -job.grads.alpha[row + x];
-            for (int k = 0; k < channels; ++k) {
-                const float g = job.grads.image[(row + x) * channels + k];
-                job.g_color[k * TILE_PIXELS + at] = g;
-                sum += g * a.background[k];
-                job.background[k] += static_cast<double>(g * T[at]);
+    each_row(grid, [&](int at, int x, int y, int n) {
+        const int64_t pixel = (job.camera * a.height + y) * a.width + x;
+        const float *image = job.grads.image + pixel * channels, *alpha = job.grads.alpha + pixel;
+        if (D && n == BLOCK) {  // the same as below, unrolled
+            for (int i = 0; i < BLOCK; ++i) {
+                behind[at + i] = -alpha[i];
+                for (int k = 0; k < D; ++k) job.g_color[k * TILE_PIXELS + at + i] = image[i * D + k];
             }
-            behind[at] = sum;
+            return;
         }
+        for (int i = 0; i < n; ++i) {
+            behind[at + i] = -alpha[i];
+            for (int k = 0; k < channels; ++k) job.g_color[k * TILE_PIXELS + at + i] = image[i * channels + k];
+        }
+    });
+    for (int k = 0; k < channels; ++k) {
+        const float* g_color = job.g_color + k * TILE_PIXELS;
+        Vec total(0.0f);
+        for (int at = 0; at < TILE_PIXELS; at += LANES) {
+            const Vec g = Vec::load(g_color + at);
+            total += g * Vec::load(T + at);
+            (Vec::load(behind + at) + g * a.background[k]).store(behind + at);
+        }
+        job.background[k] = sum(total);
     }
 }
 
@@ -91,6 +101,7 @@ void backward_tile(const TileJob& job) {
 
     for (int64_t i = static_cast<int64_t>(last) - 1; i >= 0; --i) {
         const Record& s = job.records[ids[i]];
+        __builtin_prefetch(job.records + ids[i < AHEAD ? 0 : i - AHEAD]);
         const Vec position(static_cast<float>(i));
         uint32_t blocks = grid.touched(s) & bits(position < stops);
         if (!blocks) continue;
@@ -164,7 +175,7 @@ void blend_backward(const BlendArgs& a, const Picture& picture, const BlendGrads
     const size_t scratch_size = D * (TILE_PIXELS + LANES);
     Buffer<float> scratch(scratch_size * threads), pair_sums(static_cast<size_t>(most_pairs) * (GEOMETRY + D));
     Buffer<uint8_t> pair_seen(static_cast<size_t>(most_pairs));
-    Buffer<double> background(D * static_cast<size_t>(tiles));
+    Buffer<float> background(D * static_cast<size_t>(tiles));
     for (size_t k = 0; k < D; ++k) out.background[k] = 0.0f;
 
     for (int64_t c = 0; c < a.C; ++c) {

@@ -15,6 +15,7 @@ inline namespace GSB_ISA {
 
 constexpr int BLOCKS = 16, BLOCK = 4;
 constexpr int TILE_PIXELS = TILE * TILE;
+constexpr int AHEAD = 4;  // splats whose records are fetched before they are needed
 
 // Of a lane in its block, and of a block in its tile.
 alignas(64) constexpr float COLUMN[LANES] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
@@ -101,10 +102,21 @@ struct TileGrid {
         const Vec power = least_power<Vec>(x0, x0 + (BLOCK - 1), y0, y0 + (BLOCK - 1), s.p, s.q, s.r, s.foot_x, s.foot_y);
         return bits(power <= Vec(s.reach));
     }
-
-    // Position of a pixel of the tile in the order of blocks and lanes.
-    static int lane_of(int x, int y) { return ((y >> 2) * 4 + (x >> 2)) * LANES + (y & 3) * 4 + (x & 3); }
 };
+
+// Calls f(at, x, y, n) for each row of up to four pixels that a block has in the picture: `at` is the row's place in
+// the order of blocks and lanes, (x, y) that of its first pixel in the picture.
+template <class F>
+inline void each_row(const TileGrid& grid, F f) {
+    for (int b = 0; b < BLOCKS; ++b) {
+        const int left = (b & 3) * BLOCK, top = (b >> 2) * BLOCK;
+        const int n = grid.width - left < BLOCK ? grid.width - left : BLOCK;
+        if (n <= 0) continue;
+        for (int row = 0; row < BLOCK && top + row < grid.height; ++row) {
+            f(b * LANES + row * BLOCK, grid.left + left, grid.top + top + row, n);
+        }
+    }
+}
 
 }  // namespace GSB_ISA
 }  // namespace gsb

@@ -6,7 +6,7 @@
 #ifdef __CUDACC__
 #define GSB_HD __host__ __device__
 #else
-#define GSB_HD
+#define GSB_HD __attribute__((always_inline))  // a vector that crosses a call goes through memory
 #endif
 
 // The same sources are compiled once for each instruction set: a namespace each, so that the linker keeps them apart.

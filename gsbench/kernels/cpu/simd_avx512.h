@@ -1,0 +1,85 @@
+// Sixteen floats as one AVX-512 register.
+#pragma once
+
+#include <immintrin.h>
+
+#include <cstdint>
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+struct Mask {
+    __mmask16 m;
+};
+
+struct Vec {
+    __m512 v;
+
+    Vec() = default;
+    Vec(__m512 v) : v(v) {}
+    Vec(float s) : v(_mm512_set1_ps(s)) {}
+
+    static Vec load(const float* p) { return _mm512_loadu_ps(p); }
+    void store(float* p) const { _mm512_storeu_ps(p, v); }
+};
+
+GSB_HD inline Vec operator+(Vec a, Vec b) { return _mm512_add_ps(a.v, b.v); }
+GSB_HD inline Vec operator-(Vec a, Vec b) { return _mm512_sub_ps(a.v, b.v); }
+GSB_HD inline Vec operator*(Vec a, Vec b) { return _mm512_mul_ps(a.v, b.v); }
+GSB_HD inline Vec operator/(Vec a, Vec b) { return _mm512_div_ps(a.v, b.v); }
+GSB_HD inline Mask operator<(Vec a, Vec b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
+GSB_HD inline Mask operator<=(Vec a, Vec b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LE_OQ)}; }
+GSB_HD inline Mask operator==(Vec a, Vec b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_EQ_OQ)}; }
+GSB_HD inline Mask operator&(Mask a, Mask b) { return {static_cast<__mmask16>(a.m & b.m)}; }
+GSB_HD inline Mask operator|(Mask a, Mask b) { return {static_cast<__mmask16>(a.m | b.m)}; }
+GSB_HD inline Mask operator!(Mask a) { return {static_cast<__mmask16>(~a.m)}; }
+GSB_HD inline bool any(Mask a) { return a.m != 0; }
+GSB_HD inline uint32_t bits(Mask a) { return a.m; }
+GSB_HD inline Vec select(Mask m, Vec yes, Vec no) { return _mm512_mask_mov_ps(no.v, m.m, yes.v); }
+GSB_HD inline Vec min(Vec a, Vec b) { return _mm512_min_ps(a.v, b.v); }
+GSB_HD inline Vec max(Vec a, Vec b) { return _mm512_max_ps(a.v, b.v); }
+GSB_HD inline Vec sqrt(Vec a) { return _mm512_sqrt_ps(a.v); }
+
+GSB_HD inline Vec reciprocal(Vec x) {  // 14 bits, and one step of Newton's
+    const Vec y = _mm512_rcp14_ps(x.v);
+    return y * (Vec(2.0f) - x * y);
+}
+
+GSB_HD inline Vec exp2(Vec x) {
+    const Vec r = _mm512_reduce_ps(x.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);  // x - floor(x)
+    return _mm512_scalef_ps(exp2_fraction(r).v, x.v);                                // times 2^floor(x)
+}
+
+// x = mantissa * 2^exponent, mantissa in [0.75, 1.5)
+GSB_HD inline void split(Vec x, Vec& mantissa, Vec& exponent) {
+    mantissa = _mm512_getmant_ps(x.v, _MM_MANT_NORM_p75_1p5, _MM_MANT_SIGN_zero);
+    exponent = _mm512_getexp_ps((x / mantissa).v);
+}
+
+// p[lane * stride] of the first n lanes, zero in the others; and back.
+GSB_HD inline __m512i strided(int stride) {
+    return _mm512_mullo_epi32(_mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15),
+                              _mm512_set1_epi32(stride));
+}
+GSB_HD inline __mmask16 first(int n) { return static_cast<__mmask16>((1u << n) - 1); }
+GSB_HD inline Vec gather(const float* p, int stride, int n = LANES) {
+    return _mm512_mask_i32gather_ps(_mm512_setzero_ps(), first(n), strided(stride), p, 4);
+}
+GSB_HD inline void scatter(Vec x, float* p, int stride, int n = LANES) {
+    _mm512_mask_i32scatter_ps(p, first(n), strided(stride), x.v, 4);
+}
+GSB_HD inline void store_first(Vec x, float* p, int n) { _mm512_mask_storeu_ps(p, first(n), x.v); }
+
+// The sums of four vectors' lanes, to out[0..3].
+GSB_HD inline void sum4(Vec a, Vec b, Vec c, Vec d, float* out) {
+    const __m512 ab = _mm512_add_ps(_mm512_shuffle_f32x4(a.v, b.v, 0x44), _mm512_shuffle_f32x4(a.v, b.v, 0xee));
+    const __m512 cd = _mm512_add_ps(_mm512_shuffle_f32x4(c.v, d.v, 0x44), _mm512_shuffle_f32x4(c.v, d.v, 0xee));
+    __m512 x = _mm512_add_ps(_mm512_shuffle_f32x4(ab, cd, 0x88), _mm512_shuffle_f32x4(ab, cd, 0xdd));
+    x = _mm512_add_ps(x, _mm512_permute_ps(x, 0x4e));
+    x = _mm512_add_ps(x, _mm512_permute_ps(x, 0xb1));  // each quarter holds one sum, four times
+    const __m512i pick = _mm512_setr_epi32(0, 4, 8, 12, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0);
+    _mm_storeu_ps(out, _mm512_castps512_ps128(_mm512_permutexvar_ps(pick, x)));
+}
+
+}  // namespace GSB_ISA
+}  // namespace gsb

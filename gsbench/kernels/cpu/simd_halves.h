@@ -1,0 +1,202 @@
+// Sixteen floats as two registers of AVX, or as four of SSE or NEON: a register, and pairs of halves.
+#pragma once
+
+#include <cstdint>
+
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+#if defined(__AVX2__)
+constexpr int WIDTH = 8;  // floats in a register
+#else
+constexpr int WIDTH = 4;
+#endif
+typedef float Floats __attribute__((vector_size(WIDTH * 4)));
+typedef int32_t Ints __attribute__((vector_size(WIDTH * 4)));
+
+struct RegisterMask {
+    Ints m;
+
+    GSB_HD friend RegisterMask operator&(RegisterMask a, RegisterMask b) { return {a.m & b.m}; }
+    GSB_HD friend RegisterMask operator|(RegisterMask a, RegisterMask b) { return {a.m | b.m}; }
+    GSB_HD friend RegisterMask operator!(RegisterMask a) { return {~a.m}; }
+    GSB_HD friend uint32_t bits(RegisterMask a) {
+#if defined(__AVX2__)
+        return static_cast<uint32_t>(_mm256_movemask_ps(reinterpret_cast<__m256>(a.m)));
+#elif defined(__x86_64__)
+        return static_cast<uint32_t>(_mm_movemask_ps(reinterpret_cast<__m128>(a.m)));
+#else
+        uint32_t out = 0;
+        for (int i = 0; i < WIDTH; ++i) out |= (a.m[i] & 1u) << i;
+        return out;
+#endif
+    }
+};
+
+struct Register {
+    using Mask = RegisterMask;
+    static constexpr int size = WIDTH;
+    Floats v;
+
+    Register() = default;
+    GSB_HD Register(Floats v) : v(v) {}
+#if defined(__AVX2__)
+    GSB_HD Register(float s) : v{s, s, s, s, s, s, s, s} {}
+#else
+    GSB_HD Register(float s) : v{s, s, s, s} {}
+#endif
+
+    GSB_HD static Register load(const float* p) {
+        Register x;
+        __builtin_memcpy(&x.v, p, sizeof(x.v));
+        return x;
+    }
+    GSB_HD void store(float* p) const { __builtin_memcpy(p, &v, sizeof(v)); }
+    GSB_HD static Register gather(const float* p, int stride) {
+        Register x;
+        for (int i = 0; i < WIDTH; ++i) x.v[i] = p[i * stride];
+        return x;
+    }
+    GSB_HD void scatter(float* p, int stride) const {
+        for (int i = 0; i < WIDTH; ++i) p[i * stride] = v[i];
+    }
+
+    GSB_HD friend Register operator+(Register a, Register b) { return a.v + b.v; }
+    GSB_HD friend Register operator-(Register a, Register b) { return a.v - b.v; }
+    GSB_HD friend Register operator*(Register a, Register b) { return a.v * b.v; }
+    GSB_HD friend Register operator/(Register a, Register b) { return a.v / b.v; }
+    GSB_HD friend Mask operator<(Register a, Register b) { return {a.v < b.v}; }
+    GSB_HD friend Mask operator<=(Register a, Register b) { return {a.v <= b.v}; }
+    GSB_HD friend Mask operator==(Register a, Register b) { return {a.v == b.v}; }
+    GSB_HD friend Register select(Mask m, Register yes, Register no) { return m.m ? yes.v : no.v; }
+    GSB_HD friend Register min(Register a, Register b) { return a.v < b.v ? a.v : b.v; }
+    GSB_HD friend Register max(Register a, Register b) { return a.v > b.v ? a.v : b.v; }
+    GSB_HD friend Register sqrt(Register a) {
+#if defined(__AVX2__)
+        return Floats(_mm256_sqrt_ps(a.v));
+#elif defined(__x86_64__)
+        return Floats(_mm_sqrt_ps(a.v));
+#else
+        for (int i = 0; i < WIDTH; ++i) a.v[i] = ::sqrtf(a.v[i]);
+        return a;
+#endif
+    }
+    GSB_HD friend Register exp2(Register x) {
+        const Floats bounded = x.v > -126.0f ? x.v : Floats{} - 126.0f;
+        Ints whole = __builtin_convertvector(bounded, Ints);  // towards zero: one too many below it
+        Floats r = bounded - __builtin_convertvector(whole, Floats);
+        const Ints below = r < 0.0f;  // -1 where so
+        whole += below;
+        r -= __builtin_convertvector(below, Floats);
+        return exp2_fraction(r) * reinterpret_cast<Floats>((whole + 127) << 23);
+    }
+    GSB_HD friend void split(Register x, Register& mantissa, Register& exponent) {
+        const Ints raw = reinterpret_cast<Ints>(x.v), whole = (raw - 0x3f400000) >> 23;  // 0x3f400000 is 0.75
+        mantissa.v = reinterpret_cast<Floats>(raw - (whole << 23));
+        exponent.v = __builtin_convertvector(whole, Floats);
+    }
+};
+
+template <class Half>
+struct PairMask {
+    Half lo, hi;
+
+    GSB_HD friend PairMask operator&(PairMask a, PairMask b) { return {a.lo & b.lo, a.hi & b.hi}; }
+    GSB_HD friend PairMask operator|(PairMask a, PairMask b) { return {a.lo | b.lo, a.hi | b.hi}; }
+    GSB_HD friend PairMask operator!(PairMask a) { return {!a.lo, !a.hi}; }
+    GSB_HD friend uint32_t bits(PairMask a) { return bits(a.lo) | bits(a.hi) << (sizeof(Half) / sizeof(int32_t)); }
+};
+
+template <class Half>
+struct Pair {
+    using Mask = PairMask<typename Half::Mask>;
+    static constexpr int size = 2 * Half::size;
+    Half lo, hi;
+
+    Pair() = default;
+    GSB_HD Pair(Half lo, Half hi) : lo(lo), hi(hi) {}
+    GSB_HD Pair(float s) : lo(s), hi(s) {}
+
+    GSB_HD static Pair load(const float* p) { return {Half::load(p), Half::load(p + Half::size)}; }
+    GSB_HD void store(float* p) const {
+        lo.store(p);
+        hi.store(p + Half::size);
+    }
+    GSB_HD static Pair gather(const float* p, int stride) {
+        return {Half::gather(p, stride), Half::gather(p + Half::size * stride, stride)};
+    }
+    GSB_HD void scatter(float* p, int stride) const {
+        lo.scatter(p, stride);
+        hi.scatter(p + Half::size * stride, stride);
+    }
+
+    GSB_HD friend Pair operator+(Pair a, Pair b) { return {a.lo + b.lo, a.hi + b.hi}; }
+    GSB_HD friend Pair operator-(Pair a, Pair b) { return {a.lo - b.lo, a.hi - b.hi}; }
+    GSB_HD friend Pair operator*(Pair a, Pair b) { return {a.lo * b.lo, a.hi * b.hi}; }
+    GSB_HD friend Pair operator/(Pair a, Pair b) { return {a.lo / b.lo, a.hi / b.hi}; }
+    GSB_HD friend Mask operator<(Pair a, Pair b) { return {a.lo < b.lo, a.hi < b.hi}; }
+    GSB_HD friend Mask operator<=(Pair a, Pair b) { return {a.lo <= b.lo, a.hi <= b.hi}; }
+    GSB_HD friend Mask operator==(Pair a, Pair b) { return {a.lo == b.lo, a.hi == b.hi}; }
+    GSB_HD friend Pair select(Mask m, Pair yes, Pair no) {
+        return {select(m.lo, yes.lo, no.lo), select(m.hi, yes.hi, no.hi)};
+    }
+    GSB_HD friend Pair min(Pair a, Pair b) { return {min(a.lo, b.lo), min(a.hi, b.hi)}; }
+    GSB_HD friend Pair max(Pair a, Pair b) { return {max(a.lo, b.lo), max(a.hi, b.hi)}; }
+    GSB_HD friend Pair sqrt(Pair a) { return {sqrt(a.lo), sqrt(a.hi)}; }
+    GSB_HD friend Pair exp2(Pair x) { return {exp2(x.lo), exp2(x.hi)}; }
+    GSB_HD friend void split(Pair x, Pair& mantissa, Pair& exponent) {
+        split(x.lo, mantissa.lo, exponent.lo);
+        split(x.hi, mantissa.hi, exponent.hi);
+    }
+};
+
+#if defined(__AVX2__)
+using Vec = Pair<Register>;
+#else
+using Vec = Pair<Pair<Register>>;
+#endif
+using Mask = Vec::Mask;
+static_assert(Vec::size == LANES);
+
+GSB_HD inline bool any(Mask m) { return bits(m) != 0; }
+GSB_HD inline Vec reciprocal(Vec x) { return Vec(1.0f) / x; }
+
+GSB_HD inline Vec gather(const float* p, int stride, int n = LANES) {
+    if (n == LANES) return Vec::gather(p, stride);
+    alignas(64) float lane[LANES] = {};
+    for (int i = 0; i < n; ++i) lane[i] = p[i * stride];
+    return Vec::load(lane);
+}
+GSB_HD inline void scatter(Vec x, float* p, int stride, int n = LANES) {
+    if (n == LANES) return x.scatter(p, stride);
+    alignas(64) float lane[LANES];
+    x.store(lane);
+    for (int i = 0; i < n; ++i) p[i * stride] = lane[i];
+}
+GSB_HD inline void store_first(Vec x, float* p, int n) { n == LANES ? x.store(p) : scatter(x, p, 1, n); }
+
+// The sums of four vectors' lanes, to out[0..3].
+GSB_HD inline Floats fold(Register x) { return x.v; }
+template <class Half>
+GSB_HD inline Floats fold(Pair<Half> x) {
+    return fold(x.lo + x.hi);
+}
+GSB_HD inline void sum4(Vec a, Vec b, Vec c, Vec d, float* out) {
+#if defined(__AVX2__)
+    const __m256 ab = _mm256_hadd_ps(fold(a), fold(b)), cd = _mm256_hadd_ps(fold(c), fold(d));
+    const __m256 x = _mm256_hadd_ps(ab, cd);
+    _mm_storeu_ps(out, _mm_add_ps(_mm256_castps256_ps128(x), _mm256_extractf128_ps(x, 1)));
+#elif defined(__x86_64__)
+    _mm_storeu_ps(out, _mm_hadd_ps(_mm_hadd_ps(fold(a), fold(b)), _mm_hadd_ps(fold(c), fold(d))));
+#else
+    const Floats parts[4] = {fold(a), fold(b), fold(c), fold(d)};
+    for (int i = 0; i < 4; ++i) out[i] = (parts[i][0] + parts[i][1]) + (parts[i][2] + parts[i][3]);
+#endif
+}
+
+}  // namespace GSB_ISA
+}  // namespace gsb
