@@ -50,6 +50,35 @@ void write_picture(const TileJob& job, const TileGrid& grid) {
     });
 }
 
+// One splat, the i-th of its tile, over one block. False: no pixel of the block is left to blend.
+template <int D>
+GSB_HD inline bool blend_block(const TileJob& job, const TileGrid& grid, int64_t i, int32_t id, int b, float* T,
+                               float* stop) {
+    const Record& s = job.records[id];
+    const int channels = D ? D : job.args.D, at = b * LANES;
+    const float* c = D == 3 ? s.color : job.colors + static_cast<int64_t>(id) * channels;
+    const Vec zero(0.0f);
+    const Falloff<Vec> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s.p, s.q, s.r, s.opacity);
+    const Vec before = Vec::load(T + at), after = before - before * f.alpha;
+    const Mask seen = f.alpha >= Vec(ALPHA_MIN), enough = after >= Vec(TRANSMITTANCE_MIN);
+    const Mask blended = seen & enough;
+    const Vec weight = select(blended, before * f.alpha, zero);
+    for (int k = 0; k < channels; ++k) {
+        float* sums = job.color + k * TILE_PIXELS + at;
+        (Vec::load(sums) + weight * c[k]).store(sums);
+    }
+    const Vec left = select(blended, after, before);
+    const Mask ends = seen & !enough & (before > zero);
+    if (!any(ends)) {
+        left.store(T + at);
+        return true;
+    }
+    const Vec marked = select(ends, -before, left);
+    marked.store(T + at);
+    select(ends, Vec(static_cast<float>(i)), Vec::load(stop + at)).store(stop + at);
+    return any(marked > zero);
+}
+
 // D channels, 0: as many as the arguments say. A pixel that is done, or outside, has transmittance <= 0.
 template <int D>
 void blend_tile(const TileJob& job) {
@@ -70,32 +99,23 @@ void blend_tile(const TileJob& job) {
         alive |= static_cast<uint32_t>(any(inside)) << b;
     }
 
-    for (int64_t i = 0; i < count && alive; ++i) {
-        const Record& s = job.records[ids[i]];
-        __builtin_prefetch(job.records + ids[i + AHEAD < count ? i + AHEAD : i]);
-        const float* c = D == 3 ? s.color : job.colors + static_cast<int64_t>(ids[i]) * channels;
-        for (uint32_t blocks = grid.touched(s) & alive; blocks; blocks &= blocks - 1) {
-            const int b = __builtin_ctz(blocks), at = b * LANES;
-            const Falloff<Vec> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s.p, s.q, s.r, s.opacity);
-            const Vec before = Vec::load(T + at), after = before - before * f.alpha;
-            const Mask seen = f.alpha >= Vec(ALPHA_MIN), enough = after >= Vec(TRANSMITTANCE_MIN);
-            const Mask blended = seen & enough;
-            const Vec weight = select(blended, before * f.alpha, zero);
-            for (int k = 0; k < channels; ++k) {
-                float* sums = color + k * TILE_PIXELS + at;
-                (Vec::load(sums) + weight * c[k]).store(sums);
-            }
-            Vec left = select(blended, after, before);
-            const Mask ends = seen & !enough & (before > zero);
-            if (any(ends)) {
-                left = select(ends, -before, left);
-                select(ends, Vec(static_cast<float>(i)), Vec::load(stop + at)).store(stop + at);
-                if (!any(left > zero)) alive &= ~(1u << b);
-            }
-            left.store(T + at);
+    // Which blocks a splat touches is found for many splats at once, before any is blended: the loop over a list of
+    // (splat, block) has no branch to mispredict.
+    int32_t work[BATCH * BLOCKS + LANES];
+    for (int64_t first = 0; first < count && alive; first += BATCH) {
+        const int64_t end = first + BATCH < count ? first + BATCH : count;
+        int items = 0;
+        for (int64_t i = first; i < end; ++i) {
+            __builtin_prefetch(job.records + ids[i + AHEAD < count ? i + AHEAD : i]);
+            items += append_bits(grid.touched(job.records[ids[i]]) & alive, static_cast<int32_t>(i - first) * BLOCKS,
+                                 work + items);
+        }
+        for (int item = 0; item < items; ++item) {
+            const int64_t i = first + work[item] / BLOCKS;
+            const int b = work[item] % BLOCKS;
+            if (!blend_block<D>(job, grid, i, ids[i], b, T, stop)) alive &= ~(1u << b);
         }
     }
-
     write_picture<D>(job, grid);
 }
 

@@ -79,10 +79,44 @@ void store_sums(const FalloffMoments<Vec>& m, const Vec* color, int channels, fl
     }
 }
 
+// One splat, the i-th of its tile, over the blocks it touches: its pair's sums, and the state of the pixels before it.
+template <int D>
+GSB_HD inline void backward_splat(const TileJob& job, const TileGrid& grid, int64_t i, int32_t id, uint32_t blocks,
+                                  float* T, float* behind, Vec* color) {
+    const Record& s = job.records[id];
+    const int channels = D ? D : job.args.D;
+    const float *stop = job.picture.stop + job.tile * TILE_PIXELS,
+                *c = D == 3 ? s.color : job.colors + static_cast<int64_t>(id) * channels;
+    const Vec position(static_cast<float>(i)), zero(0.0f);
+    FalloffMoments<Vec> moments{zero, zero, zero, zero, zero, zero};
+    for (int k = 0; k < channels; ++k) color[k] = zero;
+    for (; blocks; blocks &= blocks - 1) {
+        const int b = __builtin_ctz(blocks), at = b * LANES;
+        const Falloff<Vec> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s.p, s.q, s.r, s.opacity);
+        const Mask blended = (f.alpha >= Vec(ALPHA_MIN)) & (position < Vec::load(stop + at));
+        const Vec alpha = select(blended, f.alpha, zero);
+        const Vec before = Vec::load(T + at) * reciprocal(Vec(1.0f) - alpha);
+        const Vec weight = alpha * before;
+        before.store(T + at);
+        Vec g(0.0f);  // of the splat's own colour
+        for (int k = 0; k < channels; ++k) {
+            const Vec g_color = Vec::load(job.g_color + k * TILE_PIXELS + at);
+            g += g_color * c[k];
+            color[k] += weight * g_color;
+        }
+        // dC/dalpha = T (c - what is seen behind the splat); seen behind the next one nearer: a mix of the two.
+        const Vec back = Vec::load(behind + at), difference = g - back;
+        (back + alpha * difference).store(behind + at);
+        moments.add(f, select(f.free <= Vec(ALPHA_MAX), weight * difference, zero));
+    }
+    const int64_t pair = s.pair(job.tx, job.ty);
+    store_sums<D>(moments, color, channels, job.pair_sums + pair * (GEOMETRY + channels));
+    job.pair_seen[pair] = 1;
+}
+
 template <int D>
 void backward_tile(const TileJob& job) {
     const BlendArgs& a = job.args;
-    const int channels = D ? D : a.D;
     const TileGrid grid(job.tx, job.ty, a.width, a.height);
     const int32_t* ids = a.ids + a.offsets[job.tile];
     const float* stop = job.picture.stop + job.tile * TILE_PIXELS;
@@ -99,37 +133,16 @@ void backward_tile(const TileJob& job) {
     Vec local[D ? D : 1];
     Vec* color = D ? local : reinterpret_cast<Vec*>(job.color_sums);
 
-    for (int64_t i = static_cast<int64_t>(last) - 1; i >= 0; --i) {
-        const Record& s = job.records[ids[i]];
-        __builtin_prefetch(job.records + ids[i < AHEAD ? 0 : i - AHEAD]);
-        const Vec position(static_cast<float>(i));
-        uint32_t blocks = grid.touched(s) & bits(position < stops);
-        if (!blocks) continue;
-        const float* c = D == 3 ? s.color : job.colors + static_cast<int64_t>(ids[i]) * channels;
-        FalloffMoments<Vec> moments{zero, zero, zero, zero, zero, zero};
-        for (int k = 0; k < channels; ++k) color[k] = zero;
-        for (; blocks; blocks &= blocks - 1) {
-            const int b = __builtin_ctz(blocks), at = b * LANES;
-            const Falloff<Vec> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s.p, s.q, s.r, s.opacity);
-            const Mask blended = (f.alpha >= Vec(ALPHA_MIN)) & (position < Vec::load(stop + at));
-            const Vec alpha = select(blended, f.alpha, zero);
-            const Vec before = Vec::load(T + at) * reciprocal(Vec(1.0f) - alpha);
-            const Vec weight = alpha * before;
-            before.store(T + at);
-            Vec g(0.0f);  // of the splat's own colour
-            for (int k = 0; k < channels; ++k) {
-                const Vec g_color = Vec::load(job.g_color + k * TILE_PIXELS + at);
-                g += g_color * c[k];
-                color[k] += weight * g_color;
-            }
-            // dC/dalpha = T (c - what is seen behind the splat); seen behind the next one nearer: a mix of the two.
-            const Vec back = Vec::load(behind + at), difference = g - back;
-            (back + alpha * difference).store(behind + at);
-            moments.add(f, select(f.free <= Vec(ALPHA_MAX), weight * difference, zero));
+    uint32_t touched[BATCH];  // found for many splats at once, so that no branch waits for it
+    for (int64_t end = static_cast<int64_t>(last); end > 0; end -= BATCH) {
+        const int64_t first = end > BATCH ? end - BATCH : 0;
+        for (int64_t i = end - 1; i >= first; --i) {
+            __builtin_prefetch(job.records + ids[i < AHEAD ? 0 : i - AHEAD]);
+            touched[i - first] = grid.touched(job.records[ids[i]]) & bits(Vec(static_cast<float>(i)) < stops);
         }
-        const int64_t pair = s.pair(job.tx, job.ty);
-        store_sums<D>(moments, color, channels, job.pair_sums + pair * (GEOMETRY + channels));
-        job.pair_seen[pair] = 1;
+        for (int64_t i = end - 1; i >= first; --i) {
+            if (touched[i - first]) backward_splat<D>(job, grid, i, ids[i], touched[i - first], T, behind, color);
+        }
     }
 }
 

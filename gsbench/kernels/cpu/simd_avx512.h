@@ -70,6 +70,14 @@ GSB_HD inline void scatter(Vec x, float* p, int stride, int n = LANES) {
 }
 GSB_HD inline void store_first(Vec x, float* p, int n) { _mm512_mask_storeu_ps(p, first(n), x.v); }
 
+// Writes base + k for each bit k that is set, in order, and returns their number; 16 places are overwritten.
+GSB_HD inline int append_bits(uint32_t bits, int32_t base, int32_t* out) {
+    const __m512i all = _mm512_add_epi32(_mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15),
+                                         _mm512_set1_epi32(base));
+    _mm512_storeu_si512(out, _mm512_maskz_compress_epi32(static_cast<__mmask16>(bits), all));
+    return __builtin_popcount(bits);
+}
+
 // The sums of four vectors' lanes, to out[0..3].
 GSB_HD inline void sum4(Vec a, Vec b, Vec c, Vec d, float* out) {
     const __m512 ab = _mm512_add_ps(_mm512_shuffle_f32x4(a.v, b.v, 0x44), _mm512_shuffle_f32x4(a.v, b.v, 0xee));

@@ -179,6 +179,13 @@ GSB_HD inline void scatter(Vec x, float* p, int stride, int n = LANES) {
 }
 GSB_HD inline void store_first(Vec x, float* p, int n) { n == LANES ? x.store(p) : scatter(x, p, 1, n); }
 
+// Writes base + k for each bit k that is set, in order, and returns their number.
+GSB_HD inline int append_bits(uint32_t bits, int32_t base, int32_t* out) {
+    int n = 0;
+    for (; bits; bits &= bits - 1) out[n++] = base + __builtin_ctz(bits);
+    return n;
+}
+
 // The sums of four vectors' lanes, to out[0..3].
 GSB_HD inline Floats fold(Register x) { return x.v; }
 template <class Half>
