@@ -156,9 +156,20 @@ void blend_backward(In<-1, -1, 2> means2d, In<-1, -1, 3> roots, In<-1, -1> opaci
                             out_colors.data(), out_background.data()});
 }
 
+double l1_ssim(In<-1, -1, 3> image, In<-1, -1, 3> target, double ssim_weight, int threads, Out<-1, -1, 3> grad) {
+    const Frame frame(static_cast<int>(image.shape(1)), static_cast<int>(image.shape(0)), threads);
+    expect_all(frame.height, "the height", target.shape(0));
+    expect_all(frame.width, "the width", target.shape(1));
+    if (grad.size() > 0) expect_all(size(image.size()), "the gradient's size", grad.size());
+    float* g = grad.size() > 0 ? grad.data() : nullptr;
+    nb::gil_scoped_release release;
+    return active->l1_ssim(
+        {frame.height, frame.width, image.data(), target.data(), static_cast<float>(ssim_weight), g, threads});
+}
+
 // Binds f so that no argument is converted or copied: what does not fit is refused.
-template <class... Args>
-void define(nb::module_& m, const char* name, void (*f)(Args...)) {
+template <class Result, class... Args>
+void define(nb::module_& m, const char* name, Result (*f)(Args...)) {
     m.def(name, f, (static_cast<void>(sizeof(Args)), nb::arg().noconvert())...);
 }
 
@@ -171,8 +182,9 @@ NB_MODULE(_native, m) {
     m.def("active", [] { return std::string(active->isa); }, "The instruction set in use.");
     define(m, "project", project);
     define(m, "project_backward", project_backward);
-    m.def("count_tiles", count_tiles);
+    define(m, "count_tiles", count_tiles);
     define(m, "fill_tiles", fill_tiles);
     define(m, "blend", blend);
     define(m, "blend_backward", blend_backward);
+    define(m, "l1_ssim", l1_ssim);
 }

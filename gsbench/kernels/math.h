@@ -5,10 +5,7 @@
 // that by its inputs. Names of gradients start with g_.
 #pragma once
 
-#include "math/adam.h"
 #include "math/blending.h"
-#include "math/harmonics.h"
 #include "math/projection.h"
 #include "math/scalar.h"
 #include "math/similarity.h"
-#include "math/slicing.h"

@@ -13,6 +13,7 @@ int64_t count_tiles(const BinArgs&, int64_t* offsets);
 void fill_tiles(const BinArgs&, const int64_t* offsets, int32_t* ids);
 void blend(const BlendArgs&, const Picture&);
 void blend_backward(const BlendArgs&, const Picture&, const BlendGrads&);
+double l1_ssim(const SimilarityArgs&);
 
 }  // namespace GSB_ISA
 }  // namespace gsb

@@ -69,6 +69,7 @@ struct Kernels {
     void (*fill_tiles)(const BinArgs&, const int64_t* offsets, int32_t* ids);
     void (*blend)(const BlendArgs&, const Picture&);
     void (*blend_backward)(const BlendArgs&, const Picture&, const BlendGrads&);
+    double (*l1_ssim)(const SimilarityArgs&);
 };
 
 constexpr int TILE = 16;  // pixels a side

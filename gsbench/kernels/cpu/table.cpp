@@ -8,7 +8,8 @@ namespace gsb {
 inline namespace GSB_ISA {
 
 extern const Kernels table;
-const Kernels table{GSB_TEXT(GSB_ISA), project, project_backward, count_tiles, fill_tiles, blend, blend_backward};
+const Kernels table{GSB_TEXT(GSB_ISA), project, project_backward, count_tiles, fill_tiles, blend, blend_backward,
+                   l1_ssim};
 
 }  // namespace GSB_ISA
 }  // namespace gsb

@@ -1,0 +1,33 @@
+// The structural similarity of two pictures at one pixel (Wang et al. 2004, eq. 13) from filtered moments.
+#pragma once
+
+#include "scalar.h"
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+constexpr int SSIM_RADIUS = 5;  // an 11 x 11 window of standard deviation 1.5, as 3DGS trains with
+constexpr int SSIM_WINDOW = 2 * SSIM_RADIUS + 1;
+constexpr double SSIM_SIGMA = 1.5;
+
+template <class T>
+struct Similarity {
+    T value;
+    T g_mean, g_square, g_product;  // its derivatives by the filtered a, a^2 and a b
+
+    // Of filtered a, b, a^2, b^2 and a b; a is what is fitted, b the truth.
+    GSB_HD Similarity(T mean_a, T mean_b, T aa, T bb, T ab) {
+        constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
+        const T product = mean_a * mean_b, squares = mean_a * mean_a + mean_b * mean_b;
+        const T luminance = product * 2.0f + C1, structure = (ab - product) * 2.0f + C2;
+        const T B1 = squares + C1, B2 = aa + bb - squares + C2;
+        const T inverse = T(1.0f) / (B1 * B2);
+        value = luminance * structure * inverse;
+        g_product = luminance * inverse * 2.0f;
+        g_square = T(0.0f) - value * inverse * B1;
+        g_mean = (mean_b * (structure - luminance) - value * mean_a * (B2 - B1)) * inverse * 2.0f;
+    }
+};
+
+}  // namespace GSB_ISA
+}  // namespace gsb
