@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 
@@ -59,3 +60,16 @@ class Scene:
     def has_time(self) -> bool:
         """Whether every training view carries a time."""
         return all(view.time is not None for view in self.train)
+
+
+def scene_extent(
+    viewmats: Tensor,  # [C, 4, 4] the training cameras
+) -> float:
+    """Return 1.1 x the largest distance of a camera from the cameras' mean, in world units; 0 if all share one place.
+
+    Source: 3DGS, `getNerfppNorm` in scene/dataset_readers.py. Learning rates of positions and the size at which a
+    Gaussian splits are multiples of it.
+    """
+    rotations, translations = viewmats[:, :3, :3].double(), viewmats[:, :3, 3].double()
+    centers = -torch.einsum("cji,cj->ci", rotations, translations)
+    return 1.1 * float((centers - centers.mean(dim=0)).norm(dim=1).max())
