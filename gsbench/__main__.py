@@ -62,8 +62,8 @@ def _one_scene_each(composed: DictConfig) -> list[DictConfig]:
     overrides = [o for o in HydraConfig.get().overrides.task if not o.startswith("scene=")]
     known = _group("scene")
     return [
-        hydra.compose("config", [*overrides, *([f"scene={name}"] if name in known else ["scene=custom", f"scene.name={name}"])])
-        for name in composed.data.scenes
+        hydra.compose("config", [*overrides, *([f"scene={x}"] if x in known else ["scene=custom", f"scene.name={x}"])])
+        for x in composed.data.scenes
     ]
 
 

@@ -20,7 +20,7 @@ from gsbench.measure.speed import peak_memory, reset_peak_memory, synchroniser, 
 from gsbench.models import GaussianModel
 from gsbench.raster import choose_backend
 from gsbench.report.pictures import strip, write_png
-from gsbench.scenes import Scene, View
+from gsbench.scenes import Scene
 from gsbench.scenes.points import random_points
 from gsbench.train import checkpoint
 from gsbench.train.loop import DivergedError, Trainer
@@ -56,9 +56,7 @@ def run(composed: DictConfig) -> Record:
         print(f"{_name(this)}: finished before, kept: {summary(done)}; {this.folder / records.FILE_NAME}")
         return done
     reset_peak_memory(config.device)
-    model = models.build(
-        config.model.name, agr=config.agr, sh_degree=config.model.sh_degree, **config.model.options
-    )
+    model = models.build(config.model.name, agr=config.agr, sh_degree=config.model.sh_degree, **config.model.options)
     if "time" in model.observes and not scene.has_time:
         raise InputError(f"{config.model.name}: expected a scene with times, {scene.name} has none: use 3dgs or 6dgs")
     try:
@@ -127,8 +125,8 @@ def load_scene(config: Config) -> Scene:
             f"data.root={data.root}: expected a folder '{name}' with transforms_{{train,val,test}}.json and the "
             f"images they name, looked for {folder}{published}"
         )
-    scene = scenes.load(folder, downscale=config.scene.downscale, background=BACKGROUNDS[data.background])
-    return replace(scene, **{split: _on(getattr(scene, split), config.device) for split in ("train", "val", "test")})
+    background = BACKGROUNDS[data.background]
+    return scenes.load(folder, downscale=config.scene.downscale, background=background).to(config.device)
 
 
 def data_root(root: str) -> Path:
@@ -182,7 +180,7 @@ def fit_and_measure(this: Run, scene: Scene, model: GaussianModel) -> Record:
     )
     shown = pictures[:: max(1, len(pictures) // max(1, config.protocol.pictures))][: config.protocol.pictures]
     if shown:
-        write_png(this.folder / "pictures.png", strip([(render, truth) for _, render, truth in shown]))
+        write_png(strip([(render.cpu(), truth.cpu()) for _, render, truth in shown]), this.folder / "pictures.png")
     cost = Cost(
         train_s=sum(trainer.stages.seconds.values()),
         stage_s=trainer.stages.state_dict(),
@@ -258,10 +256,6 @@ def summary(record: Record) -> str:
 
 def _name(this: Run) -> str:
     return f"{this.config.scene.name} {this.label} seed{this.config.seed}"
-
-
-def _on(views: list[View], device: str) -> list[View]:
-    return [replace(view, camera=view.camera.to(device), image=view.image.to(device)) for view in views]
 
 
 def _one_line(error: BaseException) -> str:

@@ -78,7 +78,7 @@ class GaussianModel(nn.Module, ABC):
 
     @abstractmethod
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Raw parameters named in `centers` and `shape`, less `means`, for points with neighbours at `distances` [N]."""
+        """Raw parameters named in `centers` and `shape`, less `means`; neighbours of points are at `distances` [N]."""
 
     @abstractmethod
     def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
@@ -101,7 +101,7 @@ class GaussianModel(nn.Module, ABC):
         rest = dc.new_zeros(len(dc), (self.sh_degree + 1) ** 2 - 1, 3)
         return {"sh0": dc[:, None], "shN": rest}
 
-    def show(self, raw: Raw, directions: Tensor, time: Tensor | None) -> Tensor:  # noqa: ARG002 - 4DGS reads it
+    def show(self, raw: Raw, directions: Tensor, time: Tensor | None) -> Tensor:
         """Colours [N, 3] in unit directions [N, 3]."""
         return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), directions, self.stage.sh_degree)
 

@@ -34,7 +34,7 @@ def triangular(
 
 
 def triangular_parameters(factor: Tensor, *, row_scaled: bool = False) -> tuple[Tensor, Tensor]:
-    """Undo `triangular` for any square factor [N, n, n]: log_diagonal [N, n] and off_diagonal [N, n(n-1)/2] of the same S.
+    """Undo `triangular`: log_diagonal [N, n] and off_diagonal [N, n(n-1)/2] of any square factor [N, n, n] of S.
 
     With `row_scaled`, entries that form cannot reach (as large as their diagonal or larger) are cut to 99.9 % of it.
     """

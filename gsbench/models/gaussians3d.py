@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register
 from gsbench.models.factors import rotation
-from gsbench.scenes.points import Points
+from gsbench.scenes.scene import Points
 
 
 @register("3dgs")

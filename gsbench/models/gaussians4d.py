@@ -11,7 +11,7 @@ from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register
 from gsbench.models.factors import rotation4d
 from gsbench.models.slicing import mahalanobis, slice_gaussians
-from gsbench.scenes.points import Points
+from gsbench.scenes.scene import Points
 
 TIME_GATE_MIN = 0.05  # a Gaussian whose f_temp is not above this is not drawn (4DGS, gaussian_renderer)
 

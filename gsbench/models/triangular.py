@@ -11,7 +11,7 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
 from gsbench.models.factors import triangular, triangular_parameters
 from gsbench.models.slicing import Reduced, gain_of, mahalanobis, reduce, slice_gaussians, slice_reduced
-from gsbench.scenes.points import Points
+from gsbench.scenes.scene import Points
 
 # Where position, time and direction stand among the rows of the triangular factor.
 FACTOR_ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
@@ -71,7 +71,7 @@ class TriangularModel(GaussianModel):
         self.is_reduced = factor_order == "conditioned_first" and scheme == "square_root"
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Spheres, directions uniform on the unit sphere, direction scale 1, time scale sqrt(T / 10), no correlation."""
+        """Spheres; directions uniform on the unit sphere, of scale 1; time scale sqrt(T / 10); no correlation."""
         N, n = len(distances), sum(map(len, self.rows.values()))
         log_diagonal = torch.zeros(N, n)
         log_diagonal[:, self.rows["p"]] = distances.log()[:, None]

@@ -1,6 +1,6 @@
 """What is seen: a camera, a view (camera, time, image), a scene (views by split, background, extent)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -34,6 +34,10 @@ class View:
     time: float | None  # in [0, 1]; None where the data set has no time
     image: Tensor  # [H, W, 3] float32 in [0, 1], composited over the scene's background
 
+    def to(self, device: str) -> "View":
+        """The same view with its tensors on `device`."""
+        return replace(self, camera=self.camera.to(device), image=self.image.to(device))
+
 
 @dataclass(frozen=True)
 class Points:
@@ -60,6 +64,11 @@ class Scene:
     def has_time(self) -> bool:
         """Whether every training view carries a time."""
         return all(view.time is not None for view in self.train)
+
+    def to(self, device: str) -> "Scene":
+        """The same scene with its views on `device`."""
+        train, val, test = ([view.to(device) for view in views] for views in (self.train, self.val, self.test))
+        return replace(self, train=train, val=val, test=test)
 
 
 def scene_extent(

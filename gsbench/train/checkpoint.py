@@ -35,5 +35,5 @@ def load(path: Path, config_hash: str, data_hash: str, device: str) -> dict[str,
         state: dict[str, Any] = content["state"]
     except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: expected a checkpoint, could not read it ({reason}); delete it to start over") from None
+        raise InputError(f"{path}: expected a checkpoint, got {reason}; delete it to start over") from None
     return state if found == (VERSION, config_hash, data_hash) else None

@@ -65,8 +65,9 @@ class Trainer:
         train = self.config.train
         saved = time.monotonic()
         every = 0.2 if sys.stderr.isatty() else 20.0  # seconds between updates: a log file is no terminal
-        bar = tqdm(total=train.iterations, initial=self.step, desc=label, unit="it", mininterval=every, maxinterval=every)
-        with bar:
+        with tqdm(
+            total=train.iterations, initial=self.step, desc=label, unit="it", mininterval=every, maxinterval=every
+        ) as bar:
             while self.step < train.iterations:
                 loss = self._descend()
                 if self.schedule.measures(self.step):
@@ -97,7 +98,7 @@ class Trainer:
                 loss = photometric(output.image[0], view.image, train.ssim_weight) / len(views)
                 total += loss.item()
             with stages("backward"):
-                loss.backward()  # type: ignore[no-untyped-call]
+                loss.backward()
             with stages("density"):
                 self.density.observe(output.info, view.camera.width, view.camera.height, len(views))
         self._check_finite(total)

@@ -1,0 +1,54 @@
+"""The curve of a run: accuracy on validation over iterations and seconds, and the time to reach an accuracy."""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from gsbench.errors import InputError
+
+
+class Point(NamedTuple):
+    """One evaluation during training."""
+
+    iteration: int
+    seconds: float  # of training so far, evaluation excluded
+    psnr_val: float | None  # dB on the validation split; None where it was not finite
+
+
+@dataclass
+class Curve:
+    """The points of one run, in order; its state lives in the checkpoint, so that a resumed run continues it."""
+
+    points: list[Point] = field(default_factory=list)
+
+    def add(self, iteration: int, seconds: float, psnr_val: float) -> None:
+        """Append a point; raises InputError where iteration or seconds go backwards (a resume gone wrong)."""
+        if self.points and (iteration <= self.points[-1].iteration or seconds < self.points[-1].seconds):
+            raise InputError(
+                f"curve: expected a point after {self.points[-1].iteration} iterations, {self.points[-1].seconds} s; "
+                f"got {iteration} iterations, {seconds} s; restore the curve and the clock from one checkpoint"
+            )
+        self.points.append(Point(iteration, seconds, psnr_val if math.isfinite(psnr_val) else None))
+
+    @property
+    def last(self) -> Point | None:
+        """The latest point; None before the first."""
+        return self.points[-1] if self.points else None
+
+    @property
+    def best(self) -> Point | None:
+        """The earliest of the points with the highest PSNR; None where there is none."""
+        finite = [(p.psnr_val, p) for p in self.points if p.psnr_val is not None]
+        return max(finite, key=lambda pair: pair[0])[1] if finite else None
+
+    def seconds_to(self, psnr: float) -> float | None:
+        """Training seconds at the first evaluation that reached `psnr` dB, not interpolated; None if none did."""
+        return next((p.seconds for p in self.points if p.psnr_val is not None and p.psnr_val >= psnr), None)
+
+    def state_dict(self) -> list[tuple[int, float, float | None]]:
+        """The points as plain tuples, which a checkpoint read with weights_only=True accepts."""
+        return [(p.iteration, p.seconds, p.psnr_val) for p in self.points]
+
+    def load_state_dict(self, state: list[tuple[int, float, float | None]]) -> None:
+        """Continue from the points of a checkpoint."""
+        self.points = [Point(*point) for point in state]

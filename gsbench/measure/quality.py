@@ -1,0 +1,151 @@
+"""How good a picture is: PSNR, SSIM and LPIPS by one protocol, and all of them over the views of a split.
+
+Images are [H, W, 3] tensors of floats, meant in [0, 1] and clamped to it. Pixels that are NaN make the result NaN.
+Where published code disagrees on a definition, the choice made here is stated in its function.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+
+import torch
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.measure import perceptual
+from gsbench.measure.perceptual import BACKBONES, BackboneMissing
+from gsbench.measure.record import ViewScore
+
+SSIM_LEAST_SIDE = 11  # pixels: the window of a Gaussian of sigma 1.5, cut at 3.5 sigma
+
+
+def psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
+    """Peak signal-to-noise ratio in dB, its mean squared error joint over H x W x 3; infinite for equal images."""
+    return _decibels(_squared_error(a, b).mean())
+
+
+def psnr_channel_mean(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
+    """The mean of the three channels' PSNR in dB, as some codes report it: never below `psnr` (Jensen)."""
+    return fmean(_decibels(error) for error in _squared_error(a, b).mean((0, 1)))
+
+
+def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
+    """Structural similarity by scikit-image with the settings of Wang et al. 2004, in float64, mean over channels.
+
+    Without data_range scikit-image takes 2 for floats, without use_sample_covariance=False it differs from the paper.
+    """
+    a, b = _images(a, b, SSIM_LEAST_SIDE, "ssim")
+    similarity = structural_similarity(
+        a.cpu().numpy(),
+        b.cpu().numpy(),
+        channel_axis=-1,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+    )
+    return float(similarity)
+
+
+@torch.no_grad()
+def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = None) -> float:  # [H, W, 3], each
+    """LPIPS 0.1 on the "alex" or "vgg" backbone, inputs scaled to [-1, 1], on the images' device.
+
+    `weights` and what is raised (BackboneMissing, InputError): see gsbench.measure.perceptual.load.
+    """
+    network = perceptual.load(backbone, weights, str(a.device))
+    a, b = (2 * x.float() - 1 for x in _images(a, b, BACKBONES[backbone].least_side, "lpips"))
+    return float(network(a.permute(2, 0, 1)[None], b.permute(2, 0, 1)[None]))
+
+
+def quantise(image: Tensor) -> Tensor:  # [..., 3]
+    """The image as an 8-bit PNG would hold it, back in [0, 1]."""
+    return (image.clamp(0, 1) * 255).round() / 255
+
+
+@dataclass(frozen=True)
+class Quality:
+    """The quality over the views of a split, in the record's own terms."""
+
+    metrics: dict[str, float | None]  # means over the views
+    missing: dict[str, str]  # why a metric is None
+    per_view: list[ViewScore]
+
+
+def evaluate(
+    pictures: Iterable[tuple[str, Tensor, Tensor]],  # name, render [H, W, 3], truth [H, W, 3]
+    *,
+    background: tuple[float, float, float],
+    quantised: bool = False,
+    weights: dict[str, Path] | None = None,
+) -> Quality:
+    """Every metric on every picture, and their means.
+
+    `background` is the colour the truth was composited over: an image of nothing else scores `psnr_background_only`.
+    `quantised` sends renders through 8 bits first. `weights` names the trunk file by backbone. A missing backbone or a
+    picture too small for a metric leaves that metric None with the reason; see gsbench.measure.perceptual.load for the
+    weights that raise InputError.
+    """
+    measures: dict[str, Callable[[Tensor, Tensor], float]] = {
+        "psnr": psnr,
+        "psnr_channel_mean": psnr_channel_mean,
+        "ssim": ssim,
+        "psnr_background_only": lambda _, truth: psnr(truth.new_tensor(background).expand_as(truth), truth),
+    }
+    least_side = {"ssim": SSIM_LEAST_SIDE}
+    for backbone, known in BACKBONES.items():
+        measures[f"lpips_{backbone}"] = partial(lpips, backbone=backbone, weights=(weights or {}).get(backbone))
+        least_side[f"lpips_{backbone}"] = known.least_side
+    scores: dict[str, list[float]] = {metric: [] for metric in measures}
+    missing: dict[str, str] = {}
+    per_view = []
+    for name, render, truth in pictures:
+        side = min(truth.shape[:2])
+        shown = quantise(render) if quantised else render
+        here: dict[str, float] = {}
+        for metric, measure in measures.items():
+            if side < least_side.get(metric, 1):
+                missing[metric] = f"needs {least_side[metric]} pixels a side, {name} has {side}"
+                continue
+            try:
+                here[metric] = measure(shown, truth)
+            except BackboneMissing as reason:
+                missing[metric] = str(reason)
+        for metric, value in here.items():
+            scores[metric].append(value)
+        del here["psnr_background_only"]  # of the split, not of the model's view
+        per_view.append(ViewScore(name, **here))
+    if not per_view:
+        raise InputError("evaluate: expected at least one picture, got none")
+    metrics = {metric: None if metric in missing else fmean(values) for metric, values in scores.items()}
+    return Quality(metrics, missing, per_view)
+
+
+def _images(a: Tensor, b: Tensor, least_side: int, what: str) -> tuple[Tensor, Tensor]:
+    """Both images clamped to [0, 1] in float64; raises InputError where they are not two images of one size."""
+    for image in (a, b):
+        if image.ndim != 3 or image.shape[2] != 3 or not image.is_floating_point():
+            raise InputError(
+                f"{what}: expected images [H, W, 3] of floats in [0, 1], got {list(image.shape)} of {image.dtype}"
+            )
+    if a.shape != b.shape or a.device != b.device:
+        raise InputError(
+            f"{what}: expected two images of one size on one device, "
+            f"got {list(a.shape)} on {a.device} and {list(b.shape)} on {b.device}"
+        )
+    if min(a.shape[:2]) < least_side:
+        raise InputError(f"{what}: expected at least {least_side} pixels a side, got {list(a.shape)}")
+    return a.detach().double().clamp(0, 1), b.detach().double().clamp(0, 1)
+
+
+def _squared_error(a: Tensor, b: Tensor) -> Tensor:  # [H, W, 3]
+    a, b = _images(a, b, 1, "psnr")
+    return (a - b).square()
+
+
+def _decibels(mean_squared_error: Tensor) -> float:
+    """-10 log10 of it, the peak being 1."""
+    return float(-10 * mean_squared_error.log10())

@@ -1,0 +1,213 @@
+"""The schema of record.json, one file a run: written atomically, validated when read, usable without torch.
+
+A record says what was run (model, scene, seed, effects), under which protocol, what came out (metrics, cost, curve) and
+where the numbers come from (provenance). A number that is missing is null and says why in `missing`.
+"""
+
+import dataclasses
+import json
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsbench.errors import InputError, did_you_mean
+from gsbench.measure.atomic import write_atomically
+from gsbench.measure.curve import Point
+from gsbench.measure.schema import parse
+from gsbench.measure.speed import RenderTimes
+
+VERSION = 1
+FILE_NAME = "record.json"
+STATUSES = ("ok", "failed", "diverged")
+METRICS = (
+    "psnr",  # dB, joint over H x W x 3, final iteration, mean over the views of the evaluated split
+    "psnr_channel_mean",  # dB, mean of the three channels' PSNR
+    "ssim",
+    "lpips_alex",
+    "lpips_vgg",
+    "psnr_best_on_val",  # dB, at the iteration that was best on validation
+    "psnr_best_on_test",  # dB, the best seen on test during training: it LEAKS, and is only for comparing with papers
+    "psnr_background_only",  # dB of an image of nothing but background: what a model that learned nothing gets
+)
+
+
+@dataclass(frozen=True)
+class Effects:
+    """Which effects the model simulates."""
+
+    time: bool
+    direction: bool
+    refinement: bool  # AGR
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """The quality of one rendered view; None where it is missing or not finite."""
+
+    name: str
+    psnr: float | None = None
+    psnr_channel_mean: float | None = None
+    ssim: float | None = None
+    lpips_alex: float | None = None
+    lpips_vgg: float | None = None
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What the run cost."""
+
+    train_s: float  # seconds of the whole training loop less evaluation
+    stage_s: dict[str, float]  # its split by stage
+    render_ms: RenderTimes
+    fps: float  # 1000 / render_ms.p50: gsbench.measure.speed.time_renders
+    num_gaussians: int
+    bytes: int  # of the model's parameters
+    peak_memory: int  # bytes: gsbench.measure.speed.peak_memory
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where the numbers come from: gsbench.measure.provenance.provenance() fills it."""
+
+    git_commit: str | None  # "-dirty" at the end where tracked files were changed; None outside a git checkout
+    versions: dict[str, str]  # python and the packages that the numbers depend on
+    device: str  # the processor or GPU by name
+    threads: int
+    config: dict[str, Any]  # the whole resolved config, plain JSON
+    config_hash: str
+    data_hash: str  # Scene.fingerprint
+    time: str  # UTC, ISO 8601
+
+
+@dataclass(frozen=True)
+class Record:
+    """One run. `metrics` has keys of METRICS; every null among them has its reason in `missing`."""
+
+    status: str  # "ok", "failed" or "diverged"
+    reason: str | None  # why it is not ok
+    experiment: str
+    model: str
+    scene: str
+    dataset: str
+    seed: int
+    effects: Effects
+    protocol: dict[str, Any]  # plain JSON: name, background, downscale, eval_split, quantise, paper_dataset, ...
+    provenance: Provenance
+    metrics: dict[str, float | None] | None = None  # None only where the run is not ok
+    missing: dict[str, str] = field(default_factory=dict)
+    per_view: list[ViewScore] = field(default_factory=list)
+    cost: Cost | None = None  # None only where the run is not ok
+    curve: list[Point] = field(default_factory=list)
+    version: int = VERSION
+
+
+def write(record: Record, path: Path) -> None:
+    """Write `record` to `path` atomically as strict JSON.
+
+    A metric that is not finite becomes null with its reason. Raises InputError, naming the field, for anything `read`
+    would refuse, so that no record is written that cannot be read.
+    """
+    try:
+        plain = json.loads(json.dumps(dataclasses.asdict(_without_non_finite(record))))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected a record of plain JSON values: {error}") from None
+    _validated(plain, path)
+    write_atomically(path, (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())
+
+
+def read(path: Path) -> Record:
+    """Read and validate the record at `path`; raises InputError naming the file and the field."""
+    try:
+        plain = json.loads(path.read_bytes().decode(), object_pairs_hook=_unique_keys)
+        return _validated(plain, path)
+    except OSError as error:
+        raise InputError(f"{path}: expected a record, could not read it: {error.strerror}") from None
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:  # also bad UTF-8, and integers of thousands of digits
+        raise InputError(f"{path}: expected a record in JSON: {error}; delete it and run again") from None
+
+
+def _validated(plain: Any, path: Path) -> Record:
+    """`plain` JSON as a record; raises InputError naming `path` and the field."""
+    version = plain.get("version") if isinstance(plain, dict) else VERSION
+    if type(version) is not int or version != VERSION:  # first: another version has other keys
+        raise InputError(f"{path}: version: expected {VERSION}, got {ascii(version)[:80]}; run again with this gsbench")
+    record = parse(Record, plain, str(path))
+    _check(record, str(path))
+    return record
+
+
+def find(root: Path) -> list[Path]:
+    """The paths of all records under `root`, sorted."""
+    return sorted(root.rglob(FILE_NAME))
+
+
+def run_path(root: Path, experiment: str, scene: str, model: str, seed: int) -> Path:
+    """The folder of one run, ``root/<experiment>/<scene>/<model>/seed<k>``; raises InputError for an unsafe name."""
+    for what, name in (("experiment", experiment), ("scene", scene), ("model", model)):
+        _check_name(name, what)
+    if seed < 0:
+        raise InputError(f"seed: expected >= 0, got {seed}")
+    return root / experiment / scene / model / f"seed{seed}"
+
+
+def _check_name(name: str, where: str) -> None:
+    """A name becomes a folder, so it must not be able to leave its parent."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.+-]*", name):
+        raise InputError(f"{where}: expected a name of letters, digits and _ . + -, got {name!r:.80}")
+
+
+def _check(record: Record, file: str) -> None:
+    """What the types alone do not say; raises InputError naming `file` and the field."""
+    if record.status not in STATUSES:
+        raise InputError(f"{file}: status: got {record.status!r:.80}. {did_you_mean(record.status, STATUSES)}")
+    for what, name in (("experiment", record.experiment), ("scene", record.scene), ("model", record.model)):
+        _check_name(name, f"{file}: {what}")
+    if record.seed < 0:
+        raise InputError(f"{file}: seed: expected >= 0, got {record.seed}")
+    ok = record.status == "ok"
+    if ok == (record.reason is not None):
+        raise InputError(f"{file}: reason: expected {'null' if ok else 'why the run is ' + record.status}")
+    for what, value in (("metrics", record.metrics), ("cost", record.cost)):
+        if ok and value is None:
+            raise InputError(f"{file}: {what}: expected values in a run that is ok, got null")
+    metrics = record.metrics or {}
+    for name in metrics:
+        if name not in METRICS:
+            raise InputError(f"{file}: metrics: unknown metric {name!r:.80}. {did_you_mean(name, METRICS)}")
+        if metrics[name] is None and name not in record.missing:
+            raise InputError(f"{file}: missing: expected the reason why metrics.{name} is null")
+    for name in record.missing:
+        if name not in METRICS or metrics.get(name) is not None:
+            raise InputError(f"{file}: missing: {name!r:.80} is not a metric that is null")
+    iterations = [point.iteration for point in record.curve]
+    if iterations != sorted(set(iterations)):
+        raise InputError(f"{file}: curve: expected rising iterations")
+
+
+def _without_non_finite(record: Record) -> Record:
+    """The same record with metrics, view scores and curve points that are not finite set to None, with the reason."""
+    metrics, missing = record.metrics, dict(record.missing)
+    if metrics is not None:
+        bad = {name: value for name, value in metrics.items() if value is not None and not math.isfinite(value)}
+        why = {True: "not a number", False: "infinite: the images are identical"}
+        missing |= {name: why[math.isnan(value)] for name, value in bad.items()}
+        metrics = metrics | dict.fromkeys(bad)
+    views = [ViewScore(**{k: _finite(v) for k, v in vars(view).items()}) for view in record.per_view]
+    curve = [Point(p.iteration, p.seconds, _finite(p.psnr_val)) for p in record.curve]
+    return dataclasses.replace(record, metrics=metrics, missing=missing, per_view=views, curve=curve)
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """JSON leaves it open which of two equal keys counts; a record must not."""
+    unique = dict(pairs)
+    if len(unique) < len(pairs):
+        raise ValueError("a key appears twice in one object")
+    return unique

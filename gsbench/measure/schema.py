@@ -1,0 +1,101 @@
+"""Plain JSON into typed dataclasses, strictly: no unknown key, no conversion, no NaN; faults name file and field."""
+
+import dataclasses
+import math
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from gsbench.errors import InputError, did_you_mean
+
+T = TypeVar("T")
+
+
+def parse(kind: type[T], value: object, file: str) -> T:
+    """Return `value`, as json.loads gives it, as an instance of the dataclass `kind`.
+
+    Understood are dataclasses, named tuples, list[X], dict[str, X], X | None, bool, int, float (an int counts as one),
+    str, and Any (any plain JSON). Raises InputError ``<file>: <field>: expected ..., got ...``.
+    """
+    parsed: T = _parse(kind, value, file, "")
+    return parsed
+
+
+def _parse(kind: Any, value: Any, file: str, field: str) -> Any:
+    """`value` as a `kind`; `field` is its place in the file, as in ``cost.render_ms.p50`` or ``curve[3]``."""
+    if dataclasses.is_dataclass(kind):
+        return _parse_fields(kind, value, file, field)
+    if hasattr(kind, "_fields"):  # a named tuple, written as a list
+        kinds = [get_type_hints(kind)[name] for name in kind._fields]
+        if type(value) is not list or len(value) != len(kinds):
+            raise _fault(file, field, f"a list of {', '.join(kind._fields)}", value)
+        return kind(*(_parse(k, v, file, f"{field}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True))))
+    if isinstance(kind, UnionType):
+        return None if value is None else _parse(get_args(kind)[0], value, file, field)
+    if get_origin(kind) is list:
+        if type(value) is not list:
+            raise _fault(file, field, "a list", value)
+        return [_parse(get_args(kind)[0], v, file, f"{field}[{i}]") for i, v in enumerate(value)]
+    if get_origin(kind) is dict:
+        if type(value) is not dict:
+            raise _fault(file, field, "an object", value)
+        return {_text(k, file, field): _parse(get_args(kind)[1], v, file, f"{field}.{k}") for k, v in value.items()}
+    if kind is Any:
+        return _parse_any(value, file, field)
+    return _parse_scalar(kind, value, file, field)
+
+
+def _parse_fields(kind: Any, value: Any, file: str, field: str) -> Any:
+    """An object as the dataclass `kind`: every field present, and nothing else."""
+    if type(value) is not dict:
+        raise _fault(file, field, "an object", value)
+    kinds = get_type_hints(kind)
+    prefix = f"{field}." if field else ""
+    for name in value:
+        if name not in kinds:
+            raise InputError(f"{file}: {prefix}{name[:80]!a}: unknown key. {did_you_mean(name, kinds)}")
+    for name in kinds:
+        if name not in value:
+            raise InputError(f"{file}: {prefix}{name}: expected a value, the key is missing")
+    return kind(**{name: _parse(kinds[name], value[name], file, prefix + name) for name in kinds})
+
+
+def _parse_any(value: Any, file: str, field: str) -> Any:
+    """Plain JSON of any shape, its numbers finite."""
+    if value is None or type(value) is bool:
+        return value
+    for container in (dict[str, Any], list[Any]):
+        if type(value) is get_origin(container):
+            return _parse(container, value, file, field)
+    return _parse_scalar(type(value), value, file, field)
+
+
+def _parse_scalar(kind: Any, value: Any, file: str, field: str) -> Any:
+    """A bool, int, float or str, each only as itself, but for an int where a float is expected."""
+    if kind is str and type(value) is str:
+        return _text(value, file, field)
+    if kind is int and type(value) is int and abs(value) < 2**63:  # beyond it, tables hold no integers
+        return value
+    if kind is float and type(value) in (int, float):
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if math.isfinite(number):
+            return number
+    if kind is bool and type(value) is bool:
+        return value
+    names = {str: "a string", int: "an integer", float: "a finite number", bool: "true or false"}
+    raise _fault(file, field, names.get(kind, "plain JSON"), value)
+
+
+def _text(value: str, file: str, field: str) -> str:
+    """A string that can be written and printed: JSON's escapes also spell halves of characters."""
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        raise _fault(file, field, "Unicode text", value) from None
+    return value
+
+
+def _fault(file: str, field: str, expected: str, value: Any) -> InputError:
+    return InputError(f"{file}: {field or 'the file'}: expected {expected}, got {ascii(value)[:80]}")

@@ -1,0 +1,26 @@
+"""``python -m gsbench.report RESULTS_DIR``: print the table of the records in a folder and write it there."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from gsbench.errors import InputError
+from gsbench.report import layout, tables
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the tables, write ``table.md`` and ``table.csv``; return 2 where there is nothing to show."""
+    parser = argparse.ArgumentParser(prog="python -m gsbench.report", description=__doc__)
+    parser.add_argument("results", type=Path, metavar="RESULTS_DIR", help="a folder with records, at any depth")
+    folder = parser.parse_args(arguments).results
+    try:
+        print(layout.terminal(tables.write(tables.load(folder), folder)))
+    except InputError as error:
+        print(f"gsbench.report: {error}", file=sys.stderr)
+        return 2
+    print(f"Written: {folder / 'table.md'}, {folder / 'table.csv'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

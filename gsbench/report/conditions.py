@@ -1,0 +1,100 @@
+"""Under which conditions the rows of a table hold, and a warning where they differ in what should be equal."""
+
+from collections.abc import Callable
+from functools import partial
+
+from gsbench.measure.record import Record
+
+WARNING = "WARNING"
+MOST_RUNS_NAMED = 3
+DEFINITIONS = (
+    "PSNR: joint over H x W x 3, final iteration, mean over views. SSIM: scikit-image, Gaussian window, data_range 1.",
+    "FPS: 1000 / median ms of synchronised renders after warm-up, slicing and AGR included. "
+    "train min: the whole training loop less evaluation.",
+)
+
+Get = Callable[[Record], str]
+
+
+def printable(text: object) -> str:
+    """Text from a record on one line, without the control characters that a terminal would obey."""
+    return "".join(c if c.isprintable() else "?" for c in " ".join(str(text).split()))
+
+
+def conditions(records: list[Record]) -> list[str]:
+    """Footnotes on protocol, data, machine, commit, versions and seeds; the warnings come first."""
+    names = sorted({name for r in records for name in r.protocol} - {"paper_dataset"})
+    protocol: dict[str, Get] = {name: partial(_protocol, name=name) for name in names}
+    protocol["iterations"] = _iterations
+    data: dict[str, Get] = {printable(records[0].dataset): lambda r: r.provenance.data_hash[:8]}
+    notes = []
+    for title, facts in (("protocol", protocol), ("data", data)):
+        # both may go with the scene (lego is measured on val), but not differ within one
+        notes.append(f"{title}: " + "; ".join(f"{name} {_by_scene(records, get)}" for name, get in facts.items()))
+        notes += [_differ(name, records, get) for name, get in facts.items() if not _goes_with_scene(records, get)]
+    if any(r.scene == "lego" and r.protocol.get("eval_split") == "val" for r in records):
+        notes.append("lego is measured on val: the test split of D-NeRF's lego contradicts its motion.")
+    for title, get in (("machine", _machine), ("commit", _commit), ("versions", _versions)):
+        same = len({get(r) for r in records}) == 1
+        notes.append(f"{title}: {get(records[0])}" if same else _differ(title, records, get))
+    if any(_commit(r).endswith("-dirty") for r in records):
+        notes.append(f"{WARNING}: files differed from their commit (-dirty): it does not reproduce these numbers.")
+    notes += [_seeds(records), *DEFINITIONS]
+    return sorted(notes, key=lambda note: not note.startswith(WARNING))
+
+
+def _protocol(record: Record, name: str) -> str:
+    return printable(record.protocol.get(name, "not recorded"))
+
+
+def _iterations(record: Record) -> str:
+    train = record.provenance.config.get("train")
+    return printable(train.get("iterations", "not recorded")) if isinstance(train, dict) else "not recorded"
+
+
+def _machine(record: Record) -> str:
+    return f"{printable(record.provenance.device)}, {record.provenance.threads} threads"
+
+
+def _commit(record: Record) -> str:
+    commit, *dirty = printable(record.provenance.git_commit or "not recorded").partition("-")
+    return commit[:12] + "".join(dirty)
+
+
+def _versions(record: Record) -> str:
+    return ", ".join(f"{printable(k)} {printable(v)}" for k, v in sorted(record.provenance.versions.items()))
+
+
+def _seeds(records: list[Record]) -> str:
+    seeds = sorted({r.seed for r in records})
+    listed = ", ".join(map(str, seeds))
+    if len(seeds) == 1:
+        return f"seed: {listed}; from one seed no spread is known."
+    return f"seeds: {listed}; mean ± sample standard deviation over the seeds that finished, their number beside it."
+
+
+def _goes_with_scene(records: list[Record], get: Get) -> bool:
+    """Whether every scene has one value."""
+    return len({(r.scene, get(r)) for r in records}) == len({r.scene for r in records})
+
+
+def _by_scene(records: list[Record], get: Get) -> str:
+    """The value that all runs have, else each value with its scenes."""
+    scenes: dict[str, set[str]] = {}
+    for record in records:
+        scenes.setdefault(get(record), set()).add(record.scene)
+    if len(scenes) == 1:
+        return next(iter(scenes))
+    return ", ".join(f"{value} ({', '.join(sorted(scenes[value]))})" for value in sorted(scenes))
+
+
+def _differ(what: str, records: list[Record], get: Get) -> str:
+    """A warning that runs which stand side by side differ, with the runs of each value."""
+    runs: dict[str, list[str]] = {}
+    for record in records:
+        runs.setdefault(get(record), []).append(f"{record.scene}/{record.model}/seed{record.seed}")
+    listed = []
+    for value, names in sorted(runs.items()):
+        more = f" and {len(names) - MOST_RUNS_NAMED} more" if len(names) > MOST_RUNS_NAMED else ""
+        listed.append(f"{value} ({', '.join(names[:MOST_RUNS_NAMED])}{more})")
+    return f"{WARNING}: the rows differ in {what}: {'; '.join(listed)}."

@@ -1,0 +1,130 @@
+"""What a table is, and its two forms: Markdown to keep, plain text for a terminal."""
+
+import math
+import re
+import textwrap
+from dataclasses import dataclass, field
+from itertools import chain
+
+EMPTY = "–"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A quantity of the table and how it is shown."""
+
+    key: str
+    title: str
+    digits: int | None  # after the point; None: 2 below ten, else 1
+    paper: str = ""  # the field of PaperRow that is the same quantity
+
+    def show(self, mean: float, std: float = math.nan) -> str:
+        """``mean``, ``mean ± std`` where there is a spread, a dash where there is nothing."""
+        if math.isnan(mean):
+            return EMPTY
+        digits = self.digits if self.digits is not None else 1 if mean >= 10 else 2
+        return f"{mean:.{digits}f}" + ("" if math.isnan(std) else f" ± {std:.{digits}f}")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line: a model's mean over its seeds, a run that did not finish, or the paper's."""
+
+    label: str
+    cells: dict[str, str]  # by Column.key
+    seeds: str = ""  # how many
+    best: bool = False  # whether its first column is the best measured
+
+
+@dataclass(frozen=True)
+class Section:
+    """The rows of one scene, or of the average."""
+
+    title: str
+    rows: list[Row]
+    notes: list[str] = field(default_factory=list)  # why a row is not ok, what the average leaves out
+
+
+@dataclass(frozen=True)
+class Table:
+    """One experiment on one data set."""
+
+    title: str
+    columns: list[Column]
+    sections: list[Section]
+    marks: list[str]  # what (1), (2), ... in the cells stand for
+    footnotes: list[str]  # the conditions under which the numbers hold
+
+
+def markdown(tables: list[Table]) -> str:
+    """The tables as Markdown: a heading and a table for every scene, the best PSNR bold, footnotes at the end."""
+    lines: list[str] = []
+    for table in tables:
+        lines += [f"# {_escape(table.title)}", ""]
+        titles = _titles(table)
+        for section in table.sections:
+            lines += [f"## {_escape(section.title)}", ""]
+            if section.rows:
+                lines += [_line(titles), _line(["---", *["---:"] * (len(titles) - 1)])]
+            for row in section.rows:
+                label, first, *rest = map(_escape, _texts(row, table.columns))
+                lines.append(_line([label, f"**{first}**" if row.best else first, *rest]))
+            lines += ["", *(f"- {_escape(note)}" for note in section.notes), *([""] if section.notes else [])]
+        lines += [f"({i}) {_escape(mark)}  " for i, mark in enumerate(table.marks, 1)]
+        lines += ["", *(f"- {_escape(note)}" for note in table.footnotes), ""]
+    return "\n".join(lines)
+
+
+def terminal(tables: list[Table], width: int = 120) -> str:
+    """The tables as plain text within `width` columns, the best PSNR starred; columns that do not fit are left out."""
+    lines: list[str] = []
+    for table in tables:
+        texts = [[_texts(row, table.columns, star="*") for row in section.rows] for section in table.sections]
+        titles = _titles(table)
+        widths = [max(map(len, column)) for column in zip(titles, *chain.from_iterable(texts), strict=True)]
+        fitting = [n for n in range(2, len(widths) + 1) if sum(widths[:n]) + 2 * n <= width]
+        widths = widths[: max(fitting, default=1)]
+        lines += [*_wrapped(table.title, width), "", _aligned(titles, widths)[:width]]
+        for section, rows in zip(table.sections, texts, strict=True):
+            lines += _wrapped(section.title, width)
+            lines += [_aligned(row, widths)[:width] for row in rows]
+            for note in section.notes:
+                lines += _wrapped(f"  - {note}", width)
+        lines.append("")
+        for i, mark in enumerate(table.marks, 1):
+            lines += _wrapped(f"({i}) {mark}", width)
+        for note in table.footnotes:
+            lines += _wrapped(f"- {note}", width)
+        if len(widths) < len(titles):
+            lines += _wrapped(f"- only in the files, for want of width: {', '.join(titles[len(widths) :])}", width)
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _aligned(texts: list[str], widths: list[int]) -> str:
+    """As many of `texts` as there are `widths`, the first to the left and the others to the right."""
+    first, *rest = texts[: len(widths)]
+    return "  ".join(["  " + first.ljust(widths[0]), *map(str.rjust, rest, widths[1:])]).rstrip()
+
+
+def _titles(table: Table) -> list[str]:
+    return ["model", *(c.title for c in table.columns), "seeds"]
+
+
+def _texts(row: Row, columns: list[Column], star: str = "") -> list[str]:
+    """The texts of a row from left to right, the best PSNR with a `star`."""
+    first, *rest = (row.cells.get(c.key, "") for c in columns)
+    return [row.label, first + star * row.best, *rest, row.seeds]
+
+
+def _line(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    return textwrap.wrap(text, width, subsequent_indent="    ", break_on_hyphens=False)
+
+
+def _escape(text: str) -> str:
+    """Text as Markdown that shows it as it is."""
+    return re.sub(r"([\\`*<|\[\]])", r"\\\1", text)

@@ -1,0 +1,79 @@
+"""The 7DGS paper's own numbers, its Tables 1 and 2 as data, so that they stand beside what is measured here.
+
+Source: Gao et al., "7DGS: Unified Spatial-Temporal-Angular Gaussian Splatting", ICCV 2025. A cell that the paper leaves
+empty is None. Its averages are rows of the scene "avg".
+"""
+
+import csv
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+
+AVERAGE = "avg"
+MODELS = {"4dgs": False, "7dgs": True, "7dgs_noagr": False}  # what Table 1 compares, and whether it refines (AGR)
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """One row of Table 1: a model on a scene."""
+
+    psnr: float  # dB, the best on test seen during training
+    ssim: float
+    lpips: float  # the paper does not say on which backbone
+    train_min: float | None  # minutes on one V100
+    fps: float  # on one V100
+    num_gaussians: int
+
+
+@dataclass(frozen=True)
+class MethodRow:
+    """One row of Table 2: a method's average over a data set."""
+
+    method: str
+    psnr: float
+    ssim: float | None
+    lpips: float | None
+    reproduced_by_paper: bool  # rather than quoted from the method's own paper
+
+
+def paper_row(dataset: str, scene: str, model: str) -> PaperRow | None:
+    """The row of Table 1, e.g. ``paper_row("D-NeRF", "trex", "7dgs")``; None where the paper has none."""
+    return table1().get((dataset, scene, model))
+
+
+@cache
+def table1() -> dict[tuple[str, str, str], PaperRow]:
+    """Table 1 by data set ("7DGS-PBR", "D-NeRF", "Technicolor"), scene (or "avg") and model."""
+    return {
+        (row["dataset"], row["scene"], row["model"]): PaperRow(
+            psnr=float(row["psnr_db"]),
+            ssim=float(row["ssim"]),
+            lpips=float(row["lpips"]),
+            train_min=_number(row["train_min"]),
+            fps=float(row["fps"]),
+            num_gaussians=int(row["num_gaussians"]),
+        )
+        for row in _read("paper_table1.csv")
+    }
+
+
+@cache
+def table2() -> dict[str, list[MethodRow]]:
+    """Table 2 by data set ("D-NeRF", "Technicolor"), in the paper's order."""
+    table: dict[str, list[MethodRow]] = {}
+    for row in _read("paper_table2.csv"):
+        reproduced = row["reproduced_by_paper"] == "yes"
+        method = MethodRow(
+            row["method"], float(row["psnr_db"]), _number(row["ssim"]), _number(row["lpips"]), reproduced
+        )
+        table.setdefault(row["dataset"], []).append(method)
+    return table
+
+
+def _number(cell: str) -> float | None:
+    return float(cell) if cell else None
+
+
+def _read(name: str) -> list[dict[str, str]]:
+    """The rows of a table that lies beside this file."""
+    return list(csv.DictReader((resources.files(__package__) / name).read_text().splitlines()))

@@ -1,0 +1,93 @@
+"""Pictures to look at: render | ground truth | error, side by side, a row a view."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from gsbench.errors import InputError
+from gsbench.measure.atomic import write_atomically
+
+ERROR_SCALE = 0.2  # the error that is drawn brightest; fixed, so that two strips can be compared
+LEAST_WIDTH = 240  # pixels a column; a smaller image is enlarged by a whole factor, without smoothing
+HEADER = 44  # pixels
+GAP = 4  # pixels, grey: the background is often white
+GREY = 200
+
+Pixels = npt.NDArray[np.uint8]
+
+
+def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
+    """One picture of (render, truth) pairs, each [H, W, 3] in [0, 1] of one size: uint8 [H', W', 3] RGB.
+
+    The third column is the absolute error, mean over RGB, from black (none) to bright yellow (0.2 or more); the header
+    says so and shows the scale. Raises InputError where sizes differ.
+    """
+    if not rows:
+        raise InputError("strip: expected at least one pair (render, truth), got none")
+    pairs = [(np.asarray(render, np.float32), np.asarray(truth, np.float32)) for render, truth in rows]
+    shape = pairs[0][0].shape
+    for image in (image for pair in pairs for image in pair):
+        if image.shape != shape or image.ndim != 3 or shape[2] != 3 or 0 in shape:
+            raise InputError(f"strip: expected images [H, W, 3] of one size, got {image.shape} beside {shape}")
+    factor = -(-LEAST_WIDTH // shape[1])
+    lines = [_beside([_bytes(render), _bytes(truth), _error(render, truth)], factor) for render, truth in pairs]
+    gap = np.full((GAP, lines[0].shape[1], 3), GREY, np.uint8)
+    picture = [_header(shape[1] * factor)]
+    for line in lines:
+        picture += [line, gap]
+    return np.concatenate(picture[:-1])
+
+
+def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB
+    """Write `image` to `path` as PNG, atomically; raises InputError where OpenCV cannot encode it."""
+    done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    if not done:
+        raise InputError(f"{path}: expected an image that PNG can hold, got {image.shape} of {image.dtype}")
+    write_atomically(path, data.tobytes())
+
+
+def _bytes(image: npt.NDArray[np.float32]) -> Pixels:
+    """[0, 1] to 8 bits; NaN, which a model that diverged renders, as magenta."""
+    shown = (np.clip(np.nan_to_num(image), 0, 1) * 255).round().astype(np.uint8)
+    shown[np.isnan(image).any(-1)] = (255, 0, 255)
+    return shown
+
+
+def _error(render: npt.NDArray[np.float32], truth: npt.NDArray[np.float32]) -> Pixels:
+    """The absolute error through the colour map, magenta where it is NaN."""
+    error = np.abs(np.clip(render, 0, 1) - np.clip(truth, 0, 1)).mean(-1)
+    shown = _colours(np.nan_to_num(error) / ERROR_SCALE)
+    shown[np.isnan(error)] = (255, 0, 255)
+    return shown
+
+
+def _colours(values: npt.NDArray[np.floating]) -> Pixels:  # [H, W]
+    """Values in [0, 1] and above through OpenCV's inferno, [H, W, 3] RGB."""
+    levels = (np.clip(values, 0, 1) * 255).round().astype(np.uint8)
+    return np.asarray(cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _beside(images: list[Pixels], factor: int) -> Pixels:
+    """The images from left to right, enlarged, a gap between them."""
+    large = [image.repeat(factor, 0).repeat(factor, 1) for image in images]
+    gap = np.full((large[0].shape[0], GAP, 3), GREY, np.uint8)
+    return np.concatenate([large[0], gap, large[1], gap, large[2]], 1)
+
+
+def _header(width: int) -> Pixels:
+    """What the columns, `width` pixels each, are, and the scale of the error from 0 to ERROR_SCALE."""
+    header = np.full((HEADER, 3 * width + 2 * GAP, 3), 255, np.uint8)
+    titles = ("render", "ground truth", "absolute error, mean of RGB")
+    for column, title in enumerate(titles):
+        _write(header, title, column * (width + GAP) + 6, 16)
+    left, right = 2 * (width + GAP) + 6, 3 * width + 2 * GAP - 64
+    header[26:38, left + 16 : right] = _colours(np.linspace(0, 1, right - left - 16)[None].repeat(12, 0))
+    _write(header, "0", left, 37)
+    _write(header, f">= {ERROR_SCALE}", right + 6, 37)
+    return header
+
+
+def _write(image: Pixels, text: str, x: int, y: int) -> None:
+    cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)

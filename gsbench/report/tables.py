@@ -1,0 +1,218 @@
+"""Records into tables: one row a model, grouped by scene, the paper's own row beside it, nothing dropped."""
+
+import math
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+import pandas as pd
+
+from gsbench.errors import InputError
+from gsbench.measure import record as files
+from gsbench.measure.atomic import write_atomically
+from gsbench.measure.record import METRICS, Record
+from gsbench.report import layout, paper
+from gsbench.report.conditions import conditions, printable
+from gsbench.report.layout import EMPTY, Column, Row, Section, Table
+
+LEAKS = "psnr_best_on_test (leaks)"  # never shown without the word
+COLUMNS = (  # their keys are columns of `tidy`
+    Column("psnr", "PSNR", 2, "psnr"),
+    Column("ssim", "SSIM", 3, "ssim"),
+    Column("lpips_alex", "LPIPS-Alex", 3, "lpips"),
+    Column("train_min", "train min", None, "train_min"),
+    Column("fps", "FPS", None, "fps"),
+    Column("num_gaussians", "#Gaussians", 0, "num_gaussians"),
+)
+EXTRA_COLUMNS = (Column("lpips_vgg", "LPIPS-VGG", 3), Column(LEAKS, LEAKS, 2))  # where a run has them
+
+PAPER = (
+    "Table 1 of the 7DGS paper (ICCV 2025): 30,000 iterations at half resolution (Technicolor: full), PSNR is the best "
+    "on test seen during training (leaks), times are of a V100."
+)
+PAPER_OTHER_DATA = (
+    "OTHER DATA: Table 1 of the 7DGS paper for its scene of the same name. The scene measured here is a stand-in "
+    "rendered for this project, so the two rows cannot be compared."
+)
+PAPER_LPIPS = (
+    "The paper does not name the backbone of Table 1: its 7DGS has 0.198 on Technicolor there, 0.101 with AlexNet in "
+    "Table 2."
+)
+
+
+def load(root: Path) -> list[Record]:
+    """All records under `root`; raises InputError where there is none, one is damaged, or one run appears twice."""
+    if not root.is_dir():
+        raise InputError(f"{root}: expected a folder of results, found none")
+    seen: dict[tuple[str, str, str, str, int], Path] = {}
+    records = []
+    for path in files.find(root):
+        record = files.read(path)
+        run = (record.experiment, record.dataset, record.scene, record.model, record.seed)
+        if run in seen:
+            raise InputError(f"{path}: the same run as {seen[run]}; keep one of them")
+        seen[run] = path
+        records.append(record)
+    if not records:
+        raise InputError(f"{root}: expected results, found no {files.FILE_NAME} in it or below")
+    return records
+
+
+def tidy(records: list[Record]) -> pd.DataFrame:
+    """One row a run, one column a quantity; what a run does not have is empty."""
+    return pd.DataFrame([_quantities(record) for record in records])
+
+
+def _quantities(r: Record) -> dict[str, Any]:
+    """Everything a record says about its run, flat."""
+    flat: dict[str, Any] = {name: getattr(r, name) for name in ("experiment", "dataset", "scene", "model", "seed")}
+    flat |= {"status": r.status, "reason": r.reason}
+    flat |= {LEAKS if name == "psnr_best_on_test" else name: (r.metrics or {}).get(name) for name in METRICS}
+    flat["missing"] = "; ".join(f"{name}: {why}" for name, why in sorted(r.missing.items()))
+    cost = r.cost
+    flat["train_min"] = cost and cost.train_s / 60
+    flat |= {name: cost and getattr(cost, name) for name in ("fps", "num_gaussians", "bytes", "peak_memory")}
+    flat |= {f"render_ms_{name}": cost and getattr(cost.render_ms, name) for name in ("p10", "p50", "p90")}
+    flat |= {f"effect_{name}": value for name, value in vars(r.effects).items()}
+    flat |= {f"protocol_{name}": value for name, value in sorted(r.protocol.items())}
+    names = ("device", "threads", "git_commit", "config_hash", "data_hash", "time")
+    return flat | {name: getattr(r.provenance, name) for name in names}
+
+
+def build(records: list[Record]) -> list[Table]:
+    """A table for every experiment and data set among `records`, sorted by name."""
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for record in sorted(records, key=lambda r: (r.experiment, r.dataset, r.scene, r.model, r.seed)):
+        groups.setdefault((record.experiment, record.dataset), []).append(record)
+    return [_Builder(group).table() for group in groups.values()]
+
+
+class _Builder:
+    """Makes the table of one experiment on one data set; collects what the marks in its cells refer to."""
+
+    def __init__(self, records: list[Record]) -> None:
+        self.records = records
+        self.scenes = sorted({r.scene for r in records})
+        self.models = sorted({r.model for r in records})
+        flat = [_quantities(r) for r in records]
+        self.columns = [*COLUMNS, *(c for c in EXTRA_COLUMNS if any(q[c.key] is not None for q in flat))]
+        finished: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        for q in flat:
+            if q["status"] == "ok":
+                finished.setdefault((q["scene"], q["model"]), []).append(q)
+        self.values = {  # by scene and model, then column: one value a seed, NaN where a run lacks it
+            run: {c.key: [math.nan if q[c.key] is None else float(q[c.key]) for q in seeds] for c in self.columns}
+            for run, seeds in finished.items()
+        }
+        self.marks: list[str] = []
+
+    def table(self) -> Table:
+        """The table: a section for every scene, and their average where there are several."""
+        first = self.records[0]
+        sections = [self._scene(scene) for scene in self.scenes]
+        if len(sections) > 1:
+            sections.append(self._average())
+        title = f"experiment {first.experiment}, data {printable(first.dataset)}"
+        return Table(title, self.columns, sections, self.marks, [*conditions(self.records), *self._no_vgg()])
+
+    def _no_vgg(self) -> list[str]:
+        """Why there is no column for LPIPS-VGG, where there is none."""
+        shown = any(c.key == "lpips_vgg" for c in self.columns)
+        why = {printable(r.missing["lpips_vgg"]) for r in self.records if "lpips_vgg" in r.missing}
+        return [f"LPIPS-VGG has no column: {'; '.join(sorted(why))}."] if why and not shown else []
+
+    def _mark(self, text: str) -> str:
+        """The mark of a footnote, the same for the same text."""
+        if text not in self.marks:
+            self.marks.append(text)
+        return f"({self.marks.index(text) + 1})"
+
+    def _scene(self, scene: str) -> Section:
+        """A row for every model with a run that finished, one for every run that did not, and the paper's."""
+        rows: list[Row] = []
+        notes = []
+        leader = _leader([self.values[scene, model] for model in self.models if (scene, model) in self.values])
+        for model in self.models:
+            runs = [r for r in self.records if (r.scene, r.model) == (scene, model)]
+            finished = [r for r in runs if r.status == "ok"]
+            if finished:
+                cells = {c.key: self._cell(c, finished) for c in self.columns}
+                best = _shown_psnr(self.values[scene, model]) == leader
+                rows.append(Row(model, cells, str(len(finished)), best))
+            for run in runs:
+                if run.status != "ok":
+                    rows.append(Row(f"{model} seed {run.seed}", {"psnr": run.status}))
+                    notes.append(f"{model} seed {run.seed} {run.status}: {printable(run.reason)}")
+            if runs:
+                rows += self._paper_row([scene], model)
+        return Section(scene, rows, notes)
+
+    def _cell(self, column: Column, finished: list[Record]) -> str:
+        """Mean and spread over the seeds; empty, with the reason, where any of them lacks the number."""
+        values = self.values[finished[0].scene, finished[0].model][column.key]
+        if not math.isnan(fmean(values)):
+            return column.show(fmean(values), stdev(values) if len(values) > 1 else math.nan)
+        name = "psnr_best_on_test" if column.key == LEAKS else column.key
+        why = {r.missing.get(name, "not measured") for r in finished if (r.metrics or {}).get(name) is None}
+        return f"{EMPTY} " + self._mark(printable(f"{column.title} is empty: {'; '.join(sorted(why))}"))
+
+    def _average(self) -> Section:
+        """Means over the scenes that every model has finished, so that all rows average the same scenes."""
+        models = [model for model in self.models if any((scene, model) in self.values for scene in self.scenes)]
+        covered = [s for s in self.scenes if models and all((s, model) in self.values for model in models)]
+        notes = [f"{model} finished on no scene and is left out" for model in self.models if model not in models]
+        title = f"average over {len(covered)} of {len(self.scenes)} scenes"
+        if not covered:
+            return Section(title, [], [*notes, "there is no scene that every model has finished"])
+        averages = {
+            model: {c.key: [fmean(self.values[scene, model][c.key]) for scene in covered] for c in self.columns}
+            for model in models
+        }
+        if any(math.isnan(fmean(values[c.key])) for values in averages.values() for c in self.columns):
+            notes.append(f"{EMPTY} stands where a scene lacks the number")
+        leader = _leader(list(averages.values()))
+        rows = []
+        for model, values in averages.items():
+            cells = {c.key: c.show(fmean(values[c.key])) for c in self.columns}
+            rows.append(Row(model, cells, best=_shown_psnr(values) == leader))
+            rows += self._paper_row(covered, model)
+        return Section(f"{title}: {', '.join(covered)}", rows, notes)
+
+    def _paper_row(self, scenes: list[str], model: str) -> list[Row]:
+        """The paper's row for `model`, averaged over `scenes`; none where the paper lacks one of them."""
+        runs = [r for r in self.records if r.model == model and r.scene in scenes]
+        if any(r.effects.refinement != paper.MODELS.get(model) for r in runs):
+            return []  # the same name, but not the paper's model
+        datasets = {r.scene: str(r.protocol.get("paper_dataset")) for r in runs}
+        found = [paper.paper_row(datasets[scene], scene, model) for scene in scenes]
+        rows = [row for row in found if row is not None]
+        if len(rows) < len(scenes):
+            return []
+        theirs = all(r.protocol.get("paper_dataset") == r.dataset for r in runs)
+        label = f"paper {self._mark(PAPER)}" if theirs else f"paper, other data {self._mark(PAPER_OTHER_DATA)}"
+        cells = {c.key: EMPTY for c in self.columns}
+        for column in COLUMNS:
+            values = [getattr(row, column.paper) for row in rows]
+            if None not in values:
+                cells[column.key] = column.show(fmean(values))
+        cells["lpips_alex"] += f" {self._mark(PAPER_LPIPS)}"
+        return [Row(label, cells)]
+
+
+def _shown_psnr(values: dict[str, list[float]]) -> str:
+    """The mean PSNR as its column shows it."""
+    return COLUMNS[0].show(fmean(values[COLUMNS[0].key]))
+
+
+def _leader(rows: list[dict[str, list[float]]]) -> str | None:
+    """The highest mean PSNR as shown, so that rows which look equal lead together; None where no row has one."""
+    means = [mean for mean in (fmean(values[COLUMNS[0].key]) for values in rows) if not math.isnan(mean)]
+    return COLUMNS[0].show(max(means)) if means else None
+
+
+def write(records: list[Record], folder: Path) -> list[Table]:
+    """Write ``table.md`` and ``table.csv`` into `folder`, each atomically, and return the tables."""
+    tables = build(records)
+    write_atomically(folder / "table.md", layout.markdown(tables).encode())
+    write_atomically(folder / "table.csv", tidy(records).to_csv(index=False).encode())
+    return tables
