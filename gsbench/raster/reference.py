@@ -33,18 +33,21 @@ def draw(
     width: int, height: int, background: Tensor, near: float, far: float, eps2d: float, antialias: bool,
 ) -> RasterOutput:  # fmt: skip
     """Draw every camera in turn; arguments as `gsbench.raster.rasterize`, colours [C, N, D]."""
-    images, alphas, splats, pairs = [], [], [], 0
-    for viewmat, K, color in zip(viewmats, Ks, colors, strict=True):
-        splat = project(means, factors, opacities, viewmat, K, width, height, near, far, eps2d, antialias)
+    splats = [
+        project(means, factors, opacities, viewmat, K, width, height, near, far, eps2d, antialias)
+        for viewmat, K in zip(viewmats, Ks, strict=True)
+    ]
+    means2d = torch.stack([s.means2d for s in splats])  # every picture is drawn from it, so it has a gradient
+    images, alphas, pairs = [], [], 0
+    for splat, mean2d, color in zip(splats, means2d, colors, strict=True):
         tiles, gaussians = bin_tiles(splat, width, height)
-        image, alpha = blend(splat, color, tiles, gaussians, width, height)
+        image, alpha = blend(splat._replace(means2d=mean2d), color, tiles, gaussians, width, height)
         images.append(image + (1 - alpha) * background)
         alphas.append(alpha)
-        splats.append(splat)
         pairs += len(tiles)
     info = RasterInfo(
         radii=torch.stack([s.half_sizes.amax(-1).ceil().int() for s in splats]),
-        means2d=splats[0].means2d[None] if len(splats) == 1 else torch.stack([s.means2d for s in splats]),
+        means2d=means2d,
         depths=torch.stack([s.depths for s in splats]),
         pairs=pairs,
     )
