@@ -157,7 +157,9 @@ def blend(
         nth = torch.arange(longest[first], device=tiles.device)
         padding = nth >= lengths[chosen, None]
         index = gaussians[(starts[chosen, None] + nth).clamp(max=len(gaussians) - 1)]
-        rows = table[index.masked_fill(padding, len(table) - 1).flatten()].unflatten(0, index.shape)
+        index = index.masked_fill(padding, len(table) - 1)
+        # Not table[index]: its backward adds rows as threads come by, so that two runs differ in the last bits.
+        rows = table.index_select(0, index.flatten()).unflatten(0, index.shape)
         pieces.append(_blend_tiles(rows, chosen % across * TILE, chosen // across * TILE))
         first = last
     empty = table.new_zeros(across * down - first, TILE * TILE, D + 1)
