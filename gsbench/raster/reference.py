@@ -162,7 +162,7 @@ def blend(
         rows = table.index_select(0, index.flatten()).unflatten(0, index.shape)
         pieces.append(_blend_tiles(rows, chosen % across * TILE, chosen // across * TILE))
         first = last
-    empty = table.new_zeros(across * down - first, TILE * TILE, D + 1)
+    empty = table[-1, 0].expand(across * down - first, TILE * TILE, D + 1)  # zeros, but in the graph
     canvas = torch.cat([*pieces, empty])[torch.argsort(by_length)]  # back into the tiles' own order
     canvas = canvas.reshape(down, across, TILE, TILE, D + 1).transpose(1, 2).reshape(down * TILE, across * TILE, D + 1)
     canvas = canvas[:height, :width]
