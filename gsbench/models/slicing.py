@@ -60,10 +60,9 @@ def slice_gaussians(
     if factor.shape != (N, n, n) or n < 3 or query.shape[-1] != n - 3 or query.dim() > 2:
         raise InputError(f"slice_gaussians: expected mean [N, 3+k], factor [N, 3+k, 3+k] and query [N, k] or [k], "
                          f"got {list(mean.shape)}, {list(factor.shape)} and {list(query.shape)}")  # fmt: skip
+    check_scheme(scheme)
     if scheme == "square_root":
         return slice_reduced(mean, reduce(factor), query)
-    if scheme not in SCHEMES:
-        raise InputError(f"slicing scheme '{scheme}' is not known. {did_you_mean(scheme, SCHEMES)}")
     S = factor @ factor.mT
     S_pp, S_pq, S_qq = S[:, :3, :3], S[:, :3, 3:], S[:, 3:, 3:]
     if scheme == "schur":
@@ -72,6 +71,12 @@ def slice_gaussians(
         gain = torch.cholesky_solve(S_pq.mT, torch.linalg.cholesky_ex(S_qq).L).mT
     moved = mean[:, :3] + (gain @ (query - mean[:, 3:])[..., None])[..., 0]
     return Slice(moved, _cholesky3(S_pp - gain @ S_pq.mT), gain)
+
+
+def check_scheme(scheme: str) -> None:
+    """Raise InputError unless `scheme` is one of SCHEMES."""
+    if scheme not in SCHEMES:
+        raise InputError(f"slicing scheme '{scheme}' is not known. {did_you_mean(scheme, SCHEMES)}")
 
 
 def slice_reduced(mean: Tensor, reduced: Reduced, query: Tensor) -> Slice:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from gsbench.errors import InputError, did_you_mean
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
 from gsbench.models.factors import triangular, triangular_parameters
-from gsbench.models.slicing import Reduced, gain_of, mahalanobis, reduce, slice_gaussians, slice_reduced
+from gsbench.models.slicing import Reduced, check_scheme, gain_of, mahalanobis, reduce, slice_gaussians, slice_reduced
 from gsbench.scenes.scene import Points
 
 # Where position, time and direction stand among the rows of the triangular factor.
@@ -57,6 +57,7 @@ class TriangularModel(GaussianModel):
         super().__init__(**options)
         if factor_order not in FACTOR_ORDERS:
             raise InputError(f"factor_order '{factor_order}' is not known. {did_you_mean(factor_order, FACTOR_ORDERS)}")
+        check_scheme(scheme)
         lambdas = {"direction": lambda_d} | ({} if lambda_t is None else {"time": lambda_t})
         for name, value in lambdas.items():
             if value <= 0:
