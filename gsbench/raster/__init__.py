@@ -148,7 +148,8 @@ def _check(
         raise InputError(f"expected a picture of at least 1x1 whole pixels, got width={width}, height={height}")
     if not 0 < near < far or not 0 <= eps2d < math.inf:
         raise InputError(f"expected 0 < near < far and eps2d >= 0, got near={near}, far={far}, eps2d={eps2d}")
-    if N and not (0 <= opacities.detach().amin() and opacities.detach().amax() <= 1):
-        raise InputError(f"opacities: expected values in [0, 1], got {opacities.min().item()}..{opacities.max().item()}")
+    low, high = opacities.detach().aminmax() if N else (0, 0)
+    if low < 0 or high > 1:
+        raise InputError(f"opacities: expected values in [0, 1], got {low} to {high}")
     if (Ks.detach()[:, [0, 1], [0, 1]] <= 0).any():
         raise InputError("Ks: expected positive focal lengths at [0, 0] and [1, 1]")
