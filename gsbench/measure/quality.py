@@ -38,7 +38,7 @@ def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
     Without data_range scikit-image takes 2 for floats, without use_sample_covariance=False it differs from the paper.
     """
     a, b = _images(a, b, SSIM_LEAST_SIDE, "ssim")
-    similarity = structural_similarity(  # type: ignore[no-untyped-call]
+    similarity = structural_similarity(
         a.cpu().numpy(),
         b.cpu().numpy(),
         channel_axis=-1,

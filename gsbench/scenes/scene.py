@@ -1,7 +1,8 @@
 """What is seen: a camera, a view (camera, time, image), a scene (views by split, background, extent)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 
@@ -33,6 +34,10 @@ class View:
     time: float | None  # in [0, 1]; None where the data set has no time
     image: Tensor  # [H, W, 3] float32 in [0, 1], composited over the scene's background
 
+    def to(self, device: str) -> "View":
+        """The same view with its tensors on `device`."""
+        return replace(self, camera=self.camera.to(device), image=self.image.to(device))
+
 
 @dataclass(frozen=True)
 class Points:
@@ -59,3 +64,21 @@ class Scene:
     def has_time(self) -> bool:
         """Whether every training view carries a time."""
         return all(view.time is not None for view in self.train)
+
+    def to(self, device: str) -> "Scene":
+        """The same scene with its views on `device`."""
+        train, val, test = ([view.to(device) for view in views] for views in (self.train, self.val, self.test))
+        return replace(self, train=train, val=val, test=test)
+
+
+def scene_extent(
+    viewmats: Tensor,  # [C, 4, 4] the training cameras
+) -> float:
+    """Return 1.1 x the largest distance of a camera from the cameras' mean, in world units; 0 if all share one place.
+
+    Source: 3DGS, `getNerfppNorm` in scene/dataset_readers.py. Learning rates of positions and the size at which a
+    Gaussian splits are multiples of it.
+    """
+    rotations, translations = viewmats[:, :3, :3].double(), viewmats[:, :3, 3].double()
+    centers = -torch.einsum("cji,cj->ci", rotations, translations)
+    return 1.1 * float((centers - centers.mean(dim=0)).norm(dim=1).max())

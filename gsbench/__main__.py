@@ -1,0 +1,89 @@
+"""The command line: compose a config, hand each scene of it to experiment.run. Needs no torch until a run starts."""
+
+import os
+import sys
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gsbench.config import register_schema
+from gsbench.errors import InputError, did_you_mean
+
+HERE = Path(__file__).parent
+CONF = HERE / "conf" if (HERE / "conf").is_dir() else HERE.parent / "conf"  # in a wheel, else in a checkout
+
+_failures: list[str] = []  # one line for each run that did not end well; Hydra's own sweeps go on past them
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
+def entry(composed: DictConfig) -> None:
+    """Run every scene that the config names; one that fails does not stop the others."""
+    if OmegaConf.is_missing(composed, "experiment"):
+        raise InputError(f"no experiment was chosen: add +exp=NAME. Valid: {', '.join(_group('exp'))}.")
+    if OmegaConf.is_missing(composed.data, "root"):
+        raise InputError(f"data.root is not set: add data.root=PATH, the folder that holds the scenes of "
+                         f"{composed.data.dataset} ({', '.join(composed.data.scenes)}), each with "
+                         f"transforms_{{train,val,test}}.json and the images they name. "
+                         f"Published at: {composed.data.published}")  # fmt: skip
+    from gsbench import experiment  # imports torch
+
+    for one in _one_scene_each(composed):
+        try:
+            record = experiment.run(one)
+            problem = None if record.status == "ok" else f"{record.status}: {record.reason}"
+        except InputError as error:
+            problem = str(error)
+        if problem:
+            _failures.append(problem)
+            print(f"gsbench: error: {one.scene.name}: {problem}", file=sys.stderr)
+
+
+def main() -> None:
+    """Entry point of `python -m gsbench` and `gsbench`: errors are lines, not stack traces."""
+    register_schema()
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises, so that this function can say it shorter
+    try:
+        entry()
+    except InputError as error:
+        sys.exit(f"gsbench: error: {error}")
+    except (HydraException, OmegaConfBaseException) as error:
+        sys.exit(f"gsbench: error: {_explain(error)}")
+    sys.exit(1 if _failures else 0)
+
+
+def _one_scene_each(composed: DictConfig) -> list[DictConfig]:
+    """The config itself, or for scene=all one config for each scene of the data set, composed as if it was named."""
+    if composed.scene.name != "all":
+        return [composed]
+    overrides = [o for o in HydraConfig.get().overrides.task if not o.startswith("scene=")]
+    known = _group("scene")
+    return [
+        hydra.compose("config", [*overrides, *([f"scene={x}"] if x in known else ["scene=custom", f"scene.name={x}"])])
+        for x in composed.data.scenes
+    ]
+
+
+def _group(name: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / name).glob("*.yaml"))
+
+
+def _explain(error: Exception) -> str:
+    """Hydra's and OmegaConf's errors in one line that names the key and the nearest valid one."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        return f"{group} '{name}' is not known. {did_you_mean(name, error.options)}"
+    cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
+    if isinstance(cause, OmegaConfBaseException) and cause.key is not None and cause.parent_node is not None:
+        keys = [str(key) for key in cause.parent_node] if isinstance(cause.parent_node, DictConfig) else []
+        if keys and cause.key not in keys:
+            return f"config key '{cause.full_key}' is not known. {did_you_mean(str(cause.key), keys)}"
+        return f"config key '{cause.full_key}': {str(cause).splitlines()[0]}"
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    main()

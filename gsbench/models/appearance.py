@@ -1,0 +1,55 @@
+"""What colour a Gaussian shows: spherical harmonics of the direction (3DGS), times a Fourier series of time (4DGS)."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from gsbench.scenes.points import SH_C0  # Y_00
+
+# Constants of the real spherical harmonics of degree 1 to 3, in 3DGS' order and signs.
+_C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+_C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
+       -0.4570457994644658, 1.445305721320277, -0.5900435899266435)  # fmt: skip
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Real spherical harmonics up to `degree` (at most 3) of unit directions, [N, 3] -> [N, (degree + 1)^2]."""
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, SH_C0)]
+    if degree > 0:
+        basis += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree > 1:
+        xx, yy, zz = x * x, y * y, z * z
+        basis += [_C2[0] * x * y, _C2[1] * y * z, _C2[2] * (2 * zz - xx - yy), _C2[3] * x * z, _C2[4] * (xx - yy)]
+    if degree > 2:
+        basis += [
+            _C3[0] * y * (3 * xx - yy), _C3[1] * x * y * z, _C3[2] * y * (4 * zz - xx - yy),
+            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy), _C3[4] * x * (4 * zz - xx - yy),
+            _C3[5] * z * (xx - yy), _C3[6] * x * (xx - 3 * yy),
+        ]  # fmt: skip
+    return torch.stack(basis, -1)
+
+
+def sh_colors(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
+    """Colours max(0, sum beta_lm Y_lm + 0.5), [N, K, 3] and [N, 3] -> [N, 3] (3DGS; 7DGS eq. 2)."""
+    basis = sh_basis(directions, degree)
+    used = coefficients[:, : basis.shape[-1]]
+    return ((basis[..., None] * used).sum(1) + 0.5).clamp(min=0)
+
+
+def sh_time_colors(coefficients: Tensor, directions: Tensor, degree: int, time_offset: Tensor) -> Tensor:
+    """Colours of 4DSH: Y_lm(d) cos(2 pi n (t - mu_t) / T), T = 1 (4DGS, eq. 12).
+
+    Args:
+        coefficients: [N, M, K, 3], one set of K spherical harmonics for each frequency n = 0 .. M-1.
+        directions: [N, 3] unit vectors.
+        degree: of the spherical harmonics in use.
+        time_offset: [N] t - mu_t.
+    """
+    frequencies = torch.arange(coefficients.shape[1], device=time_offset.device)
+    waves = torch.cos(2 * math.pi * frequencies * time_offset[:, None])  # [N, M]
+    basis = sh_basis(directions, degree)
+    used = (coefficients[:, :, : basis.shape[-1]] * waves[..., None, None]).sum(1)
+    return ((basis[..., None] * used).sum(1) + 0.5).clamp(min=0)

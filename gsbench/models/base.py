@@ -1,0 +1,263 @@
+"""What every model is: N Gaussians with raw parameters, observed by `slice`, and edited row by row; the registry."""
+
+import importlib
+import inspect
+import math
+import pkgutil
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from gsbench.errors import InputError, did_you_mean
+from gsbench.models.appearance import sh_colors
+from gsbench.models.refinement import Refinement
+from gsbench.scenes.points import SH_C0, nearest_distances
+from gsbench.scenes.scene import Points
+
+Raw = dict[str, Tensor]  # raw parameters by name, N rows each
+CHILDREN = 2  # a split leaves two Gaussians ..
+SHRINK = 0.8 * CHILDREN  # .. each 1.6 times smaller (3DGS, gaussian_model.py)
+INITIAL_OPACITY = 0.1
+
+
+class Gaussians3D(NamedTuple):
+    """What the rasterizer draws: one slice of a model."""
+
+    means: Tensor  # [N, 3]
+    factors: Tensor  # [N, 3, 3]
+    opacities: Tensor  # [N]
+    colors: Tensor  # [N, 3]
+
+
+class Conditioned(NamedTuple):
+    """The geometry of one slice."""
+
+    means: Tensor  # [N, 3]
+    factors: Tensor  # [N, 3, 3]
+    gate: Tensor  # [N] f_temp f_dir in [0, 1]: how much of the opacity is left
+
+
+@dataclass(frozen=True)
+class Stage:
+    """How much of a model is switched on at some point of the training."""
+
+    sh_degree: int
+    refine: bool  # AGR moves the parameters and learns
+    tune_modulation: bool  # lambda_t and lambda_d learn
+
+
+class GaussianModel(nn.Module, ABC):
+    """N Gaussians. A subclass gives its raw geometry, how that is sliced, and how a Gaussian is split; no more."""
+
+    observes: ClassVar[tuple[str, ...]] = ()  # of "time", "direction"
+    centers: ClassVar[tuple[str, ...]] = ("means",)  # raw parameters that are means: AGR reads and moves these ..
+    shape: ClassVar[tuple[str, ...]]  # .. and moves these, which make the factor
+
+    def __init__(self, *, agr: bool = False, sh_degree: int = 3) -> None:
+        """Make a model without Gaussians; `initialise` or `load_state` gives it some.
+
+        Raises:
+            InputError: sh_degree is not 0, 1, 2 or 3.
+        """
+        super().__init__()
+        if sh_degree not in range(4):
+            raise InputError(f"sh_degree: expected 0, 1, 2 or 3, got {sh_degree}")
+        self.splats = nn.ParameterDict()
+        self.log_modulation = nn.ParameterDict()  # ln lambda_t, ln lambda_d of the models that have them
+        self.refinement: Refinement | None = None
+        self.agr = agr
+        self.sh_degree = sh_degree
+        self.extent = 1.0  # of the scene, world units
+        self.stage = Stage(sh_degree, agr, False)
+
+    # ---- what a subclass gives
+
+    @abstractmethod
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        """Raw parameters named in `centers` and `shape`, less `means`; neighbours of points are at `distances` [N]."""
+
+    @abstractmethod
+    def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
+        """Slice Gaussians with raw parameters `raw` at what this model observes."""
+
+    @abstractmethod
+    def scales(self) -> Tensor:
+        """Each Gaussian's largest standard deviation in space, [N], world units."""
+
+    @abstractmethod
+    def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
+        """Raw geometry of the children of parents, of which `raw` holds CHILDREN copies in a row."""
+
+    def long_in_time(self) -> Tensor:
+        """Which Gaussians ask to be split for their extent in time, [N] bool (7DGS, section 4.4)."""
+        return torch.zeros(len(self), dtype=torch.bool, device=self.splats["means"].device)
+
+    def initial_colors(self, dc: Tensor) -> Raw:
+        """Raw appearance that shows the colour dc [N, 3] (of degree 0) at every direction and time."""
+        rest = dc.new_zeros(len(dc), (self.sh_degree + 1) ** 2 - 1, 3)
+        return {"sh0": dc[:, None], "shN": rest}
+
+    def show(self, raw: Raw, directions: Tensor, time: Tensor | None) -> Tensor:
+        """Colours [N, 3] in unit directions [N, 3]."""
+        return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), directions, self.stage.sh_degree)
+
+    # ---- what every model does
+
+    def __len__(self) -> int:
+        return len(self.splats["means"]) if "means" in self.splats else 0
+
+    @torch.no_grad()
+    def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
+        """Start from points: isotropic in space at the distance of three neighbours, opacity 0.1 (3DGS, section 5.1).
+
+        Args:
+            points: where Gaussians start, in which colours.
+            extent: of the scene, world units; density control and learning rates are relative to it.
+            generator: what is random is drawn from it.
+        """
+        self.extent = extent
+        distances = nearest_distances(points.means)
+        raw = {"means": points.means, **self.initial_geometry(points, distances, generator)}
+        raw["opacities"] = torch.full((len(points.means),), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)))
+        raw |= self.initial_colors((points.colors - 0.5) / SH_C0)
+        self.splats = nn.ParameterDict({name: nn.Parameter(value.clone()) for name, value in raw.items()})
+        if self.agr:
+            features = sum(raw[name].shape[-1] for name in self.centers)
+            shape = sum(raw[name].shape[-1] for name in self.shape)
+            outputs = [*(raw[name].shape[-1] for name in self.centers), shape]
+            self.refinement = Refinement(features, outputs, generator)
+        self.set_stage(self.stage)
+
+    def slice(self, camera_center: Tensor, time: float | None) -> Gaussians3D:
+        """Observe the model from a place [3] at a time in [0, 1]: 3D Gaussians for the rasterizer.
+
+        Raises:
+            InputError: the model needs a time and got none.
+        """
+        if time is None and ("time" in self.observes or self.agr):
+            raise InputError(f"{type(self).__name__}: expected a time in [0, 1], got none: this model observes time")
+        t = None if time is None else camera_center.new_tensor(time)
+        raw = self.refined(t)
+        means, factors, gate = self.condition(raw, camera_center, t)
+        colors = self.show(raw, unit(means - camera_center), t)
+        return Gaussians3D(means, factors, torch.sigmoid(raw["opacities"]) * gate, colors)
+
+    def refined(self, time: Tensor | None) -> Raw:
+        """Raw parameters after AGR: raw + phi(f) (7DGS eq. 15), on log-diagonals before the exp."""
+        raw: Raw = dict(self.splats.items())
+        if self.refinement is None or not self.stage.refine or time is None:
+            return raw
+        features = torch.cat([raw[name] for name in self.centers], -1)
+        *centers, shape = self.refinement(features, time)
+        for name, residual in zip(self.centers, centers, strict=True):
+            raw[name] = raw[name] + residual
+        parts = shape.split([raw[name].shape[-1] for name in self.shape], -1)
+        for name, residual in zip(self.shape, parts, strict=True):
+            raw[name] = raw[name] + residual
+        return raw
+
+    def modulation(self, name: str) -> Tensor:
+        """lambda_t or lambda_d of `log_modulation`, positive by exp, []."""
+        return self.log_modulation[name].exp()
+
+    def set_stage(self, stage: Stage) -> None:
+        """Switch parts on or off; what is off neither acts nor learns."""
+        self.stage = stage
+        for parameter in self.log_modulation.parameters():
+            parameter.requires_grad_(stage.tune_modulation)
+        if self.refinement is not None:
+            self.refinement.requires_grad_(stage.refine)
+
+    def groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by the name their learning rate goes by."""
+        groups = {name: [parameter] for name, parameter in self.splats.items()}
+        if self.refinement is not None:
+            groups["refinement"] = list(self.refinement.parameters())
+        if len(self.log_modulation):
+            groups["modulation"] = list(self.log_modulation.parameters())
+        return groups
+
+    # ---- density control: rows are kept, copied and split here, whatever they mean
+
+    @torch.no_grad()
+    def select(self, rows: Tensor) -> None:
+        """Keep the given rows, in the given order, repeated where repeated. Parameters stay the same objects."""
+        for parameter in self.splats.values():
+            parameter.data = parameter.data[rows]
+            parameter.grad = None
+
+    @torch.no_grad()
+    def split(self, rows: Tensor, generator: torch.Generator) -> None:
+        """Turn rows [M], CHILDREN copies of each parent in a row, into its children."""
+        raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.shape)}
+        for name, value in self.divide(raw, generator).items():
+            self.splats[name].data[rows] = value
+
+    @torch.no_grad()
+    def reset_opacities(self, ceiling: float) -> None:
+        """Lower every opacity to at most `ceiling` (3DGS, section 5.2)."""
+        self.splats["opacities"].data.clamp_(max=math.log(ceiling / (1 - ceiling)))
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over a `state_dict` of any number of Gaussians.
+
+        Raises:
+            InputError: the state is not this model's.
+        """
+        rows = {name.removeprefix("splats."): value for name, value in state.items() if name.startswith("splats.")}
+        if set(rows) != set(self.splats) or len({len(value) for value in rows.values()}) != 1:
+            raise InputError(f"checkpoint: expected Gaussians with {sorted(self.splats)}, got {sorted(rows)}")
+        for name, value in rows.items():
+            self.splats[name].data = torch.empty_like(value, device=self.splats[name].device)
+        try:
+            self.load_state_dict(state)
+        except RuntimeError as error:
+            raise InputError(f"checkpoint: not of this model: {' '.join(str(error).split())}") from None
+
+
+def unit(vectors: Tensor) -> Tensor:
+    """Vectors [N, 3] at length 1; a vector too short to have a direction becomes zero, and so does its gradient."""
+    square = vectors.square().sum(-1, keepdim=True)
+    defined = square > 1e-20
+    return torch.where(defined, vectors * torch.where(defined, square, 1.0).rsqrt(), 0.0)
+
+
+_REGISTRY: dict[str, type[GaussianModel]] = {}
+M = TypeVar("M", bound=type[GaussianModel])
+
+
+def register(name: str) -> Callable[[M], M]:
+    """Class decorator: `build` finds the model by this name."""
+
+    def enter(model: M) -> M:
+        _REGISTRY[name] = model
+        return model
+
+    return enter
+
+
+def build(name: str, **options: Any) -> GaussianModel:
+    """Make the model registered as `name`, without Gaussians yet.
+
+    Every module of `gsbench.models` is imported first, so that a new model is one new file in that folder.
+
+    Raises:
+        InputError: no such model, or an option it does not have.
+    """
+    package = importlib.import_module("gsbench.models")
+    for module in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"gsbench.models.{module.name}")
+    if name not in _REGISTRY:
+        raise InputError(f"model '{name}' is not known. {did_you_mean(name, _REGISTRY)}")
+    model = _REGISTRY[name]
+    # A constructor passes on what it does not name itself: its options are those of all classes it stands on.
+    signatures = [inspect.signature(cls.__init__) for cls in model.__mro__ if issubclass(cls, GaussianModel)]
+    known = [p.name for s in signatures for p in s.parameters.values() if p.kind is p.KEYWORD_ONLY]
+    for option in options:
+        if option not in known:
+            raise InputError(f"model '{name}' has no option '{option}'. {did_you_mean(option, known)}")
+    return model(**options)

@@ -1,0 +1,47 @@
+"""3DGS: nothing is observed, the slice is the Gaussian itself (Kerbl et al. 2023)."""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register
+from gsbench.models.factors import rotation
+from gsbench.scenes.scene import Points
+
+
+@register("3dgs")
+class Gaussians3DModel(GaussianModel):
+    """Means, log scales and quaternions: F = R S, cov = R S S R^T (3DGS eq. 6)."""
+
+    shape = ("scales", "quats")
+
+    def __init__(self, **options: Any) -> None:
+        """Options as `GaussianModel`."""
+        super().__init__(**options)
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        """Spheres."""
+        quats = torch.zeros(len(distances), 4)
+        quats[:, 0] = 1
+        return {"scales": distances.log()[:, None].repeat(1, 3), "quats": quats}
+
+    def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
+        """The Gaussian as it is."""
+        return Conditioned(raw["means"], self.factors(raw), torch.ones_like(raw["opacities"]))
+
+    def scales(self) -> Tensor:
+        """Largest of the three scales."""
+        return self.splats["scales"].detach().amax(-1).exp()
+
+    def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
+        """Children drawn from the parent's own distribution, 1.6 times smaller (3DGS, section 5.2)."""
+        z = torch.randn(raw["means"].shape, generator=generator).to(raw["means"])
+        means = raw["means"] + (self.factors(raw) @ z[..., None])[..., 0]
+        return {"means": means, "scales": raw["scales"] - math.log(SHRINK)}
+
+    @staticmethod
+    def factors(raw: Raw) -> Tensor:
+        """R S, [N, 3, 3]."""
+        return rotation(raw["quats"]) * raw["scales"].exp()[:, None, :]

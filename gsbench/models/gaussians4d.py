@@ -1,0 +1,97 @@
+"""4DGS: Gaussians in space and time, and colours that change with time (Yang et al. 2023)."""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gsbench.errors import InputError
+from gsbench.models.appearance import sh_time_colors
+from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register
+from gsbench.models.factors import rotation4d
+from gsbench.models.slicing import check_scheme, mahalanobis, slice_gaussians
+from gsbench.scenes.scene import Points
+
+TIME_GATE_MIN = 0.05  # a Gaussian whose f_temp is not above this is not drawn (4DGS, gaussian_renderer)
+
+
+@register("4dgs")
+class Gaussians4DModel(GaussianModel):
+    """Means and times, four log scales and two quaternions: F = M_left(l) M_right(r) S over (x, y, z, t)."""
+
+    observes = ("time",)
+    centers = ("means", "times")
+    shape = ("scales", "left_quats", "right_quats")
+
+    def __init__(
+        self, *, time_degree: int = 2, scheme: str = "square_root", lambda_t: float = 1.0, **options: Any
+    ) -> None:
+        """Make an empty model.
+
+        Args:
+            time_degree: frequencies of the colour's Fourier series beside the constant one; 0: colours do not change.
+            scheme: of `slice_gaussians`.
+            lambda_t: sensitivity of the temporal opacity.
+            options: as `GaussianModel`.
+
+        Raises:
+            InputError: an option out of its range.
+        """
+        super().__init__(**options)
+        if time_degree < 0 or lambda_t <= 0:
+            raise InputError(f"4dgs: expected time_degree >= 0 and lambda_t > 0, got {time_degree} and {lambda_t}")
+        check_scheme(scheme)
+        self.time_degree = time_degree
+        self.scheme = scheme
+        self.log_modulation["time"] = nn.Parameter(torch.tensor(math.log(lambda_t)))
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        """Spheres in space, times uniform over the clip and a tenth of it beyond, time scale sqrt(T / 5)."""
+        N = len(distances)
+        scales = torch.cat([distances.log()[:, None].repeat(1, 3), torch.full((N, 1), 0.5 * math.log(1 / 5))], -1)
+        quats = torch.zeros(N, 4)
+        quats[:, 0] = 1
+        times = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
+        return {"times": times, "scales": scales, "left_quats": quats, "right_quats": quats.clone()}
+
+    def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
+        """Slice at t; f_temp = exp(-1/2 lambda_t (t - mu_t)^2 / S_t)."""
+        assert time is not None
+        factor = self.factors(raw)
+        mean, factor3, _ = slice_gaussians(
+            torch.cat([raw["means"], raw["times"]], -1), factor, time[None], scheme=self.scheme
+        )
+        gate = torch.exp(-0.5 * self.modulation("time") * mahalanobis(factor[:, 3:], time - raw["times"]))
+        return Conditioned(mean, factor3, torch.where(gate > TIME_GATE_MIN, gate, 0.0))
+
+    def initial_colors(self, dc: Tensor) -> Raw:
+        """4DSH coefficients [N, time_degree + 1, K, 3]: only the constant one is not zero."""
+        K = (self.sh_degree + 1) ** 2
+        waves = dc.new_zeros(len(dc), self.time_degree + 1, K, 3)
+        return {"sh0": dc[:, None, None], "shN": waves.flatten(1, 2)[:, 1:]}
+
+    def show(self, raw: Raw, directions: Tensor, time: Tensor | None) -> Tensor:
+        """4DSH."""
+        assert time is not None
+        coefficients = torch.cat([raw["sh0"].flatten(1, 2), raw["shN"]], 1).unflatten(1, (self.time_degree + 1, -1))
+        return sh_time_colors(coefficients, directions, self.stage.sh_degree, time - raw["times"][:, 0])
+
+    def scales(self) -> Tensor:
+        """Largest of the three spatial scales, as 4DGS' density control has it."""
+        return self.splats["scales"].detach()[:, :3].amax(-1).exp()
+
+    def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
+        """Children drawn from the parent's distribution in space and time, all scales 1.6 times smaller."""
+        z = torch.randn(len(raw["means"]), 4, generator=generator).to(raw["means"])
+        offset = (self.factors(raw) @ z[..., None])[..., 0]
+        return {
+            "means": raw["means"] + offset[:, :3],
+            "times": raw["times"] + offset[:, 3:],
+            "scales": raw["scales"] - math.log(SHRINK),
+        }
+
+    @staticmethod
+    def factors(raw: Raw) -> Tensor:
+        """R S, [N, 4, 4]."""
+        return rotation4d(raw["left_quats"], raw["right_quats"]) * raw["scales"].exp()[:, None, :]

@@ -1,0 +1,20 @@
+"""7DGS: Gaussians over position, time and direction (Gao et al. 2025)."""
+
+import torch
+from torch import Tensor
+
+from gsbench.models.base import register
+from gsbench.models.triangular import TriangularModel
+
+
+@register("7dgs")
+class Gaussians7DModel(TriangularModel):
+    """Observes t and d; q = {t, d}."""
+
+    observes = ("time", "direction")
+    centers = ("means", "times", "directions")
+
+    @torch.no_grad()
+    def long_in_time(self) -> Tensor:
+        """|S_pt| > 0.05 extent and sqrt(S_t) > 0.25 T (7DGS, section 4.4)."""
+        return self.moves_long(self.factors(dict(self.splats.items())))

@@ -1,0 +1,29 @@
+"""One picture of a model: slice it, draw the slice."""
+
+from torch import Tensor
+
+from gsbench.config import RasterConfig
+from gsbench.models.base import GaussianModel, Gaussians3D
+from gsbench.raster import RasterOutput, rasterize
+from gsbench.scenes.scene import Camera
+
+
+def draw(gaussians: Gaussians3D, camera: Camera, background: Tensor, config: RasterConfig) -> RasterOutput:
+    """Draw one slice from one camera, before a background colour [3]."""
+    return rasterize(
+        *gaussians,
+        camera.viewmat[None],
+        camera.K[None],
+        camera.width,
+        camera.height,
+        background=background,
+        backend=config.backend,
+        antialias=config.antialias,
+    )
+
+
+def render(
+    model: GaussianModel, camera: Camera, time: float | None, background: Tensor, config: RasterConfig
+) -> Tensor:
+    """The picture [H, W, 3] of a model from a camera at a time."""
+    return draw(model.slice(camera.center, time), camera, background, config).image[0]

@@ -1,0 +1,159 @@
+"""The slicing equation: a joint Gaussian over (p, q), observed at q, is a 3D Gaussian over p (7DGS, section 4.2).
+
+    K = S_pq S_qq^-1        mean = mu_p + K (q - mu_q)        cov = S_pp - K S_pq^T
+
+A Gaussian is given by a factor F of S = F F^T. Its rows are ordered (p, q); its columns are any. Forming S squares the
+condition number, so the default scheme never does: it turns the rows of F by reflections until
+F = [T_pq T_pp; T_qq 0] with T_qq lower triangular (square-root Kalman filters: Kailath, Sayed, Hassibi, chapter 12),
+
+    K = T_pq T_qq^-1        cov = T_pp T_pp^T
+
+and hands T_pp itself to the rasterizer: semi-definite by construction, nothing subtracted.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError, did_you_mean
+
+SCHEMES = ("square_root", "schur", "cholesky")
+
+
+class Slice(NamedTuple):
+    """What is left of a joint Gaussian once q is observed."""
+
+    mean: Tensor  # [N, 3]
+    factor: Tensor  # [N, 3, 3] F of cov = F F^T
+    gain: Tensor  # [N, 3, k] K: how the mean moves with q
+
+
+class Reduced(NamedTuple):
+    """A factor turned to [T_qq 0; T_pq T_pp]: conditioned variables first, T_qq lower triangular."""
+
+    T_qq: Tensor  # [N, k, k]
+    T_pq: Tensor  # [N, 3, k]
+    T_pp: Tensor  # [N, 3, 3]
+
+
+def slice_gaussians(
+    mean: Tensor,  # [N, 3+k]
+    factor: Tensor,  # [N, 3+k, 3+k]
+    query: Tensor,  # [N, k] or [k]
+    *,
+    scheme: str = "square_root",
+) -> Slice:
+    """Condition N joint Gaussians on q = query (7DGS eq. 9 and 10).
+
+    Args:
+        mean: (mu_p, mu_q).
+        factor: any square F with S = F F^T, rows ordered (p, q).
+        query: the observed q, one for all or one each.
+        scheme: `square_root` works on F; `schur` inverts S_qq and subtracts, as published code does; `cholesky` solves
+            with a Cholesky factor of S_qq and subtracts. The last two are for comparison: they lose half the digits.
+
+    Raises:
+        InputError: shapes that do not fit, or an unknown scheme.
+    """
+    N, n = mean.shape
+    if factor.shape != (N, n, n) or n < 3 or query.shape[-1] != n - 3 or query.dim() > 2:
+        raise InputError(f"slice_gaussians: expected mean [N, 3+k], factor [N, 3+k, 3+k] and query [N, k] or [k], "
+                         f"got {list(mean.shape)}, {list(factor.shape)} and {list(query.shape)}")  # fmt: skip
+    check_scheme(scheme)
+    if scheme == "square_root":
+        return slice_reduced(mean, reduce(factor), query)
+    S = factor @ factor.mT
+    S_pp, S_pq, S_qq = S[:, :3, :3], S[:, :3, 3:], S[:, 3:, 3:]
+    if scheme == "schur":
+        gain = S_pq @ torch.linalg.inv_ex(S_qq).inverse
+    else:
+        gain = torch.cholesky_solve(S_pq.mT, torch.linalg.cholesky_ex(S_qq).L).mT
+    moved = mean[:, :3] + (gain @ (query - mean[:, 3:])[..., None])[..., 0]
+    return Slice(moved, _cholesky3(S_pp - gain @ S_pq.mT), gain)
+
+
+def check_scheme(scheme: str) -> None:
+    """Raise InputError unless `scheme` is one of SCHEMES."""
+    if scheme not in SCHEMES:
+        raise InputError(f"slicing scheme '{scheme}' is not known. {did_you_mean(scheme, SCHEMES)}")
+
+
+def slice_reduced(mean: Tensor, reduced: Reduced, query: Tensor) -> Slice:
+    """`slice_gaussians` for a factor that is [T_qq 0; T_pq T_pp] already: no reduction, the cheapest form there is."""
+    gain = gain_of(reduced.T_pq, reduced.T_qq)
+    moved = mean[:, :3] + (gain * (query - mean[:, 3:])[..., None, :]).sum(-1)
+    return Slice(moved, reduced.T_pp, gain)
+
+
+def reduce(factor: Tensor) -> Reduced:
+    """Turn a factor with rows (p, q), [N, 3+k, n], to [T_qq 0; T_pq T_pp] by reflections from the right."""
+    k = factor.shape[1] - 3
+    T, rest = triangularise(torch.cat([factor[:, 3:], factor[:, :3]], 1), k)
+    return Reduced(T[:, :k], T[:, k:], rest[:, k:])
+
+
+def mahalanobis(rows: Tensor, delta: Tensor) -> Tensor:
+    """delta^T (R R^T)^-1 delta for some rows R of a factor, [N, m, n] and [N, m] -> [N], with nothing inverted.
+
+    This is the exponent of f_temp and f_dir (7DGS eq. 11 and 12): R R^T is the marginal block S_t or S_d.
+    """
+    T, _ = triangularise(rows, rows.shape[1])
+    white: list[Tensor] = []  # T^-1 delta, by forward substitution
+    for i in range(rows.shape[1]):
+        known = sum((T[:, i, j] * white[j] for j in range(i)), start=torch.zeros_like(delta[:, i]))
+        white.append((delta[:, i] - known) / T[:, i, i])
+    return torch.stack(white, -1).square().sum(-1)
+
+
+def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Reflect [N, r, n] rows from the right until the first k are lower triangular: [N, r, k] and the rest [N, r, n-k].
+
+    R H H^T R^T = R R^T, so no covariance changes. Householder, with the sign that avoids cancellation (Golub and
+    Van Loan, section 5.1).
+    """
+    rest, columns = rows, []
+    for i in range(k):
+        x = rest[:, i]
+        square = (x * x).sum(-1, keepdim=True)
+        length = torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
+        signed = torch.where(x[:, :1] < 0, -length, length)
+        v = torch.cat([x[:, :1] + signed, x[:, 1:]], -1)
+        vv = (v * v).sum(-1, keepdim=True)
+        step = v * (2 / torch.where(vv > 0, vv, 1.0))  # zero for a row of zeros, which stays as it is
+        rest = rest - (rest * v[:, None]).sum(-1, keepdim=True) * step[:, None]
+        # Row i is now (-+|x|, 0, ..): written as such, so that T is triangular to the last bit.
+        columns.append(torch.cat([torch.zeros_like(rest[:, :i, 0]), -signed, rest[:, i + 1 :, 0]], -1))
+        rest = rest[..., 1:]
+    T = torch.stack(columns, -1) if columns else rows[..., :0]
+    return T, rest
+
+
+def gain_of(T_pq: Tensor, T_qq: Tensor) -> Tensor:
+    """K = T_pq T_qq^-1, [N, 3, k] and [N, k, k] lower triangular: back substitution, unrolled over the few columns."""
+    k = T_qq.shape[-1]
+    solved: list[Tensor] = []  # columns k-1, k-2, ..
+    for j in reversed(range(k)):
+        column = T_pq[..., j]
+        for i, x in zip(range(k - 1, j, -1), solved, strict=True):
+            column = column - x * T_qq[:, i, j, None]
+        solved.append(column / T_qq[:, j, j, None])
+    return torch.stack(solved[::-1], -1) if solved else T_pq
+
+
+def _cholesky3(S: Tensor) -> Tensor:
+    """A lower triangular factor of [N, 3, 3], negative pivots cut to zero: what is indefinite in S is lost."""
+
+    def root(x: Tensor) -> Tensor:
+        return torch.where(x > 0, torch.where(x > 0, x, 1.0).sqrt(), 0.0)
+
+    def over(x: Tensor, pivot: Tensor) -> Tensor:
+        return torch.where(pivot > 0, x / torch.where(pivot > 0, pivot, 1.0), 0.0)
+
+    a = root(S[:, 0, 0])
+    b, c = over(S[:, 1, 0], a), over(S[:, 2, 0], a)
+    d = root(S[:, 1, 1] - b * b)
+    e = over(S[:, 2, 1] - b * c, d)
+    f = root(S[:, 2, 2] - c * c - e * e)
+    zero = torch.zeros_like(a)
+    return torch.stack([a, zero, zero, b, d, zero, c, e, f], -1).unflatten(-1, (3, 3))

@@ -1,0 +1,153 @@
+"""What 6DGS and 7DGS share: Gaussians over position, direction and maybe time, by one triangular factor."""
+
+import math
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gsbench.errors import InputError, did_you_mean
+from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
+from gsbench.models.factors import triangular, triangular_parameters
+from gsbench.models.slicing import Reduced, check_scheme, gain_of, mahalanobis, reduce, slice_gaussians, slice_reduced
+from gsbench.scenes.scene import Points
+
+# Where position, time and direction stand among the rows of the triangular factor.
+FACTOR_ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
+WIDTH = {"p": 3, "t": 1, "d": 3}
+TIME_CORRELATION = 0.05  # split in time where |S_pt| is above this part of the scene's extent ..
+TIME_SCALE = 0.25  # .. and sqrt(S_t) above this part of the clip (7DGS, section 4.4)
+
+
+class TriangularModel(GaussianModel):
+    """Means of p, d and t and one lower triangular factor of their covariance.
+
+    Rows of a factor are ordered (p, d, t) wherever slicing sees them: with d before t, the leading block of the
+    reduced factor is the marginal one of d.
+    """
+
+    shape = ("log_diagonal", "off_diagonal")
+
+    def __init__(
+        self,
+        *,
+        lambda_d: float,
+        lambda_t: float | None = None,
+        factor_order: str = "conditioned_first",
+        scheme: str = "square_root",
+        row_scaled: bool = False,
+        directional_half: bool = True,
+        **options: Any,
+    ) -> None:
+        """Make an empty model.
+
+        Args:
+            lambda_d: initial sensitivity of f_dir.
+            lambda_t: initial sensitivity of f_temp, of a model that observes time.
+            factor_order: `paper`, the factor triangular over (p, t, d), or `conditioned_first`, over (d, t, p).
+            scheme: of `slice_gaussians`.
+            row_scaled: see `triangular`.
+            directional_half: whether f_dir has the 1/2 of 7DGS eq. 12, which 6DGS lacks.
+            options: as `GaussianModel`.
+
+        Raises:
+            InputError: an option out of its range.
+        """
+        super().__init__(**options)
+        if factor_order not in FACTOR_ORDERS:
+            raise InputError(f"factor_order '{factor_order}' is not known. {did_you_mean(factor_order, FACTOR_ORDERS)}")
+        check_scheme(scheme)
+        lambdas = {"direction": lambda_d} | ({} if lambda_t is None else {"time": lambda_t})
+        for name, value in lambdas.items():
+            if value <= 0:
+                raise InputError(f"lambda of {name}: expected a positive number, got {value}")
+            self.log_modulation[name] = nn.Parameter(torch.tensor(math.log(value)))
+        self.scheme = scheme
+        self.row_scaled = row_scaled
+        self.directional_half = directional_half
+        # Row numbers of p, d and t in the triangular factor, and the order that sorts its rows to (p, d, t).
+        letters = "".join(x * WIDTH[x] for x in FACTOR_ORDERS[factor_order] if x != "t" or "time" in self.observes)
+        self.rows = {x: [i for i, letter in enumerate(letters) if letter == x] for x in "pdt"}
+        self.is_reduced = factor_order == "conditioned_first" and scheme == "square_root"
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        """Spheres; directions uniform on the unit sphere, of scale 1; time scale sqrt(T / 10); no correlation."""
+        N, n = len(distances), sum(map(len, self.rows.values()))
+        log_diagonal = torch.zeros(N, n)
+        log_diagonal[:, self.rows["p"]] = distances.log()[:, None]
+        log_diagonal[:, self.rows["t"]] = 0.5 * math.log(1 / 10)
+        raw = {"log_diagonal": log_diagonal, "off_diagonal": torch.zeros(N, n * (n - 1) // 2)}
+        raw["directions"] = F.normalize(torch.randn(N, 3, generator=generator), dim=-1)
+        if "time" in self.observes:
+            raw["times"] = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
+        return raw
+
+    def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
+        """Slice at d = the unit vector from the camera to mu_p, and t (7DGS, algorithm 1)."""
+        factor = self.factors(raw)
+        query = unit(raw["means"] - camera_center)
+        mean = torch.cat([raw["means"], raw["directions"]], -1)
+        exponent = (1 if self.directional_half else 2) * self.modulation("direction") * mahalanobis(
+            factor[:, 3:6], query - raw["directions"])  # fmt: skip
+        if time is not None and "time" in self.observes:
+            query = torch.cat([query, time.expand(len(query), 1)], -1)
+            mean = torch.cat([mean, raw["times"]], -1)
+            exponent = exponent + self.modulation("time") * mahalanobis(factor[:, 6:], time - raw["times"])
+        if self.is_reduced:
+            mean3, factor3, _ = slice_reduced(mean, self._blocks(factor), query)
+        else:
+            mean3, factor3, _ = slice_gaussians(mean, factor, query, scheme=self.scheme)
+        return Conditioned(mean3, factor3, torch.exp(-0.5 * exponent))
+
+    def scales(self) -> Tensor:
+        """Largest standard deviation of the sliced Gaussian, which is the same at every t and d."""
+        T_pp = reduce(self.factors(dict(self.splats.items())).detach()).T_pp
+        return torch.linalg.matrix_norm(T_pp, ord=2)
+
+    def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
+        """Children along the parent's path where it is long in time, else drawn from its slice; K is theirs too.
+
+        In the reduced factor [T_qq 0; K T_qq T_pp] a child's shape is T_pp / 1.6 (space) or T_qq with its last row,
+        that of t, divided by 1.6 (time). K stays: a child moves as its parent did.
+        """
+        factor = self.factors(raw)
+        T_qq, T_pq, T_pp = reduce(factor)
+        gain = gain_of(T_pq, T_qq)
+        in_time = self.moves_long(factor)[:, None]
+        z = torch.randn(raw["means"].shape, generator=generator).to(factor)
+        children = {"means": raw["means"] + torch.where(in_time, 0, (T_pp @ z[..., None])[..., 0])}
+        T_pp = torch.where(in_time[..., None], T_pp, T_pp / SHRINK)
+        if "time" in self.observes:
+            step = torch.where(in_time, z[:, :1], 0)  # in standard deviations of t
+            path = factor[:, :3] @ factor[:, 6:].mT / factor[:, 6:].norm(dim=-1, keepdim=True)  # S_pt / sqrt(S_t)
+            children["means"] = children["means"] + path[..., 0] * step
+            children["times"] = raw["times"] + factor[:, 6].norm(dim=-1, keepdim=True) * step
+            T_qq = torch.cat([T_qq[:, :-1], torch.where(in_time[..., None], T_qq[:, -1:] / SHRINK, T_qq[:, -1:])], 1)
+        p_rows = torch.cat([gain @ T_qq, T_pp], -1)
+        q_rows = torch.cat([T_qq, T_pp.new_zeros(len(T_qq), T_qq.shape[1], 3)], -1)
+        factor = torch.cat([p_rows, q_rows], 1)[:, self._own_order()]
+        children["log_diagonal"], children["off_diagonal"] = triangular_parameters(factor, row_scaled=self.row_scaled)
+        return children
+
+    def factors(self, raw: Raw) -> Tensor:
+        """The triangular factor with its rows sorted to (p, d, t), [N, n, n]."""
+        L = triangular(raw["log_diagonal"], raw["off_diagonal"], row_scaled=self.row_scaled)
+        return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
+
+    def _blocks(self, factor: Tensor) -> Reduced:
+        """The factor of `conditioned_first` as what it is: reduced already, its first columns those of q."""
+        k = factor.shape[-1] - 3
+        return Reduced(factor[:, 3:, :k], factor[:, :3, :k], factor[:, :3, k:])
+
+    def _own_order(self) -> list[int]:
+        """For each row of the triangular factor, its place in (p, d, t)."""
+        sorted_rows = self.rows["p"] + self.rows["d"] + self.rows["t"]
+        return sorted(range(len(sorted_rows)), key=sorted_rows.__getitem__)
+
+    def moves_long(self, factor: Tensor) -> Tensor:
+        """Whether Gaussians move with time and are long in it, [N, n, n] -> [N] bool (7DGS, section 4.4)."""
+        if "time" not in self.observes:
+            return torch.zeros(len(factor), dtype=torch.bool, device=factor.device)
+        S_pt = (factor[:, :3] @ factor[:, 6:].mT)[..., 0]
+        return (S_pt.norm(dim=-1) > TIME_CORRELATION * self.extent) & (factor[:, 6].norm(dim=-1) > TIME_SCALE)

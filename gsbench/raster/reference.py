@@ -1,0 +1,190 @@
+"""The rasterizer in plain torch: any dtype and device, differentiable in every input, the truth for other backends.
+
+Read it beside Kerbl et al. 2023 ("3DGS") and Zwicker et al. 2001 ("EWA splatting"):
+project -> bin into tiles -> blend.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsbench.raster import RasterInfo, RasterOutput
+
+ALPHA_MAX = 0.999
+ALPHA_MIN = 1.0 / 255.0
+TRANSMITTANCE_MIN = 1e-4
+TILE = 8  # pixels a side; small tiles waste fewer of the pairs that blending evaluates
+CHUNK = 1 << 21  # (Gaussian, pixel) products blended at a time: bounds memory, and fits caches
+
+
+class Splats(NamedTuple):
+    """Gaussians on the image plane of one camera."""
+
+    means2d: Tensor  # [N, 2] pixels
+    conics: Tensor  # [N, 3] xx, xy, yy of the inverse of the 2D covariance
+    opacities: Tensor  # [N]
+    depths: Tensor  # [N]
+    half_sizes: Tensor  # [N, 2] pixels: alpha < ALPHA_MIN outside means2d +- half_sizes; 0: not drawn
+
+
+def draw(
+    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, background: Tensor, near: float, far: float, eps2d: float, antialias: bool,
+) -> RasterOutput:  # fmt: skip
+    """Draw every camera in turn; arguments as `gsbench.raster.rasterize`, colours [C, N, D]."""
+    splats = [
+        project(means, factors, opacities, viewmat, K, width, height, near, far, eps2d, antialias)
+        for viewmat, K in zip(viewmats, Ks, strict=True)
+    ]
+    means2d = torch.stack([s.means2d for s in splats])  # every picture is drawn from it, so it has a gradient
+    images, alphas, pairs = [], [], 0
+    for splat, mean2d, color in zip(splats, means2d, colors, strict=True):
+        tiles, gaussians = bin_tiles(splat, width, height)
+        image, alpha = blend(splat._replace(means2d=mean2d), color, tiles, gaussians, width, height)
+        images.append(image + (1 - alpha) * background)
+        alphas.append(alpha)
+        pairs += len(tiles)
+    info = RasterInfo(
+        radii=torch.stack([s.half_sizes.amax(-1).ceil().int() for s in splats]),
+        means2d=means2d,
+        depths=torch.stack([s.depths for s in splats]),
+        pairs=pairs,
+    )
+    return RasterOutput(torch.stack(images), torch.stack(alphas), info)
+
+
+def project(
+    means: Tensor,  # [N, 3]
+    factors: Tensor,  # [N, 3, 3]
+    opacities: Tensor,  # [N]
+    viewmat: Tensor,  # [4, 4]
+    K: Tensor,  # [3, 3]
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    eps2d: float,
+    antialias: bool,
+) -> Splats:
+    """Project Gaussians by the affine approximation of the pinhole at their means (EWA splatting, eq. 29)."""
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
+    means_c = means @ rotation.T + translation
+    drawn = (means_c[:, 2] > near) & (means_c[:, 2] < far)
+    # What is not drawn still passes through every line below: give it a harmless depth, and a zero gradient.
+    x, y, z = torch.where(drawn[:, None], means_c, means_c.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
+
+    # The Jacobian is taken no farther than 15 % of the picture's width outside of it (3DGS, forward.cu), where the
+    # affine approximation would blow up.
+    margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
+    u = (x / z).clamp(-cx / fx - margin_x, (width - cx) / fx + margin_x)
+    v = (y / z).clamp(-cy / fy - margin_y, (height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    J = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).unflatten(-1, (2, 3))
+    M = J @ rotation @ factors  # [N, 2, 3]: the 2D covariance is M M^T, never formed from a 3D one
+    m1, m2 = M.unbind(-2)
+
+    xx, xy, yy = (m1 * m1).sum(-1), (m1 * m2).sum(-1), (m2 * m2).sum(-1)
+    # det(M M^T + e I) by Lagrange's identity, |m1|^2 |m2|^2 - (m1 m2)^2 = |m1 x m2|^2: nothing cancels for a needle.
+    area2 = torch.linalg.cross(m1, m2).square().sum(-1)
+    det = area2 + eps2d * (xx + yy) + eps2d**2
+    drawn = drawn & (det > 0)
+    det = torch.where(drawn, det, 1.0)
+    conics = torch.stack([yy + eps2d, -xy, xx + eps2d], -1) / det[:, None]
+    if antialias:
+        ratio = torch.where(area2 > 0, area2, 1.0) / det
+        opacities = torch.where(area2 > 0, opacities * ratio.sqrt(), 0.0)
+
+    # alpha >= 1/255 only where power <= ln(255 opacity); that ellipse's bounding box has half sizes
+    # sqrt(2 power cov_xx), sqrt(2 power cov_yy). A hundredth of a pixel more, lest rounding cut off a pixel.
+    power = (255 * opacities.detach()).clamp(min=1).log()
+    half_sizes = (2 * power[:, None] * torch.stack([xx + eps2d, yy + eps2d], -1).detach()).sqrt() + 0.01
+    inside = ((means2d + half_sizes > 0) & (means2d - half_sizes < means2d.new_tensor([width, height]))).all(-1)
+    drawn = drawn & (opacities >= ALPHA_MIN) & inside
+    return Splats(means2d, conics, opacities, means_c[:, 2], torch.where(drawn[:, None], half_sizes, 0.0))
+
+
+@torch.no_grad()
+def bin_tiles(splats: Splats, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """List (tile, Gaussian) pairs sorted by tile, then by depth, then by index: tiles [P], gaussians [P]."""
+    order = torch.argsort(splats.depths, stable=True)
+    order = order[splats.half_sizes[order].amax(-1) > 0]
+    center, half = splats.means2d[order], splats.half_sizes[order]
+    size = center.new_tensor([width, height])
+    # Clamped as floats: a huge Gaussian's bounds overflow integers.
+    low = (torch.minimum((center - half).clamp(min=0), size) / TILE).floor().long()
+    high = (torch.minimum((center + half).clamp(min=0), size) / TILE).ceil().long()
+    columns, rows = (high - low).clamp(min=1).unbind(-1)
+    count = columns * rows
+    owner = torch.repeat_interleave(torch.arange(len(order), device=order.device), count)
+    nth = torch.arange(len(owner), device=order.device) - (count.cumsum(0) - count)[owner]  # 0, 1, .. within an owner
+    across = -(-width // TILE)
+    down = -(-height // TILE)
+    tile_x = (low[owner, 0] + nth % columns[owner]).clamp(max=across - 1)
+    tile_y = (low[owner, 1] + nth // columns[owner]).clamp(max=down - 1)
+    tiles, by_tile = torch.sort(tile_y * across + tile_x, stable=True)  # stable: depth order survives within a tile
+    return tiles, order[owner[by_tile]]
+
+
+def blend(
+    splats: Splats,
+    colors: Tensor,  # [N, D]
+    tiles: Tensor,  # [P]
+    gaussians: Tensor,  # [P]
+    width: int,
+    height: int,
+) -> tuple[Tensor, Tensor]:
+    """Blend each tile's Gaussians front to back (3DGS eq. 3): image [H, W, D] without background, alpha [H, W, 1].
+
+    Tiles of similar length are blended together, padded to the longest with a Gaussian of zero opacity.
+    """
+    across, down = -(-width // TILE), -(-height // TILE)
+    D = colors.shape[-1]
+    # One row a Gaussian, plus the padding's row of zeros, so that one gather (and one scatter backward) serves all.
+    table = torch.cat([splats.means2d, splats.conics, splats.opacities[:, None], colors], -1)
+    table = torch.cat([table, table.new_zeros(1, 6 + D)])
+
+    lengths = torch.bincount(tiles, minlength=across * down)
+    starts = lengths.cumsum(0) - lengths
+    by_length = torch.argsort(lengths, descending=True, stable=True)
+    longest = lengths[by_length].tolist()
+    pieces, first = [], 0
+    while first < len(longest) and longest[first]:
+        last = min(len(longest), first + max(1, CHUNK // (longest[first] * TILE * TILE)))
+        chosen = by_length[first:last]
+        nth = torch.arange(longest[first], device=tiles.device)
+        padding = nth >= lengths[chosen, None]
+        index = gaussians[(starts[chosen, None] + nth).clamp(max=len(gaussians) - 1)]
+        index = index.masked_fill(padding, len(table) - 1)
+        # Not table[index]: its backward adds rows as threads come by, so that two runs differ in the last bits.
+        rows = table.index_select(0, index.flatten()).unflatten(0, index.shape)
+        pieces.append(_blend_tiles(rows, chosen % across * TILE, chosen // across * TILE))
+        first = last
+    empty = table[-1, 0].expand(across * down - first, TILE * TILE, D + 1)  # zeros, but in the graph
+    canvas = torch.cat([*pieces, empty])[torch.argsort(by_length)]  # back into the tiles' own order
+    canvas = canvas.reshape(down, across, TILE, TILE, D + 1).transpose(1, 2).reshape(down * TILE, across * TILE, D + 1)
+    canvas = canvas[:height, :width]
+    return canvas[..., :D], canvas[..., D:]
+
+
+def _blend_tiles(
+    rows: Tensor,  # [T, K, 6 + D]: mean2d, conic, opacity, colour of the K Gaussians of each of T tiles, in depth order
+    left: Tensor,  # [T] pixels
+    top: Tensor,  # [T] pixels
+) -> Tensor:  # [T, TILE * TILE, D + 1]: colour and alpha
+    offsets = torch.arange(TILE, device=rows.device) + 0.5
+    dx = (left[:, None, None] + offsets) - rows[..., 0:1]  # [T, K, TILE]
+    dy = (top[:, None, None] + offsets) - rows[..., 1:2]
+    xx, xy, yy, opacity = rows[..., 2:6].unbind(-1)
+    # power = 1/2 d^T conic d, from a row term, a column term and their product
+    power = (0.5 * yy[..., None] * dy * dy)[..., :, None] + (0.5 * xx[..., None] * dx * dx)[..., None, :]
+    power = power + (xy[..., None] * dy)[..., :, None] * dx[..., None, :]  # [T, K, TILE, TILE]
+    alpha = (opacity[..., None, None] * torch.exp(-power)).clamp(max=ALPHA_MAX).flatten(-2)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
+    after = torch.cumprod(1 - alpha, 1)  # transmittance behind each Gaussian
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
+    weight = torch.where(after >= TRANSMITTANCE_MIN, alpha * before, 0.0)  # [T, K, TILE * TILE]
+    color = torch.cat([rows[..., 6:], torch.ones_like(rows[..., :1])], -1)
+    return weight.transpose(1, 2) @ color

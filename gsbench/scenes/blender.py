@@ -1,0 +1,262 @@
+"""The Blender layout of NeRF-synthetic, D-NeRF and 7DGS-PBR: transforms_{train,val,test}.json beside PNG images."""
+
+import json
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.scenes import files, images
+from gsbench.scenes.scene import Camera, Scene, View, scene_extent
+
+_RIGID_TOLERANCE = 1e-4  # D-NeRF writes single precision: its trex is orthonormal to 2.2e-6
+_LARGEST = 1e30  # squares in double and sums in single precision stay finite up to here
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # as instant-ngp and nerfstudio write them
+
+
+@dataclass(frozen=True)
+class _Intrinsics:
+    """A pinhole in pixels of the full image; what the file leaves out follows from the image's size."""
+
+    angle_x: float | None  # horizontal field of view in radians; None where the focal length is given
+    focal: tuple[float, float] | None
+    principal: tuple[float | None, float | None]
+    size: tuple[float | None, float | None]  # width, height the file claims
+
+    def matrix(self, width: int, height: int, downscale: int) -> Tensor:  # [3, 3] float32
+        """K of the downscaled image. Pixel centres sit at +0.5, so scaling an image scales all of K's first rows."""
+        if self.focal is not None:
+            fx, fy = self.focal
+        else:
+            assert self.angle_x is not None
+            fx = fy = 0.5 * width / math.tan(0.5 * self.angle_x)
+        cx = width / 2 if self.principal[0] is None else self.principal[0]
+        cy = height / 2 if self.principal[1] is None else self.principal[1]
+        s = 1 / downscale
+        return torch.tensor([[fx * s, 0, cx * s], [0, fy * s, cy * s], [0, 0, 1]], dtype=torch.float32)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One entry of `frames`, checked; its image not yet read."""
+
+    path: Path
+    name: str  # relative to the scene's folder: "train/r_000.png"
+    where: str  # the image's path and the field that names it, for messages
+    time: float | None
+    viewmat: Tensor  # [4, 4] float32
+
+
+@dataclass(frozen=True)
+class _Split:
+    """One transforms_<split>.json, checked."""
+
+    source: Path
+    intrinsics: _Intrinsics
+    frames: list[_Frame]
+    digest: str
+
+
+def load(root: Path, *, downscale: int, background: tuple[float, float, float]) -> Scene:
+    """Load a scene in the Blender layout; see `gsbench.scenes.load` for the arguments.
+
+    The JSON gives `camera_angle_x`, or `fl_x` with optional `fl_y`, `cx`, `cy`, `w`, `h` in pixels of the full image,
+    and `frames` of `file_path` (relative, ".png" may be left out), `time` in [0, 1] (all frames or none) and
+    `transform_matrix`, camera to world in OpenGL axes. Without transforms_val.json there are no validation views.
+    Initial points are never taken from the folder: a points3d.ply there was drawn at random by 3DGS.
+
+    Raises:
+        InputError: anything that is missing, damaged or contradicts itself, by file and field.
+    """
+    root = root.resolve()
+    splits = {"train": _read_split(root, "train"), "test": _read_split(root, "test")}
+    if (root / "transforms_val.json").exists():
+        splits["val"] = _read_split(root, "val")
+    _check_times(splits)
+    views, digests = _read_views(splits, downscale, background)
+    digests |= {split.source.name: split.digest for split in splits.values()}
+    return Scene(
+        name=root.name,
+        train=views["train"],
+        val=views.get("val", []),
+        test=views["test"],
+        background=background,
+        extent=scene_extent(torch.stack([view.camera.viewmat for view in views["train"]])),
+        points=None,
+        fingerprint=files.fingerprint(digests),
+    )
+
+
+def _read_split(root: Path, name: str) -> _Split:
+    """Read and check transforms_<name>.json."""
+    source = root / f"transforms_{name}.json"
+    data = files.read_file(source, str(source))
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError) as error:  # ValueError: not JSON, not text, or an integer of 4300 digits
+        raise InputError(f"{source}: expected JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{source}: expected a JSON object with 'frames', got a {type(content).__name__}")
+    frames = content.get("frames")
+    if not isinstance(frames, list):
+        raise InputError(f"{source}: frames: expected a list of frames, got {_brief(frames)}")
+    if not frames:
+        raise InputError(f"{source}: frames: expected at least one frame, the {name} split is empty")
+    return _Split(
+        source,
+        _read_intrinsics(content, source),
+        [_read_frame(root, frame, source, index) for index, frame in enumerate(frames)],
+        files.digest(data),
+    )
+
+
+def _read_intrinsics(content: dict[str, Any], source: Path) -> _Intrinsics:
+    """Read `fl_x` and its companions, else `camera_angle_x`."""
+    given = ("camera_angle_x", "fl_x", "fl_y", "cx", "cy", "w", "h", *_DISTORTION)
+    values = {key: _number(content[key], f"{source}: {key}") for key in given if key in content}
+    for key in _DISTORTION:
+        if values.get(key, 0) != 0:
+            raise InputError(f"{source}: {key}: expected a pinhole camera, got {values[key]}: undistort the images")
+    for key in ("fl_x", "fl_y", "w", "h"):
+        if key in values and values[key] <= 0:
+            raise InputError(f"{source}: {key}: expected a positive number of pixels, got {values[key]}")
+    angle = values.get("camera_angle_x")
+    if angle is not None and not 1e-6 < angle < math.pi:
+        raise InputError(f"{source}: camera_angle_x: expected radians between 0 and pi, got {angle}")
+    focal = (values["fl_x"], values.get("fl_y", values["fl_x"])) if "fl_x" in values else None
+    if focal is None and angle is None:
+        raise InputError(f"{source}: expected intrinsics as 'camera_angle_x' or 'fl_x', found neither")
+    return _Intrinsics(angle, focal, (values.get("cx"), values.get("cy")), (values.get("w"), values.get("h")))
+
+
+def _read_frame(root: Path, frame: object, source: Path, index: int) -> _Frame:
+    """Check one entry of `frames`."""
+    where = f"{source}: frames[{index}]"
+    if not isinstance(frame, dict):
+        raise InputError(f"{where}: expected an object with 'file_path' and 'transform_matrix', got {_brief(frame)}")
+    name = frame.get("file_path")
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{where}.file_path: expected the image's path, got {_brief(name)}")
+    with_suffix = name if name.lower().endswith(".png") else f"{name}.png"
+    path = files.find_inside(root, with_suffix, f"{where}.file_path")
+    time = None
+    if "time" in frame:
+        time = _number(frame["time"], f"{where}.time")
+        if not 0 <= time <= 1:
+            raise InputError(f"{where}.time: expected a time in [0, 1], got {time}")
+    viewmat = _viewmat(frame.get("transform_matrix"), f"{where}.transform_matrix")
+    named_by = f"{path} ({source.name}, frames[{index}].file_path)"
+    return _Frame(path, path.relative_to(root).as_posix(), named_by, time, viewmat)
+
+
+def _viewmat(
+    matrix: object,  # [4, 4] nested lists: camera to world, OpenGL axes (x right, y up, z backward)
+    where: str,
+) -> Tensor:  # [4, 4] float32: world to camera, OpenCV axes (x right, y down, z forward)
+    """Invert a rigid camera-to-world matrix as [R^T | -R^T c] after turning its y and z axes round."""
+    rows = matrix if isinstance(matrix, list) else []
+    if len(rows) != 4 or not all(isinstance(row, list) and len(row) == 4 for row in rows):
+        raise InputError(f"{where}: expected 4 rows of 4 numbers, got {_brief(matrix)}")
+    c2w: NDArray[np.float64] = np.array([[_number(value, where) for value in row] for row in rows])
+    if not np.allclose(c2w[3], [0, 0, 0, 1], rtol=0, atol=_RIGID_TOLERANCE):
+        raise InputError(f"{where}: expected the last row 0 0 0 1, got {c2w[3].tolist()}")
+    rotation = c2w[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    determinant = np.linalg.det(rotation)
+    if error > _RIGID_TOLERANCE or determinant < 0:
+        raise InputError(
+            f"{where}: expected a rigid camera-to-world matrix (R^T R = I to {_RIGID_TOLERANCE}, det R = +1), got an "
+            f"error of {error:.2g} and a determinant of {determinant:.6g}: take out scale, shear and mirroring"
+        )
+    turned = rotation * [1, -1, -1]
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = turned.T
+    viewmat[:3, 3] = -turned.T @ c2w[:3, 3]
+    return torch.from_numpy(viewmat.astype(np.float32))
+
+
+def _check_times(splits: dict[str, _Split]) -> None:
+    """Refuse a data set in which some frames carry a time and some do not."""
+    first = splits["train"].frames[0].time
+    for split in splits.values():
+        for index, frame in enumerate(split.frames):
+            if (frame.time is None) != (first is None):
+                has, other = ("no time", "has one") if frame.time is None else ("a time", "has none")
+                raise InputError(
+                    f"{split.source}: frames[{index}].time: this frame has {has} and the first training frame {other}: "
+                    "give a time to all frames or to none"
+                )
+
+
+def _read_views(
+    splits: dict[str, _Split], downscale: int, background: tuple[float, float, float]
+) -> tuple[dict[str, list[View]], dict[str, str]]:
+    """Read all images on threads, in order; return the views by split and the images' digests by name.
+
+    Threads and never forks: reading and decoding release the interpreter, and a fork after OpenMP ran hangs. Only the
+    final float images are kept.
+    """
+
+    def read(frame: _Frame) -> tuple[tuple[int, int], Tensor, str]:
+        data = files.read_file(frame.path, frame.where)
+        pixels = images.decode_png(data, frame.where)
+        height, width = pixels.shape[:2]
+        return (width, height), images.composite(pixels, background, downscale, frame.where), files.digest(data)
+
+    views: dict[str, list[View]] = {}
+    digests: dict[str, str] = {}
+    with images.quiet_opencv(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        photographs = pool.map(read, [frame for split in splits.values() for frame in split.frames])
+        expected: tuple[int, int] | None = None
+        for name, split in splits.items():
+            views[name] = []
+            for frame in split.frames:
+                size, image, digest = next(photographs)
+                expected = expected or size
+                _check_size(size, expected, split, frame)
+                K = split.intrinsics.matrix(*size, downscale)
+                camera = Camera(frame.viewmat, K, image.shape[1], image.shape[0])
+                views[name].append(View(frame.name[: -len(".png")], camera, frame.time, image))
+                digests[frame.name] = digest
+    return views, digests
+
+
+def _check_size(size: tuple[int, int], expected: tuple[int, int], split: _Split, frame: _Frame) -> None:
+    """Refuse an image whose size is not the first image's, or not the one its JSON claims."""
+    if size != expected:
+        raise InputError(
+            f"{frame.where}: expected {expected[0]}x{expected[1]} as the first training image, got {size[0]}x{size[1]}"
+        )
+    for key, claimed, actual in zip(("w", "h"), split.intrinsics.size, size, strict=True):
+        if claimed is not None and claimed != actual:
+            raise InputError(
+                f"{split.source}: {key}: expected the images' own {actual}, got {claimed}: scale all intrinsics with it"
+            )
+
+
+def _number(value: object, where: str) -> float:
+    """Return `value` as a finite float; true and false are not numbers."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if abs(number) <= _LARGEST:
+            return number
+    raise InputError(f"{where}: expected a finite number, got {_brief(value)}")
+
+
+def _brief(value: object) -> str:
+    """Show a JSON value in a message, cut to what a line bears."""
+    if isinstance(value, list | dict):
+        return f"a {type(value).__name__} of {len(value)}"
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

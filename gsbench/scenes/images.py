@@ -1,0 +1,112 @@
+"""Photographs from PNG: checked, decoded by OpenCV, composited once over the background, area-filtered to size."""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsbench.errors import InputError
+
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_MAX_PIXELS = 2**26  # a few kilobytes of PNG can claim gigabytes of pixels; 8192 x 8192 is beyond every data set
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Keep OpenCV's own log off stderr: what it would say about a broken file, an InputError says in one line."""
+    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(before)
+
+
+def decode_png(
+    data: bytes,
+    where: str,  # the file's path, for the message
+) -> Pixels:  # [H, W, 3|4] RGB or RGBA, as stored: straight alpha
+    """Decode an 8- or 16-bit RGB or RGBA PNG.
+
+    The file's structure is checked before OpenCV sees it, since a decoder may return the rows it found of a truncated
+    file and leave the rest black.
+
+    Raises:
+        InputError: not a PNG, truncated, damaged, of zero size, or neither RGB nor RGBA.
+    """
+    width, height = _check_structure(data, where)
+    if width == 0 or height == 0:
+        raise InputError(f"{where}: expected an image with pixels, its size is {width}x{height}: render it again")
+    if width * height > _MAX_PIXELS:
+        raise InputError(f"{where}: expected at most {_MAX_PIXELS} pixels, its size is {width}x{height}: resize it")
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again") from error
+    if pixels is None:
+        raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again")
+    if pixels.ndim != 3 or pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{where}: expected 8- or 16-bit RGB or RGBA, got {pixels.dtype} of shape {pixels.shape}")
+    to_rgb = cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB
+    return cv2.cvtColor(pixels, to_rgb)  # type: ignore[return-value]  # OpenCV's stubs do not keep the dtype
+
+
+def composite(
+    pixels: Pixels,  # [H, W, 3|4] RGB or RGBA, straight alpha
+    background: tuple[float, float, float],
+    downscale: int,
+    where: str,  # the file's path, for the message
+) -> Tensor:  # [H / downscale, W / downscale, 3] float32 in [0, 1]
+    """Composite straight alpha over `background` once, in float, and average every downscale x downscale block.
+
+    The composite comes before the filter: averaging straight colours and alpha apart would let the (arbitrary) colour
+    of transparent pixels bleed into every silhouette. Over a constant background it equals filtering premultiplied
+    colours and compositing afterwards, as both steps are linear.
+
+    Raises:
+        InputError: `downscale` does not divide the image.
+    """
+    height, width = pixels.shape[:2]
+    if height % downscale or width % downscale:
+        raise InputError(
+            f"{where}: expected a downscale that divides the image, got downscale={downscale} for {width}x{height}"
+        )
+    values = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    image: NDArray[Any] = values[..., :3]
+    if pixels.shape[2] == 4:
+        alpha = values[..., 3:]
+        image = image * alpha + np.asarray(background, np.float32) * (1 - alpha)
+    if downscale > 1:  # with an integer factor INTER_AREA is the mean of each block
+        image = cv2.resize(image, (width // downscale, height // downscale), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(np.clip(image, 0, 1))  # float rounding may leave [0, 1] by an ulp
+
+
+def _check_structure(data: bytes, where: str) -> tuple[int, int]:
+    """Walk the chunks from IHDR to IEND, lengths and checksums (PNG specification, section 5); return width, height."""
+    if not data.startswith(_SIGNATURE):
+        raise InputError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
+    size = (0, 0)
+    at = len(_SIGNATURE)
+    while True:
+        header = data[at : at + 8]
+        length, kind = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
+        body, checksum = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
+        if len(checksum) < 4:
+            raise InputError(f"{where}: truncated PNG, it ends at byte {len(data)} before its IEND: copy it again")
+        if zlib.crc32(kind + body) != int.from_bytes(checksum, "big"):
+            raise InputError(f"{where}: damaged PNG, wrong checksum of chunk {kind!r} at byte {at}: copy it again")
+        if at == len(_SIGNATURE):
+            if kind != b"IHDR" or length != 13:
+                raise InputError(f"{where}: damaged PNG, its first chunk is {kind!r} and not IHDR: copy it again")
+            size = struct.unpack(">II", body[:8])
+        if kind == b"IEND":
+            return size
+        at += 12 + length

@@ -1,0 +1,99 @@
+"""PLY files read as untrusted input: the vertices of an ascii or little-endian file, as a structured array."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.errors import InputError
+from gsbench.scenes import files
+
+_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "<i2"),
+    **dict.fromkeys(("ushort", "uint16"), "<u2"),
+    **dict.fromkeys(("int", "int32"), "<i4"),
+    **dict.fromkeys(("uint", "uint32"), "<u4"),
+    **dict.fromkeys(("float", "float32"), "<f4"),
+    **dict.fromkeys(("double", "float64"), "<f8"),
+}
+_HEADER_LIMIT = 65536  # bytes; a 3DGS header of 62 properties takes 1,600
+_HEADER_END = re.compile(rb"\nend_header[ \t]*\r?\n")
+
+
+def read_vertices(path: Path) -> NDArray[np.void]:
+    """Return the vertex element of a PLY file as a structured array [P], one field a property.
+
+    The vertex element must come first and hold scalars only, as in every point cloud of COLMAP and 3DGS; what follows
+    it is not read. The count is held against the file's size before anything of that size is made.
+
+    Raises:
+        InputError: not such a PLY, or fewer bytes or values than its header promises.
+    """
+    data = files.read_file(path, str(path))
+    end = _HEADER_END.search(data, 0, _HEADER_LIMIT)
+    if not data.startswith(b"ply") or end is None:
+        raise InputError(f"{path}: expected a PLY: 'ply' first and 'end_header' within {_HEADER_LIMIT} bytes")
+    lines = data[: end.start()].decode("ascii", "replace").splitlines()
+    encoding, count, dtype = _read_header(lines, path)
+    body = data[end.end() :]
+    if encoding == "ascii":
+        return _read_ascii(body, count, dtype, path)
+    if count * dtype.itemsize > len(body):
+        raise InputError(
+            f"{path}: element vertex: expected {count} x {dtype.itemsize} bytes, found {len(body)}: truncated"
+        )
+    return np.frombuffer(body, dtype, count)
+
+
+def _read_header(lines: list[str], path: Path) -> tuple[str, int, np.dtype[np.void]]:
+    """Return the encoding, the vertex count and the vertex type of a PLY header."""
+    words = [line.split() for line in lines[1:]]
+    words = [line for line in words if line and line[0] not in ("comment", "obj_info")]
+    match words:
+        case [["format", ("ascii" | "binary_little_endian") as encoding, _], *rest]:
+            pass
+        case _:
+            raise InputError(f"{path}: format: expected 'ascii' or 'binary_little_endian', got {words[:1]!r:.80}")
+    match rest:
+        case [["element", "vertex", count], *rest] if re.fullmatch("[0-9]{1,18}", count):
+            pass
+        case _:
+            raise InputError(f"{path}: expected 'element vertex <count>' first, got {rest[:1]!r:.80}")
+    fields: dict[str, str] = {}
+    for line in rest:
+        match line:
+            case ["element", *_]:
+                break
+            case ["property", kind, name] if kind in _TYPES and name not in fields:
+                fields[name] = _TYPES[kind]
+            case _:
+                raise InputError(f"{path}: element vertex: expected distinct scalar properties, got {line!r:.80}")
+    if not fields or int(count) == 0:
+        raise InputError(f"{path}: element vertex: expected points, got {count} of {len(fields)} properties")
+    return encoding, int(count), np.dtype(list(fields.items()))
+
+
+def _read_ascii(body: bytes, count: int, dtype: np.dtype[np.void], path: Path) -> NDArray[np.void]:
+    """Parse `count` rows of numbers; a value its property's type cannot hold is refused, not wrapped."""
+    names = dtype.names or ()
+    values = body.split()[: count * len(names)]
+    if len(values) < count * len(names):
+        raise InputError(
+            f"{path}: element vertex: expected {count} x {len(names)} values, found {len(values)}: truncated"
+        )
+    try:
+        table = np.array([float(value) for value in values]).reshape(count, len(names))
+    except ValueError as error:
+        raise InputError(f"{path}: element vertex: expected numbers, some values are not") from error
+    vertices = np.empty(count, dtype)
+    for name, column in zip(names, table.T, strict=True):
+        kind = dtype[name]
+        if kind.kind in "iu":
+            limits = np.iinfo(kind)
+            if not ((column >= limits.min) & (column <= limits.max)).all():
+                raise InputError(f"{path}: {name}: expected values of {limits.min}..{limits.max}, some are outside")
+        vertices[name] = column
+    return vertices

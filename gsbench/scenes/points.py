@@ -1,0 +1,92 @@
+"""Initial points: drawn at random or given by a PLY, and how far apart they lie."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.scenes.ply import read_vertices
+from gsbench.scenes.scene import Points
+
+SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic Y_00; 3DGS: colour = 0.5 + SH_C0 f_dc
+
+_MIN_SQUARED_DISTANCE = 1e-7  # 3DGS, create_from_pcd: clamp_min(distCUDA2, 1e-7), so that log(scale) stays finite
+
+
+def random_points(count: int, half_width: float, generator: torch.Generator) -> Points:
+    """Draw `count` points uniformly in the cube [-half_width, half_width]^3, of nearly one grey.
+
+    Colours are 0.5 + SH_C0 u / 255 with u uniform in [0, 1), as 3DGS and 4DGS draw them (readNerfSyntheticInfo:
+    SH2RGB(random / 255)). Everything is float32 on the generator's device.
+    """
+    if count < 1:
+        raise InputError(f"random points: expected a count of at least 1, got {count}")
+    if not (math.isfinite(half_width) and half_width > 0):
+        raise InputError(f"random points: expected a positive half width, got {half_width}")
+    draws = torch.rand(2, count, 3, generator=generator, device=generator.device)
+    return Points(means=(2 * draws[0] - 1) * half_width, colors=0.5 + SH_C0 * draws[1] / 255)
+
+
+def read_ply(path: str | Path) -> Points:
+    """Read points from an ascii or binary little-endian PLY: `x y z` and `red green blue`, else 3DGS' `f_dc_0..2`.
+
+    Integer colours are divided by their type's largest value, float colours are taken as they are; a colour beyond
+    [0, 1] is refused, except from `f_dc`, which reaches there by nature and is clamped.
+
+    Raises:
+        InputError: not such a PLY, truncated, without positions or colours, or with a value that is not finite.
+    """
+    vertices = read_vertices(Path(path))
+    means = _columns(vertices, ("x", "y", "z"), path)
+    names = vertices.dtype.names or ()
+    if "red" in names:
+        colors = _columns(vertices, ("red", "green", "blue"), path)
+        kind = vertices.dtype["red"]
+        if kind.kind in "iu":
+            colors = colors / np.iinfo(kind).max
+        if colors.min() < 0 or colors.max() > 1:
+            raise InputError(f"{path}: red green blue: expected uchar 0..255 or float 0..1, some are outside")
+    else:
+        colors = (0.5 + SH_C0 * _columns(vertices, ("f_dc_0", "f_dc_1", "f_dc_2"), path)).clip(0, 1)
+    return Points(_tensor(means), _tensor(colors))
+
+
+def nearest_distances(
+    means: Tensor,  # [P, 3]
+    k: int = 3,
+) -> Tensor:  # [P] in the dtype and on the device of `means`
+    """Return the root of the mean squared distance of every point to its `k` nearest others, at least sqrt(1e-7).
+
+    This is the initial scale of 3DGS, sqrt(clamp_min(distCUDA2, 1e-7)); distCUDA2 is the mean SQUARED distance.
+
+    Raises:
+        InputError: not more than `k` points, or a point that is not finite.
+    """
+    if means.shape[0] <= k:
+        raise InputError(f"points: expected more than {k} to measure their spacing, got {means.shape[0]}")
+    positions = means.detach().cpu().double().numpy()
+    if not np.isfinite(positions).all():
+        raise InputError("points: expected finite positions, some are not")
+    distances, _ = cKDTree(positions).query(positions, k=k + 1)  # the nearest is the point itself, or one on top of it
+    squared = np.square(distances[:, 1:]).mean(axis=1)
+    return torch.from_numpy(np.sqrt(squared.clip(min=_MIN_SQUARED_DISTANCE))).to(means)
+
+
+def _columns(vertices: NDArray[np.void], names: tuple[str, str, str], path: str | Path) -> NDArray[np.float64]:
+    """Return three properties as [P, 3] float64, finite in single precision."""
+    for name in names:
+        if name not in (vertices.dtype.names or ()):
+            raise InputError(f"{path}: {name}: expected this vertex property, found {vertices.dtype.names!r:.120}")
+    columns = np.stack([vertices[name] for name in names], axis=1).astype(np.float64)
+    if not (np.abs(columns) <= np.finfo(np.float32).max).all():
+        raise InputError(f"{path}: {' '.join(names)}: expected finite numbers, some are not")
+    return columns
+
+
+def _tensor(values: NDArray[np.float64]) -> Tensor:
+    return torch.from_numpy(values.astype(np.float32))

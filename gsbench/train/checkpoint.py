@@ -1,0 +1,39 @@
+"""A training run on disk: written whole or not at all, read as untrusted input."""
+
+import io
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsbench.errors import InputError
+from gsbench.measure.atomic import write_atomically
+
+VERSION = 1
+FILE_NAME = "checkpoint.pt"
+
+
+def save(path: Path, config_hash: str, data_hash: str, state: dict[str, Any]) -> None:
+    """Write the state of a run of this config on this data."""
+    buffer = io.BytesIO()
+    torch.save({"version": VERSION, "config": config_hash, "data": data_hash, "state": state}, buffer)
+    write_atomically(path, buffer.getvalue())
+
+
+def load(path: Path, config_hash: str, data_hash: str, device: str) -> dict[str, Any] | None:
+    """Read the state at `path`; None where there is none, or it is of another config, other data or another version.
+
+    Raises:
+        InputError: the file is there and is no checkpoint.
+    """
+    if not path.exists():
+        return None
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+        found = (content["version"], content["config"], content["data"])
+        state: dict[str, Any] = content["state"]
+    except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: expected a checkpoint, got {reason}; delete it to start over") from None
+    return state if found == (VERSION, config_hash, data_hash) else None

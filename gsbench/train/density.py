@@ -1,0 +1,77 @@
+"""Adaptive density control: clone where small, split where large, prune what is faint (3DGS, section 5.2)."""
+
+import torch
+from torch import Tensor
+
+from gsbench.config import DensifyConfig
+from gsbench.models import GaussianModel
+from gsbench.models.base import CHILDREN
+from gsbench.raster import RasterInfo
+from gsbench.train.optim import Optimizer
+
+
+class DensityControl:
+    """Collects the gradients of 2D means and, when asked, edits the model and the optimizer's moments alike."""
+
+    def __init__(self, model: GaussianModel, optimizer: Optimizer, config: DensifyConfig, min_opacity: float) -> None:
+        """Control the density of `model`, pruning below `min_opacity`."""
+        self.model = model
+        self.optimizer = optimizer
+        self.config = config
+        self.min_opacity = min_opacity
+        self.forget()
+
+    def forget(self) -> None:
+        """Start collecting anew."""
+        like = self.model.splats["opacities"].detach()
+        self.gradient = torch.zeros_like(like)  # [N] sum over views of |gradient of the 2D mean|
+        self.seen = torch.zeros_like(like)  # [N] number of views that drew the Gaussian
+
+    @torch.no_grad()
+    def observe(self, info: RasterInfo, width: int, height: int, views: int) -> None:
+        """Add one view's gradients, of a loss that is a mean over `views`, in units of half the picture (NDC)."""
+        if info.means2d.grad is None:
+            return
+        half_picture = info.means2d.new_tensor([width / 2, height / 2])
+        self.gradient += (info.means2d.grad * half_picture * views).norm(dim=-1).sum(0)
+        self.seen += (info.radii > 0).sum(0)
+
+    @torch.no_grad()
+    def densify(self, generator: torch.Generator, prune_large: bool) -> None:
+        """Clone, split and prune; children's randomness is drawn from `generator`."""
+        model, config = self.model, self.config
+        scales = model.scales()
+        wanted = self.gradient / self.seen.clamp(min=1) > config.grad_threshold
+        small = scales <= config.clone_below * model.extent
+        split = (wanted & ~small) | model.long_in_time()
+        clone = wanted & small & ~split
+
+        kept, cloned = (~split).nonzero()[:, 0], clone.nonzero()[:, 0]
+        parents = split.nonzero()[:, 0].repeat_interleave(CHILDREN)
+        self._select(torch.cat([kept, cloned, parents]), fresh=len(cloned) + len(parents))
+        children = torch.arange(len(model) - len(parents), len(model), device=parents.device)
+        model.split(children, generator)
+
+        keep = torch.sigmoid(model.splats["opacities"]) >= self.min_opacity
+        if prune_large:
+            keep &= model.scales() <= config.prune_above * model.extent
+        self._select(keep.nonzero()[:, 0], fresh=0)
+        self.forget()
+
+    def reset_opacities(self) -> None:
+        """Lower opacities to twice what is pruned, so that only what is needed grows back before the next pruning."""
+        self.model.reset_opacities(2 * self.min_opacity)
+        self.optimizer.forget(self.model.splats["opacities"])
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What was collected since the last densification."""
+        return {"gradient": self.gradient, "seen": self.seen}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from `state_dict`."""
+        self.gradient, self.seen = state["gradient"], state["seen"]
+
+    def _select(self, rows: Tensor, fresh: int) -> None:
+        is_fresh = torch.arange(len(rows), device=rows.device) >= len(rows) - fresh
+        self.model.select(rows)
+        self.optimizer.follow(self.model, rows, is_fresh)

@@ -1,0 +1,172 @@
+"""The training loop: see a batch of views, descend, control the density, look at the val split now and then."""
+
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from gsbench.config import Config
+from gsbench.errors import InputError
+from gsbench.measure.curve import Curve
+from gsbench.measure.quality import psnr
+from gsbench.measure.speed import Stages
+from gsbench.models import GaussianModel
+from gsbench.models.render import draw, render
+from gsbench.scenes import Scene, View
+from gsbench.train.density import DensityControl
+from gsbench.train.losses import photometric
+from gsbench.train.optim import Optimizer
+from gsbench.train.schedule import Schedule, batch, generator
+
+
+class DivergedError(RuntimeError):
+    """A loss or a gradient was not finite."""
+
+
+@dataclass
+class Best:
+    """PSNR on the evaluated split at chosen moments of the training, dB."""
+
+    val: float = -math.inf  # the best on val so far ..
+    eval_at_best_val: float | None = None  # .. and what the evaluated split had then
+    eval: float | None = None  # the best on the evaluated split itself: this leaks
+
+
+class Trainer:
+    """One model, one scene, one run. `step` counts finished steps; the state is exact between two of them."""
+
+    def __init__(self, model: GaussianModel, scene: Scene, views: list[View], config: Config) -> None:
+        """Fit `model`, already initialised and on `config.device`, to `scene.train`; `views` is the evaluated split."""
+        train = config.train
+        self.model = model
+        self.scene = scene
+        self.views = views
+        self.config = config
+        self.background = torch.tensor(scene.background, device=config.device)
+        self.schedule = Schedule(train, config.model.sh_degree, config.agr)
+        self.optimizer = Optimizer(model, config.model, scene.extent, train.iterations)
+        self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity)
+        self.stages = Stages(config.device)
+        self.curve = Curve()
+        self.best = Best()
+        self.step = 0
+
+    def run(self, save: Callable[[dict[str, Any]], None], label: str) -> None:
+        """Train to the end, calling `save(state)` every `checkpoint_minutes` and once at the end.
+
+        Raises:
+            DivergedError: with the step and the parameter; the last saved state is from before it.
+        """
+        train = self.config.train
+        saved = time.monotonic()
+        every = 0.2 if sys.stderr.isatty() else 20.0  # seconds between updates: a log file is no terminal
+        with tqdm(
+            total=train.iterations, initial=self.step, desc=label, unit="it", mininterval=every, maxinterval=every
+        ) as bar:
+            while self.step < train.iterations:
+                loss = self._descend()
+                if self.schedule.measures(self.step):
+                    self._measure()
+                self.step += 1
+                bar.update()
+                last = self.curve.last
+                shown = f"{last.psnr_val:.2f} dB" if last and last.psnr_val is not None else "-"
+                bar.set_postfix_str(f"loss {loss:.4f}, val {shown}, {len(self.model)} Gaussians", refresh=False)
+                if time.monotonic() - saved >= 60 * train.checkpoint_minutes and self.step < train.iterations:
+                    save(self.state_dict())
+                    saved = time.monotonic()
+        save(self.state_dict())
+
+    def _descend(self) -> float:
+        """One step: the loss is the mean over a batch of views."""
+        step, train, stages = self.step, self.config.train, self.stages
+        self.model.set_stage(self.schedule.stage(step))
+        views = [self.scene.train[i] for i in batch(step, len(self.scene.train), train.batch_size, self.config.seed)]
+        total = 0.0
+        for view in views:
+            with stages("slice"):
+                gaussians = self.model.slice(view.camera.center, view.time)
+            with stages("raster"):
+                try:
+                    output = draw(gaussians, view.camera, self.background, self.config.raster)
+                except InputError as error:  # the rasterizer's door is the first to see a slice that is not finite
+                    raise DivergedError(f"step {step}: {error}") from None
+                output.info.means2d.retain_grad()
+            with stages("loss"):
+                loss = photometric(output.image[0], view.image, train.ssim_weight) / len(views)
+                total += loss.item()
+            with stages("backward"):
+                loss.backward()
+            with stages("density"):
+                self.density.observe(output.info, view.camera.width, view.camera.height, len(views))
+        self._check_finite(total)
+        with stages("optimizer"):
+            self.optimizer.step(step)
+        with stages("density"):
+            if self.schedule.densifies(step):
+                self.density.densify(generator(self.config.seed, step), self.schedule.has_reset(step))
+            if self.schedule.resets(step):
+                self.density.reset_opacities()
+        return total
+
+    def _check_finite(self, loss: float) -> None:
+        """Stop before a value that is not finite reaches a parameter."""
+        for name, parameters in self.model.groups().items():
+            gradients = [p.grad for p in parameters if p.grad is not None]
+            if not all(bool(g.sum().isfinite()) or bool(g.isfinite().all()) for g in gradients):
+                raise DivergedError(f"step {self.step}: the gradient of '{name}' is not finite (loss {loss})")
+        if not math.isfinite(loss):
+            raise DivergedError(f"step {self.step}: the loss is {loss}")
+
+    def _measure(self) -> None:
+        """Add a point to the curve; its cost is in no stage, so in no training time."""
+        self.model.set_stage(self.schedule.stage(self.step))
+        val = self.psnr(self.scene.val) if self.scene.val else math.nan
+        self.curve.add(self.step + 1, sum(self.stages.seconds.values()), val)
+        leak = self.config.protocol.best_on_test
+        if not leak and not val > self.best.val:
+            return
+        now = self.psnr(self.views)
+        if val > self.best.val:
+            self.best.val, self.best.eval_at_best_val = val, now
+        if leak and (self.best.eval is None or now > self.best.eval):
+            self.best.eval = now
+
+    @torch.no_grad()
+    def psnr(self, views: list[View]) -> float:
+        """Mean PSNR over views, dB."""
+        return sum(psnr(self.render(view), view.image) for view in views) / len(views)
+
+    @torch.no_grad()
+    def render(self, view: View) -> Tensor:
+        """The model's picture of a view, [H, W, 3]."""
+        return render(self.model, view.camera, view.time, self.background, self.config.raster)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the next step depends on, and all that was measured so far."""
+        return {
+            "step": self.step,
+            "model": self.model.state_dict(),
+            "optimizer": self.optimizer.adam.state_dict(),
+            "density": self.density.state_dict(),
+            "stages": self.stages.state_dict(),
+            "curve": self.curve.state_dict(),
+            "best": vars(self.best).copy(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from `state_dict` to the bits an unbroken run would have."""
+        self.step = state["step"]
+        self.model.load_state(state["model"])
+        self.optimizer.adam.load_state_dict(state["optimizer"])
+        self.density.load_state_dict(state["density"])
+        self.stages.load_state_dict(state["stages"])
+        self.curve.load_state_dict(state["curve"])
+        self.best = Best(**state["best"])
+        self.model.set_stage(self.schedule.stage(max(0, self.step - 1)))

@@ -1,0 +1,44 @@
+"""What is minimised: (1 - w) L1 + w (1 - SSIM) (3DGS eq. 7)."""
+
+import functools
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+WINDOW = 11
+SIGMA = 1.5
+
+
+def photometric(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    """The training loss of one picture, [H, W, 3] and [H, W, 3] in [0, 1] -> []."""
+    loss = F.l1_loss(image, target)
+    if ssim_weight == 0:
+        return loss
+    return (1 - ssim_weight) * loss + ssim_weight * (1 - structural_similarity(image, target))
+
+
+def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
+    """Mean SSIM in an 11 x 11 Gaussian window, zero padded, as 3DGS trains with; results are measured by
+    `gsbench.measure.quality.ssim` instead (Wang et al. 2004).
+    """  # fmt: skip
+    a, b = a.permute(2, 0, 1), b.permute(2, 0, 1)
+    moments = _blur(torch.cat([a, b, a * a, b * b, a * b]))
+    mean_a, mean_b, aa, bb, ab = moments.split(len(a))
+    variances, covariance = aa - mean_a**2 + bb - mean_b**2, ab - mean_a * mean_b
+    C1, C2 = 0.01**2, 0.03**2
+    similarity = (2 * mean_a * mean_b + C1) * (2 * covariance + C2)
+    return (similarity / ((mean_a**2 + mean_b**2 + C1) * (variances + C2))).mean()
+
+
+def _blur(planes: Tensor) -> Tensor:  # [P, H, W]
+    kernel = _kernel(planes.device, planes.dtype)
+    planes = F.conv2d(planes[:, None], kernel[None, None, :, None], padding=(WINDOW // 2, 0))
+    return F.conv2d(planes, kernel[None, None, None, :], padding=(0, WINDOW // 2))[:, 0]
+
+
+@functools.cache
+def _kernel(device: torch.device, dtype: torch.dtype) -> Tensor:
+    x = torch.arange(WINDOW, device=device, dtype=dtype) - WINDOW // 2
+    kernel = torch.exp(-(x**2) / (2 * SIGMA**2))
+    return kernel / kernel.sum()

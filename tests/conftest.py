@@ -1,0 +1,16 @@
+"""Fixtures that every test folder may use."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of data sets that are not committed; skips where it is missing."""
+    default = Path(__file__).resolve().parents[2] / "shared"
+    data = Path(os.environ.get("GSBENCH_SHARED", default)) / "data"
+    if not data.is_dir():
+        pytest.skip(f"needs the shared data sets, not found at {data} (set GSBENCH_SHARED)")
+    return data

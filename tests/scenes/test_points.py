@@ -1,0 +1,182 @@
+"""Initial points: drawn, read from a PLY, and their spacing."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from gsbench.errors import InputError
+from gsbench.scenes.points import nearest_distances, random_points, read_ply
+
+VERTEX = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+KINDS = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"}
+
+
+def ply(vertices: np.ndarray, encoding: str = "binary_little_endian") -> bytes:
+    """Write a PLY as COLMAP and 3DGS do."""
+    properties = "".join(f"property {KINDS[vertices.dtype[n].str[1:]]} {n}\n" for n in vertices.dtype.names)
+    header = f"ply\nformat {encoding} 1.0\ncomment made by a test\nelement vertex {len(vertices)}\n{properties}"
+    if encoding == "ascii":
+        body = "".join(" ".join(str(value) for value in row) + "\n" for row in vertices.tolist()).encode()
+    else:
+        body = vertices.tobytes()
+    return (header + "end_header\n").encode() + body
+
+
+def save(tmp_path: Path, data: bytes) -> Path:
+    path = tmp_path / "points3d.ply"
+    path.write_bytes(data)
+    return path
+
+
+ROUND_TRIP = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@ROUND_TRIP
+@given(
+    hnp.arrays(np.float32, st.tuples(st.integers(1, 9), st.just(3)), elements=st.floats(-1e6, 1e6, width=32)),
+    st.sampled_from(["ascii", "binary_little_endian"]),
+    st.integers(0, 255),
+)
+def test_ply_round_trip(tmp_path: Path, means: np.ndarray, encoding: str, red: int) -> None:
+    """Catches swapped columns, a wrong stride, lost digits and a colour off by its scale, in both encodings."""
+    vertices = np.zeros(len(means), VERTEX)
+    vertices["x"], vertices["y"], vertices["z"] = means.T
+    vertices["red"], vertices["blue"] = red, 255
+    points = read_ply(save(tmp_path, ply(vertices, encoding)))
+    assert points.means.dtype == points.colors.dtype == torch.float32
+    np.testing.assert_array_equal(points.means.numpy(), means)
+    np.testing.assert_allclose(points.colors.numpy(), np.tile([red / 255, 0, 1], (len(means), 1)), atol=1e-7)
+
+
+def test_ply_of_3dgs(tmp_path: Path) -> None:
+    """3DGS stores f_dc: colour 0.5 + C0 f_dc, clamped; other properties lie between and are stepped over."""
+    vertices = np.zeros(
+        2, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("nx", "f4"), *((f"f_dc_{i}", "f4") for i in range(3))]
+    )
+    vertices["f_dc_0"], vertices["f_dc_1"] = 1.0, 9.0
+    colors = read_ply(save(tmp_path, ply(vertices))).colors
+    torch.testing.assert_close(colors[1], torch.tensor([0.5 + 0.28209479177387814, 1.0, 0.5]))
+
+
+def test_ply_with_elements_after_the_vertices(tmp_path: Path) -> None:
+    """Faces after the vertices are not read: catches a reader that takes their list for a vertex property."""
+    data = ply(np.ones(2, VERTEX)).replace(
+        b"end_header", b"element face 1\nproperty list uchar int vertex_indices\nend_header"
+    )
+    assert read_ply(save(tmp_path, data + bytes(13))).means.shape == (2, 3)
+
+
+GOOD = ply(np.ones(3, VERTEX))
+GOOD_ASCII = ply(np.ones(3, VERTEX), "ascii")
+BAD_PLY = {
+    "not a ply": (b"solid cube", "'ply'"),
+    "no end of header": (GOOD[:60], "end_header"),
+    "big endian": (GOOD.replace(b"little", b"big"), "format"),
+    "no vertex": (GOOD.replace(b"vertex", b"face"), "element vertex"),
+    "count negative": (GOOD.replace(b"vertex 3", b"vertex -3"), "element vertex"),
+    "count zero": (GOOD.replace(b"vertex 3", b"vertex 0"), "element vertex"),
+    "count beyond the file": (GOOD.replace(b"vertex 3", b"vertex 999999999999"), "truncated"),
+    "count beyond the file, ascii": (GOOD_ASCII.replace(b"vertex 3", b"vertex 999999999999"), "truncated"),
+    "truncated": (GOOD[:-1], "truncated"),
+    "list property": (GOOD.replace(b"property uchar red", b"property list uchar int red"), "scalar properties"),
+    "unknown type": (GOOD.replace(b"uchar red", b"colour red"), "scalar properties"),
+    "property twice": (GOOD.replace(b"float y", b"float x"), "scalar properties"),
+    "no position": (GOOD.replace(b"float z", b"float w"), "z: expected"),
+    "no colour": (GOOD.replace(b"uchar red", b"uchar r"), "f_dc_0"),
+    "half a colour": (GOOD.replace(b"uchar blue", b"uchar b"), "blue"),
+    "not a number, ascii": (GOOD_ASCII.replace(b"1.0 1.0", b"1.0 one"), "expected numbers"),
+    "colour 256, ascii": (GOOD_ASCII.replace(b"1 1 1\n", b"1 1 256\n"), "blue"),
+    "position not finite": (GOOD_ASCII.replace(b"1.0 1.0", b"1.0 nan"), "x y z"),
+    "float colour of 255": (ply(np.full(1, 255, [(n, "f4") for n, _ in VERTEX])), "red green blue"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_PLY)
+def test_bad_ply(tmp_path: Path, fault: str) -> None:
+    """Catches a fault let through (a huge count allocates nothing) and a message without file or field."""
+    data, part = BAD_PLY[fault]
+    with pytest.raises(InputError) as caught:
+        read_ply(save(tmp_path, data))
+    assert "points3d.ply" in str(caught.value)
+    assert part in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.binary(max_size=200)
+    | st.binary(max_size=80).map(lambda tail: b"ply\nformat ascii 1.0\n" + tail + b"\nend_header\n1 2 3")
+    | st.builds(
+        lambda at, new, good: good[:at] + new + good[at + len(new) :],
+        st.integers(0, len(GOOD)),
+        st.binary(min_size=1, max_size=4),
+        st.sampled_from([GOOD, GOOD_ASCII]),
+    )
+)
+def test_any_bytes_are_points_or_an_input_error(tmp_path: Path, data: bytes) -> None:
+    """Catches any other exception, and points that are not finite or have no colour."""
+    try:
+        points = read_ply(save(tmp_path, data))
+    except InputError:
+        return
+    assert points.means.isfinite().all()
+    assert 0 <= points.colors.min() <= points.colors.max() <= 1
+
+
+def test_random_points_fill_the_cube_from_the_seed() -> None:
+    """Catches a ball, a half cube, colours off grey, and draws that do not come from the generator given."""
+    points = random_points(20_000, 1.3, torch.Generator().manual_seed(7))
+    again = random_points(20_000, 1.3, torch.Generator().manual_seed(7))
+    assert torch.equal(points.means, again.means)
+    assert torch.equal(points.colors, again.colors)
+    assert points.means.abs().max() <= 1.3
+    counts = torch.histc(points.means[:, 1], bins=4, min=-1.3, max=1.3)
+    assert (counts - 5000).abs().max() < 5 * math.sqrt(5000)  # five standard deviations of a fair draw
+    corners = (points.means.abs() > 1.3 * 0.8).all(dim=1).double().mean()
+    assert corners == pytest.approx(0.2**3, rel=0.4)
+    assert 0.5 <= points.colors.min() < points.colors.max() <= 0.5 + 0.2821 / 255
+
+
+@pytest.mark.parametrize(("count", "half_width"), [(0, 1.0), (5, 0.0), (5, -1.0), (5, float("nan"))])
+def test_random_points_need_a_count_and_a_cube(count: int, half_width: float) -> None:
+    """Catches an empty or inside-out cube that would only fail far into a run."""
+    with pytest.raises(InputError, match="random points"):
+        random_points(count, half_width, torch.Generator())
+
+
+def test_nearest_distances_against_brute_force() -> None:
+    """Catches the point itself among its neighbours, a mean of distances for a mean of squares, a missing root."""
+    means = torch.rand(200, 3, generator=torch.Generator().manual_seed(3))
+    pairs = torch.cdist(means.double(), means.double()).fill_diagonal_(math.inf)
+    expected = pairs.topk(3, largest=False).values.square().mean(dim=1).sqrt()
+    torch.testing.assert_close(nearest_distances(means), expected.float())
+
+
+def test_nearest_distances_of_points_on_top_of_each_other() -> None:
+    """3DGS clamps distCUDA2 at 1e-7: catches a scale of zero, whose logarithm is not finite."""
+    torch.testing.assert_close(nearest_distances(torch.ones(5, 3)), torch.full((5,), math.sqrt(1e-7)))
+
+
+def test_nearest_distances_need_neighbours() -> None:
+    """Catches an infinite spacing for too few points, and a crash in the tree for points that are not finite."""
+    with pytest.raises(InputError, match="more than 3"):
+        nearest_distances(torch.zeros(3, 3))
+    with pytest.raises(InputError, match="finite"):
+        nearest_distances(torch.full((9, 3), math.nan))
+
+
+def test_playroom_points(shared_data: Path) -> None:
+    """A real file: a property (the time) behind the colours; catches a stride taken from known properties only."""
+    path = shared_data / "scenes" / "playroom" / "points3d.ply"
+    if not path.is_file():
+        pytest.skip(f"needs the playroom scene's points at {path}")
+    points = read_ply(path)
+    assert points.means.shape == (36_000, 3)
+    assert points.means.abs().max() < 10
+    assert 0.1 < points.colors.mean() < 0.9

@@ -1,0 +1,43 @@
+"""A data set small enough to break in every way: 8x6 pixels, two training frames, one of val and one of test."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+# An OpenGL camera at (0, 0, 4) that looks down its own -z axis at the origin.
+FRONT = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 4.0], [0, 0, 0, 1.0]]
+# The same, from (4, 0, 0): x axis along -z of the world.
+SIDE = [[0, 0, 1.0, 4.0], [0, 1.0, 0, 0], [-1.0, 0, 0, 0], [0, 0, 0, 1.0]]
+COUNTS = {"train": 2, "val": 1, "test": 1}
+
+
+def write_png(path: Path, rgba: np.ndarray) -> None:
+    """Write RGB or RGBA as PNG by OpenCV, whose order is BGR."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.concatenate([rgba[..., 2::-1], rgba[..., 3:]], axis=-1))
+
+
+def edit(root: Path, change: Callable[[dict[str, Any]], object], split: str = "train") -> None:
+    """Apply `change` to the content of transforms_<split>.json."""
+    source = root / f"transforms_{split}.json"
+    content = json.loads(source.read_text())
+    change(content)
+    source.write_text(json.dumps(content))
+
+
+def write_tiny(root: Path) -> Path:
+    """Write the data set into `root`; return `root`."""
+    random = np.random.default_rng(0)
+    for split, count in COUNTS.items():
+        frames = []
+        for index in range(count):
+            write_png(root / split / f"r_{index}.png", random.integers(0, 256, (6, 8, 4), np.uint8))
+            matrix = SIDE if index else FRONT
+            frames.append({"file_path": f"./{split}/r_{index}", "time": float(index), "transform_matrix": matrix})
+        content = {"camera_angle_x": 0.8, "frames": frames}
+        (root / f"transforms_{split}.json").write_text(json.dumps(content))
+    return root
