@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from gsbench.errors import InputError, did_you_mean
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
 from gsbench.models.factors import triangular, triangular_parameters
-from gsbench.models.slicing import Reduced, check_scheme, gain_of, mahalanobis, reduce, slice_gaussians, slice_reduced
+from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.scene import Points
 
 # Where position, time and direction stand among the rows of the triangular factor.
@@ -86,19 +86,18 @@ class TriangularModel(GaussianModel):
     def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
         """Slice at d = the unit vector from the camera to mu_p, and t (7DGS, algorithm 1)."""
         factor = self.factors(raw)
-        query = unit(raw["means"] - camera_center)
         mean = torch.cat([raw["means"], raw["directions"]], -1)
-        exponent = (1 if self.directional_half else 2) * self.modulation("direction") * mahalanobis(
-            factor[:, 3:6], query - raw["directions"])  # fmt: skip
+        query = unit(raw["means"] - camera_center)
         if time is not None and "time" in self.observes:
-            query = torch.cat([query, time.expand(len(query), 1)], -1)
             mean = torch.cat([mean, raw["times"]], -1)
-            exponent = exponent + self.modulation("time") * mahalanobis(factor[:, 6:], time - raw["times"])
-        if self.is_reduced:
-            mean3, factor3, _ = slice_reduced(mean, self._blocks(factor), query)
+            query = torch.cat([query, time.expand(len(query), 1)], -1)
+        reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
+        white = whiten(reduced.T_qq, query - mean[:, 3:])
+        if self.scheme == "square_root":
+            means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
-            mean3, factor3, _ = slice_gaussians(mean, factor, query, scheme=self.scheme)
-        return Conditioned(mean3, factor3, torch.exp(-0.5 * exponent))
+            means, factors, _ = slice_gaussians(mean, factor, query, scheme=self.scheme)
+        return Conditioned(means, factors, self._gate(white, reduced.T_qq, query - mean[:, 3:]))
 
     def scales(self) -> Tensor:
         """Largest standard deviation of the sliced Gaussian, which is the same at every t and d."""
@@ -134,6 +133,15 @@ class TriangularModel(GaussianModel):
         """The triangular factor with its rows sorted to (p, d, t), [N, n, n]."""
         L = triangular(raw["log_diagonal"], raw["off_diagonal"], row_scaled=self.row_scaled)
         return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
+
+    def _gate(self, white: Tensor, T_qq: Tensor, delta: Tensor) -> Tensor:
+        """f_dir f_temp = exp(-1/2 (lambda_d |white_d|^2 + lambda_t (t - mu_t)^2 / S_t)) (7DGS eq. 11 and 12)."""
+        half = 0.5 if self.directional_half else 1.0
+        exponent = half * self.modulation("direction") * white[:, :3].square().sum(-1)
+        if "time" in self.observes:
+            S_t = T_qq[:, 3].square().sum(-1)
+            exponent = exponent + 0.5 * self.modulation("time") * delta[:, 3].square() / S_t
+        return torch.exp(-exponent)
 
     def _blocks(self, factor: Tensor) -> Reduced:
         """The factor of `conditioned_first` as what it is: reduced already, its first columns those of q."""
