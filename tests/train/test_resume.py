@@ -91,7 +91,7 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, tmp_pa
 
 
 def test_a_reloaded_checkpoint_measures_the_same(square: Path, tmp_path: Path) -> None:
-    """Catches a test score that differs between the model in training and the one on disk (32.63 / 33.02 dB elsewhere)."""
+    """Catches a score that differs between the model in training and on disk (elsewhere 32.63 and 33.02 dB)."""
     arguments = overrides(square, tmp_path, *RUN)
     assert gsbench(*arguments).returncode == 0
     (path,) = record.find(tmp_path)
