@@ -16,6 +16,7 @@ from gsbench.scenes.scene import Points
 # Where position, time and direction stand among the rows of the triangular factor.
 FACTOR_ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
 WIDTH = {"p": 3, "t": 1, "d": 3}
+EXPONENT_MAX = 80.0  # exp(-80) = 2e-35: beyond, f is 0
 TIME_CORRELATION = 0.05  # split in time where |S_pt| is above this part of the scene's extent ..
 TIME_SCALE = 0.25  # .. and sqrt(S_t) above this part of the clip (7DGS, section 4.4)
 
@@ -92,12 +93,19 @@ class TriangularModel(GaussianModel):
             mean = torch.cat([mean, raw["times"]], -1)
             query = torch.cat([query, time.expand(len(query), 1)], -1)
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
-        white = whiten(reduced.T_qq, query - mean[:, 3:])
+        delta = query - mean[:, 3:]
+        # A Gaussian so far from the query that nothing is left of it is left out of what follows, lest its huge
+        # numbers reach a gradient as 0 x inf: it stays at mu_p, gated to zero.
+        with torch.no_grad():
+            seen = self._exponent(reduced.T_qq, delta, whiten(reduced.T_qq, delta)) < EXPONENT_MAX
+        delta = torch.where(seen[:, None], delta, 0.0)
+        white = whiten(reduced.T_qq, delta)
+        gate = torch.where(seen, torch.exp(-self._exponent(reduced.T_qq, delta, white)), 0.0)
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
             means, factors, _ = slice_gaussians(mean, factor, query, scheme=self.scheme)
-        return Conditioned(means, factors, self._gate(white, reduced.T_qq, query - mean[:, 3:]))
+        return Conditioned(means, factors, gate)
 
     def scales(self) -> Tensor:
         """Largest standard deviation of the sliced Gaussian, which is the same at every t and d."""
@@ -134,14 +142,14 @@ class TriangularModel(GaussianModel):
         L = triangular(raw["log_diagonal"], raw["off_diagonal"], row_scaled=self.row_scaled)
         return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
 
-    def _gate(self, white: Tensor, T_qq: Tensor, delta: Tensor) -> Tensor:
-        """f_dir f_temp = exp(-1/2 (lambda_d |white_d|^2 + lambda_t (t - mu_t)^2 / S_t)) (7DGS eq. 11 and 12)."""
+    def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
+        """-ln(f_dir f_temp) = 1/2 (lambda_d |white_d|^2 + lambda_t (t - mu_t)^2 / S_t), [N] (7DGS eq. 11 and 12)."""
         half = 0.5 if self.directional_half else 1.0
         exponent = half * self.modulation("direction") * white[:, :3].square().sum(-1)
         if "time" in self.observes:
-            S_t = T_qq[:, 3].square().sum(-1)
-            exponent = exponent + 0.5 * self.modulation("time") * delta[:, 3].square() / S_t
-        return torch.exp(-exponent)
+            distance = delta[:, 3] / T_qq[:, 3].norm(dim=-1)  # in standard deviations, sqrt(S_t)
+            exponent = exponent + 0.5 * self.modulation("time") * distance.square()
+        return exponent
 
     def _blocks(self, factor: Tensor) -> Reduced:
         """The factor of `conditioned_first` as what it is: reduced already, its first columns those of q."""
