@@ -56,8 +56,8 @@ def slice_gaussians(
     Raises:
         InputError: shapes that do not fit, or an unknown scheme.
     """
-    N, n = mean.shape
-    if factor.shape != (N, n, n) or n < 3 or query.shape[-1] != n - 3 or query.dim() > 2:
+    N, n = mean.shape if mean.dim() == 2 else (0, 0)
+    if n < 3 or factor.shape != (N, n, n) or query.shape not in ((N, n - 3), (n - 3,)):
         raise InputError(f"slice_gaussians: expected mean [N, 3+k], factor [N, 3+k, 3+k] and query [N, k] or [k], "
                          f"got {list(mean.shape)}, {list(factor.shape)} and {list(query.shape)}")  # fmt: skip
     check_scheme(scheme)
