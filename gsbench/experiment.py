@@ -50,13 +50,13 @@ def run(composed: DictConfig) -> Record:
     """
     this = identify(composed)
     config = this.config
+    model = models.build(config.model.name, agr=config.agr, sh_degree=config.model.sh_degree, **config.model.options)
     scene = load_scene(config)
     done = finished(this, scene)
     if done is not None:
         print(f"{_name(this)}: finished before, kept: {summary(done)}; {this.folder / records.FILE_NAME}")
         return done
     reset_peak_memory(config.device)
-    model = models.build(config.model.name, agr=config.agr, sh_degree=config.model.sh_degree, **config.model.options)
     if "time" in model.observes and not scene.has_time:
         raise InputError(f"{config.model.name}: expected a scene with times, {scene.name} has none: use 3dgs or 6dgs")
     try:

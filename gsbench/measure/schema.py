@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import cache
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -25,7 +26,7 @@ def _parse(kind: Any, value: Any, file: str, field: str) -> Any:
     if dataclasses.is_dataclass(kind):
         return _parse_fields(kind, value, file, field)
     if hasattr(kind, "_fields"):  # a named tuple, written as a list
-        kinds = [get_type_hints(kind)[name] for name in kind._fields]
+        kinds = list(_kinds(kind).values())
         if type(value) is not list or len(value) != len(kinds):
             raise _fault(file, field, f"a list of {', '.join(kind._fields)}", value)
         return kind(*(_parse(k, v, file, f"{field}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True))))
@@ -44,11 +45,17 @@ def _parse(kind: Any, value: Any, file: str, field: str) -> Any:
     return _parse_scalar(kind, value, file, field)
 
 
+@cache
+def _kinds(kind: Any) -> dict[str, Any]:
+    """The types of the fields, in their order."""
+    return get_type_hints(kind)
+
+
 def _parse_fields(kind: Any, value: Any, file: str, field: str) -> Any:
     """An object as the dataclass `kind`: every field present, and nothing else."""
     if type(value) is not dict:
         raise _fault(file, field, "an object", value)
-    kinds = get_type_hints(kind)
+    kinds = _kinds(kind)
     prefix = f"{field}." if field else ""
     for name in value:
         if name not in kinds:

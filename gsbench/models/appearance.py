@@ -48,7 +48,7 @@ def sh_time_colors(coefficients: Tensor, directions: Tensor, degree: int, time_o
         degree: of the spherical harmonics in use.
         time_offset: [N] t - mu_t.
     """
-    frequencies = torch.arange(coefficients.shape[1], device=time_offset.device)
+    frequencies = torch.arange(coefficients.shape[1], device=time_offset.device, dtype=time_offset.dtype)
     waves = torch.cos(2 * math.pi * frequencies * time_offset[:, None])  # [N, M]
     basis = sh_basis(directions, degree)
     used = (coefficients[:, :, : basis.shape[-1]] * waves[..., None, None]).sum(1)

@@ -10,7 +10,7 @@ from gsbench.errors import InputError
 from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register
 from gsbench.models.factors import rotation4d
-from gsbench.models.slicing import mahalanobis, slice_gaussians
+from gsbench.models.slicing import check_scheme, mahalanobis, slice_gaussians
 from gsbench.scenes.scene import Points
 
 TIME_GATE_MIN = 0.05  # a Gaussian whose f_temp is not above this is not drawn (4DGS, gaussian_renderer)
@@ -41,6 +41,7 @@ class Gaussians4DModel(GaussianModel):
         super().__init__(**options)
         if time_degree < 0 or lambda_t <= 0:
             raise InputError(f"4dgs: expected time_degree >= 0 and lambda_t > 0, got {time_degree} and {lambda_t}")
+        check_scheme(scheme)
         self.time_degree = time_degree
         self.scheme = scheme
         self.log_modulation["time"] = nn.Parameter(torch.tensor(math.log(lambda_t)))

@@ -56,14 +56,13 @@ def slice_gaussians(
     Raises:
         InputError: shapes that do not fit, or an unknown scheme.
     """
-    N, n = mean.shape
-    if factor.shape != (N, n, n) or n < 3 or query.shape[-1] != n - 3 or query.dim() > 2:
+    N, n = mean.shape if mean.dim() == 2 else (0, 0)
+    if n < 3 or factor.shape != (N, n, n) or query.shape not in ((N, n - 3), (n - 3,)):
         raise InputError(f"slice_gaussians: expected mean [N, 3+k], factor [N, 3+k, 3+k] and query [N, k] or [k], "
                          f"got {list(mean.shape)}, {list(factor.shape)} and {list(query.shape)}")  # fmt: skip
+    check_scheme(scheme)
     if scheme == "square_root":
         return slice_reduced(mean, reduce(factor), query)
-    if scheme not in SCHEMES:
-        raise InputError(f"slicing scheme '{scheme}' is not known. {did_you_mean(scheme, SCHEMES)}")
     S = factor @ factor.mT
     S_pp, S_pq, S_qq = S[:, :3, :3], S[:, :3, 3:], S[:, 3:, 3:]
     if scheme == "schur":
@@ -74,11 +73,17 @@ def slice_gaussians(
     return Slice(moved, _cholesky3(S_pp - gain @ S_pq.mT), gain)
 
 
+def check_scheme(scheme: str) -> None:
+    """Raise InputError unless `scheme` is one of SCHEMES."""
+    if scheme not in SCHEMES:
+        raise InputError(f"slicing scheme '{scheme}' is not known. {did_you_mean(scheme, SCHEMES)}")
+
+
 def slice_reduced(mean: Tensor, reduced: Reduced, query: Tensor) -> Slice:
-    """`slice_gaussians` for a factor that is [T_qq 0; T_pq T_pp] already: no reduction, the cheapest form there is."""
-    gain = gain_of(reduced.T_pq, reduced.T_qq)
-    moved = mean[:, :3] + (gain * (query - mean[:, 3:])[..., None, :]).sum(-1)
-    return Slice(moved, reduced.T_pp, gain)
+    """`slice_gaussians` for a factor that is [T_qq 0; T_pq T_pp] already: mean = mu_p + T_pq (T_qq^-1 (q - mu_q))."""
+    white = whiten(reduced.T_qq, query - mean[:, 3:])
+    moved = mean[:, :3] + (reduced.T_pq * white[:, None]).sum(-1)
+    return Slice(moved, reduced.T_pp, gain_of(reduced.T_pq, reduced.T_qq))
 
 
 def reduce(factor: Tensor) -> Reduced:
@@ -94,11 +99,21 @@ def mahalanobis(rows: Tensor, delta: Tensor) -> Tensor:
     This is the exponent of f_temp and f_dir (7DGS eq. 11 and 12): R R^T is the marginal block S_t or S_d.
     """
     T, _ = triangularise(rows, rows.shape[1])
-    white: list[Tensor] = []  # T^-1 delta, by forward substitution
-    for i in range(rows.shape[1]):
-        known = sum((T[:, i, j] * white[j] for j in range(i)), start=torch.zeros_like(delta[:, i]))
-        white.append((delta[:, i] - known) / T[:, i, i])
-    return torch.stack(white, -1).square().sum(-1)
+    return whiten(T, delta).square().sum(-1)
+
+
+def whiten(T: Tensor, delta: Tensor) -> Tensor:
+    """T^-1 delta for lower triangular T, [N, m, m] and [N, m] -> [N, m], by forward substitution.
+
+    The squares of its first i entries add up to the Mahalanobis distance of the first i variables alone.
+    """
+    rows = T.unbind(1)
+    white: list[Tensor] = []
+    for i, residual in enumerate(delta.unbind(-1)):
+        for j, known in enumerate(white):
+            residual = residual - rows[i][:, j] * known
+        white.append(residual / rows[i][:, i])
+    return torch.stack(white, -1)
 
 
 def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:

@@ -3,6 +3,7 @@
 import functools
 import importlib
 import importlib.util
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -119,14 +120,17 @@ def _check(
     width: int, height: int, background: Tensor | None, near: float, far: float, eps2d: float,
 ) -> None:  # fmt: skip
     """Raise InputError unless everything is as `rasterize` says."""
-    N, C = len(means), len(viewmats)
-    D = colors.shape[-1] if colors.dim() else 0
     tensors = {"means": means, "factors": factors, "opacities": opacities, "colors": colors,
                "viewmats": viewmats, "Ks": Ks}  # fmt: skip
-    shapes = {"means": (N, 3), "factors": (N, 3, 3), "opacities": (N,),
-              "colors": (N, D) if colors.dim() == 2 else (C, N, D), "viewmats": (C, 4, 4), "Ks": (C, 3, 3)}  # fmt: skip
     if background is not None:
-        tensors["background"], shapes["background"] = background, (D,)
+        tensors["background"] = background
+    for name, tensor in tensors.items():
+        if not isinstance(tensor, Tensor) or tensor.dim() == 0:
+            what = "one of shape []" if isinstance(tensor, Tensor) else type(tensor).__name__
+            raise InputError(f"{name}: expected a tensor of at least one dimension, got {what}")
+    N, C, D = len(means), len(viewmats), colors.shape[-1]
+    shapes = {"means": (N, 3), "factors": (N, 3, 3), "opacities": (N,), "viewmats": (C, 4, 4), "Ks": (C, 3, 3),
+              "colors": (N, D) if colors.dim() == 2 else (C, N, D), "background": (D,)}  # fmt: skip
     for name, tensor in tensors.items():
         if tuple(tensor.shape) != shapes[name]:
             raise InputError(f"{name}: expected shape {list(shapes[name])}, got {list(tensor.shape)}")
@@ -139,10 +143,13 @@ def _check(
             row = int((~torch.isfinite(tensor)).flatten().nonzero()[0])
             raise InputError(f"{name}: expected finite values, got {tensor.flatten()[row].item()} at flat index {row}")
     if D < 1 or C < 1:
-        raise InputError(f"expected at least one colour channel and one camera, got D={D}, C={C}")
-    if width < 1 or height < 1:
-        raise InputError(f"expected a picture of at least 1x1 pixels, got width={width}, height={height}")
-    if not 0 < near < far or eps2d < 0:
+        raise InputError(f"colors, viewmats: expected at least one channel and one camera, got D={D}, C={C}")
+    if not all(isinstance(size, int) and size >= 1 for size in (width, height)):
+        raise InputError(f"expected a picture of at least 1x1 whole pixels, got width={width}, height={height}")
+    if not 0 < near < far or not 0 <= eps2d < math.inf:
         raise InputError(f"expected 0 < near < far and eps2d >= 0, got near={near}, far={far}, eps2d={eps2d}")
+    low, high = opacities.detach().aminmax() if N else (0, 0)
+    if low < 0 or high > 1:
+        raise InputError(f"opacities: expected values in [0, 1], got {low} to {high}")
     if (Ks.detach()[:, [0, 1], [0, 1]] <= 0).any():
         raise InputError("Ks: expected positive focal lengths at [0, 0] and [1, 1]")

@@ -33,18 +33,21 @@ def draw(
     width: int, height: int, background: Tensor, near: float, far: float, eps2d: float, antialias: bool,
 ) -> RasterOutput:  # fmt: skip
     """Draw every camera in turn; arguments as `gsbench.raster.rasterize`, colours [C, N, D]."""
-    images, alphas, splats, pairs = [], [], [], 0
-    for viewmat, K, color in zip(viewmats, Ks, colors, strict=True):
-        splat = project(means, factors, opacities, viewmat, K, width, height, near, far, eps2d, antialias)
+    splats = [
+        project(means, factors, opacities, viewmat, K, width, height, near, far, eps2d, antialias)
+        for viewmat, K in zip(viewmats, Ks, strict=True)
+    ]
+    means2d = torch.stack([s.means2d for s in splats])  # every picture is drawn from it, so it has a gradient
+    images, alphas, pairs = [], [], 0
+    for splat, mean2d, color in zip(splats, means2d, colors, strict=True):
         tiles, gaussians = bin_tiles(splat, width, height)
-        image, alpha = blend(splat, color, tiles, gaussians, width, height)
+        image, alpha = blend(splat._replace(means2d=mean2d), color, tiles, gaussians, width, height)
         images.append(image + (1 - alpha) * background)
         alphas.append(alpha)
-        splats.append(splat)
         pairs += len(tiles)
     info = RasterInfo(
         radii=torch.stack([s.half_sizes.amax(-1).ceil().int() for s in splats]),
-        means2d=splats[0].means2d[None] if len(splats) == 1 else torch.stack([s.means2d for s in splats]),
+        means2d=means2d,
         depths=torch.stack([s.depths for s in splats]),
         pairs=pairs,
     )
@@ -154,10 +157,12 @@ def blend(
         nth = torch.arange(longest[first], device=tiles.device)
         padding = nth >= lengths[chosen, None]
         index = gaussians[(starts[chosen, None] + nth).clamp(max=len(gaussians) - 1)]
-        rows = table[index.masked_fill(padding, len(table) - 1).flatten()].unflatten(0, index.shape)
+        index = index.masked_fill(padding, len(table) - 1)
+        # Not table[index]: its backward adds rows as threads come by, so that two runs differ in the last bits.
+        rows = table.index_select(0, index.flatten()).unflatten(0, index.shape)
         pieces.append(_blend_tiles(rows, chosen % across * TILE, chosen // across * TILE))
         first = last
-    empty = table.new_zeros(across * down - first, TILE * TILE, D + 1)
+    empty = table[-1, 0].expand(across * down - first, TILE * TILE, D + 1)  # zeros, but in the graph
     canvas = torch.cat([*pieces, empty])[torch.argsort(by_length)]  # back into the tiles' own order
     canvas = canvas.reshape(down, across, TILE, TILE, D + 1).transpose(1, 2).reshape(down * TILE, across * TILE, D + 1)
     canvas = canvas[:height, :width]

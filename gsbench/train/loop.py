@@ -12,6 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gsbench.config import Config
+from gsbench.errors import InputError
 from gsbench.measure.curve import Curve
 from gsbench.measure.quality import psnr
 from gsbench.measure.speed import Stages
@@ -92,7 +93,10 @@ class Trainer:
             with stages("slice"):
                 gaussians = self.model.slice(view.camera.center, view.time)
             with stages("raster"):
-                output = draw(gaussians, view.camera, self.background, self.config.raster)
+                try:
+                    output = draw(gaussians, view.camera, self.background, self.config.raster)
+                except InputError as error:  # the rasterizer's door is the first to see a slice that is not finite
+                    raise DivergedError(f"step {step}: {error}") from None
                 output.info.means2d.retain_grad()
             with stages("loss"):
                 loss = photometric(output.image[0], view.image, train.ssim_weight) / len(views)

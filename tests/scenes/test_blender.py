@@ -148,8 +148,16 @@ def test_suffixes_duplicates_and_paths_that_stay_inside(tiny: Path) -> None:
 
 
 def test_extent_is_that_of_3dgs(tiny: Path) -> None:
-    """Cameras at (0,0,4) and (4,0,0): half their distance x 1.1; catches a diagonal, or translations for centres."""
+    """Cameras at (0,0,4) and (4,0,0): half their distance x 1.1; catches a diagonal, and test cameras counted in."""
     assert scenes.load(tiny).extent == pytest.approx(1.1 * math.sqrt(8))
+
+
+def test_extent_of_turned_cameras() -> None:
+    """Against the centres the JSON states: catches translations, or a rotation the wrong way round, for centres."""
+    frames = json.loads((folder() / "suzanne" / "transforms_train.json").read_text())["frames"]
+    centers = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
+    radius = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    assert scenes.load(folder() / "suzanne").extent == pytest.approx(1.1 * radius, rel=1e-6)
 
 
 def test_fingerprint_says_which_data(tiny: Path) -> None:
@@ -187,12 +195,12 @@ def test_the_truth_about_effects_is_not_read(tmp_path: Path) -> None:
 
 def test_opencv_log_level_is_restored(tiny: Path) -> None:
     """Catches a loader that leaves the whole process's OpenCV silent, after success and after failure."""
-    before = cv2.utils.logging.getLogLevel()
+    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_INFO)
     scenes.load(tiny)
     (tiny / "test" / "r_0.png").unlink()
     with pytest.raises(InputError):
         scenes.load(tiny)
-    assert cv2.utils.logging.getLogLevel() == before
+    assert cv2.utils.logging.setLogLevel(before) == cv2.utils.logging.LOG_LEVEL_INFO
 
 
 def test_real_trex(shared_data: Path) -> None:

@@ -1,0 +1,48 @@
+# Two commands do everything on a fresh machine: `make table1` and `make test`. Each sets itself up.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+MODELS := 3dgs,4dgs,6dgs,7dgs,7dgs_noagr
+# More overrides: make table1 ARGS="train.iterations=3000 seed=1"
+ARGS ?=
+
+.PHONY: table1 test test-all lint format setup clean
+.DEFAULT_GOAL := help
+
+help:  ## what there is to make
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+setup: $(VENV)/installed  ## make .venv and install gsbench into it, with the pinned versions
+
+# Installed again whenever what is installed changes: the metadata, the pins, the native sources.
+$(VENV)/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \
+		{ echo "gsbench needs Python 3.11, 3.12 or 3.13; $(PYTHON) is $$($(PYTHON) --version). Try make PYTHON=python3.12"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR on the embedded scenes; print and write the table
+	@status=0; \
+	$(BIN)/python -m gsbench --multirun +exp=mini model=$(MODELS) $(ARGS) || status=$$?; \
+	$(BIN)/python -m gsbench.report results/mini || status=$$?; \
+	exit $$status
+
+test: lint  ## lint, types and all tests but the slow ones
+	$(BIN)/python -m pytest
+
+test-all: lint  ## the slow tests too
+	$(BIN)/python -m pytest -m 'slow or not slow'
+
+lint: setup  ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: setup  ## let ruff rewrite the code
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:  ## remove what was built and installed; results stay
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

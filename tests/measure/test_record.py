@@ -1,0 +1,324 @@
+"""The record: what is written is read back, what is damaged is refused with one line that names the place."""
+
+import dataclasses
+import json
+import math
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gsbench.errors import InputError
+from gsbench.measure import record as files
+from gsbench.measure.curve import Point
+from gsbench.measure.provenance import git_commit, provenance
+from gsbench.measure.record import METRICS, Cost, Effects, Provenance, Record, ViewScore
+from gsbench.measure.speed import RenderTimes
+
+
+def make(**changes: object) -> Record:
+    record = Record(
+        status="ok",
+        reason=None,
+        experiment="mini",
+        model="7dgs",
+        scene="suzanne",
+        dataset="mini",
+        seed=0,
+        effects=Effects(time=True, direction=True, refinement=True),
+        protocol={"name": "gsbench", "background": [1.0, 1.0, 1.0], "quantise": False},
+        metrics={"psnr": 25.5, "lpips_vgg": None},
+        missing={"lpips_vgg": "no weights"},
+        per_view=[ViewScore("test/r_000", 25.5, 25.6, 0.9)],
+        cost=Cost(60.0, {"raster": 50.0}, RenderTimes(1.0, 2.0, 3.0), 500.0, 1000, 4000, 10**9),
+        curve=[Point(500, 30.0, 24.0), Point(1000, 60.0, 25.0)],
+        provenance=Provenance("abc", {"python": "3.11"}, "a CPU", 2, {"train": {"iterations": 1000}}, "c", "d", "2026"),
+    )
+    return dataclasses.replace(record, **changes)  # type: ignore[arg-type]
+
+
+def refused(path: Path, *words: str) -> None:
+    """The file is refused by an InputError of one line that names it and every one of `words`."""
+    with pytest.raises(InputError) as caught:
+        files.read(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in (str(path), *words):
+        assert word in message
+
+
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+texts = st.text(st.characters(codec="utf-8"), max_size=20)
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63) + 1, 2**63 - 1) | numbers | texts,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    metrics=st.dictionaries(st.sampled_from(METRICS), numbers),
+    config=st.dictionaries(texts, plain, max_size=4),
+    reason=texts,
+    seconds=st.lists(numbers, max_size=4),
+    seed=st.integers(0, 2**63 - 1),
+)
+def test_what_is_written_is_read_back(tmp_path, metrics, config, reason, seconds, seed):
+    """Would catch a field that is lost, converted or rounded on its way through the file."""
+    curve = [Point(i, s, None) for i, s in enumerate(seconds)]
+    record = make(status="failed", reason=reason, metrics=metrics, missing={}, curve=curve, seed=seed)
+    record = dataclasses.replace(record, provenance=dataclasses.replace(record.provenance, config=config))
+    files.write(record, tmp_path / "record.json")
+    assert files.read(tmp_path / "record.json") == record
+
+
+@pytest.mark.parametrize(("value", "why"), [(math.inf, "identical"), (math.nan, "not a number")])
+def test_a_metric_that_is_not_finite_becomes_null_with_its_reason(tmp_path, value, why):
+    """Would catch NaN or Infinity in the file, which is not JSON, or a null that nobody can explain."""
+    path = tmp_path / "record.json"
+    views = [ViewScore("a", value, value, 1.0)]
+    files.write(make(metrics={"psnr": value}, missing={}, per_view=views, curve=[Point(1, 1.0, value)]), path)
+    assert "Infinity" not in path.read_text()
+    assert "NaN" not in path.read_text()
+    read = files.read(path)
+    assert read.metrics == {"psnr": None}
+    assert why in read.missing["psnr"]
+    assert read.per_view[0].psnr is None
+    assert read.per_view[0].ssim == 1.0
+    assert read.curve == [Point(1, 1.0, None)]
+
+
+def test_a_run_that_failed_needs_neither_metrics_nor_cost(tmp_path):
+    """Would catch a failed run that cannot be recorded, and so would vanish from the table."""
+    record = make(status="diverged", reason="step 3: means", metrics=None, missing={}, cost=None, per_view=[], curve=[])
+    files.write(record, tmp_path / "record.json")
+    assert files.read(tmp_path / "record.json") == record
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"status": "fine"}, "status"),
+        ({"status": "failed"}, "reason"),
+        ({"reason": "but why"}, "reason"),
+        ({"metrics": None, "missing": {}}, "metrics"),
+        ({"cost": None}, "cost"),
+        ({"metrics": {"pnsr": 1.0}, "missing": {}}, "Did you mean 'psnr'"),
+        ({"missing": {}}, "lpips_vgg"),
+        ({"missing": {"lpips_vgg": "no weights", "psnr": "it is there"}}, "missing"),
+        ({"scene": "../other"}, "scene"),
+        ({"seed": -1}, "seed"),
+        ({"protocol": {"far": math.inf}}, "protocol.far"),
+        ({"protocol": {"path": Path("x")}}, "plain JSON"),
+        ({"curve": [Point(2, 1.0, None), Point(1, 2.0, None)]}, "curve"),
+        ({"version": 2}, "version"),
+        ({"seed": "0"}, "seed"),
+        ({"effects": {"time": True}}, "effects.direction"),
+    ],
+)
+def test_what_read_would_refuse_is_not_written(tmp_path, changes, word):
+    """Would catch a record that is written and can never be read again, and a fault that does not name its field."""
+    path = tmp_path / "record.json"
+    with pytest.raises(InputError, match=word):
+        files.write(make(**changes), path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        (["surprise"], 1, ["surprise", "unknown key"]),
+        (["scnee"], "x", ["Did you mean 'scene'"]),
+        (["cost", "render_ms", "p50"], "2", ["cost.render_ms.p50", "a finite number", "'2'"]),
+        (["cost", "render_ms", "p50"], True, ["cost.render_ms.p50"]),
+        (["cost", "num_gaussians"], 1.0, ["cost.num_gaussians", "an integer"]),
+        (["seed"], 2**63, ["seed"]),
+        (["seed"], True, ["seed", "an integer"]),
+        (["effects", "time"], 1, ["effects.time", "true or false"]),
+        (["per_view", 0, "ssim"], [], ["per_view[0].ssim"]),
+        (["curve", 1], [1, 2], ["curve[1]", "iteration, seconds, psnr_val"]),
+        (["curve", 1, 0], 0.5, ["curve[1][0]"]),
+        (["provenance", "versions", "python"], None, ["provenance.versions.python"]),
+        (["model"], "\ud800", ["model", "Unicode"]),
+        (["version"], 2, ["version", "expected 1"]),
+        (["version"], True, ["version"]),
+        (["version"], 1.0, ["version"]),
+        (["cost", "fps"], 10**400, ["cost.fps"]),
+    ],
+)
+def test_a_wrong_value_is_refused_by_name(tmp_path, place, value, words):
+    """Would catch a reader that converts ("2" to 2, true to 1), lets a key through, or does not say where."""
+    path = tmp_path / "record.json"
+    files.write(make(), path)
+    whole = json.loads(path.read_text())
+    inner = whole
+    for step in place[:-1]:
+        inner = inner[step]
+    inner[place[-1]] = value
+    path.write_text(json.dumps(whole))
+    refused(path, *words)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"null",
+        b"\xff\xfe",
+        b"[" * 100_000,
+        b'{"version": 1}',
+        b'{"version": 1, "version": 1}',
+        b'{"version": ' + b"9" * 5000 + b"}",
+    ],
+)
+def test_what_is_no_record_is_refused(tmp_path, text):
+    """Would catch a stack trace (RecursionError, UnicodeDecodeError, KeyError) on a file that is not a record."""
+    path = tmp_path / "record.json"
+    path.write_bytes(text)
+    refused(path)
+
+
+def test_a_key_that_appears_twice_is_refused(tmp_path):
+    """Would catch a record with two seeds, of which readers pick one each."""
+    path = tmp_path / "record.json"
+    files.write(make(), path)
+    path.write_text(path.read_text().replace('"seed": 0', '"seed": 0, "seed": 1'))
+    refused(path, "twice")
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+    """Would catch an OSError that reaches the user."""
+    refused(tmp_path / "record.json")
+    refused(tmp_path)
+
+
+def test_nan_in_the_file_is_refused(tmp_path):
+    """Would catch a reader that takes Python's NaN and 1e999 for JSON numbers."""
+    path = tmp_path / "record.json"
+    files.write(make(), path)
+    for bad in ("NaN", "Infinity", "1e999"):
+        path.write_text(path.read_text().replace("25.5", bad))
+        refused(path, "finite")
+        files.write(make(), path)
+
+
+def test_a_damaged_record_never_raises_anything_but_input_error(tmp_path):
+    """Would catch any other exception on truncated, overwritten, cut and doubled bytes (3,000 damages, fixed seed)."""
+    path = tmp_path / "record.json"
+    files.write(make(), path)
+    whole = path.read_bytes()
+    draw = random.Random(0)
+    refusals = 0
+    for _ in range(3000):
+        damaged = bytearray(whole)
+        for _ in range(draw.randint(1, 3)):
+            at, to = sorted(draw.choices(range(len(damaged) + 1), k=2))
+            kind = draw.randrange(4)
+            if kind == 0:
+                damaged = damaged[:at]
+            elif kind == 1:
+                damaged[at:to] = b""
+            elif kind == 2:
+                damaged[at:at] = damaged[at:to]
+            else:
+                damaged[at : at + 1] = draw.choice([b"\x00", b'"', b"}", b"[", b"1e9", b"null", b"\xc3", b"-", b"\\"])
+        path.write_bytes(bytes(damaged))
+        try:
+            files.read(path)
+        except InputError:
+            refusals += 1
+    assert refusals > 2500
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data(), value=plain)
+def test_any_json_in_any_place_reads_or_is_refused(tmp_path, data, value):
+    """Would catch an exception other than InputError for well-formed JSON of the wrong shape."""
+    path = tmp_path / "record.json"
+    files.write(make(), path)
+    whole = json.loads(path.read_text())
+    inner = whole
+    while True:
+        key = data.draw(st.sampled_from(sorted(inner) if isinstance(inner, dict) else range(len(inner))))
+        if not inner[key] or not isinstance(inner[key], (dict, list)) or data.draw(st.booleans()):
+            break
+        inner = inner[key]
+    inner[key] = value
+    path.write_text(json.dumps(whole))
+    try:
+        files.read(path)
+    except InputError as error:
+        assert str(path) in str(error)  # noqa: PT017  # reading well is fine, too
+
+
+def test_a_failure_while_writing_leaves_the_old_record(tmp_path, monkeypatch):
+    """Would catch a writer that empties the file first: a full disk would then cost a finished run."""
+    path = tmp_path / "record.json"
+    files.write(make(), path)
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError("no space left")))
+    with pytest.raises(OSError, match="no space"):
+        files.write(make(seed=5), path)
+    assert files.read(path) == make()
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_paths_say_what_a_run_is_and_cannot_leave_the_root(tmp_path):
+    """Would catch a scene named "../.." writing outside the results, and a layout that `find` does not find."""
+    folder = files.run_path(tmp_path, "mini", "suzanne", "7dgs", 3)
+    assert folder == tmp_path / "mini" / "suzanne" / "7dgs" / "seed3"
+    files.write(make(seed=3), folder / files.FILE_NAME)
+    assert files.find(tmp_path) == [folder / "record.json"]
+    for name in ("..", ".", "", "a/b", "a\\b", ".hidden", "a\n", "a b", "-x"):
+        with pytest.raises(InputError, match="scene"):
+            files.run_path(tmp_path, "mini", name, "7dgs", 0)
+    with pytest.raises(InputError, match="seed"):
+        files.run_path(tmp_path, "mini", "suzanne", "7dgs", -1)
+
+
+def test_provenance_names_the_machine_and_hashes_the_config(tmp_path):
+    """Would catch a hash that depends on the order of keys, or a field that cannot be written."""
+    one = provenance(config={"a": 1, "b": [2]}, data_hash="d", threads=2)
+    two = provenance(config={"b": [2], "a": 1}, data_hash="d", threads=2, device="a GPU")
+    other = provenance(config={"a": 1, "b": [3]}, data_hash="d", threads=2)
+    assert one.config_hash == two.config_hash != other.config_hash
+    assert one.device
+    assert two.device == "a GPU"
+    assert one.versions["torch"]
+    assert one.time.endswith("+00:00")
+    files.write(make(provenance=one), tmp_path / "record.json")
+    assert files.read(tmp_path / "record.json").provenance == one
+
+
+def test_the_commit_is_that_of_this_checkout():
+    """Would catch the commit of the folder the run was started in, and changes to tracked files kept quiet."""
+    here = Path(files.__file__).parent
+    git = ["git", "-C", str(here)]
+    tracked = subprocess.run([*git, "ls-files", "--error-unmatch", "record.py"], capture_output=True, check=False)
+    if tracked.returncode:
+        pytest.skip("gsbench is not in a git checkout here")
+    head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+    assert git_commit() in (head, f"{head}-dirty")
+
+
+def test_the_commit_is_unknown_where_git_is_missing(monkeypatch):
+    """Would catch a run on a machine without git that ends in an exception after hours of training."""
+    monkeypatch.setenv("PATH", "")
+    assert git_commit() is None
+
+
+def test_records_and_tables_do_not_import_torch():
+    """Would catch two seconds of importing torch before a table is printed, and a table that needs torch at all."""
+    code = (
+        "import sys, gsbench.measure.record, gsbench.measure.speed, gsbench.report.tables, gsbench.report.pictures;"
+        "from gsbench.measure.provenance import versions; versions();"
+        "sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,128 @@
+"""Timing and the curve: what is timed, what is waited for, what a resumed run continues."""
+
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.errors import InputError
+from gsbench.measure import speed
+from gsbench.measure.curve import Curve, Point
+
+
+def test_render_times_are_percentiles_after_warm_up(monkeypatch):
+    """Would catch warm-up calls in the figures, percentiles taken wrongly, and an FPS that is not 1000 / median."""
+    now = [0.0]
+    costs = iter([100.0] * 5 + list(range(1, 32)))  # warm-up is slow, then 1..31 ms
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0] / 1000)
+
+    def render(_: int) -> None:
+        now[0] += next(costs)
+
+    times = speed.time_renders(render, count=31, warmup=5)
+    assert (times.p10, times.p50, times.p90) == pytest.approx((4, 16, 28))
+    assert times.fps == pytest.approx(1000 / 16)
+
+
+def test_the_device_is_waited_for_inside_the_timed_region():
+    """Would catch unsynchronised timing, which reports how fast work is queued rather than done."""
+    events: list[str] = []
+    speed.time_renders(lambda i: events.append(f"render {i}"), 30, 0, lambda: events.append("wait"))
+    assert events == [event for i in range(30) for event in ("wait", f"render {i}", "wait")]
+
+
+def test_too_few_renders_are_refused():
+    """Would catch an FPS from a handful of frames."""
+    with pytest.raises(InputError, match="30"):
+        speed.time_renders(lambda _: None, count=29)
+
+
+def test_stages_add_up_and_survive_a_resume(monkeypatch):
+    """Would catch a resumed run whose stages start at zero, and a stage whose time is lost when its body raises."""
+    now = iter(range(100))
+    monkeypatch.setattr(time, "perf_counter", lambda: float(next(now)))
+    stages = speed.Stages()
+    for name in ("slice", "raster", "slice"):
+        with stages(name):
+            pass
+    with pytest.raises(KeyError), stages("loss"):
+        raise KeyError
+    assert stages.seconds == {"slice": 2.0, "raster": 1.0, "loss": 1.0}
+    resumed = speed.Stages()
+    resumed.load_state_dict(stages.state_dict())
+    with resumed("slice"):
+        pass
+    assert resumed.seconds["slice"] == 3.0
+    assert stages.seconds["slice"] == 2.0
+
+
+def test_stages_do_not_nest():
+    """Would catch seconds counted twice, so that stage_s adds up to more than train_s."""
+    stages = speed.Stages()
+    with pytest.raises(InputError, match="'b' was opened inside 'a'"), stages("a"), stages("b"):
+        pass
+    with stages("b"):  # and the refusal does not leave "a" open
+        pass
+
+
+def test_peak_memory_sees_an_allocation_and_can_start_anew():
+    """Would catch kilobytes taken for bytes, and a run that reports the peak of an earlier one in its process."""
+    speed.reset_peak_memory()
+    before = speed.peak_memory()
+    block = np.ones(200 * 2**20, np.uint8)
+    high = speed.peak_memory()
+    assert high - before > 150 * 2**20
+    assert high < 2**40
+    del block
+    speed.reset_peak_memory()
+    assert speed.peak_memory() < high - 100 * 2**20
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
+def test_on_a_gpu_the_stage_that_caused_the_work_pays_for_it():
+    """Would catch a missing synchronisation: queueing 200 large products takes far less time than doing them."""
+    a = torch.rand(4096, 4096, device="cuda")
+    stages = speed.Stages("cuda")
+    speed.reset_peak_memory("cuda")
+    with stages("warm"):
+        a @ a
+    start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+    with stages("products"):
+        start.record()
+        for _ in range(200):
+            a @ a
+        end.record()
+    with stages("nothing"):
+        pass
+    assert stages.seconds["products"] >= start.elapsed_time(end) / 1000
+    assert stages.seconds["nothing"] < stages.seconds["products"] / 10
+    assert speed.peak_memory("cuda") >= 4096 * 4096 * 4
+
+
+def test_the_curve_answers_best_last_and_time_to_accuracy():
+    """Would catch interpolation between points that were never measured, and a best that NaN wins."""
+    curve = Curve()
+    assert curve.best is None
+    assert curve.last is None
+    for iteration, seconds, psnr in ((100, 1.0, 20.0), (200, 2.0, 24.0), (300, 3.0, float("nan")), (400, 4.0, 24.0)):
+        curve.add(iteration, seconds, psnr)
+    assert curve.best == Point(200, 2.0, 24.0)
+    assert curve.last == Point(400, 4.0, 24.0)
+    assert curve.points[2].psnr_val is None
+    assert curve.seconds_to(20.0) == 1.0
+    assert curve.seconds_to(20.1) == 2.0
+    assert curve.seconds_to(24.1) is None
+
+
+def test_a_curve_continues_from_its_checkpoint_and_never_goes_back(tmp_path):
+    """Would catch a resume that adds points twice, or a state that weights_only=True refuses to load."""
+    curve = Curve()
+    curve.add(100, 1.0, 20.0)
+    torch.save(curve.state_dict(), tmp_path / "state.pt")
+    resumed = Curve()
+    resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    assert resumed.points == curve.points
+    for iteration, seconds in ((100, 2.0), (200, 0.5)):
+        with pytest.raises(InputError, match="checkpoint"):
+            resumed.add(iteration, seconds, 21.0)

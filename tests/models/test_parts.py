@@ -1,0 +1,201 @@
+"""Factors, colours, the refinement's networks and directions, each against its definition."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.special import sph_harm_y
+from torch import Tensor, nn
+
+from gsbench.models.appearance import sh_basis, sh_colors, sh_time_colors
+from gsbench.models.base import unit
+from gsbench.models.factors import rotation, rotation4d, triangular, triangular_parameters
+from gsbench.models.refinement import Refinement, encode_time
+
+PROPERTY = settings(max_examples=25, deadline=None)
+seeds = st.integers(0, 2**31)
+ORDERS = [(degree, m) for degree in range(4) for m in range(-degree, degree + 1)]  # 3DGS' order of coefficients
+
+
+def normal(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def directions(seed: int, N: int) -> Tensor:
+    return nn.functional.normalize(normal(seed, N, 3), dim=-1)
+
+
+# ---- factors
+
+
+def test_triangular_row_by_row() -> None:
+    """Catches off-diagonals filled column by column, or above the diagonal."""
+    L = triangular(torch.tensor([[0.0, 1.0, 2.0]]), torch.tensor([[5.0, 6.0, 7.0]]))
+    expected = torch.tensor([[1.0, 0, 0], [5, math.e, 0], [6, 7, math.e**2]])
+    torch.testing.assert_close(L[0], expected)
+
+
+def test_triangular_row_scaled() -> None:
+    """Catches another scaling than (2 sigmoid(x) - 1) times the diagonal of the entry's own row."""
+    L = triangular(torch.tensor([[0.0, 1.0, 2.0]]), torch.tensor([[5.0, -6.0, 0.0]]), row_scaled=True)
+    expected = [(2 / (1 + math.exp(-5.0)) - 1) * math.e, (2 / (1 + math.exp(6.0)) - 1) * math.e**2, 0.0]
+    torch.testing.assert_close(L[0, [1, 2, 2], [0, 0, 1]], torch.tensor(expected))
+
+
+@PROPERTY
+@given(seeds, st.sampled_from([3, 6, 7]), st.booleans())
+def test_triangular_parameters_undo_triangular(seed: int, n: int, row_scaled: bool) -> None:
+    """Catches a factor that changes when a split writes it back: parameters -> L -> L Q -> parameters."""
+    log_diagonal, off_diagonal = normal(seed, 4, n), normal(seed + 1, 4, n * (n - 1) // 2)
+    L = triangular(log_diagonal, off_diagonal, row_scaled=row_scaled)
+    Q = torch.linalg.qr(normal(seed + 2, 4, n, n))[0]
+    back = triangular_parameters(L @ Q, row_scaled=row_scaled)
+    torch.testing.assert_close(back, (log_diagonal, off_diagonal), rtol=1e-6, atol=1e-6)
+
+
+def test_row_scaled_cuts_what_it_cannot_reach() -> None:
+    """Catches atanh of 1 or more, which is not finite: such entries become 99.9 % of their diagonal."""
+    factor = torch.tensor([[[1.0, 0, 0], [4.0, 2.0, 0], [-9.0, 0, 3.0]]])
+    L = triangular(*triangular_parameters(factor, row_scaled=True), row_scaled=True)
+    torch.testing.assert_close(L[0], torch.tensor([[1.0, 0, 0], [1.998, 2.0, 0], [-2.997, 0, 3.0]]))
+
+
+@PROPERTY
+@given(seeds)
+def test_rotation(seed: int) -> None:
+    """Catches a transpose or another order of components than wxyz, and lengths that matter."""
+    q = normal(seed, 5, 4)
+    expected = Rotation.from_quat(q.numpy(), scalar_first=True).as_matrix()
+    np.testing.assert_allclose(rotation(q).numpy(), expected, atol=1e-12)
+
+
+def hamilton(a: Tensor, b: Tensor) -> Tensor:
+    """Product of quaternions wxyz, [N, 4] and [N, 4]."""
+    w = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(-1, keepdim=True)
+    return torch.cat([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + torch.linalg.cross(a[:, 1:], b[:, 1:])], -1)
+
+
+@PROPERTY
+@given(seeds)
+def test_rotation4d(seed: int) -> None:
+    """Catches a sign in M_left or M_right: their product is a rotation, v -> l v conj(r) as quaternions."""
+    left, right, v = normal(seed, 5, 4), normal(seed + 1, 5, 4), normal(seed + 2, 5, 4)
+    R = rotation4d(left, right)
+    torch.testing.assert_close(R @ R.mT, torch.eye(4, dtype=torch.float64).expand(5, 4, 4))
+    torch.testing.assert_close(torch.linalg.det(R), torch.ones(5, dtype=torch.float64))
+    left, right = left / left.norm(dim=-1, keepdim=True), right / right.norm(dim=-1, keepdim=True)
+    conjugate = right * torch.tensor([1.0, -1, -1, -1])
+    torch.testing.assert_close((R @ v[..., None])[..., 0], hamilton(hamilton(left, v), conjugate))
+
+
+def test_rotation4d_is_general() -> None:
+    """Catches an identity that turns, and two quaternions that reach only a part of the six rotations of 4D."""
+    one = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)
+    torch.testing.assert_close(rotation4d(one, one)[0], torch.eye(4, dtype=torch.float64))
+    generators = [rotation4d(one + 1e-6 * e, one) for e in torch.eye(4).double()[1:, None]]
+    generators += [rotation4d(one, one + 1e-6 * e) for e in torch.eye(4).double()[1:, None]]
+    span = torch.stack([(G[0] - torch.eye(4)) / 1e-6 for G in generators]).flatten(1)
+    assert torch.linalg.matrix_rank(span, rtol=1e-3) == 6  # all of so(4)
+
+
+# ---- colours
+
+
+def test_spherical_harmonics_are_scipy_s() -> None:
+    """Catches a wrong constant, order or sign. 3DGS' real basis is sqrt(2) Re / Im of Y_lm, phase (-1)^m included."""
+    d = directions(0, 50)
+    polar, azimuth = np.arccos(d[:, 2].numpy()), np.arctan2(d[:, 1].numpy(), d[:, 0].numpy())
+    expected = []
+    for degree, m in ORDERS:
+        Y = sph_harm_y(degree, abs(m), polar, azimuth)
+        expected.append(Y.real if m == 0 else math.sqrt(2) * (Y.real if m > 0 else Y.imag))
+    np.testing.assert_allclose(sh_basis(d, 3).numpy(), np.stack(expected, -1), atol=1e-12)
+
+
+def test_spherical_harmonics_are_orthonormal() -> None:
+    """Catches a basis function that mixes with another, by a quadrature that is exact for degree 6."""
+    z, weights = np.polynomial.legendre.leggauss(8)
+    phi = np.arange(16) * 2 * np.pi / 16
+    s = np.sqrt(1 - z * z)[:, None]
+    d = np.stack(np.broadcast_arrays(s * np.cos(phi), s * np.sin(phi), z[:, None]), -1).reshape(-1, 3)
+    Y = sh_basis(torch.from_numpy(d), 3).numpy()
+    np.testing.assert_allclose(Y.T * np.repeat(weights * np.pi / 8, 16) @ Y, np.eye(16), atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colors(degree: int) -> None:
+    """Catches coefficients above the degree in use that still show, a lost +0.5 and a clamp at another value."""
+    coefficients, d = normal(1, 20, 16, 3), directions(2, 20)
+    n = (degree + 1) ** 2
+    expected = np.maximum(0, np.einsum("nk,nkc->nc", sh_basis(d, 3).numpy()[:, :n], coefficients.numpy()[:, :n]) + 0.5)
+    np.testing.assert_allclose(sh_colors(coefficients, d, degree).numpy(), expected, atol=1e-12)
+    assert (expected == 0).any()
+
+
+def test_time_colors() -> None:
+    """Catches 4DSH with another frequency, phase or period: sum over n of cos(2 pi n (t - mu_t)) beta_n Y."""
+    coefficients, d, offset = normal(3, 20, 3, 16, 3), directions(4, 20), normal(5, 20)
+    waves = np.stack([np.cos(2 * np.pi * n * offset.numpy()) for n in range(3)], -1)
+    sums = np.einsum("nm,nk,nmkc->nc", waves, sh_basis(d, 3).numpy(), coefficients.numpy())
+    colors = sh_time_colors(coefficients, d, 3, offset)
+    np.testing.assert_allclose(colors.numpy(), np.maximum(0, sums + 0.5), atol=1e-12)
+    torch.testing.assert_close(sh_time_colors(coefficients, d, 3, offset + 1), colors)
+    assert not torch.allclose(sh_time_colors(coefficients, d, 3, offset + 0.5), colors)
+    torch.testing.assert_close(sh_time_colors(coefficients[:, :1], d, 2, offset), sh_colors(coefficients[:, 0], d, 2))
+
+
+# ---- refinement
+
+
+def test_time_encoding() -> None:
+    """Catches another octave, order or factor than (sin 2^k pi t, cos 2^k pi t), k = 0..9."""
+    t = 0.37
+    expected = [f(2**k * math.pi * t) for k in range(10) for f in (math.sin, math.cos)]
+    np.testing.assert_allclose(encode_time(torch.tensor(t, dtype=torch.float64)).numpy(), expected, atol=1e-10)
+
+
+def test_refinement_starts_at_zero_but_learns() -> None:
+    """Catches residuals before any training, and an output layer of zeros that gets no gradient."""
+    refinement = Refinement(7, [3, 1, 3, 28], torch.Generator().manual_seed(0))
+    residuals = refinement(normal(0, 5, 7).float(), torch.tensor(0.3))
+    assert [r.shape for r in residuals] == [(5, 3), (5, 1), (5, 3), (5, 28)]
+    assert not any(r.any() for r in residuals)
+    sum(r.sum() for r in residuals).backward()
+    assert all(w.grad.any() for w in refinement.weights_out)
+
+
+def test_refinement_is_four_perceptrons_on_27_numbers() -> None:
+    """Catches a shortcut of the shared first layer that is not 27 x 64 x c on the concatenated features."""
+    refinement = Refinement(7, [3, 1, 3, 28], torch.Generator().manual_seed(0)).double()
+    for i, p in enumerate([*refinement.weights_out, *refinement.biases_out]):
+        p.data = normal(i, *p.shape)
+    features, time = normal(9, 6, 7), torch.tensor(0.3, dtype=torch.float64)
+    f = torch.cat([features, encode_time(time).expand(6, -1)], -1)
+    assert f.shape[-1] == 27
+    for i, (width, residual) in enumerate(zip([3, 1, 3, 28], refinement(features, time), strict=True)):
+        rows = slice(64 * i, 64 * (i + 1))
+        perceptron = nn.Sequential(nn.Linear(27, 64), nn.ReLU(), nn.Linear(64, width)).double()
+        first, last = perceptron[0], perceptron[2]
+        first.weight.data, first.bias.data = refinement.weight_in.data[rows], refinement.bias_in.data[rows]
+        last.weight.data, last.bias.data = refinement.weights_out[i].data, refinement.biases_out[i].data
+        torch.testing.assert_close(residual, perceptron(f))
+
+
+# ---- directions
+
+
+def test_unit() -> None:
+    """Catches a direction of another length than 1, and NaN where a camera sits on a mean: zero, with no gradient."""
+    vectors = torch.tensor([[3.0, 0, 4], [0, 0, 0], [1e-15, 0, 0], [0, -1e-5, 0]], requires_grad=True)
+    directions = unit(vectors)
+    torch.testing.assert_close(directions[[0, 3]], torch.tensor([[0.6, 0, 0.8], [0, -1, 0]]))
+    assert not directions[[1, 2]].any()
+    (directions * torch.tensor([1.0, 2, 3])).sum().backward()
+    assert vectors.grad.isfinite().all()
+    assert not vectors.grad[[1, 2]].any()
+    assert vectors.grad[[0, 3]].any()
+    assert torch.autograd.gradcheck(unit, normal(0, 4, 3).requires_grad_())

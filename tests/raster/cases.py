@@ -1,0 +1,230 @@
+"""Scenes that a rasterizer can get wrong, by name: the arguments of `rasterize`, for any backend and float type."""
+
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Arguments = dict[str, Any]
+_BUILDERS: dict[str, Callable[[torch.Generator], Arguments]] = {}
+
+
+def case(name: str, dtype: torch.dtype = torch.float64, device: str = "cpu") -> Arguments:
+    """Keyword arguments of `rasterize`; the same numbers, rounded, in every dtype."""
+    arguments = _BUILDERS[name](torch.Generator().manual_seed(zlib.crc32(name.encode())))
+    return {k: v.to(device, dtype) if isinstance(v, Tensor) else v for k, v in arguments.items()}
+
+
+def names() -> list[str]:
+    """Every case."""
+    return list(_BUILDERS)
+
+
+def _case(build: Callable[[torch.Generator], Arguments]) -> Callable[[torch.Generator], Arguments]:
+    _BUILDERS[build.__name__.strip("_")] = build
+    return build
+
+
+def gaussians(g: torch.Generator, N: int, size: float = 0.15, D: int = 3) -> Arguments:
+    """N Gaussians in [-1, 1]^3, of about `size`, by full 3x3 factors."""
+    return {
+        "means": 2 * _rand(g, N, 3) - 1,
+        "factors": size * torch.randn(N, 3, 3, generator=g, dtype=torch.float64),
+        "opacities": 0.05 + 0.9 * _rand(g, N),
+        "colors": _rand(g, N, D),
+    }
+
+
+def camera(width: int, height: int, eye: tuple[float, float, float] = (0.5, -0.4, -4.0)) -> Arguments:
+    """One camera at `eye` that looks at the origin, with a picture about as wide as [-1, 1]^3 seems from there."""
+    focal = 2.0 * min(width, height)
+    return {
+        "viewmats": look_at(eye)[None],
+        "Ks": intrinsics(focal, focal, width / 2, height / 2)[None],
+        "width": width,
+        "height": height,
+    }
+
+
+def look_at(eye: tuple[float, float, float]) -> Tensor:
+    """World to camera, [4, 4], OpenCV axes, from `eye` to the origin."""
+    position = torch.tensor(eye, dtype=torch.float64)
+    z = -position / position.norm()
+    x = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.1], dtype=torch.float64), z)
+    x = x / x.norm()
+    R = torch.stack([x, torch.linalg.cross(z, x), z])
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = R, -R @ position
+    return viewmat
+
+
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
+    """[3, 3], pixels."""
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def _rand(g: torch.Generator, *shape: int) -> Tensor:
+    return torch.rand(*shape, generator=g, dtype=torch.float64)
+
+
+def _rotations(g: torch.Generator, N: int) -> Tensor:
+    return torch.linalg.qr(torch.randn(N, 3, 3, generator=g, dtype=torch.float64))[0]
+
+
+@_case
+def random(g: torch.Generator) -> Arguments:
+    return gaussians(g, 60) | camera(33, 17)
+
+
+@_case
+def needles(g: torch.Generator) -> Arguments:
+    """Axes 1e4 : 1 : 1 and 1e4 : 1e4 : 1, many times as long as the picture is wide."""
+    scene = gaussians(g, 24) | camera(33, 17)
+    axes = torch.tensor([[2.0, 2e-4, 2e-4], [2.0, 2.0, 2e-4]], dtype=torch.float64).repeat(12, 1)
+    return scene | {"factors": _rotations(g, 24) * axes[:, None]}
+
+
+@_case
+def flat(g: torch.Generator) -> Arguments:
+    """Singular factors: a disc, a line, a point."""
+    scene = gaussians(g, 24) | camera(33, 17)
+    axes = torch.tensor([[0.3, 0.3, 0], [0.3, 0, 0], [0, 0, 0]], dtype=torch.float64).repeat(8, 1)
+    return scene | {"factors": _rotations(g, 24) * axes[:, None]}
+
+
+@_case
+def larger_than_picture(g: torch.Generator) -> Arguments:
+    return gaussians(g, 12, size=8.0) | camera(20, 12)
+
+
+@_case
+def near_plane(g: torch.Generator) -> Arguments:
+    """Means behind the camera, on it, within `near` of it and just beyond, with extents that cross all of that."""
+    scene = gaussians(g, 40, size=0.4) | camera(24, 16, eye=(0.0, 0.0, -1e-3))
+    z = torch.linspace(-1, 1, 40, dtype=torch.float64)[:, None]
+    return scene | {"means": torch.cat([0.3 * scene["means"][:, :2], z], -1), "near": 0.2}
+
+
+@_case
+def far_plane(g: torch.Generator) -> Arguments:
+    return gaussians(g, 20) | camera(16, 16) | {"far": 4.1}
+
+
+@_case
+def off_screen(g: torch.Generator) -> Arguments:
+    """Around the border on all sides: outside but reaching in, and farther than the Jacobian's clamp."""
+    scene = gaussians(g, 60, size=0.6) | camera(24, 16)
+    angle = 6.2832 * _rand(g, 60)
+    ring = torch.stack([angle.cos(), angle.sin(), 0 * angle], -1) * (0.8 + 2.5 * _rand(g, 60, 1))
+    return scene | {"means": ring}
+
+
+@_case
+def nothing_in_view(g: torch.Generator) -> Arguments:
+    scene = gaussians(g, 8) | camera(16, 8)
+    return scene | {"means": scene["means"] + 50, "background": torch.tensor([0.2, 0.4, 0.6])}
+
+
+@_case
+def transparent(g: torch.Generator) -> Arguments:
+    """Opacities of zero and of just below 1/255, which are never drawn, among some just above."""
+    scene = gaussians(g, 30, size=0.3) | camera(16, 16)
+    return scene | {"opacities": torch.tensor([0.0, 0.99 / 255, 1.2 / 255], dtype=torch.float64).repeat(10)}
+
+
+@_case
+def opaque_stack(g: torch.Generator) -> Arguments:
+    """A thousand behind each other: the first few are all that is seen."""
+    scene = gaussians(g, 1000, size=0.5) | camera(9, 9)
+    return scene | {"opacities": 0.6 + 0.4 * _rand(g, 1000), "means": scene["means"] * 0.3}
+
+
+@_case
+def saturated(g: torch.Generator) -> Arguments:
+    """Opacity 1 exactly: alpha stops at 0.999."""
+    return gaussians(g, 10, size=0.5) | camera(16, 16) | {"opacities": torch.ones(10)}
+
+
+@_case
+def equal_depths(g: torch.Generator) -> Arguments:
+    """All at the same depth to the last bit: the lower index is in front."""
+    scene = gaussians(g, 30, size=0.4) | camera(16, 16)
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 4.0
+    return scene | {"means": scene["means"] * torch.tensor([1.0, 1.0, 0.0]), "viewmats": viewmat[None]}
+
+
+@_case
+def one_pixel(g: torch.Generator) -> Arguments:
+    return gaussians(g, 20, size=0.5) | camera(1, 1)
+
+
+@_case
+def tall(g: torch.Generator) -> Arguments:
+    """17 x 33: no multiple of any tile."""
+    return gaussians(g, 40) | camera(17, 33)
+
+
+@_case
+def no_gaussian(g: torch.Generator) -> Arguments:
+    return gaussians(g, 0) | camera(9, 5) | {"background": torch.tensor([0.1, 0.2, 0.3])}
+
+
+@_case
+def one_gaussian(g: torch.Generator) -> Arguments:
+    scene = gaussians(g, 1, size=0.5) | camera(19, 10)
+    return scene | {"means": torch.tensor([[0.1, 0.05, 0.0]]), "opacities": torch.tensor([0.8])}
+
+
+@_case
+def three_cameras(g: torch.Generator) -> Arguments:
+    """Different places and focal lengths, one colour set a camera, one background for all."""
+    scene = gaussians(g, 30) | camera(20, 14)
+    eyes = ((0.5, -0.4, -4.0), (3.0, 1.0, -2.0), (-2.0, 0.5, 3.0))
+    return scene | {
+        "viewmats": torch.stack([look_at(eye) for eye in eyes]),
+        "Ks": torch.stack([intrinsics(f, f, 10, 7) for f in (20.0, 28.0, 40.0)]),
+        "colors": _rand(g, 3, 30, 3),
+        "background": torch.tensor([1.0, 0.5, 0.0]),
+    }
+
+
+@_case
+def oblong_pixels(g: torch.Generator) -> Arguments:
+    return gaussians(g, 40) | camera(24, 16) | {"Ks": intrinsics(25.0, 50.0, 12, 8)[None]}
+
+
+@_case
+def principal_point_off_center(g: torch.Generator) -> Arguments:
+    return gaussians(g, 40) | camera(24, 16) | {"Ks": intrinsics(30.0, 30.0, 5.3, 12.8)[None]}
+
+
+@_case
+def principal_point_outside(g: torch.Generator) -> Arguments:
+    return gaussians(g, 40, size=0.3) | camera(24, 16) | {"Ks": intrinsics(30.0, 30.0, -9.0, 21.0)[None]}
+
+
+@_case
+def one_channel(g: torch.Generator) -> Arguments:
+    return gaussians(g, 20, D=1) | camera(16, 12) | {"background": torch.tensor([0.7])}
+
+
+@_case
+def five_channels(g: torch.Generator) -> Arguments:
+    """Colours need not be in [0, 1]."""
+    scene = gaussians(g, 20, D=5) | camera(16, 12)
+    return scene | {"colors": 4 * scene["colors"] - 2, "background": torch.arange(5) - 2.0}
+
+
+@_case
+def antialiased(g: torch.Generator) -> Arguments:
+    """Sizes from far below a pixel, where the filter dims, to large."""
+    scene = gaussians(g, 60) | camera(24, 16) | {"antialias": True}
+    return scene | {"factors": scene["factors"] * 10 ** (1 - 2.5 * _rand(g, 60, 1, 1))}
+
+
+@_case
+def wide_filter(g: torch.Generator) -> Arguments:
+    return gaussians(g, 30) | camera(16, 16) | {"eps2d": 2.0}

@@ -1,0 +1,111 @@
+"""What `rasterize` refuses: every fault is an InputError of one line that names the argument."""
+
+from typing import Any
+
+import pytest
+import torch
+from cases import case
+
+from gsbench.errors import InputError
+from gsbench.raster import choose_backend, rasterize
+
+TENSORS = {"means": (40, 3), "factors": (40, 3, 3), "opacities": (40,), "colors": (40, 3),
+           "viewmats": (1, 4, 4), "Ks": (1, 3, 3), "background": (3,)}  # fmt: skip
+
+
+def refused(changes: dict[str, Any], name: str) -> None:
+    """Assert that the scene with `changes` raises an InputError of one line that begins with or states `name`."""
+    arguments = {**case("tall"), "background": torch.zeros(3, dtype=torch.float64), "backend": "reference"}
+    with pytest.raises(InputError) as error:
+        rasterize(**arguments | changes)
+    assert name in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_the_scene_itself_is_accepted() -> None:
+    """Catches a scene that is refused for another reason than the one tested."""
+    arguments = {**case("tall"), "background": torch.zeros(3, dtype=torch.float64)}
+    assert {k: tuple(arguments[k].shape) for k in TENSORS} == TENSORS
+    rasterize(**arguments, backend="reference")
+
+
+@pytest.mark.parametrize("name", TENSORS)
+def test_shapes(name: str) -> None:
+    """Catches a shape that is let in and fails in the depths, or draws nonsense by broadcasting."""
+    wrong = [(), (0,), (7,), (*TENSORS[name], 1), (1, *TENSORS[name]), (*TENSORS[name][:-1], 2)]
+    # Colours may have any number of channels (background then does not fit), one set a camera.
+    for shape in wrong:
+        if name == "colors" and shape in {(1, 40, 3), (40, 2)}:
+            continue
+        refused({name: torch.zeros(shape, dtype=torch.float64)}, name)
+    refused({name: [[0.0]]}, name)
+
+
+def test_rows_that_differ() -> None:
+    """Catches numbers of Gaussians, cameras or channels that do not agree."""
+    refused({"opacities": torch.zeros(39).double()}, "opacities: expected shape [40], got [39]")
+    refused({"colors": torch.zeros(2, 40, 3).double()}, "colors: expected shape [1, 40, 3], got [2, 40, 3]")
+    refused({"colors": torch.zeros(40, 2).double()}, "background: expected shape [2], got [3]")
+    refused({"Ks": torch.eye(3).double().repeat(2, 1, 1)}, "Ks: expected shape [1, 3, 3], got [2, 3, 3]")
+    refused({"colors": torch.zeros(40, 0).double(), "background": None}, "colors")
+    refused({"viewmats": torch.zeros(0, 4, 4).double(), "Ks": torch.zeros(0, 3, 3).double()}, "viewmats")
+
+
+@pytest.mark.parametrize("name", TENSORS)
+def test_types_and_places(name: str) -> None:
+    """Catches mixed precision, integers, and a tensor on another device."""
+    value = {**case("tall"), "background": torch.zeros(3)}[name]
+    wrong_type = "opacities" if name == "means" else name  # the others are held to the means
+    refused({name: value.float()} if name != "means" else {"opacities": value[:, 0].float()}, wrong_type)
+    refused({name: value.int()}, name if name != "means" else "float type")
+    if name != "means":
+        refused({name: torch.zeros(TENSORS[name], dtype=torch.float64, device="meta")}, name)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", TENSORS)
+def test_values_that_are_not_finite(name: str, bad: float) -> None:
+    """Catches NaN and infinities, which would be drawn as nothing and train as NaN."""
+    value = {**case("tall"), "background": torch.zeros(3, dtype=torch.float64)}[name].clone()
+    value.view(-1)[-1] = bad
+    refused({name: value}, f"{name}: expected finite values")
+
+
+def test_large_sums_are_finite() -> None:
+    """Catches a check of the sum alone: finite values whose sum overflows are accepted."""
+    arguments = case("tall", torch.float32)
+    arguments["colors"] = torch.full((40, 3), 3e38)
+    rasterize(**arguments, backend="reference")
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"width": 0}, "width=0"),
+        ({"height": -3}, "height=-3"),
+        ({"width": 8.5}, "width=8.5"),
+        ({"near": 0.0}, "near=0.0"),
+        ({"near": -1.0}, "near=-1.0"),
+        ({"near": 2.0, "far": 2.0}, "far=2.0"),
+        ({"near": float("nan")}, "near=nan"),
+        ({"far": float("nan")}, "far=nan"),
+        ({"eps2d": -0.1}, "eps2d=-0.1"),
+        ({"eps2d": float("nan")}, "eps2d=nan"),
+        ({"eps2d": float("inf")}, "eps2d=inf"),
+        ({"opacities": torch.full((40,), 1.5).double()}, "opacities: expected values in [0, 1]"),
+        ({"opacities": torch.full((40,), -0.1).double()}, "opacities: expected values in [0, 1]"),
+        ({"Ks": torch.diag(torch.tensor([-5.0, 5.0, 1.0])).double()[None]}, "Ks: expected positive focal lengths"),
+        ({"Ks": torch.diag(torch.tensor([5.0, 0.0, 1.0])).double()[None]}, "Ks: expected positive focal lengths"),
+        ({"backend": "refrence"}, "Did you mean 'reference'?"),
+        ({"backend": ""}, "raster backend ''"),
+    ],
+)
+def test_values(changes: dict[str, Any], name: str) -> None:
+    """Catches a number out of its range that would draw an empty or a wrong picture without a word."""
+    refused(changes, name)
+
+
+def test_auto_falls_back_to_the_reference() -> None:
+    """Catches `auto` choosing a backend that cannot serve the tensors: the native one has no float64."""
+    assert choose_backend("auto", "cpu", torch.float64) == "reference"
+    assert choose_backend("reference", "cpu", torch.float32) == "reference"

@@ -1,0 +1,245 @@
+"""The reference rasterizer against a brute-force picture, finite differences, and what must hold for any scene."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cases import camera, case, gaussians, names
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracle import Picture, paint
+from torch import Tensor
+
+from gsbench.raster import RasterOutput, rasterize
+
+DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "Ks", "background")
+PROPERTY = settings(max_examples=15, deadline=None)
+seeds = st.integers(0, 2**31)
+
+
+def draw(arguments: dict[str, Any]) -> RasterOutput:
+    return rasterize(**arguments, backend="reference")
+
+
+def brute_force(arguments: dict[str, Any], **more: Any) -> Picture:
+    arrays = {k: v.detach().double().numpy() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+    return paint(**arrays, **more)
+
+
+def scene(seed: int, N: int = 12) -> dict[str, Any]:
+    return gaussians(torch.Generator().manual_seed(seed), N, size=0.3) | camera(16, 12)
+
+
+@pytest.mark.parametrize("name", names())
+def test_picture_is_the_brute_force_one(name: str) -> None:
+    """Catches any wrong rule of the picture, and a tile, bound or padding that loses or invents a Gaussian."""
+    arguments = case(name)
+    output, picture = draw(arguments), brute_force(arguments)
+    np.testing.assert_allclose(output.image.numpy(), picture.image, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(output.alpha.numpy(), picture.alpha, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", names())
+def test_picture_in_single_precision(name: str) -> None:
+    """Catches cancellation: float32 keeps 1e-4 wherever no rounding can flip a decision of the picture's rules."""
+    arguments = case(name, torch.float32)
+    output, picture = draw(arguments), brute_force(arguments)
+    assert output.image.dtype == output.alpha.dtype == torch.float32
+    decided = picture.slack > 1e-3
+    assert decided.mean() > 0.8
+    np.testing.assert_allclose(output.image.numpy()[decided], picture.image[decided], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", names())
+def test_info(name: str) -> None:
+    """Catches radii that miss a pixel drawn or hide a Gaussian from density control, and depths of another camera."""
+    arguments = case(name)
+    info, picture = draw(arguments).info, brute_force(arguments)
+    C, N = len(arguments["viewmats"]), len(arguments["means"])
+    assert info.radii.shape == (C, N)
+    assert info.radii.dtype == torch.int32
+    assert info.means2d.shape == (C, N, 2)
+    R, t = arguments["viewmats"][:, :3, :3], arguments["viewmats"][:, :3, 3]
+    camera_means = arguments["means"] @ R.mT + t[:, None]
+    torch.testing.assert_close(info.depths, camera_means[..., 2])
+    c, i, row, column = np.nonzero(picture.touched)
+    pixels = torch.from_numpy(np.stack([column + 0.5, row + 0.5], -1))
+    assert ((pixels - info.means2d[c, i]).abs().amax(-1) <= info.radii[c, i]).all()
+    drawn = (info.radii > 0).sum()
+    assert (info.pairs == 0) == (drawn == 0)
+    assert info.pairs >= drawn
+
+
+# ---- gradients
+
+
+def smooth(name: str) -> dict[str, Any]:
+    """Six Gaussians of a case, whose picture has no decision so close that a finite difference would flip it."""
+    arguments = case(name)
+    few = torch.linspace(0, len(arguments["means"]) - 1, 6).long()
+    arguments |= {k: arguments[k][few] for k in ("means", "factors", "opacities")}
+    arguments["colors"] = arguments["colors"][..., few, :]
+    D = arguments["colors"].shape[-1]
+    arguments.setdefault("background", torch.linspace(0.2, 0.9, D, dtype=torch.float64))
+    assert brute_force(arguments).slack.min() > 1e-4
+    assert draw(arguments).info.pairs > 0
+    return arguments
+
+
+GRADIENT_CASES = ("random", "off_screen", "larger_than_picture", "near_plane", "flat", "three_cameras", "antialiased",
+                  "oblong_pixels", "principal_point_outside", "one_channel", "five_channels")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GRADIENT_CASES)
+def test_gradients_of_every_input(name: str) -> None:
+    """Catches a wrong or missing derivative of any input, cameras and background included (central differences)."""
+    arguments = smooth(name)
+    inputs = tuple(arguments.pop(k).requires_grad_() for k in DIFFERENTIABLE)
+    weight = torch.randn(2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def loss(*tensors: Tensor) -> Tensor:
+        output = draw(arguments | dict(zip(DIFFERENTIABLE, tensors, strict=True)))
+        waves = torch.arange(output.image.numel(), dtype=torch.float64).mul(0.05).sin().view_as(output.image)
+        return weight[0] * (waves * output.image.square()).sum() + weight[1] * output.alpha.square().sum()
+
+    assert torch.autograd.gradcheck(loss, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["random", "off_screen", "three_cameras"])
+def test_gradient_of_2d_means(name: str) -> None:
+    """Catches `info.means2d` off the path of the loss: its gradient, which drives densification, would be None."""
+    arguments = smooth(name)
+    arguments["means"].requires_grad_()
+    output = draw(arguments)
+    output.info.means2d.retain_grad()
+    waves = torch.arange(output.image.numel(), dtype=torch.float64).mul(0.05).sin().view_as(output.image)
+    (waves * output.image).sum().backward()
+
+    def loss(offsets: np.ndarray) -> float:
+        return float((waves.numpy() * brute_force(arguments, offsets2d=offsets).image).sum())
+
+    expected, h = np.zeros(output.info.means2d.shape), 1e-6
+    for index in np.ndindex(expected.shape):
+        offsets = np.zeros_like(expected)
+        offsets[index] = h
+        expected[index] = (loss(offsets) - loss(-offsets)) / (2 * h)
+    np.testing.assert_allclose(output.info.means2d.grad.numpy(), expected, rtol=1e-5, atol=1e-8)
+    assert np.abs(expected).max() > 1e-2
+
+
+@pytest.mark.parametrize("name", names())
+def test_gradients_are_finite(name: str) -> None:
+    """Catches NaN by way of what is not drawn (behind the camera, singular, transparent), and a picture of nothing
+    that leaves the autograd graph."""
+    arguments = case(name, torch.float32)
+    arguments = {k: v.requires_grad_() if k in DIFFERENTIABLE else v for k, v in arguments.items()}
+    output = draw(arguments)
+    output.info.means2d.retain_grad()
+    (output.image.square().sum() + output.alpha.sum()).backward()
+    for tensor in (*(arguments[k] for k in DIFFERENTIABLE if k in arguments), output.info.means2d):
+        assert tensor.grad is not None
+        assert tensor.grad.isfinite().all()
+    hidden = output.info.radii.amax(0) == 0
+    assert not arguments["means"].grad[hidden].any()
+
+
+# ---- properties
+
+
+@PROPERTY
+@given(seeds)
+def test_order_of_gaussians_does_not_matter(seed: int) -> None:
+    """Catches a sort by index. To 1e-12 and not to the bit: a matrix product may round by the place of a row."""
+    a = scene(seed)
+    order = torch.randperm(12, generator=torch.Generator().manual_seed(seed))
+    b = a | {k: a[k][order] for k in ("means", "factors", "opacities", "colors")}
+    torch.testing.assert_close(draw(b).image, draw(a).image, rtol=0, atol=1e-12)
+    assert torch.equal(draw(b).info.radii, draw(a).info.radii[:, order])
+
+
+@PROPERTY
+@given(seeds)
+def test_rigid_motion_of_the_world(seed: int) -> None:
+    """Catches a camera that is not the inverse of its pose: moving world and camera alike changes nothing."""
+    a = scene(seed)
+    g = torch.Generator().manual_seed(seed)
+    Q = torch.linalg.qr(torch.randn(3, 3, generator=g, dtype=torch.float64))[0]
+    Q = Q * torch.linalg.det(Q).sign()
+    s = torch.randn(3, generator=g, dtype=torch.float64)
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3], motion[:3, 3] = Q, s
+    b = a | {
+        "means": a["means"] @ Q.T + s,
+        "factors": Q @ a["factors"],
+        "viewmats": a["viewmats"] @ torch.linalg.inv(motion),
+    }
+    torch.testing.assert_close(draw(b).image, draw(a).image, rtol=0, atol=1e-9)
+
+
+@PROPERTY
+@given(seeds)
+def test_only_the_covariance_of_a_factor_matters(seed: int) -> None:
+    """Catches use of F other than by F F^T: F Q is the same Gaussian for any orthogonal Q, reflections included."""
+    a = scene(seed)
+    g = torch.Generator().manual_seed(seed)
+    Q = torch.linalg.qr(torch.randn(12, 3, 3, generator=g, dtype=torch.float64))[0]
+    torch.testing.assert_close(draw(a | {"factors": a["factors"] @ Q}).image, draw(a).image, rtol=0, atol=1e-9)
+
+
+@PROPERTY
+@given(seeds, st.floats(-3, 4), st.floats(0, 1))
+def test_pictures_are_finite_and_covered_at_most_once(seed: int, log_size: float, opacity: float) -> None:
+    """Catches NaN, and more light than there is, for sizes from a thousandth to 10^4 of the scene in float32."""
+    a = scene(seed) | {"opacities": torch.full((12,), opacity)}
+    a["factors"] = a["factors"] * 10**log_size
+    a = {k: v.float() if isinstance(v, Tensor) else v for k, v in a.items()}
+    output = draw(a)
+    assert output.image.isfinite().all()
+    assert (output.alpha >= 0).all()
+    assert (output.alpha <= 1 - 0.99e-4).all()  # blending ends at a transmittance of 1e-4
+    assert (output.image <= 1).all()  # as colours are
+    assert (output.info.radii >= 0).all()
+
+
+@PROPERTY
+@given(seeds, st.integers(0, 4))
+def test_coverage_grows_with_opacity(seed: int, which: int) -> None:
+    """Catches a sign in the blending. Five Gaussians below 0.8 stay above the transmittance that ends a pixel."""
+    a = scene(seed, N=5)
+    a["opacities"] = a["opacities"] * 0.6
+    more = a["opacities"].clone()
+    more[which] += 0.2
+    assert (draw(a | {"opacities": more}).alpha >= draw(a).alpha - 1e-12).all()
+
+
+@PROPERTY
+@given(seeds)
+def test_background_shows_where_nothing_is(seed: int) -> None:
+    """Catches a background that is added twice or not dimmed by what is before it."""
+    a = scene(seed)
+    background = torch.tensor([0.3, 0.5, 0.9], dtype=torch.float64)
+    output, black = draw(a | {"background": background}), draw(a)
+    torch.testing.assert_close(output.image, black.image + (1 - black.alpha) * background)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_same_bits_twice(threads: int) -> None:
+    """Catches sums whose order depends on the threads, in the picture and in every gradient.
+
+    Large enough that torch runs its scatters in parallel: with 2 threads `table[index]` failed this.
+    """
+    a = gaussians(torch.Generator().manual_seed(0), 1500, size=0.05) | camera(64, 64)
+    a = {k: v.float() if isinstance(v, Tensor) else v for k, v in a.items()}
+    before, runs = torch.get_num_threads(), []
+    try:
+        torch.set_num_threads(threads)
+        for _ in range(3):
+            inputs = [a[k].detach().requires_grad_() for k in DIFFERENTIABLE[:6]]
+            output = draw(a | dict(zip(DIFFERENTIABLE, inputs, strict=False)))
+            output.image.square().sum().backward()
+            runs.append([output.image.detach(), *(i.grad for i in inputs)])
+    finally:
+        torch.set_num_threads(before)
+    for run in runs[1:]:
+        assert all(torch.equal(x, y) for x, y in zip(runs[0], run, strict=True))

@@ -1,0 +1,104 @@
+"""Strips of pictures: where things are, what the error's colours mean, what is written."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsbench.errors import InputError
+from gsbench.report import pictures
+from gsbench.report.pictures import ERROR_SCALE, GAP, HEADER
+
+
+def cells(picture: np.ndarray, height: int, width: int, row: int = 0) -> list[np.ndarray]:
+    """The three images of a row."""
+    top = HEADER + row * (height + GAP)
+    return [picture[top : top + height, i * (width + GAP) :][:, :width] for i in range(3)]
+
+
+def test_render_truth_and_error_are_where_the_header_says():
+    """Would catch swapped columns, swapped red and blue, or an error that is not the absolute mean over RGB."""
+    truth = np.random.default_rng(0).random((30, 300, 3))
+    render = truth.copy()
+    render[:10] = np.clip(truth[:10] + ERROR_SCALE / 2, None, 1)
+    render[20:] = 1 - truth[20:]
+    picture = pictures.strip([(render, truth), (truth, truth)])
+    shown, reference, error = cells(picture, 30, 300)
+    assert np.abs(shown / 255 - render).max() <= 0.5 / 255 + 1e-6
+    assert np.abs(reference / 255 - truth).max() <= 0.5 / 255 + 1e-6
+    assert (error[10:20] == error[10, 0]).all()
+    assert error[10, 0].sum() < 20  # none is black
+    brightest = np.abs(render - truth).mean(-1) >= ERROR_SCALE
+    assert brightest.sum() > 100
+    assert (error[brightest] == error[brightest][0]).all()
+    assert error[brightest][0][:2].min() > 200  # 0.2 and more is bright yellow
+    assert (cells(picture, 30, 300, 1)[2] == error[10, 0]).all()
+
+
+def test_the_error_does_not_depend_on_its_sign_or_its_neighbours():
+    """Would catch a signed error, and a scale that adapts to the picture, so that two strips cannot be compared."""
+    truth = np.full((4, 300, 3), 0.5)
+    worse = truth.copy()
+    worse[0] = 0
+    plus, minus, beside = (
+        cells(pictures.strip([(r, truth)]), 4, 300)[2][3] for r in (truth + 0.07, truth - 0.07, worse + 0.07)
+    )
+    assert (plus == minus).all()
+    assert (plus == beside).all()
+
+
+def test_the_error_is_the_mean_over_channels():
+    """Would catch a maximum: an error in one channel is a third of the same error in all."""
+    truth = np.zeros((4, 300, 3))
+    one, every = truth.copy(), truth + 0.05
+    one[..., 0] = 0.15
+    assert (
+        cells(pictures.strip([(one, truth)]), 4, 300)[2] == cells(pictures.strip([(every, truth)]), 4, 300)[2]
+    ).all()
+
+
+def test_small_images_are_enlarged_without_smoothing():
+    """Would catch interpolated pixels: every pixel of a 100-wide image becomes 3 x 3 equal ones."""
+    image = np.random.default_rng(0).random((5, 100, 3))
+    shown = cells(pictures.strip([(image, image)]), 15, 300)[0]
+    assert (shown.reshape(5, 3, 100, 3, 3).min((1, 3)) == shown.reshape(5, 3, 100, 3, 3).max((1, 3))).all()
+    assert np.abs(shown[1::3, 1::3] / 255 - image).max() < 0.01
+
+
+def test_nan_is_seen():
+    """Would catch broken pixels that look like a perfect black."""
+    truth = np.zeros((4, 300, 3))
+    render = truth.copy()
+    render[1, 2, 0] = np.nan
+    shown, _, error = cells(pictures.strip([(render, truth)]), 4, 300)
+    assert shown[1, 2].tolist() == error[1, 2].tolist() == [255, 0, 255]
+    assert shown[1, 3].tolist() == [0, 0, 0]
+
+
+@settings(max_examples=20, deadline=None)
+@given(height=st.integers(1, 20), width=st.integers(1, 400), rows=st.integers(1, 3))
+def test_any_size_gives_a_picture(height, width, rows):
+    """Would catch a header that is drawn outside a narrow picture."""
+    image = np.zeros((height, width, 3), np.float32)
+    picture = pictures.strip([(image, image)] * rows)
+    factor = -(-240 // width)
+    assert picture.shape == (HEADER + rows * (height * factor + GAP) - GAP, 3 * width * factor + 2 * GAP, 3)
+    assert picture[:HEADER].min() < 128  # something is written there
+
+
+def test_sizes_that_differ_are_refused():
+    """Would catch broadcasting, and a numpy error from the depths."""
+    image = np.zeros((4, 5, 3))
+    for bad in ([], [(image, image[:3])], [(image, image), (image[:3], image[:3])], [(image[..., 0], image[..., 0])]):
+        with pytest.raises(InputError, match="strip"):
+            pictures.strip(bad)
+
+
+def test_the_png_holds_what_was_drawn(tmp_path):
+    """Would catch RGB written as BGR, and a temporary file left behind."""
+    image = np.random.default_rng(0).integers(0, 256, (7, 9, 3), np.uint8)
+    pictures.write_png(image, tmp_path / "new" / "a.png")
+    read = cv2.imread(str(tmp_path / "new" / "a.png"))
+    assert (cv2.cvtColor(read, cv2.COLOR_BGR2RGB) == image).all()
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["a.png"]

@@ -1,0 +1,242 @@
+"""The table: a golden page, the rules of averaging and of the paper's rows, warnings, the command."""
+
+import dataclasses
+import subprocess
+import sys
+
+import pandas as pd
+import pytest
+from make_golden import GOLDEN, GOLDEN_TERMINAL, make, records
+
+from gsbench.errors import InputError
+from gsbench.measure import record as files
+from gsbench.report import layout, tables
+from gsbench.report.__main__ import main
+
+
+def page(*of: files.Record) -> str:
+    return layout.markdown(tables.build(list(of)))
+
+
+def section(text: str, title: str) -> str:
+    """The part of a page under the heading that begins with `title`."""
+    return text.split(f"## {title}", 1)[1].split("\n## ")[0].split("\n(1)")[0]
+
+
+def failed(**changes: object) -> files.Record:
+    return make(
+        **{"status": "failed", "reason": "out of memory", "metrics": None, "missing": {}, "cost": None} | changes
+    )
+
+
+def test_the_golden_page():
+    """Would catch any change of the page nobody meant. If it is meant: run make_golden.py and read the difference."""
+    assert page(*records()) == GOLDEN.read_text()
+    assert layout.terminal(tables.build(records())) == GOLDEN_TERMINAL.read_text()
+
+
+def test_no_run_is_dropped():
+    """Would catch failed and diverged runs, or seeds, that vanish from the page or the CSV."""
+    text = page(*records())
+    assert "| 7dgs seed 2 | diverged |" in text
+    assert "7dgs seed 2 diverged: step 431" in text
+    assert "| 7dgs_noagr seed 0 | failed |" in text
+    frame = tables.tidy(records())
+    assert len(frame) == len(records())
+    assert frame["status"].value_counts().to_dict() == {"ok": 7, "diverged": 1, "failed": 1}
+    assert frame.loc[frame["status"] == "failed", "reason"].tolist() == ["out of memory"]
+
+
+def test_seeds_become_mean_and_sample_deviation():
+    """Would catch a population deviation, or a failed seed that counts: 24, 25, 26 have mean 25 and deviation 1."""
+    runs = [make(seed=seed, psnr=psnr) for seed, psnr in enumerate((24.0, 25.0, 26.0))]
+    text = section(page(*runs, failed(seed=3)), "suzanne")
+    assert "| 7dgs | **25.00 ± 1.00** |" in text
+    assert "| 3 |" in text
+    assert "| 7dgs seed 3 | failed |" in text
+
+
+def test_a_seed_without_a_number_empties_the_cell():
+    """Would catch a mean over fewer seeds than the row claims."""
+    metrics = {**make().metrics, "ssim": None}
+    other = make(seed=1, metrics=metrics, missing={"ssim": "too small", "lpips_vgg": "none"})
+    text = page(make(), other)
+    assert "| – (1) |" in section(text, "suzanne")
+    assert "(1) SSIM is empty: too small" in text
+
+
+def test_the_average_is_over_scenes_that_every_model_finished():
+    """Would catch an average in which one model is spared a hard scene."""
+    runs = [
+        make("4dgs", "suzanne", psnr=20.0),
+        make("7dgs", "suzanne", psnr=22.0),
+        make("4dgs", "moving-matte", psnr=30.0),
+        failed(model="7dgs", scene="moving-matte"),
+    ]
+    text = section(page(*runs), "average")
+    assert text.startswith(" over 1 of 2 scenes: suzanne\n")
+    assert "| 4dgs | 20.00 |" in text
+    assert "| 7dgs | **22.00** |" in text
+
+
+def test_an_average_over_no_scene_says_so():
+    """Would catch a division by zero, and an average that quietly disappears."""
+    text = section(page(make("4dgs", "suzanne"), make("7dgs", "moving-matte")), "average")
+    assert "over 0 of 2 scenes" in text
+    assert "no scene that every model has finished" in text
+    assert "over 0 of 2 scenes" in page(failed(), failed(scene="moving-matte"))
+
+
+def trex(dataset: str = "D-NeRF", model: str = "7dgs", scene: str = "trex", **changes: object) -> files.Record:
+    protocol = {**make().protocol, "paper_dataset": "D-NeRF"}
+    return make(model, scene, **{"dataset": dataset, "protocol": protocol} | changes)
+
+
+def test_the_papers_row_stands_beside_its_own_scene():
+    """Would catch the paper's numbers in wrong columns or units: trex is 30.72 dB, 63.4 min, 67994 Gaussians."""
+    text = page(trex(), make(scene="invented", dataset="D-NeRF"))
+    assert "| paper (1) | 30.72 | 0.980 | 0.018 (2) | 63.4 | 156.5 | 67994 |" in text
+    assert "other data" not in text
+
+
+def test_a_stand_in_is_called_other_data():
+    """Would catch the paper's suzanne shown as if this project's suzanne could be compared with it."""
+    text = page(trex(dataset="mini"))
+    assert "| paper, other data (1) | 30.72 |" in text
+    assert "stand-in" in text
+
+
+def test_no_paper_row_where_the_paper_has_none():
+    """Would catch a row matched by scene name alone, by a model's name alone, or for a model of other effects."""
+    for run in (
+        make(protocol={**make().protocol, "paper_dataset": None}),
+        make(protocol={"name": "gsbench"}),
+        trex(scene="suzanne"),
+        trex(model="3dgs"),
+        trex(effects=make("7dgs_noagr").effects),
+    ):
+        assert "paper" not in page(run).lower()
+
+
+def test_the_papers_average_is_over_the_same_scenes():
+    """Would catch the paper's average over eight scenes beside ours over two: (30.72 + 32.96) / 2 = 31.84."""
+    text = section(page(trex(), trex(scene="hellwarrior")), "average")
+    assert "| paper (1) | 31.84 |" in text
+    assert "paper" not in section(page(trex(), trex(scene="hellwarrior"), trex(scene="invented")), "average")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"device": "another CPU"}, "the rows differ in machine"),
+        ({"threads": 64}, "the rows differ in machine"),
+        ({"git_commit": "fedcba"}, "the rows differ in commit"),
+        ({"git_commit": None}, "the rows differ in commit"),
+        ({"versions": {"torch": "2.6"}}, "the rows differ in versions"),
+        ({"data_hash": "77"}, "the rows differ in mini"),
+        ({"config": {"train": {"iterations": 7}}}, "the rows differ in iterations"),
+    ],
+)
+def test_rows_made_under_other_conditions_are_warned_of(changes, words):
+    """Would catch two numbers compared that were measured on different machines, code, data or lengths of training."""
+    one = make("4dgs")
+    other = dataclasses.replace(make("7dgs"), provenance=dataclasses.replace(one.provenance, **changes))
+    assert f"WARNING: {words}" in page(one, other)
+    assert "WARNING" not in page(one, make("7dgs"))
+
+
+def test_a_protocol_may_go_with_the_scene_but_not_within_it():
+    """Would catch a warning about lego on val, which is meant, or none about two rows of one scene on two splits."""
+    val = {**make().protocol, "eval_split": "val"}
+    text = page(trex(), trex(scene="lego", protocol={**trex().protocol, "eval_split": "val"}))
+    assert "eval_split test (trex), val (lego)" in text
+    assert "lego is measured on val" in text
+    assert "WARNING" not in text
+    assert "WARNING: the rows differ in eval_split: test (suzanne/4dgs/seed0); val" in page(
+        make("4dgs"), make(protocol=val)
+    )
+
+
+def test_columns_that_leak_or_are_rare_say_so():
+    """Would catch the best-on-test column without its warning, or an LPIPS-VGG that was measured and is not shown."""
+    metrics = {**make().metrics, "lpips_vgg": 0.25, "psnr_best_on_test": 26.5}
+    text = page(make(metrics=metrics, missing={}))
+    assert "LPIPS-VGG | psnr_best_on_test (leaks) |" in text
+    assert "| 0.250 | 26.50 |" in text
+    assert "LPIPS-VGG has no column: no trunk weights" in page(make())
+
+
+def test_text_from_a_record_cannot_break_the_page_or_the_terminal():
+    """Would catch a reason with a pipe, a newline or an escape code that breaks the table or colours the terminal."""
+    run = failed(reason="a | b\nc <script> \x1b[31m *d*", dataset="x|y\x07")
+    text = page(run)
+    assert "a \\| b c \\<script> ?\\[31m \\*d\\*" in text
+    assert not set(layout.terminal(tables.build([run]))) & {"\x1b", "\x07"}
+
+
+@pytest.mark.parametrize("width", [120, 80, 40])
+def test_the_terminal_form_fits(width):
+    """Would catch a line that wraps, also with several seeds, every column and a long model name."""
+    metrics = {**make().metrics, "lpips_vgg": 0.25, "psnr_best_on_test": 26.5}
+    runs = [*records(), make(seed=3, metrics=metrics, missing={})]
+    runs += [dataclasses.replace(make(seed=seed), model="a_model_with_a_name_of_forty_letters_____") for seed in (0, 1)]
+    text = layout.terminal(tables.build(runs), width)
+    assert max(map(len, text.splitlines())) <= width
+    assert "only in the files, for want of width" in text
+    assert "7dgs seed 2" in text
+
+
+def test_the_csv_reads_back(tmp_path):
+    """Would catch a CSV that rounds, or whose cells move: one row a run, numbers to the last digit."""
+    tables.write(records(), tmp_path)
+    frame = pd.read_csv(tmp_path / "table.csv", dtype={"psnr": str})
+    assert [float(psnr) for psnr in frame["psnr"].dropna()] == [r.metrics["psnr"] for r in records() if r.metrics]
+    assert frame["seed"].tolist() == [r.seed for r in records()]
+    assert frame["protocol_eval_split"].unique().tolist() == ["test"]
+    assert (tmp_path / "table.md").read_text() == GOLDEN.read_text()
+
+
+def test_the_command_prints_and_writes(tmp_path, capsys):
+    """Would catch a command that needs anything but a folder: records at any depth, several experiments."""
+    for run in (*records(), make(experiment="other", psnr=11.5)):
+        folder = files.run_path(tmp_path, run.experiment, run.scene, run.model, run.seed)
+        files.write(run, folder / files.FILE_NAME)
+    assert main([str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "experiment mini, data mini" in printed
+    assert "experiment other, data mini" in printed
+    assert "11.50*" in printed
+    assert max(map(len, printed.splitlines()[:-1])) <= 120
+    assert GOLDEN.read_text() in (tmp_path / "table.md").read_text()
+    assert len(pd.read_csv(tmp_path / "table.csv")) == len(records()) + 1
+
+
+def test_the_command_is_clear_where_there_is_nothing_to_show(tmp_path, capsys):
+    """Would catch a stack trace, or an exit code of 0, for an empty folder, a missing one, or a damaged record."""
+    for folder in (tmp_path, tmp_path / "missing"):
+        assert main([str(folder)]) == 2
+        assert "found no" in capsys.readouterr().err
+    (tmp_path / "record.json").write_text("{")
+    assert main([str(tmp_path)]) == 2
+    assert "record.json: expected a record in JSON" in capsys.readouterr().err
+    assert not (tmp_path / "table.md").exists()
+
+
+def test_the_same_run_twice_is_refused(tmp_path):
+    """Would catch a copied folder that counts as a second seed and halves the spread."""
+    for name in ("a", "b"):
+        files.write(make(), tmp_path / name / "record.json")
+    with pytest.raises(InputError, match="the same run as"):
+        tables.load(tmp_path)
+
+
+def test_python_dash_m_runs():
+    """Would catch a package that cannot be run, and one that imports torch to say so."""
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "gsbench.report", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "RESULTS_DIR" in done.stdout
+    assert "| torch\n" not in done.stderr

@@ -1,0 +1,146 @@
+"""The command line as a user meets it: help, one run, sweeps, and everything that can be typed wrong."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tiny_run import ROOT, gsbench, overrides, write_moving_square
+
+from gsbench.measure import record
+
+
+def test_help_lists_what_there_is_without_torch() -> None:
+    """Catches a help text that pays for importing torch, or does not name models, experiments and scenes."""
+    code = (
+        "import sys; sys.argv = ['gsbench', '--help']\n"
+        "from gsbench.__main__ import main\n"
+        "try: main()\n"
+        "finally: sys.stderr.write('torch imported' if 'torch' in sys.modules else 'no torch')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert "no torch" in done.stderr
+    for word in ("7dgs_noagr", "dnerf", "mini", "pbr", "suzanne", "agr=true|false"):
+        assert word in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["+exp=mini", "model=7dg"], ["model '7dg'", "Did you mean '7dgs'"]),
+        (["+exp=dnrf"], ["exp 'dnrf'", "Did you mean 'dnerf'"]),
+        (["+exp=mini", "scene=suzane"], ["scene 'suzane'", "Did you mean 'suzanne'"]),
+        (["+exp=mini", "train.iteratons=5"], ["train.iteratons", "Did you mean 'iterations'"]),
+        (["+exp=mini", "trian.iterations=5"], ["trian", "Did you mean 'train'"]),
+        (["+exp=mini", "train.iterations=many"], ["train.iterations", "many"]),
+        (["+exp=mini", "train.iterations=0"], ["train.iterations", "at least 1"]),
+        (["+exp=mini", "device=gpu"], ["device 'gpu'", "Valid: cpu, cuda"]),
+        (["+exp=mini", "device=cuda:99"], ["device 'cuda:99'", "device=cpu"]),
+        (["+exp=mini", "raster.backend=refrence"], ["backend 'refrence'", "Did you mean 'reference'"]),
+        (["+exp=mini", "data.background=grey"], ["data.background 'grey'", "black, white"]),
+        (["+exp=mini", "scene.eval_split=tset"], ["eval_split 'tset'", "Did you mean 'test'"]),
+        (["+exp=mini", "model.options.schem=schur"], ["option 'schem'", "Did you mean 'scheme'"]),
+        (["+exp=mini", "model.options.scheme=shur"], ["scheme 'shur'", "Did you mean 'schur'"]),
+        (["+exp=mini", "scene.downscale=7"], ["downscale", "7"]),
+        (["model=7dgs"], ["+exp=NAME", "dnerf, mini, pbr"]),
+        (["+exp=dnerf"], ["data.root", "transforms_", "albertpumarola/D-NeRF"]),
+        (["+exp=dnerf", "scene=trex", "data.root=/nowhere"], ["/nowhere/trex", "transforms_", "D-NeRF"]),
+        (["+exp=mini", "scene=custom", "scene.name=../sample"], ["scene: expected a name", "../sample"]),
+    ],
+)
+def test_what_is_typed_wrong_is_told_in_one_line(arguments: list[str], expected: list[str], tmp_path: Path) -> None:
+    """Catches a stack trace, or a message that does not name the key, the nearest valid one, or what to do."""
+    done = gsbench(*arguments, *([f"results={tmp_path}"] if "+exp" in arguments[0] else []))
+    assert done.returncode != 0
+    errors = [line for line in done.stderr.splitlines() if line.startswith("gsbench: error:")]
+    assert errors, done.stderr
+    assert "Traceback" not in done.stderr
+    for part in expected:
+        assert part in errors[0]
+    assert not list(tmp_path.rglob("record.json"))
+
+
+@pytest.fixture(scope="module")
+def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_square(tmp_path_factory.mktemp("data"))
+
+
+def test_a_sweep_writes_a_record_a_run_and_keeps_what_is_finished(square: Path, tmp_path: Path) -> None:
+    """Catches runs that overwrite each other, AGR that cannot be switched, and finished runs that are done again."""
+    sweep = ["-m", *overrides(square, tmp_path), "model=4dgs,3dgs", "agr=true,false"]
+    first = gsbench(*sweep)
+    assert first.returncode == 0, first.stderr
+    found = {p.parent.parent.name: record.read(p) for p in record.find(tmp_path)}
+    assert set(found) == {"3dgs", "3dgs_agr", "4dgs", "4dgs_agr"}
+    for label, one in found.items():
+        assert one.status == "ok"
+        assert one.effects.refinement == label.endswith("_agr")
+        assert one.effects.time == label.startswith("4dgs")
+        assert one.metrics is not None
+        assert one.cost is not None
+        assert len(one.curve) == 2
+        assert one.metrics["psnr"] is not None
+        assert set(one.cost.stage_s) >= {"slice", "raster", "loss", "backward", "optimizer"}
+        assert (tmp_path / "dnerf" / "square" / label / "seed0" / "pictures.png").is_file()
+    written = {p: p.stat().st_mtime_ns for p in record.find(tmp_path)}
+    again = gsbench(*sweep)
+    assert again.returncode == 0
+    assert again.stdout.count("finished before, kept") == 4
+    assert {p: p.stat().st_mtime_ns for p in record.find(tmp_path)} == written
+
+
+def test_a_changed_config_runs_again_and_says_so(square: Path, tmp_path: Path) -> None:
+    """Catches a result of another config that is passed off as this one's."""
+    gsbench(*overrides(square, tmp_path, "model=3dgs"))
+    again = gsbench(*overrides(square, tmp_path, "model=3dgs", "train.iterations=31"))
+    assert "running again" in again.stderr
+    (path,) = record.find(tmp_path)
+    assert record.read(path).curve[-1].iteration == 31
+
+
+def test_one_bad_scene_does_not_stop_the_others(tmp_path: Path) -> None:
+    """Catches an experiment that dies with its first broken scene, or hides it behind exit code 0."""
+    data = write_moving_square(tmp_path / "data")
+    write_moving_square(tmp_path / "data", "broken")
+    source = tmp_path / "data" / "broken" / "transforms_train.json"
+    content = json.loads(source.read_text())
+    content["frames"][0]["file_path"] = "./train/gone"
+    source.write_text(json.dumps(content))
+    arguments = [a for a in overrides(data, tmp_path / "results", "model=3dgs") if not a.startswith("scene.name")]
+    arguments = ["scene=all" if a == "scene=custom" else a for a in arguments]
+    done = gsbench(*[a if not a.startswith("data.scenes") else "data.scenes=[broken,square]" for a in arguments])
+    assert done.returncode == 1
+    assert "gsbench: error: broken: " in done.stderr
+    assert "gone" in done.stderr
+    assert [p.parts[-4] for p in record.find(tmp_path / "results")] == ["square"]
+
+
+def test_a_scene_without_time_is_refused_by_models_of_time(tmp_path: Path) -> None:
+    """Catches a 4DGS fitted to a made-up time; 3DGS takes the same scene."""
+    data = write_moving_square(tmp_path / "data")
+    for source in (data / "square").glob("transforms_*.json"):
+        content = json.loads(source.read_text())
+        for frame in content["frames"]:
+            del frame["time"]
+        source.write_text(json.dumps(content))
+    refused = gsbench(*overrides(data, tmp_path / "r", "model=4dgs"))
+    assert refused.returncode == 1
+    assert "times" in refused.stderr
+    assert "use 3dgs or 6dgs" in refused.stderr
+    assert gsbench(*overrides(data, tmp_path / "r", "model=6dgs")).returncode == 0
+
+
+def test_divergence_ends_as_a_record_and_the_rest_goes_on(square: Path, tmp_path: Path) -> None:
+    """Catches a diverged run that is lost, hidden, or takes the sweep with it: one line, a record, exit code 1."""
+    sweep = ["-m", *overrides(square, tmp_path), "model=3dgs", "seed=0,1"]
+    done = gsbench(*sweep, "model.lr.scales.start=1e30")
+    assert done.returncode == 1
+    found = [record.read(path) for path in record.find(tmp_path)]
+    assert len(found) == 2
+    for one in found:
+        assert one.status == "diverged"
+        assert one.reason is not None
+        assert one.reason.startswith("step 1: factors")
+        assert one.metrics is None
+    assert done.stderr.count("gsbench: error: square: diverged: step 1: factors") == 2

@@ -1,0 +1,61 @@
+"""A run small enough for a test: a data set of a few pixels, a config of a few steps, the command line around it."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+SIZE = 16
+COUNTS = {"train": 6, "val": 2, "test": 2}
+
+
+def write_moving_square(root: Path, name: str = "square") -> Path:
+    """Write a data set with one scene, a white square that moves with time, seen from cameras on a circle."""
+    import json
+
+    for split, count in COUNTS.items():
+        frames = []
+        for i in range(count):
+            time, angle = i / (count - 1), 2 * np.pi * i / count
+            image = np.zeros((SIZE, SIZE, 4), np.uint8)
+            left = 3 + round(5 * time)
+            image[5:11, left : left + 5] = 255
+            path = root / name / split / f"r_{i}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(path), image)
+            c, s = np.cos(angle), np.sin(angle)
+            matrix = [[c, 0, s, 4 * s], [0, 1, 0, 0], [-s, 0, c, 4 * c], [0, 0, 0, 1]]
+            frames.append({"file_path": f"./{split}/r_{i}", "time": time, "transform_matrix": matrix})
+        content = {"camera_angle_x": 0.7, "frames": frames}
+        (root / name / f"transforms_{split}.json").write_text(json.dumps(content))
+    return root
+
+
+def overrides(data: Path, results: Path, *more: str) -> list[str]:
+    """The overrides of a run of 30 steps on that data set."""
+    return [
+        "+exp=dnerf", f"data.root={data}", "data.scenes=[square]", "scene=custom", "scene.name=square",
+        "scene.downscale=1", "data.initial_points=40", "train.iterations=30", "train.batch_size=2",
+        "train.curve_points=2", f"results={results}", *more,
+    ]  # fmt: skip
+
+
+def environment() -> dict[str, str]:
+    """One thread: tests share the machine, and the sums of a run are those of its thread count."""
+    return {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
+
+
+def command(*arguments: str) -> list[str]:
+    """`python -m gsbench` with arguments."""
+    return [sys.executable, "-m", "gsbench", *arguments]
+
+
+def gsbench(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line to its end."""
+    return subprocess.run(
+        command(*arguments), capture_output=True, text=True, timeout=240, cwd=ROOT, env=environment(), check=False
+    )

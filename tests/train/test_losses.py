@@ -1,0 +1,58 @@
+"""The training loss against scikit-image, finite differences and its own definition."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.signal import convolve2d
+from torch import Tensor
+
+from gsbench.train.losses import photometric, structural_similarity
+
+
+def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
+    random = torch.Generator().manual_seed(height * 1000 + width)
+    return (
+        torch.rand(height, width, 3, generator=random, dtype=torch.float64),
+        torch.rand(height, width, 3, generator=random, dtype=torch.float64),
+    )
+
+
+def ssim_by_numpy(a: np.ndarray, b: np.ndarray) -> float:
+    x = np.arange(11) - 5
+    kernel = np.exp(-(x**2) / (2 * 1.5**2))
+    window = np.outer(kernel, kernel) / kernel.sum() ** 2
+    total = []
+    for c in range(3):
+        blur = [convolve2d(p, window, mode="same") for p in
+                (a[..., c], b[..., c], a[..., c] ** 2, b[..., c] ** 2, a[..., c] * b[..., c])]  # fmt: skip
+        ma, mb, aa, bb, ab = blur
+        top = (2 * ma * mb + 1e-4) * (2 * (ab - ma * mb) + 9e-4)
+        total.append(top / ((ma**2 + mb**2 + 1e-4) * (aa - ma**2 + bb - mb**2 + 9e-4)))
+    return float(np.mean(total))
+
+
+@pytest.mark.parametrize("size", [(11, 11), (17, 33), (1, 1), (5, 40)])
+def test_ssim_is_the_definition(size: tuple[int, int]) -> None:
+    """Catches a wrong window, padding or constant: a direct 2D convolution in numpy, zero padded, is the truth."""
+    a, b = pair(*size)
+    assert structural_similarity(a, b).item() == pytest.approx(ssim_by_numpy(a.numpy(), b.numpy()), rel=1e-10)
+
+
+def test_identical_pictures_cost_nothing() -> None:
+    """Catches a constant term in the loss."""
+    a, _ = pair(20, 20)
+    assert photometric(a, a, 0.2).item() == pytest.approx(0, abs=1e-12)
+
+
+def test_weights() -> None:
+    """Catches swapped or missing weights: (1 - w) L1 + w (1 - SSIM), 3DGS eq. 7."""
+    a, b = pair(20, 24)
+    l1, ssim = (a - b).abs().mean().item(), structural_similarity(a, b).item()
+    for w in (0.0, 0.2, 1.0):
+        assert photometric(a, b, w).item() == pytest.approx((1 - w) * l1 + w * (1 - ssim), rel=1e-12)
+
+
+def test_gradient() -> None:
+    """Catches a detached term: the gradient is that of finite differences."""
+    a, b = pair(12, 13)
+    assert torch.autograd.gradcheck(lambda x: photometric(x, b, 0.2), (a.requires_grad_(),))

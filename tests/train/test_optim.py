@@ -1,0 +1,121 @@
+"""Learning rates, and Adam's moments when Gaussians come and go."""
+
+import copy
+import math
+
+import pytest
+import torch
+
+from gsbench.config import DensifyConfig, LearningRate, ModelConfig
+from gsbench.errors import InputError
+from gsbench.models import GaussianModel, build
+from gsbench.raster import RasterInfo
+from gsbench.scenes.points import random_points
+from gsbench.train.density import DensityControl
+from gsbench.train.optim import Optimizer, rate_at
+
+RATES = {name: LearningRate(1e-2) for name in ("means", "scales", "quats", "opacities", "sh0", "shN")}
+
+
+def fitted(count: int = 20, rates: dict[str, LearningRate] = RATES) -> tuple[GaussianModel, Optimizer]:
+    model = build("3dgs")
+    random = torch.Generator().manual_seed(0)
+    model.initialise(random_points(count, 1.0, random), extent=2.0, generator=random)
+    return model, Optimizer(model, ModelConfig("3dgs", lr=rates), extent=2.0, iterations=100)
+
+
+def descend(model: GaussianModel, optimizer: Optimizer, step: int) -> None:
+    loss = sum((p * (i + 1)).square().sum() for i, p in enumerate(model.splats.values()))
+    assert isinstance(loss, torch.Tensor)
+    loss.backward()
+    optimizer.step(step)
+
+
+def test_rate_is_log_linear() -> None:
+    """Catches a linear or stepwise decay: half way, the rate is the geometric mean (3DGS' xyz rate)."""
+    rate = LearningRate(1.6e-4, 1.6e-6, per_extent=True)
+    assert rate_at(rate, 0, 5) == pytest.approx(8e-4)
+    assert rate_at(rate, 0.5, 5) == pytest.approx(8e-5)
+    assert rate_at(rate, 1, 5) == pytest.approx(8e-6)
+    assert rate_at(LearningRate(0.05), 0.7, 5) == 0.05
+    assert math.isclose(rate_at(LearningRate(0.0), 0.7, 5), 0.0)
+
+
+def test_a_copied_gaussian_does_not_inherit_momentum() -> None:
+    """Catches moments left at the wrong rows: kept rows keep theirs, in the new order, fresh ones start at zero."""
+    model, optimizer = fitted()
+    for step in range(3):
+        descend(model, optimizer, step)
+    before = copy.deepcopy({n: optimizer.adam.state[p]["exp_avg"] for n, p in model.splats.items()})
+    rows = torch.tensor([5, 3, 3, 19])
+    model.select(rows)
+    optimizer.follow(model, rows, fresh=torch.tensor([False, False, True, False]))
+    for name, parameter in model.splats.items():
+        moments = optimizer.adam.state[parameter]["exp_avg"]
+        assert moments.shape == parameter.shape
+        torch.testing.assert_close(moments[[0, 1, 3]], before[name][[5, 3, 19]], rtol=0, atol=0)
+        assert not moments[2].any()
+    descend(model, optimizer, 3)  # and Adam still steps
+
+
+def test_rates_and_parameters_must_match() -> None:
+    """Catches a parameter that silently never learns, and a misspelt rate that silently does nothing."""
+    with pytest.raises(InputError, match="'quats' has none"):
+        fitted(rates={n: r for n, r in RATES.items() if n != "quats"})
+    with pytest.raises(InputError, match=r"no 'sacles'.*Did you mean 'scales'"):
+        fitted(rates={**RATES, "sacles": LearningRate(1.0)})
+
+
+def info_with_gradient(gradients: torch.Tensor) -> RasterInfo:  # [N, 2]
+    means2d = torch.zeros(1, *gradients.shape)
+    means2d.grad = gradients[None]
+    radii = torch.ones(1, len(gradients), dtype=torch.int32)
+    return RasterInfo(radii, means2d, torch.ones(1, len(gradients)), 0)
+
+
+def test_density_control_clones_small_splits_large_prunes_faint() -> None:
+    """Catches a wrong criterion or count of any of the three, and a gradient in pixels instead of half pictures."""
+    model, optimizer = fitted(6)
+    descend(model, optimizer, 0)
+    control = DensityControl(model, optimizer, DensifyConfig(grad_threshold=1.0), min_opacity=0.01)
+    with torch.no_grad():
+        model.splats["scales"].fill_(math.log(0.001))  # small: below 0.01 x extent 2
+        model.splats["scales"][3:5] = math.log(0.1)  # large
+        model.splats["opacities"].fill_(0.0)
+        model.splats["opacities"][5] = -6.0  # sigmoid is 0.0025
+        model.splats["means"].copy_(torch.arange(6.0)[:, None].expand(6, 3))
+    gradients = torch.zeros(6, 2)
+    gradients[[0, 3]] = torch.tensor([0.03, 0.0])  # x 100 / 2 pixels x 1 view = 1.5 > 1
+    gradients[1] = torch.tensor([0.0, 0.03])  # x 50 / 2 = 0.75 < 1
+    control.observe(info_with_gradient(gradients), width=100, height=50, views=1)
+    control.densify(torch.Generator().manual_seed(1), prune_large=False)
+    means = model.splats["means"].detach()[:, 0]
+    assert len(model) == 7  # 1, 2, 4 kept; 0 cloned to two; 3 split in two; 5 pruned
+    assert means[:5].tolist() == [0, 1, 2, 4, 0]
+    assert (model.splats["scales"][5:] < math.log(0.1) - math.log(1.59)).all()
+    assert control.gradient.shape == (7,)
+    assert not control.gradient.any()
+    descend(model, optimizer, 1)
+
+
+def test_large_gaussians_are_pruned_only_when_asked() -> None:
+    """Catches pruning by size before the first opacity reset."""
+    model, optimizer = fitted(4)
+    with torch.no_grad():
+        model.splats["scales"].fill_(math.log(0.1))
+        model.splats["scales"][0] = math.log(0.3)  # above 0.1 x extent 2
+    control = DensityControl(model, optimizer, DensifyConfig(), min_opacity=0.01)
+    control.densify(torch.Generator(), prune_large=False)
+    assert len(model) == 4
+    control.densify(torch.Generator(), prune_large=True)
+    assert len(model) == 3
+
+
+def test_opacity_reset_forgets_momentum() -> None:
+    """Catches momentum that undoes the reset in the next steps, and a reset to below what is pruned."""
+    model, optimizer = fitted(4)
+    descend(model, optimizer, 0)
+    control = DensityControl(model, optimizer, DensifyConfig(), min_opacity=0.01)
+    control.reset_opacities()
+    assert torch.sigmoid(model.splats["opacities"]).max().item() == pytest.approx(0.02)
+    assert not optimizer.adam.state[model.splats["opacities"]]["exp_avg"].any()

@@ -1,0 +1,84 @@
+"""The recipe's steps at any length of run, and the order of views."""
+
+import pytest
+
+from gsbench.config import DensifyConfig, TrainConfig
+from gsbench.train.schedule import STEPS_BETWEEN_RESETS, Schedule, batch, generator
+
+
+def schedule(iterations: int, batch_size: int = 4) -> Schedule:
+    return Schedule(TrainConfig(iterations=iterations, batch_size=batch_size), sh_degree=3, agr=True)
+
+
+def test_full_run_is_the_recipe_as_published() -> None:
+    """Catches an off-by-one in any step of the 30,000-iteration run: 3DGS' and 7DGS' own numbers."""
+    s = schedule(30_000)
+    densified = [step + 1 for step in range(30_000) if s.densifies(step)]
+    assert densified == list(range(600, 15_001, 100))
+    assert [step + 1 for step in range(30_000) if s.resets(step)] == [3_000, 6_000, 9_000, 12_000]
+    assert [s.stage(step).sh_degree for step in (0, 999, 1_000, 2_999, 3_000, 29_999)] == [0, 0, 1, 2, 3, 3]
+    assert not s.stage(2_999).refine
+    assert s.stage(3_000).refine
+    assert not s.stage(14_999).tune_modulation
+    assert s.stage(15_000).tune_modulation
+
+
+@pytest.mark.parametrize("iterations", [200, 1_000, 7_000, 12_345])
+def test_short_run_keeps_the_proportions(iterations: int) -> None:
+    """Catches a step that does not scale: each happens at the same part of the run as in the recipe."""
+    short = schedule(iterations)
+    for recipe in (500, 1_000, 3_000, 15_000):
+        assert short.scaled(recipe) == max(1, round(recipe / 30_000 * iterations))
+    assert short.stage(iterations - 1).sh_degree == 3
+    assert short.stage(iterations - 1).refine
+    assert short.densify_stop == iterations // 2 or iterations % 2
+
+
+def test_intervals_never_fall_below_what_they_wait_for() -> None:
+    """Catches densification from a handful of gradients, and opacity resets faster than Adam can recover from."""
+    s = schedule(600, batch_size=2)
+    assert s.densify_every * 2 >= 50
+    assert s.reset_every == STEPS_BETWEEN_RESETS
+    resets = [step for step in range(600) if s.resets(step)]
+    assert all(step + 1 + s.reset_every // 2 <= s.densify_stop for step in resets)
+
+
+def test_agr_never_acts_where_it_is_off() -> None:
+    """Catches a schedule that refines a model without AGR."""
+    s = Schedule(TrainConfig(iterations=100), sh_degree=3, agr=False)
+    assert not any(s.stage(step).refine for step in range(100))
+
+
+@pytest.mark.parametrize(("iterations", "points"), [(1_000, 10), (7, 3), (5, 20), (100, 1)])
+def test_curve_has_its_points_and_ends_at_the_last_step(iterations: int, points: int) -> None:
+    """Catches a curve that misses the final iteration or has another number of points than asked for."""
+    s = Schedule(TrainConfig(iterations=iterations, curve_points=points), sh_degree=3, agr=False)
+    steps = [step for step in range(iterations) if s.measures(step)]
+    assert steps[-1] == iterations - 1
+    assert len(steps) == min(points, iterations)
+
+
+def test_every_view_is_seen_once_an_epoch() -> None:
+    """Catches sampling with replacement, and batches that lose views where an epoch ends within them."""
+    seen = [view for step in range(35) for view in batch(step, 7, 3, seed=1)]
+    for epoch in range(15):
+        assert sorted(seen[7 * epoch : 7 * epoch + 7]) == list(range(7))
+    assert seen[:7] != seen[7:14]
+
+
+def test_batches_depend_on_seed_and_step_alone() -> None:
+    """Catches hidden state in the order of views, which a resumed run would not have."""
+    assert batch(12, 60, 4, seed=3) == batch(12, 60, 4, seed=3)
+    assert any(batch(k, 60, 4, seed=3) != batch(k, 60, 4, seed=4) for k in range(3))
+
+
+def test_streams_of_different_purposes_differ() -> None:
+    """Catches seeds that collide: (0, 1) and (1, 0), or a stream reused for another purpose."""
+    first = {generator(*key).initial_seed() for key in [(0,), (1,), (0, 0), (0, 1), (1, 0), (0, 1, 0)]}
+    assert len(first) == 6
+
+
+def test_densify_config_is_the_published_one() -> None:
+    """Catches a silent change of the published thresholds."""
+    d = DensifyConfig()
+    assert (d.grad_threshold, d.clone_below, d.prune_above) == (2e-4, 0.01, 0.1)
