@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from tiny_run import ROOT, environment, gsbench, overrides, write_moving_square
+from tiny_run import ROOT, gsbench, overrides, write_moving_square
 
 from gsbench.measure import record
 
@@ -99,7 +99,7 @@ def test_a_changed_config_runs_again_and_says_so(square: Path, tmp_path: Path) -
     assert record.read(path).curve[-1].iteration == 31
 
 
-def test_one_bad_scene_does_not_stop_the_others(square: Path, tmp_path: Path) -> None:
+def test_one_bad_scene_does_not_stop_the_others(tmp_path: Path) -> None:
     """Catches an experiment that dies with its first broken scene, or hides it behind exit code 0."""
     data = write_moving_square(tmp_path / "data")
     write_moving_square(tmp_path / "data", "broken")

@@ -22,15 +22,11 @@ def triangular(
     """
     n = log_diagonal.shape[-1]
     diagonal = log_diagonal.exp()
-    i, j = torch.tril_indices(n, n, -1, device=log_diagonal.device)
-    if row_scaled:
-        off_diagonal = (2 * torch.sigmoid(off_diagonal) - 1) * diagonal[:, i]
-    # One gather fills the matrix from [0, diagonal, off-diagonal].
-    where = torch.zeros(n, n, dtype=torch.long, device=log_diagonal.device)
-    where.diagonal().copy_(torch.arange(1, n + 1))
-    where[i, j] = torch.arange(n + 1, n + 1 + len(i), device=where.device)
-    entries = torch.cat([torch.zeros_like(diagonal[:, :1]), diagonal, off_diagonal], -1)
-    return entries[:, where]
+    rows = []
+    for i, (below, d) in enumerate(zip(off_diagonal.split(list(range(n)), -1), diagonal.split(1, -1), strict=True)):
+        entries = (2 * torch.sigmoid(below) - 1) * d if row_scaled else below
+        rows.append(F.pad(torch.cat([entries, d], -1), (0, n - 1 - i)))
+    return torch.stack(rows, 1)
 
 
 def triangular_parameters(factor: Tensor, *, row_scaled: bool = False) -> tuple[Tensor, Tensor]:

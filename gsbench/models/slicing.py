@@ -80,10 +80,10 @@ def check_scheme(scheme: str) -> None:
 
 
 def slice_reduced(mean: Tensor, reduced: Reduced, query: Tensor) -> Slice:
-    """`slice_gaussians` for a factor that is [T_qq 0; T_pq T_pp] already: no reduction, the cheapest form there is."""
-    gain = gain_of(reduced.T_pq, reduced.T_qq)
-    moved = mean[:, :3] + (gain * (query - mean[:, 3:])[..., None, :]).sum(-1)
-    return Slice(moved, reduced.T_pp, gain)
+    """`slice_gaussians` for a factor that is [T_qq 0; T_pq T_pp] already: mean = mu_p + T_pq (T_qq^-1 (q - mu_q))."""
+    white = whiten(reduced.T_qq, query - mean[:, 3:])
+    moved = mean[:, :3] + (reduced.T_pq * white[:, None]).sum(-1)
+    return Slice(moved, reduced.T_pp, gain_of(reduced.T_pq, reduced.T_qq))
 
 
 def reduce(factor: Tensor) -> Reduced:
@@ -99,11 +99,21 @@ def mahalanobis(rows: Tensor, delta: Tensor) -> Tensor:
     This is the exponent of f_temp and f_dir (7DGS eq. 11 and 12): R R^T is the marginal block S_t or S_d.
     """
     T, _ = triangularise(rows, rows.shape[1])
-    white: list[Tensor] = []  # T^-1 delta, by forward substitution
-    for i in range(rows.shape[1]):
-        known = sum((T[:, i, j] * white[j] for j in range(i)), start=torch.zeros_like(delta[:, i]))
-        white.append((delta[:, i] - known) / T[:, i, i])
-    return torch.stack(white, -1).square().sum(-1)
+    return whiten(T, delta).square().sum(-1)
+
+
+def whiten(T: Tensor, delta: Tensor) -> Tensor:
+    """T^-1 delta for lower triangular T, [N, m, m] and [N, m] -> [N, m], by forward substitution.
+
+    The squares of its first i entries add up to the Mahalanobis distance of the first i variables alone.
+    """
+    rows = T.unbind(1)
+    white: list[Tensor] = []
+    for i, residual in enumerate(delta.unbind(-1)):
+        for j, known in enumerate(white):
+            residual = residual - rows[i][:, j] * known
+        white.append(residual / rows[i][:, i])
+    return torch.stack(white, -1)
 
 
 def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:

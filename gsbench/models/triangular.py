@@ -10,12 +10,13 @@ from torch import Tensor
 from gsbench.errors import InputError, did_you_mean
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
 from gsbench.models.factors import triangular, triangular_parameters
-from gsbench.models.slicing import Reduced, check_scheme, gain_of, mahalanobis, reduce, slice_gaussians, slice_reduced
+from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.scene import Points
 
 # Where position, time and direction stand among the rows of the triangular factor.
 FACTOR_ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
 WIDTH = {"p": 3, "t": 1, "d": 3}
+EXPONENT_MAX = 80.0  # exp(-80) = 2e-35: beyond, f is 0
 TIME_CORRELATION = 0.05  # split in time where |S_pt| is above this part of the scene's extent ..
 TIME_SCALE = 0.25  # .. and sqrt(S_t) above this part of the clip (7DGS, section 4.4)
 
@@ -80,19 +81,25 @@ class TriangularModel(GaussianModel):
     def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
         """Slice at d = the unit vector from the camera to mu_p, and t (7DGS, algorithm 1)."""
         factor = self.factors(raw)
-        query = unit(raw["means"] - camera_center)
         mean = torch.cat([raw["means"], raw["directions"]], -1)
-        exponent = (1 if self.directional_half else 2) * self.modulation("direction") * mahalanobis(
-            factor[:, 3:6], query - raw["directions"])  # fmt: skip
+        query = unit(raw["means"] - camera_center)
         if time is not None and "time" in self.observes:
-            query = torch.cat([query, time.expand(len(query), 1)], -1)
             mean = torch.cat([mean, raw["times"]], -1)
-            exponent = exponent + self.modulation("time") * mahalanobis(factor[:, 6:], time - raw["times"])
-        if self.is_reduced:
-            mean3, factor3, _ = slice_reduced(mean, self._blocks(factor), query)
+            query = torch.cat([query, time.expand(len(query), 1)], -1)
+        reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
+        delta = query - mean[:, 3:]
+        # A Gaussian so far from the query that nothing is left of it is left out of what follows, lest its huge
+        # numbers reach a gradient as 0 x inf: it stays at mu_p, gated to zero.
+        with torch.no_grad():
+            seen = self._exponent(reduced.T_qq, delta, whiten(reduced.T_qq, delta)) < EXPONENT_MAX
+        delta = torch.where(seen[:, None], delta, 0.0)
+        white = whiten(reduced.T_qq, delta)
+        gate = torch.where(seen, torch.exp(-self._exponent(reduced.T_qq, delta, white)), 0.0)
+        if self.scheme == "square_root":
+            means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
-            mean3, factor3, _ = slice_gaussians(mean, factor, query, scheme=self.scheme)
-        return Conditioned(mean3, factor3, torch.exp(-0.5 * exponent))
+            means, factors, _ = slice_gaussians(mean, factor, query, scheme=self.scheme)
+        return Conditioned(means, factors, gate)
 
     def scales(self) -> Tensor:
         """Largest standard deviation of the sliced Gaussian, which is the same at every t and d."""
@@ -128,6 +135,15 @@ class TriangularModel(GaussianModel):
         """The triangular factor with its rows sorted to (p, d, t), [N, n, n]."""
         L = triangular(raw["log_diagonal"], raw["off_diagonal"], row_scaled=self.row_scaled)
         return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
+
+    def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
+        """-ln(f_dir f_temp) = 1/2 (lambda_d |white_d|^2 + lambda_t (t - mu_t)^2 / S_t), [N] (7DGS eq. 11 and 12)."""
+        half = 0.5 if self.directional_half else 1.0
+        exponent = half * self.modulation("direction") * white[:, :3].square().sum(-1)
+        if "time" in self.observes:
+            distance = delta[:, 3] / T_qq[:, 3].norm(dim=-1)  # in standard deviations, sqrt(S_t)
+            exponent = exponent + 0.5 * self.modulation("time") * distance.square()
+        return exponent
 
     def _blocks(self, factor: Tensor) -> Reduced:
         """The factor of `conditioned_first` as what it is: reduced already, its first columns those of q."""

@@ -186,6 +186,14 @@ def test_what_is_no_record_is_refused(tmp_path, text):
     refused(path)
 
 
+def test_a_key_that_appears_twice_is_refused(tmp_path):
+    """Would catch a record with two seeds, of which readers pick one each."""
+    path = tmp_path / "record.json"
+    files.write(make(), path)
+    path.write_text(path.read_text().replace('"seed": 0', '"seed": 0, "seed": 1'))
+    refused(path, "twice")
+
+
 def test_a_missing_file_and_a_folder_are_refused(tmp_path):
     """Would catch an OSError that reaches the user."""
     refused(tmp_path / "record.json")

@@ -1,4 +1,4 @@
-"""Makes golden/table.md: run it after a change that is meant, and read the difference before committing it.
+"""Makes the golden pages: run it after a change that is meant, and read the difference before committing it.
 
     python tests/report/make_golden.py
 
@@ -14,6 +14,7 @@ from gsbench.measure.speed import RenderTimes
 from gsbench.report import layout, tables
 
 GOLDEN = Path(__file__).parent / "golden" / "table.md"
+GOLDEN_TERMINAL = GOLDEN.with_suffix(".txt")
 EFFECTS = {
     "3dgs": Effects(time=False, direction=False, refinement=False),
     "4dgs": Effects(time=True, direction=False, refinement=False),
@@ -92,4 +93,4 @@ def records() -> list[Record]:
 if __name__ == "__main__":
     GOLDEN.parent.mkdir(exist_ok=True)
     GOLDEN.write_text(layout.markdown(tables.build(records())))
-    print(layout.terminal(tables.build(records())))
+    GOLDEN_TERMINAL.write_text(layout.terminal(tables.build(records())))

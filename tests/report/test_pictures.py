@@ -48,6 +48,16 @@ def test_the_error_does_not_depend_on_its_sign_or_its_neighbours():
     assert (plus == beside).all()
 
 
+def test_the_error_is_the_mean_over_channels():
+    """Would catch a maximum: an error in one channel is a third of the same error in all."""
+    truth = np.zeros((4, 300, 3))
+    one, every = truth.copy(), truth + 0.05
+    one[..., 0] = 0.15
+    assert (
+        cells(pictures.strip([(one, truth)]), 4, 300)[2] == cells(pictures.strip([(every, truth)]), 4, 300)[2]
+    ).all()
+
+
 def test_small_images_are_enlarged_without_smoothing():
     """Would catch interpolated pixels: every pixel of a 100-wide image becomes 3 x 3 equal ones."""
     image = np.random.default_rng(0).random((5, 100, 3))

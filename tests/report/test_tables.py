@@ -6,7 +6,7 @@ import sys
 
 import pandas as pd
 import pytest
-from make_golden import GOLDEN, make, records
+from make_golden import GOLDEN, GOLDEN_TERMINAL, make, records
 
 from gsbench.errors import InputError
 from gsbench.measure import record as files
@@ -32,6 +32,7 @@ def failed(**changes: object) -> files.Record:
 def test_the_golden_page():
     """Would catch any change of the page nobody meant. If it is meant: run make_golden.py and read the difference."""
     assert page(*records()) == GOLDEN.read_text()
+    assert layout.terminal(tables.build(records())) == GOLDEN_TERMINAL.read_text()
 
 
 def test_no_run_is_dropped():
@@ -93,7 +94,7 @@ def trex(dataset: str = "D-NeRF", model: str = "7dgs", scene: str = "trex", **ch
 
 def test_the_papers_row_stands_beside_its_own_scene():
     """Would catch the paper's numbers in wrong columns or units: trex is 30.72 dB, 63.4 min, 67994 Gaussians."""
-    text = page(trex())
+    text = page(trex(), make(scene="invented", dataset="D-NeRF"))
     assert "| paper (1) | 30.72 | 0.980 | 0.018 (2) | 63.4 | 156.5 | 67994 |" in text
     assert "other data" not in text
 
