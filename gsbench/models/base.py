@@ -160,6 +160,16 @@ class GaussianModel(nn.Module, ABC):
             raw[name] = raw[name] + residual
         return raw
 
+    def modulate(self, name: str, value: float) -> None:
+        """Give the model lambda_t (`time`) or lambda_d (`direction`), at `value` to begin with.
+
+        Raises:
+            InputError: `value` is not a positive number.
+        """
+        if not isinstance(value, int | float) or not 0 < value < math.inf:
+            raise InputError(f"lambda_{name[0]}: expected a positive number, got {value}")
+        self.log_modulation[name] = nn.Parameter(torch.tensor(math.log(value)))
+
     def modulation(self, name: str) -> Tensor:
         """lambda_t or lambda_d of `log_modulation`, positive by exp, []."""
         return self.log_modulation[name].exp()
@@ -246,7 +256,7 @@ def build(name: str, **options: Any) -> GaussianModel:
     Every module of `gsbench.models` is imported first, so that a new model is one new file in that folder.
 
     Raises:
-        InputError: no such model, or an option it does not have.
+        InputError: no such model, an option it does not have, or one that it needs and did not get.
     """
     package = importlib.import_module("gsbench.models")
     for module in pkgutil.iter_modules(package.__path__):
@@ -256,8 +266,11 @@ def build(name: str, **options: Any) -> GaussianModel:
     model = _REGISTRY[name]
     # A constructor passes on what it does not name itself: its options are those of all classes it stands on.
     signatures = [inspect.signature(cls.__init__) for cls in model.__mro__ if issubclass(cls, GaussianModel)]
-    known = [p.name for s in signatures for p in s.parameters.values() if p.kind is p.KEYWORD_ONLY]
+    known = {p.name: p.default for s in signatures for p in s.parameters.values() if p.kind is p.KEYWORD_ONLY}
     for option in options:
         if option not in known:
             raise InputError(f"model '{name}' has no option '{option}'. {did_you_mean(option, known)}")
+    for option, default in known.items():
+        if default is inspect.Parameter.empty and option not in options:
+            raise InputError(f"model '{name}' needs the option '{option}', which has no default")
     return model(**options)

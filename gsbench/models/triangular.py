@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
@@ -34,7 +34,6 @@ class TriangularModel(GaussianModel):
         self,
         *,
         lambda_d: float,
-        lambda_t: float | None = None,
         factor_order: str = "conditioned_first",
         scheme: str = "square_root",
         row_scaled: bool = False,
@@ -45,7 +44,6 @@ class TriangularModel(GaussianModel):
 
         Args:
             lambda_d: initial sensitivity of f_dir.
-            lambda_t: initial sensitivity of f_temp, of a model that observes time.
             factor_order: `paper`, the factor triangular over (p, t, d), or `conditioned_first`, over (d, t, p).
             scheme: of `slice_gaussians`.
             row_scaled: see `triangular`.
@@ -59,11 +57,7 @@ class TriangularModel(GaussianModel):
         if factor_order not in FACTOR_ORDERS:
             raise InputError(f"factor_order '{factor_order}' is not known. {did_you_mean(factor_order, FACTOR_ORDERS)}")
         check_scheme(scheme)
-        lambdas = {"direction": lambda_d} | ({} if lambda_t is None else {"time": lambda_t})
-        for name, value in lambdas.items():
-            if value <= 0:
-                raise InputError(f"lambda of {name}: expected a positive number, got {value}")
-            self.log_modulation[name] = nn.Parameter(torch.tensor(math.log(value)))
+        self.modulate("direction", lambda_d)
         self.scheme = scheme
         self.row_scaled = row_scaled
         self.directional_half = directional_half
