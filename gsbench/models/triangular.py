@@ -89,12 +89,13 @@ class TriangularModel(GaussianModel):
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
         delta = query - mean[:, 3:]
         # A Gaussian so far from the query that nothing is left of it is left out of what follows, lest its huge
-        # numbers reach a gradient as 0 x inf: it stays at mu_p, gated to zero.
+        # numbers reach a gradient as 0 x inf: it stays at mu_p, gated to zero, as if it were a unit one at the query.
         with torch.no_grad():
             seen = self._exponent(reduced.T_qq, delta, whiten(reduced.T_qq, delta)) < EXPONENT_MAX
         delta = torch.where(seen[:, None], delta, 0.0)
-        white = whiten(reduced.T_qq, delta)
-        gate = torch.where(seen, torch.exp(-self._exponent(reduced.T_qq, delta, white)), 0.0)
+        T_qq = torch.where(seen[:, None, None], reduced.T_qq, torch.eye(delta.shape[1]).to(delta))
+        white = whiten(T_qq, delta)
+        gate = torch.where(seen, torch.exp(-self._exponent(T_qq, delta, white)), 0.0)
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
