@@ -58,7 +58,7 @@ class GaussianModel(nn.Module, ABC):
     shape: ClassVar[tuple[str, ...]]  # .. and moves these, which make the factor
 
     def __init__(self, *, agr: bool = False, sh_degree: int = 3) -> None:
-        """Make a model without Gaussians; `initialise` or `load_state` gives it some.
+        """Make a model without Gaussians; `initialise` gives it some, `load_state` others.
 
         Raises:
             InputError: sh_degree is not 0, 1, 2 or 3.
