@@ -58,7 +58,7 @@ class GaussianModel(nn.Module, ABC):
     shape: ClassVar[tuple[str, ...]]  # .. and moves these, which make the factor
 
     def __init__(self, *, agr: bool = False, sh_degree: int = 3) -> None:
-        """Make a model without Gaussians; `initialise` or `load_state` gives it some.
+        """Make a model without Gaussians; `initialise` gives it some, `load_state` others.
 
         Raises:
             InputError: sh_degree is not 0, 1, 2 or 3.
@@ -218,15 +218,18 @@ class GaussianModel(nn.Module, ABC):
         Raises:
             InputError: the state is not this model's.
         """
-        rows = {name.removeprefix("splats."): value for name, value in state.items() if name.startswith("splats.")}
-        if set(rows) != set(self.splats) or len({len(value) for value in rows.values()}) != 1:
-            raise InputError(f"checkpoint: expected Gaussians with {sorted(self.splats)}, got {sorted(rows)}")
-        for name, value in rows.items():
-            self.splats[name].data = torch.empty_like(value, device=self.splats[name].device)
-        try:
-            self.load_state_dict(state)
-        except RuntimeError as error:
-            raise InputError(f"checkpoint: not of this model: {' '.join(str(error).split())}") from None
+        means = state.get("splats.means")
+        N = len(means) if isinstance(means, Tensor) and means.dim() else 0
+        own = {name: list(value.shape) for name, value in self.state_dict().items()}
+        expected = {name: [N, *shape[1:]] if name.startswith("splats.") else shape for name, shape in own.items()}
+        got = {name: list(value.shape) if isinstance(value, Tensor) else value for name, value in state.items()}
+        for name in sorted(expected.keys() | got.keys()):
+            if name not in expected or expected[name] != got.get(name):
+                raise InputError(f"checkpoint: not of this model: expected {name} of shape "
+                                 f"{expected.get(name, 'none')}, got {got.get(name, 'none')!s:.60}")  # fmt: skip
+        for name, parameter in self.splats.items():
+            parameter.data = torch.empty_like(state[f"splats.{name}"], device=parameter.device)
+        self.load_state_dict(state)
 
 
 def unit(vectors: Tensor) -> Tensor:

@@ -89,12 +89,13 @@ class TriangularModel(GaussianModel):
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
         delta = query - mean[:, 3:]
         # A Gaussian so far from the query that nothing is left of it is left out of what follows, lest its huge
-        # numbers reach a gradient as 0 x inf: it stays at mu_p, gated to zero.
+        # numbers reach a gradient as 0 x inf: it stays at mu_p, gated to zero, as if it were a unit one at the query.
         with torch.no_grad():
             seen = self._exponent(reduced.T_qq, delta, whiten(reduced.T_qq, delta)) < EXPONENT_MAX
         delta = torch.where(seen[:, None], delta, 0.0)
-        white = whiten(reduced.T_qq, delta)
-        gate = torch.where(seen, torch.exp(-self._exponent(reduced.T_qq, delta, white)), 0.0)
+        T_qq = torch.where(seen[:, None, None], reduced.T_qq, torch.eye(delta.shape[1]).to(delta))
+        white = whiten(T_qq, delta)
+        gate = torch.where(seen, torch.exp(-self._exponent(T_qq, delta, white)), 0.0)
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
@@ -120,10 +121,12 @@ class TriangularModel(GaussianModel):
         children = {"means": raw["means"] + torch.where(in_time, 0, (T_pp @ z[..., None])[..., 0])}
         T_pp = torch.where(in_time[..., None], T_pp, T_pp / SHRINK)
         if "time" in self.observes:
-            step = torch.where(in_time, z[:, :1], 0)  # in standard deviations of t
-            path = factor[:, :3] @ factor[:, 6:].mT / factor[:, 6:].norm(dim=-1, keepdim=True)  # S_pt / sqrt(S_t)
-            children["means"] = children["means"] + path[..., 0] * step
-            children["times"] = raw["times"] + factor[:, 6].norm(dim=-1, keepdim=True) * step
+            # z standard deviations along t, and what p and d are expected to be there: S_(p,d,t),t / sqrt(S_t)
+            path = (factor @ factor[:, 6, :, None])[..., 0] / factor[:, 6].norm(dim=-1, keepdim=True)
+            path = path * torch.where(in_time, z[:, :1], 0)
+            children["means"] = children["means"] + path[:, :3]
+            children["directions"] = raw["directions"] + path[:, 3:6]
+            children["times"] = raw["times"] + path[:, 6:]
             T_qq = torch.cat([T_qq[:, :-1], torch.where(in_time[..., None], T_qq[:, -1:] / SHRINK, T_qq[:, -1:])], 1)
         p_rows = torch.cat([gain @ T_qq, T_pp], -1)
         q_rows = torch.cat([T_qq, T_pp.new_zeros(len(T_qq), T_qq.shape[1], 3)], -1)
