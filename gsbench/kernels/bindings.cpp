@@ -256,6 +256,47 @@ void show_colors_backward(In<-1, -1, 3> sh0, In<-1, -1, 3> shN, In<-1, 3> means,
                                  {g_colors.data(), out_sh0.data(), out_shN.data(), out_means.data(), out_times.data()});
 }
 
+gsb::RefineArgs refine_args(const In<-1, -1>& features, const In<-1, -1>& weight_in, const In<-1>& bias_in,
+                            const In<-1, 64>& weight_out, const In<-1>& bias_out, const std::vector<int>& widths,
+                            int threads) {
+    const int64_t rows = size(widths.size()) * 64;
+    int64_t outputs = 0;
+    for (int width : widths) {
+        if (width < 1) throw std::invalid_argument("expected positive widths");
+        outputs += width;
+    }
+    expect_all(rows, "the hidden units", weight_in.shape(0), bias_in.shape(0));
+    expect_all(size(features.shape(1)), "the features", weight_in.shape(1));
+    expect_all(outputs, "the outputs", weight_out.shape(0), bias_out.shape(0));
+    const Frame frame(1, 1, threads);
+    return {size(features.shape(0)), static_cast<int>(features.shape(1)), static_cast<int>(widths.size()),
+            static_cast<int>(outputs), widths.data(), features.data(), weight_in.data(), bias_in.data(),
+            weight_out.data(), bias_out.data(), threads};
+}
+
+void refine(In<-1, -1> features, In<-1, -1> weight_in, In<-1> bias_in, In<-1, 64> weight_out, In<-1> bias_out,
+            std::vector<int> widths, int threads, Out<-1, -1> out) {
+    const auto args = refine_args(features, weight_in, bias_in, weight_out, bias_out, widths, threads);
+    expect_all(args.N, "N", out.shape(0));
+    expect_all(args.outputs, "the outputs", out.shape(1));
+    nb::gil_scoped_release release;
+    active->refine(args, out.data());
+}
+
+void refine_backward(In<-1, -1> features, In<-1, -1> weight_in, In<-1> bias_in, In<-1, 64> weight_out, In<-1> bias_out,
+                     std::vector<int> widths, int threads, In<-1, -1> g_out, Out<-1, -1> out_features,
+                     Out<-1, -1> out_weight_in, Out<-1> out_bias_in, Out<-1, 64> out_weight_out, Out<-1> out_bias_out) {
+    const auto args = refine_args(features, weight_in, bias_in, weight_out, bias_out, widths, threads);
+    expect_all(args.N, "N", g_out.shape(0));
+    expect_all(args.outputs, "the outputs", g_out.shape(1), out_weight_out.shape(0), out_bias_out.shape(0));
+    expect_all(size(features.size()), "the features", out_features.size());
+    expect_all(size(weight_in.size()), "the weights", out_weight_in.size());
+    expect_all(size(bias_in.size()), "the hidden units", out_bias_in.size());
+    nb::gil_scoped_release release;
+    active->refine_backward(args, g_out.data(), {out_features.data(), out_weight_in.data(), out_bias_in.data(),
+                                                 out_weight_out.data(), out_bias_out.data()});
+}
+
 // Binds f so that no argument is converted or copied: what does not fit is refused.
 template <class Result, class... Args>
 void define(nb::module_& m, const char* name, Result (*f)(Args...)) {
@@ -280,4 +321,6 @@ NB_MODULE(_native, m) {
     define(m, "observe_triangular_backward", observe_triangular_backward);
     define(m, "show_colors", show_colors);
     define(m, "show_colors_backward", show_colors_backward);
+    define(m, "refine", refine);
+    define(m, "refine_backward", refine_backward);
 }

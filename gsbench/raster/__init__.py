@@ -106,7 +106,7 @@ def choose_backend(backend: str, device: str = "cpu", dtype: torch.dtype = torch
 @functools.cache
 def native_available() -> bool:
     """Whether the native kernels are part of this installation."""
-    return importlib.util.find_spec("gsbench.kernels") is not None
+    return importlib.util.find_spec("gsbench.kernels._native") is not None
 
 
 @functools.cache

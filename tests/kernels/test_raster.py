@@ -1,6 +1,5 @@
 """The native rasterizer against a brute-force picture, the reference's gradients in float64, and its own promises."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,25 +13,7 @@ from gsbench import kernels
 from gsbench.errors import InputError
 from gsbench.raster import RasterOutput, rasterize
 
-if not kernels.available():
-    pytest.skip("the native kernels are not built in this installation", allow_module_level=True)
-
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background")
-SETS = kernels.native().instruction_sets()
-
-
-@pytest.fixture(params=SETS)
-def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
-    kernels.use_instruction_set(request.param)
-    yield request.param
-    kernels.use_instruction_set(SETS[-1])
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def single(name: str) -> dict[str, Any]:

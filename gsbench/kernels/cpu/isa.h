@@ -18,6 +18,8 @@ void observe_triangular(const TriangularArgs&, const Observation&);
 void observe_triangular_backward(const TriangularArgs&, const Observation& grads, TriangularGrads&);
 void show_colors(const ColorArgs&, float* colors);
 void show_colors_backward(const ColorArgs&, const ColorGrads&);
+void refine(const RefineArgs&, float* out);
+void refine_backward(const RefineArgs&, const float* grads, const RefineGrads&);
 
 }  // namespace GSB_ISA
 }  // namespace gsb

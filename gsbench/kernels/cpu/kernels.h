@@ -98,6 +98,21 @@ struct ColorGrads {
     float *sh0, *shN, *means, *times;
 };
 
+// Perceptrons features x 64 x width, one for each of `networks`, on every Gaussian (AGR).
+struct RefineArgs {
+    int64_t N;
+    int features_width, networks, outputs;  // outputs: the sum of widths
+    const int* widths;
+    const float* features;               // [N, features_width]
+    const float *weight_in, *bias_in;    // [networks * 64, features_width] [networks * 64]
+    const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
+    int threads;
+};
+
+struct RefineGrads {
+    float *features, *weight_in, *bias_in, *weight_out, *bias_out;
+};
+
 struct Kernels {
     const char* isa;
     void (*project)(const ProjectArgs&, const Splats&);
@@ -111,6 +126,8 @@ struct Kernels {
     void (*observe_triangular_backward)(const TriangularArgs&, const Observation& grads, TriangularGrads&);
     void (*show_colors)(const ColorArgs&, float* colors);
     void (*show_colors_backward)(const ColorArgs&, const ColorGrads&);
+    void (*refine)(const RefineArgs&, float* out);
+    void (*refine_backward)(const RefineArgs&, const float* grads, const RefineGrads&);
 };
 
 constexpr int TILE = 16;  // pixels a side
