@@ -93,7 +93,7 @@ class GaussianModel(nn.Module, ABC):
         """Raw geometry of the children of parents, of which `raw` holds CHILDREN copies in a row."""
 
     def long_in_time(self) -> Tensor:
-        """Which Gaussians ask to be split for their extent in time, [N] bool (7DGS, section 4.4)."""
+        """Which Gaussians are split, rather than cloned, for their extent in time, [N] bool (7DGS, section 4.4)."""
         return torch.zeros(len(self), dtype=torch.bool, device=self.splats["means"].device)
 
     def initial_colors(self, dc: Tensor) -> Raw:
