@@ -1,0 +1,117 @@
+// The door between Python and the CUDA kernels. Tensors cross as addresses, not as arrays: a DLPack capsule costs
+// microseconds for each, as much as the kernels themselves take. gsbench/kernels/cuda/*.py checks what it passes.
+#include <nanobind/nanobind.h>
+
+#include "kernels.h"
+#include "sort.h"
+
+namespace nb = nanobind;
+
+namespace {
+
+// A device pointer or stream of whatever type is wanted, an int in Python; 0 is null.
+struct Address {
+    uintptr_t value;
+
+    template <class T>
+    operator T*() const {
+        return reinterpret_cast<T*>(value);
+    }
+};
+
+}  // namespace
+
+namespace nanobind::detail {
+
+template <>
+struct type_caster<Address> {
+    NB_TYPE_CASTER(Address, const_name("int"))
+
+    bool from_python(handle source, uint8_t flags, cleanup_list* cleanup) noexcept {
+        make_caster<uintptr_t> number;
+        if (!number.from_python(source, flags, cleanup)) return false;
+        value.value = number.value;
+        return true;
+    }
+};
+
+}  // namespace nanobind::detail
+
+namespace {
+
+using gsb::cuda::BinArgs;
+using gsb::cuda::BlendArgs;
+using gsb::cuda::Cameras;
+using gsb::cuda::Gaussians;
+
+void flag_values(int64_t N, int64_t C, int64_t colors, int D, Address means, Address factors, Address opacities,
+                 Address color, Address viewmats, Address Ks, Address background, Address flags, Address stream) {
+    gsb::cuda::flag_values({N, C, colors, D, means, factors, opacities, color, viewmats, Ks, background}, flags, stream);
+}
+
+void project(int64_t N, Address means, Address factors, Address opacities, int64_t C, Address viewmats, Address Ks,
+             int width, int height, float near, float far, float eps2d, bool antialias, Address means2d, Address roots,
+             Address depths, Address half_sizes, Address stream) {
+    gsb::cuda::project({N, means, factors, opacities}, {C, viewmats, Ks, width, height, near, far, eps2d, antialias},
+                       {means2d, roots, depths, half_sizes}, stream);
+}
+
+void project_backward(int64_t N, Address means, Address factors, Address opacities, int64_t C, Address viewmats,
+                      Address Ks, int width, int height, float near, float far, float eps2d, bool antialias,
+                      Address g_means2d, Address g_roots, Address g_depths, Address out_means, Address out_factors,
+                      Address out_opacities, Address out_viewmats, Address stream) {
+    gsb::cuda::project_backward({N, means, factors, opacities},
+                                {C, viewmats, Ks, width, height, near, far, eps2d, antialias},
+                                {g_means2d, g_roots, g_depths},
+                                {out_means, out_factors, out_opacities, out_viewmats}, stream);
+}
+
+void count_tiles(int64_t N, int64_t C, Address means2d, Address roots, Address depths, Address half_sizes, int width,
+                 int height, Address keys, Address indices, Address sorted_keys, Address order, Address ends,
+                 Address scratch, size_t bytes, Address stream) {
+    gsb::cuda::count_tiles({N, C, means2d, roots, depths, half_sizes, width, height}, keys, indices, sorted_keys, order,
+                           ends, scratch, bytes, stream);
+}
+
+void fill_tiles(int64_t N, int64_t C, Address means2d, Address roots, Address depths, Address half_sizes, int width,
+                int height, Address order, Address ends, int64_t pairs, Address tiles, Address splats,
+                Address sorted_tiles, Address ids, Address offsets, Address scratch, size_t bytes, Address stream) {
+    gsb::cuda::fill_tiles({N, C, means2d, roots, depths, half_sizes, width, height}, order, ends, pairs, tiles, splats,
+                          sorted_tiles, ids, offsets, scratch, bytes, stream);
+}
+
+void blend(int64_t N, int64_t C, int D, bool color_per_camera, Address means2d, Address roots, Address colors,
+           Address background, Address offsets, Address ids, int width, int height, Address image, Address alpha,
+           Address transmittance, Address stop, Address stream) {
+    gsb::cuda::blend({N, C, D, color_per_camera, means2d, roots, colors, background, offsets, ids, width, height},
+                     {image, alpha, transmittance, stop}, stream);
+}
+
+void blend_backward(int64_t N, int64_t C, int D, bool color_per_camera, Address means2d, Address roots, Address colors,
+                    Address background, Address offsets, Address ids, int width, int height, Address transmittance,
+                    Address stop, Address g_image, Address g_alpha, Address sums, Address out_means2d,
+                    Address out_roots, Address out_colors, Address stream) {
+    gsb::cuda::blend_backward(
+        {N, C, D, color_per_camera, means2d, roots, colors, background, offsets, ids, width, height},
+        {nullptr, nullptr, transmittance, stop}, {g_image, g_alpha, sums, out_means2d, out_roots, out_colors}, stream);
+}
+
+void l1_ssim(int height, int width, Address image, Address target, float ssim_weight, Address loss, Address derivatives,
+             Address grad, Address stream) {
+    gsb::cuda::l1_ssim({height, width, image, target, ssim_weight, loss, derivatives, grad}, stream);
+}
+
+}  // namespace
+
+NB_MODULE(GSB_MODULE, m) {
+    m.def("scratch_bytes", &gsb::cuda::scratch_bytes, "Bytes that sorting and summing n items need.");
+    m.def("similarity_blocks", &gsb::cuda::similarity_blocks, "Parts that l1_ssim leaves of its loss.");
+    m.def("flag_values", &flag_values);
+    m.def("project", &project);
+    m.def("project_backward", &project_backward);
+    m.def("count_tiles", &count_tiles);
+    m.def("fill_tiles", &fill_tiles);
+    m.def("blend", &blend);
+    m.def("blend_backward", &blend_backward);
+    m.def("l1_ssim", &l1_ssim);
+}
