@@ -58,7 +58,7 @@ class GaussianModel(nn.Module, ABC):
     shape: ClassVar[tuple[str, ...]]  # .. and moves these, which make the factor
 
     def __init__(self, *, agr: bool = False, sh_degree: int = 3) -> None:
-        """Make a model without Gaussians; `initialise` or `load_state` gives it some.
+        """Make a model without Gaussians; `initialise` gives it some, `load_state` others.
 
         Raises:
             InputError: sh_degree is not 0, 1, 2 or 3.
@@ -93,7 +93,7 @@ class GaussianModel(nn.Module, ABC):
         """Raw geometry of the children of parents, of which `raw` holds CHILDREN copies in a row."""
 
     def long_in_time(self) -> Tensor:
-        """Which Gaussians ask to be split for their extent in time, [N] bool (7DGS, section 4.4)."""
+        """Which Gaussians are split, rather than cloned, for their extent in time, [N] bool (7DGS, section 4.4)."""
         return torch.zeros(len(self), dtype=torch.bool, device=self.splats["means"].device)
 
     def initial_colors(self, dc: Tensor) -> Raw:
@@ -160,6 +160,16 @@ class GaussianModel(nn.Module, ABC):
             raw[name] = raw[name] + residual
         return raw
 
+    def modulate(self, name: str, value: float) -> None:
+        """Give the model lambda_t (`time`) or lambda_d (`direction`), at `value` to begin with.
+
+        Raises:
+            InputError: `value` is not a positive number.
+        """
+        if not isinstance(value, int | float) or not 0 < value < math.inf:
+            raise InputError(f"lambda_{name[0]}: expected a positive number, got {value}")
+        self.log_modulation[name] = nn.Parameter(torch.tensor(math.log(value)))
+
     def modulation(self, name: str) -> Tensor:
         """lambda_t or lambda_d of `log_modulation`, positive by exp, []."""
         return self.log_modulation[name].exp()
@@ -208,15 +218,18 @@ class GaussianModel(nn.Module, ABC):
         Raises:
             InputError: the state is not this model's.
         """
-        rows = {name.removeprefix("splats."): value for name, value in state.items() if name.startswith("splats.")}
-        if set(rows) != set(self.splats) or len({len(value) for value in rows.values()}) != 1:
-            raise InputError(f"checkpoint: expected Gaussians with {sorted(self.splats)}, got {sorted(rows)}")
-        for name, value in rows.items():
-            self.splats[name].data = torch.empty_like(value, device=self.splats[name].device)
-        try:
-            self.load_state_dict(state)
-        except RuntimeError as error:
-            raise InputError(f"checkpoint: not of this model: {' '.join(str(error).split())}") from None
+        means = state.get("splats.means")
+        N = len(means) if isinstance(means, Tensor) and means.dim() else 0
+        own = {name: list(value.shape) for name, value in self.state_dict().items()}
+        expected = {name: [N, *shape[1:]] if name.startswith("splats.") else shape for name, shape in own.items()}
+        got = {name: list(value.shape) if isinstance(value, Tensor) else value for name, value in state.items()}
+        for name in sorted(expected.keys() | got.keys()):
+            if name not in expected or expected[name] != got.get(name):
+                raise InputError(f"checkpoint: not of this model: expected {name} of shape "
+                                 f"{expected.get(name, 'none')}, got {got.get(name, 'none')!s:.60}")  # fmt: skip
+        for name, parameter in self.splats.items():
+            parameter.data = torch.empty_like(state[f"splats.{name}"], device=parameter.device)
+        self.load_state_dict(state)
 
 
 def unit(vectors: Tensor) -> Tensor:
@@ -246,7 +259,7 @@ def build(name: str, **options: Any) -> GaussianModel:
     Every module of `gsbench.models` is imported first, so that a new model is one new file in that folder.
 
     Raises:
-        InputError: no such model, or an option it does not have.
+        InputError: no such model, an option it does not have, or one that it needs and did not get.
     """
     package = importlib.import_module("gsbench.models")
     for module in pkgutil.iter_modules(package.__path__):
@@ -256,8 +269,11 @@ def build(name: str, **options: Any) -> GaussianModel:
     model = _REGISTRY[name]
     # A constructor passes on what it does not name itself: its options are those of all classes it stands on.
     signatures = [inspect.signature(cls.__init__) for cls in model.__mro__ if issubclass(cls, GaussianModel)]
-    known = [p.name for s in signatures for p in s.parameters.values() if p.kind is p.KEYWORD_ONLY]
+    known = {p.name: p.default for s in signatures for p in s.parameters.values() if p.kind is p.KEYWORD_ONLY}
     for option in options:
         if option not in known:
             raise InputError(f"model '{name}' has no option '{option}'. {did_you_mean(option, known)}")
+    for option, default in known.items():
+        if default is inspect.Parameter.empty and option not in options:
+            raise InputError(f"model '{name}' needs the option '{option}', which has no default")
     return model(**options)

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.models.appearance import sh_time_colors
@@ -39,12 +39,12 @@ class Gaussians4DModel(GaussianModel):
             InputError: an option out of its range.
         """
         super().__init__(**options)
-        if time_degree < 0 or lambda_t <= 0:
-            raise InputError(f"4dgs: expected time_degree >= 0 and lambda_t > 0, got {time_degree} and {lambda_t}")
+        if not isinstance(time_degree, int) or time_degree < 0:
+            raise InputError(f"time_degree: expected 0, 1, 2, .., got {time_degree}")
         check_scheme(scheme)
         self.time_degree = time_degree
         self.scheme = scheme
-        self.log_modulation["time"] = nn.Parameter(torch.tensor(math.log(lambda_t)))
+        self.modulate("time", lambda_t)
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Spheres in space, times uniform over the clip and a tenth of it beyond, time scale sqrt(T / 5)."""

@@ -1,5 +1,7 @@
 """7DGS: Gaussians over position, time and direction (Gao et al. 2025)."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -13,6 +15,19 @@ class Gaussians7DModel(TriangularModel):
 
     observes = ("time", "direction")
     centers = ("means", "times", "directions")
+
+    def __init__(self, *, lambda_t: float, **options: Any) -> None:
+        """Make an empty model.
+
+        Args:
+            lambda_t: initial sensitivity of f_temp.
+            options: as `TriangularModel`.
+
+        Raises:
+            InputError: an option out of its range.
+        """
+        super().__init__(**options)
+        self.modulate("time", lambda_t)
 
     @torch.no_grad()
     def long_in_time(self) -> Tensor:

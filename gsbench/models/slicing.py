@@ -113,7 +113,7 @@ def whiten(T: Tensor, delta: Tensor) -> Tensor:
         for j, known in enumerate(white):
             residual = residual - rows[i][:, j] * known
         white.append(residual / rows[i][:, i])
-    return torch.stack(white, -1)
+    return torch.stack(white, -1) if white else delta
 
 
 def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
@@ -34,7 +34,6 @@ class TriangularModel(GaussianModel):
         self,
         *,
         lambda_d: float,
-        lambda_t: float | None = None,
         factor_order: str = "conditioned_first",
         scheme: str = "square_root",
         row_scaled: bool = False,
@@ -45,7 +44,6 @@ class TriangularModel(GaussianModel):
 
         Args:
             lambda_d: initial sensitivity of f_dir.
-            lambda_t: initial sensitivity of f_temp, of a model that observes time.
             factor_order: `paper`, the factor triangular over (p, t, d), or `conditioned_first`, over (d, t, p).
             scheme: of `slice_gaussians`.
             row_scaled: see `triangular`.
@@ -59,11 +57,7 @@ class TriangularModel(GaussianModel):
         if factor_order not in FACTOR_ORDERS:
             raise InputError(f"factor_order '{factor_order}' is not known. {did_you_mean(factor_order, FACTOR_ORDERS)}")
         check_scheme(scheme)
-        lambdas = {"direction": lambda_d} | ({} if lambda_t is None else {"time": lambda_t})
-        for name, value in lambdas.items():
-            if value <= 0:
-                raise InputError(f"lambda of {name}: expected a positive number, got {value}")
-            self.log_modulation[name] = nn.Parameter(torch.tensor(math.log(value)))
+        self.modulate("direction", lambda_d)
         self.scheme = scheme
         self.row_scaled = row_scaled
         self.directional_half = directional_half
@@ -95,12 +89,13 @@ class TriangularModel(GaussianModel):
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
         delta = query - mean[:, 3:]
         # A Gaussian so far from the query that nothing is left of it is left out of what follows, lest its huge
-        # numbers reach a gradient as 0 x inf: it stays at mu_p, gated to zero.
+        # numbers reach a gradient as 0 x inf: it stays at mu_p, gated to zero, as if it were a unit one at the query.
         with torch.no_grad():
             seen = self._exponent(reduced.T_qq, delta, whiten(reduced.T_qq, delta)) < EXPONENT_MAX
         delta = torch.where(seen[:, None], delta, 0.0)
-        white = whiten(reduced.T_qq, delta)
-        gate = torch.where(seen, torch.exp(-self._exponent(reduced.T_qq, delta, white)), 0.0)
+        T_qq = torch.where(seen[:, None, None], reduced.T_qq, torch.eye(delta.shape[1]).to(delta))
+        white = whiten(T_qq, delta)
+        gate = torch.where(seen, torch.exp(-self._exponent(T_qq, delta, white)), 0.0)
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
@@ -126,10 +121,12 @@ class TriangularModel(GaussianModel):
         children = {"means": raw["means"] + torch.where(in_time, 0, (T_pp @ z[..., None])[..., 0])}
         T_pp = torch.where(in_time[..., None], T_pp, T_pp / SHRINK)
         if "time" in self.observes:
-            step = torch.where(in_time, z[:, :1], 0)  # in standard deviations of t
-            path = factor[:, :3] @ factor[:, 6:].mT / factor[:, 6:].norm(dim=-1, keepdim=True)  # S_pt / sqrt(S_t)
-            children["means"] = children["means"] + path[..., 0] * step
-            children["times"] = raw["times"] + factor[:, 6].norm(dim=-1, keepdim=True) * step
+            # z standard deviations along t, and what p and d are expected to be there: S_(p,d,t),t / sqrt(S_t)
+            path = (factor @ factor[:, 6, :, None])[..., 0] / factor[:, 6].norm(dim=-1, keepdim=True)
+            path = path * torch.where(in_time, z[:, :1], 0)
+            children["means"] = children["means"] + path[:, :3]
+            children["directions"] = raw["directions"] + path[:, 3:6]
+            children["times"] = raw["times"] + path[:, 6:]
             T_qq = torch.cat([T_qq[:, :-1], torch.where(in_time[..., None], T_qq[:, -1:] / SHRINK, T_qq[:, -1:])], 1)
         p_rows = torch.cat([gain @ T_qq, T_pp], -1)
         q_rows = torch.cat([T_qq, T_pp.new_zeros(len(T_qq), T_qq.shape[1], 3)], -1)

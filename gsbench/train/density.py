@@ -43,8 +43,8 @@ class DensityControl:
         scales = model.scales()
         wanted = self.gradient / self.seen.clamp(min=1) > config.grad_threshold
         small = scales <= config.clone_below * model.extent
-        split = (wanted & ~small) | model.long_in_time()
-        clone = wanted & small & ~split
+        split = wanted & (~small | model.long_in_time())
+        clone = wanted & ~split
 
         kept, cloned = (~split).nonzero()[:, 0], clone.nonzero()[:, 0]
         parents = split.nonzero()[:, 0].repeat_interleave(CHILDREN)

@@ -32,13 +32,17 @@ def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _blur(planes: Tensor) -> Tensor:  # [P, H, W]
-    kernel = _kernel(planes.device, planes.dtype)
-    planes = F.conv2d(planes[:, None], kernel[None, None, :, None], padding=(WINDOW // 2, 0))
-    return F.conv2d(planes, kernel[None, None, None, :], padding=(0, WINDOW // 2))[:, 0]
+    """Blur by the Gaussian window, zero padded: separable, so a banded matrix from the left and one from the right.
+
+    Small pictures are blurred, and differentiated, many times faster so than by torch's convolutions on the CPU.
+    """
+    height, width = planes.shape[-2:]
+    return _band(height, planes.device, planes.dtype) @ planes @ _band(width, planes.device, planes.dtype)
 
 
 @functools.cache
-def _kernel(device: torch.device, dtype: torch.dtype) -> Tensor:
-    x = torch.arange(WINDOW, device=device, dtype=dtype) - WINDOW // 2
-    kernel = torch.exp(-(x**2) / (2 * SIGMA**2))
-    return kernel / kernel.sum()
+def _band(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:  # [size, size], symmetric
+    offset = torch.arange(size, device=device)[:, None] - torch.arange(size, device=device)
+    window = torch.exp(-((torch.arange(WINDOW, device=device, dtype=dtype) - WINDOW // 2) ** 2) / (2 * SIGMA**2))
+    weight = torch.exp(-(offset.to(dtype) ** 2) / (2 * SIGMA**2)) / window.sum()
+    return torch.where(offset.abs() <= WINDOW // 2, weight, 0.0)

@@ -108,6 +108,18 @@ def test_reduction_keeps_the_covariance(seed: int, k: int) -> None:
     assert torch.equal(T_qq, T_qq.tril())
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("size", [1.0, 1e-2, 1e-3, 1e-4, 1e-6])
+def test_reduction_of_what_is_nearly_reduced(size: float, sign: int) -> None:
+    """Catches the reflection of the other sign, which cancels where a row has almost its final form (float32)."""
+    F = torch.cat([normal(0, 200, 3, 7), size * normal(1, 200, 4, 7)], 1)
+    F[:, 3:, :4] += sign * (torch.eye(4) + normal(2, 200, 4, 4).tril(-1))
+    T_qq, T_pq, T_pp = (x.double() for x in reduce(F.float()))
+    T = torch.cat([torch.cat([T_pq, T_pp], -1), torch.cat([T_qq, torch.zeros(200, 4, 3)], -1)], 1)
+    F = F.float().double()
+    assert relative(T @ T.mT, (F @ F.mT).numpy()).max() < 2e-6
+
+
 @PROPERTY
 @given(seeds, st.floats(-3, 3), st.integers(0, 4))
 def test_slice_is_affine_in_the_query(seed: int, s: float, k: int) -> None:

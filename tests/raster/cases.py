@@ -87,6 +87,14 @@ def needles(g: torch.Generator) -> Arguments:
 
 
 @_case
+def needles_across_a_large_picture(g: torch.Generator) -> Arguments:
+    """Half a pixel wide, hundreds long: dx^2, dx dy and dy^2 cancel to a thousandth or less of themselves."""
+    scene = gaussians(g, 16) | camera(400, 300)
+    axes = torch.tensor([2.0, 2e-4, 2e-4], dtype=torch.float64)
+    return scene | {"factors": _rotations(g, 16) * axes}
+
+
+@_case
 def flat(g: torch.Generator) -> Arguments:
     """Singular factors: a disc, a line, a point."""
     scene = gaussians(g, 24) | camera(33, 17)
@@ -144,7 +152,7 @@ def opaque_stack(g: torch.Generator) -> Arguments:
 @_case
 def saturated(g: torch.Generator) -> Arguments:
     """Opacity 1 exactly: alpha stops at 0.999."""
-    return gaussians(g, 10, size=0.5) | camera(16, 16) | {"opacities": torch.ones(10)}
+    return gaussians(g, 10, size=20.0) | camera(16, 16) | {"opacities": torch.ones(10)}
 
 
 @_case

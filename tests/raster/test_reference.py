@@ -144,6 +144,19 @@ def test_gradients_are_finite(name: str) -> None:
     assert not arguments["means"].grad[hidden].any()
 
 
+def test_a_point_without_filter() -> None:
+    """Catches 0/0 where nothing is added to a covariance of zero: not drawn, and no NaN in any gradient."""
+    arguments = case("random") | {"eps2d": 0.0}
+    arguments["factors"][::2] = 0
+    arguments["factors"].requires_grad_()
+    output = draw(arguments)
+    output.image.sum().backward()
+    assert output.image.isfinite().all()
+    assert arguments["factors"].grad.isfinite().all()
+    assert not output.info.radii[:, ::2].any()
+    assert output.info.radii[:, 1::2].any()
+
+
 # ---- properties
 
 

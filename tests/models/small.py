@@ -1,0 +1,63 @@
+"""Small models for the tests: every registered one and its variants, fresh or in the midst of a training."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsbench.models import GaussianModel, build
+from gsbench.scenes.scene import Points
+
+N = 24
+EXTENT = 2.0
+CAMERA = torch.tensor([0.3, -0.2, -4.0], dtype=torch.float64)
+MODELS: dict[str, dict[str, Any]] = {
+    "3dgs": {},
+    "4dgs": {},
+    "6dgs": {"lambda_d": 0.35, "directional_half": False},
+    "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
+}
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    **{name: (name, options) for name, options in MODELS.items()},
+    **{f"{name}_agr": (name, options | {"agr": True}) for name, options in MODELS.items()},
+    "4dgs_constant_colors": ("4dgs", {"time_degree": 0}),
+    **{f"{name}_paper": (name, MODELS[name] | {"factor_order": "paper"}) for name in ("6dgs", "7dgs")},
+    **{f"{name}_row_scaled": (name, MODELS[name] | {"row_scaled": True}) for name in ("6dgs", "7dgs")},
+}
+
+
+def seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def fresh(variant: str, count: int = N, seed: int = 0, **options: Any) -> GaussianModel:
+    """A model as it starts, in float32."""
+    name, own = VARIANTS[variant]
+    model = build(name, **own | options)
+    g = seeded(seed)
+    model.initialise(Points(torch.rand(count, 3, generator=g) * 2 - 1, torch.rand(count, 3, generator=g)), EXTENT, g)
+    return model
+
+
+def lively(variant: str, count: int = N, seed: int = 0, **options: Any) -> GaussianModel:
+    """A model in float64 with every raw parameter moved and networks that say something."""
+    model = fresh(variant, count, seed, **options).double()
+    g = seeded(seed + 1)
+    with torch.no_grad():
+        for parameter in model.splats.values():
+            parameter += 0.3 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
+        if model.refinement is not None:
+            for parameter in [*model.refinement.weights_out, *model.refinement.biases_out]:
+                parameter += 0.05 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
+    return model
+
+
+def raw(model: GaussianModel) -> dict[str, Tensor]:
+    """The raw parameters, detached copies."""
+    return {name: parameter.detach().clone() for name, parameter in model.splats.items()}
+
+
+def joint(model: GaussianModel) -> Tensor:
+    """Covariance of each Gaussian of a triangular model, rows and columns ordered (p, d, t)."""
+    factor = model.factors(raw(model))
+    return factor @ factor.mT

@@ -1,0 +1,53 @@
+"""From config to table on the embedded scenes: that models of more dimensions earn them, measured, in a short run."""
+
+from pathlib import Path
+
+import pytest
+from tiny_run import gsbench
+
+from gsbench.measure import record
+from gsbench.report import layout, tables
+
+SHORT = ("train.iterations=250", "train.curve_points=2", "data.initial_points=800")
+
+
+def scores(results: Path) -> dict[tuple[str, str], float]:
+    found = {}
+    for path in record.find(results):
+        one = record.read(path)
+        assert one.status == "ok", one.reason
+        assert one.metrics is not None
+        psnr = one.metrics["psnr"]
+        assert psnr is not None
+        background = one.metrics["psnr_background_only"]
+        assert background is not None
+        assert psnr > background + 3, f"{one.scene} {one.model}: {psnr:.2f} dB, an empty picture has {background:.2f}"
+        found[one.scene, one.model] = psnr
+    return found
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("results")
+    done = gsbench("-m", "+exp=mini", "model=3dgs,4dgs,7dgs", f"results={folder}", *SHORT)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_every_model_learns_and_time_is_worth_something(results: Path) -> None:
+    """Catches a model that does not learn, or a time dimension that does nothing where things move."""
+    psnr = scores(results)
+    assert len(psnr) == 6
+    assert psnr["moving-matte", "4dgs"] > psnr["moving-matte", "3dgs"]
+    assert psnr["suzanne", "7dgs"] > psnr["suzanne", "3dgs"]
+
+
+def test_the_table_has_every_run_and_the_papers_row(results: Path) -> None:
+    """Catches a table that drops runs, the average, or the paper's row beside the stand-in scene."""
+    folder = results / "mini"
+    text = layout.terminal(tables.write(tables.load(folder), folder))
+    for word in ("moving-matte", "suzanne", "3dgs", "4dgs", "7dgs", "28.26"):
+        assert word in text
+        assert word in (folder / "table.md").read_text()
+    assert max(map(len, text.splitlines())) <= 120
+    assert len((folder / "table.csv").read_text().splitlines()) == 1 + 6
