@@ -19,7 +19,8 @@ def draw(
     runs differ in the last bits. Intrinsics have no gradient here.
 
     Raises:
-        InputError: not float32 on a GPU, a gradient by `Ks` is asked for, a value out of range, or no memory is left.
+        InputError: not float32 on a GPU, a gradient by `Ks` is asked for, or a value is out of range.
+        torch.OutOfMemoryError: saying what was drawn and what to lower.
     """
     if means.dtype != torch.float32 or not means.is_cuda or not available():
         raise InputError(f"raster backend 'cuda': expected float32 tensors on a CUDA device, got {means.dtype} on "
@@ -29,9 +30,10 @@ def draw(
                      View(width, height, near, far, eps2d, antialias))  # fmt: skip
     except torch.OutOfMemoryError as error:
         C, N, D = colors.shape
-        raise InputError(f"out of memory on {means.device} while drawing {C} pictures of {width}x{height} with {D} "
-                         f"channels from {N} Gaussians: use a smaller picture, fewer cameras at once or fewer "
-                         f"Gaussians ({str(error).split('. ')[0]})") from None  # fmt: skip
+        raise torch.OutOfMemoryError(
+            f"{means.device} while drawing {C} pictures of {width}x{height} with {D} channels from {N} Gaussians: use "
+            f"a smaller picture, fewer cameras at once or fewer Gaussians ({' '.join(str(error).split())[:120]})"
+        ) from None
 
 
 def splat(
