@@ -167,6 +167,136 @@ double l1_ssim(In<-1, -1, 3> image, In<-1, -1, 3> target, double ssim_weight, in
         {frame.height, frame.width, image.data(), target.data(), static_cast<float>(ssim_weight), g, threads});
 }
 
+gsb::TriangularArgs triangular_args(const In<-1, 3>& means, const In<-1, 3>& directions, const In<-1>& times,
+                                    const In<-1, -1>& log_diagonal, const In<-1, -1>& off_diagonal,
+                                    const In<-1>& opacities, const In<3>& center, double time, double lambda_d,
+                                    double lambda_t, double half, bool conditioned_first, bool row_scaled,
+                                    int threads) {
+    const int64_t N = size(means.shape(0)), n = size(log_diagonal.shape(1));
+    const bool has_time = n == 7;
+    if (n != 6 && n != 7) throw std::invalid_argument("expected a factor of 6 or 7 rows");
+    expect_all(N, "N", directions.shape(0), log_diagonal.shape(0), off_diagonal.shape(0), opacities.shape(0));
+    expect_all(has_time ? N : 0, "times", times.shape(0));
+    expect_all(n * (n - 1) / 2, "the entries below the diagonal", off_diagonal.shape(1));
+    const Frame frame(1, 1, threads);
+    const float *at = center.data(), *t = has_time ? times.data() : nullptr;
+    return {N, conditioned_first, row_scaled, static_cast<float>(half), static_cast<float>(lambda_d),
+            static_cast<float>(lambda_t), static_cast<float>(time), {at[0], at[1], at[2]}, means.data(),
+            directions.data(), t, log_diagonal.data(), off_diagonal.data(), opacities.data(), threads};
+}
+
+void observe_triangular(In<-1, 3> means, In<-1, 3> directions, In<-1> times, In<-1, -1> log_diagonal,
+                        In<-1, -1> off_diagonal, In<-1> opacities, In<3> center, double time, double lambda_d,
+                        double lambda_t, double half, bool conditioned_first, bool row_scaled, int threads,
+                        Out<-1, 3> out_means, Out<-1, 3, 3> out_factors, Out<-1> out_opacities) {
+    const auto args = triangular_args(means, directions, times, log_diagonal, off_diagonal, opacities, center, time,
+                                      lambda_d, lambda_t, half, conditioned_first, row_scaled, threads);
+    expect_all(args.N, "N", out_means.shape(0), out_factors.shape(0), out_opacities.shape(0));
+    nb::gil_scoped_release release;
+    active->observe_triangular(args, {out_means.data(), out_factors.data(), out_opacities.data()});
+}
+
+void observe_triangular_backward(In<-1, 3> means, In<-1, 3> directions, In<-1> times, In<-1, -1> log_diagonal,
+                                 In<-1, -1> off_diagonal, In<-1> opacities, In<3> center, double time, double lambda_d,
+                                 double lambda_t, double half, bool conditioned_first, bool row_scaled, int threads,
+                                 Out<-1, 3> g_means, Out<-1, 3, 3> g_factors, Out<-1> g_opacities,
+                                 Out<-1, 3> out_means, Out<-1, 3> out_directions, Out<-1> out_times,
+                                 Out<-1, -1> out_log_diagonal, Out<-1, -1> out_off_diagonal, Out<-1> out_opacities,
+                                 Out<2> out_lambdas) {
+    const auto args = triangular_args(means, directions, times, log_diagonal, off_diagonal, opacities, center, time,
+                                      lambda_d, lambda_t, half, conditioned_first, row_scaled, threads);
+    expect_all(args.N, "N", g_means.shape(0), g_factors.shape(0), g_opacities.shape(0), out_means.shape(0),
+               out_directions.shape(0), out_opacities.shape(0));
+    expect_all(size(times.size()), "times", out_times.size());
+    expect_all(size(log_diagonal.size()), "the diagonal", out_log_diagonal.size());
+    expect_all(size(off_diagonal.size()), "the entries below the diagonal", out_off_diagonal.size());
+    gsb::TriangularGrads grads{out_means.data(), out_directions.data(), out_times.data(), out_log_diagonal.data(),
+                               out_off_diagonal.data(), out_opacities.data(), {}};
+    {
+        nb::gil_scoped_release release;
+        active->observe_triangular_backward(args, {g_means.data(), g_factors.data(), g_opacities.data()}, grads);
+    }
+    out_lambdas.data()[0] = grads.lambdas[0];
+    out_lambdas.data()[1] = grads.lambdas[1];
+}
+
+gsb::ColorArgs color_args(const In<-1, -1, 3>& sh0, const In<-1, -1, 3>& shN, const In<-1, 3>& means,
+                          const In<-1>& opacities, const In<-1>& times, const In<3>& center, double time, int degree,
+                          int waves, int threads) {
+    const int64_t N = size(means.shape(0)), all = size(shN.shape(1)) + 1;
+    if (degree < 0 || degree > 3 || waves < 1 || waves > 8 || all % waves || all / waves < (degree + 1) * (degree + 1)) {
+        throw std::invalid_argument("degree, waves and the number of coefficients do not fit");
+    }
+    expect_all(N, "N", sh0.shape(0), shN.shape(0), opacities.shape(0));
+    expect_all(1, "the constant coefficient", sh0.shape(1));
+    if (waves > 1) expect_all(N, "times", times.shape(0));
+    const Frame frame(1, 1, threads);
+    const float* at = center.data();
+    return {N, degree, static_cast<int>(all / waves), waves, sh0.data(), shN.data(), means.data(), opacities.data(),
+            waves > 1 ? times.data() : nullptr, static_cast<float>(time), {at[0], at[1], at[2]}, threads};
+}
+
+void show_colors(In<-1, -1, 3> sh0, In<-1, -1, 3> shN, In<-1, 3> means, In<-1> opacities, In<-1> times, In<3> center,
+                 double time, int degree, int waves, int threads, Out<-1, 3> colors) {
+    const auto args = color_args(sh0, shN, means, opacities, times, center, time, degree, waves, threads);
+    expect_all(args.N, "N", colors.shape(0));
+    nb::gil_scoped_release release;
+    active->show_colors(args, colors.data());
+}
+
+void show_colors_backward(In<-1, -1, 3> sh0, In<-1, -1, 3> shN, In<-1, 3> means, In<-1> opacities, In<-1> times,
+                          In<3> center, double time, int degree, int waves, int threads, In<-1, 3> g_colors,
+                          Out<-1, -1, 3> out_sh0, Out<-1, -1, 3> out_shN, Out<-1, 3> out_means, Out<-1> out_times) {
+    const auto args = color_args(sh0, shN, means, opacities, times, center, time, degree, waves, threads);
+    expect_all(args.N, "N", g_colors.shape(0), out_sh0.shape(0), out_means.shape(0));
+    expect_all(size(shN.size()), "the coefficients", out_shN.size());
+    expect_all(args.times ? args.N : 0, "times", out_times.shape(0));
+    nb::gil_scoped_release release;
+    active->show_colors_backward(args,
+                                 {g_colors.data(), out_sh0.data(), out_shN.data(), out_means.data(), out_times.data()});
+}
+
+gsb::RefineArgs refine_args(const In<-1, -1>& features, const In<-1, -1>& weight_in, const In<-1>& bias_in,
+                            const In<-1, 64>& weight_out, const In<-1>& bias_out, const std::vector<int>& widths,
+                            int threads) {
+    const int64_t rows = size(widths.size()) * 64;
+    int64_t outputs = 0;
+    for (int width : widths) {
+        if (width < 1) throw std::invalid_argument("expected positive widths");
+        outputs += width;
+    }
+    expect_all(rows, "the hidden units", weight_in.shape(0), bias_in.shape(0));
+    expect_all(size(features.shape(1)), "the features", weight_in.shape(1));
+    expect_all(outputs, "the outputs", weight_out.shape(0), bias_out.shape(0));
+    const Frame frame(1, 1, threads);
+    return {size(features.shape(0)), static_cast<int>(features.shape(1)), static_cast<int>(widths.size()),
+            static_cast<int>(outputs), widths.data(), features.data(), weight_in.data(), bias_in.data(),
+            weight_out.data(), bias_out.data(), threads};
+}
+
+void refine(In<-1, -1> features, In<-1, -1> weight_in, In<-1> bias_in, In<-1, 64> weight_out, In<-1> bias_out,
+            std::vector<int> widths, int threads, Out<-1, -1> out) {
+    const auto args = refine_args(features, weight_in, bias_in, weight_out, bias_out, widths, threads);
+    expect_all(args.N, "N", out.shape(0));
+    expect_all(args.outputs, "the outputs", out.shape(1));
+    nb::gil_scoped_release release;
+    active->refine(args, out.data());
+}
+
+void refine_backward(In<-1, -1> features, In<-1, -1> weight_in, In<-1> bias_in, In<-1, 64> weight_out, In<-1> bias_out,
+                     std::vector<int> widths, int threads, In<-1, -1> g_out, Out<-1, -1> out_features,
+                     Out<-1, -1> out_weight_in, Out<-1> out_bias_in, Out<-1, 64> out_weight_out, Out<-1> out_bias_out) {
+    const auto args = refine_args(features, weight_in, bias_in, weight_out, bias_out, widths, threads);
+    expect_all(args.N, "N", g_out.shape(0));
+    expect_all(args.outputs, "the outputs", g_out.shape(1), out_weight_out.shape(0), out_bias_out.shape(0));
+    expect_all(size(features.size()), "the features", out_features.size());
+    expect_all(size(weight_in.size()), "the weights", out_weight_in.size());
+    expect_all(size(bias_in.size()), "the hidden units", out_bias_in.size());
+    nb::gil_scoped_release release;
+    active->refine_backward(args, g_out.data(), {out_features.data(), out_weight_in.data(), out_bias_in.data(),
+                                                 out_weight_out.data(), out_bias_out.data()});
+}
+
 // Binds f so that no argument is converted or copied: what does not fit is refused.
 template <class Result, class... Args>
 void define(nb::module_& m, const char* name, Result (*f)(Args...)) {
@@ -187,4 +317,10 @@ NB_MODULE(_native, m) {
     define(m, "blend", blend);
     define(m, "blend_backward", blend_backward);
     define(m, "l1_ssim", l1_ssim);
+    define(m, "observe_triangular", observe_triangular);
+    define(m, "observe_triangular_backward", observe_triangular_backward);
+    define(m, "show_colors", show_colors);
+    define(m, "show_colors_backward", show_colors_backward);
+    define(m, "refine", refine);
+    define(m, "refine_backward", refine_backward);
 }

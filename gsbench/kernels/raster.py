@@ -41,7 +41,7 @@ def project(
 
 
 @project.register_fake
-def _(means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, *_: Any) -> tuple[Tensor, ...]:
+def _(means: Tensor, _factors: Tensor, _opacities: Tensor, viewmats: Tensor, *_: Any) -> tuple[Tensor, ...]:
     C, N = len(viewmats), len(means)
     return tuple(means.new_empty(shape) for shape in ((C, N, 2), (C, N, 3), (C, N), (C, N), (C, N, 2)))
 
@@ -104,7 +104,7 @@ def bin_tiles(means2d: Tensor, depths: Tensor, half_sizes: Tensor, width: int, h
 
 
 @bin_tiles.register_fake
-def _(means2d: Tensor, depths: Tensor, half_sizes: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+def _(means2d: Tensor, _depths: Tensor, _half: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
     pairs = torch.library.get_ctx().new_dynamic_size()
     offsets = means2d.new_empty(len(means2d) * count_tiles(width, height) + 1, dtype=torch.int64)
     return offsets, means2d.new_empty(pairs, dtype=torch.int32)
@@ -126,7 +126,7 @@ def blend(
 
 
 @blend.register_fake
-def _(means2d: Tensor, roots: Tensor, opacities: Tensor, half_sizes: Tensor, colors: Tensor, *rest: Any) -> Any:
+def _(means2d: Tensor, _roots: Tensor, _opacities: Tensor, _half: Tensor, colors: Tensor, *rest: Any) -> Any:
     return _blend_outputs(means2d, colors, rest[-2], rest[-1])
 
 

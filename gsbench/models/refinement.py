@@ -38,8 +38,12 @@ class Refinement(nn.Module):
 
     def forward(self, features: Tensor, time: Tensor) -> list[Tensor]:
         """Residuals, one [N, c] for each output, of N feature rows [N, features] at one time []."""
-        # gamma(t) is the same for all Gaussians: it enters as one vector, not as 20 more columns.
-        at_time = F.linear(encode_time(time), self.weight_in[:, self.features :], self.bias_in)
-        hidden = torch.relu(F.linear(features, self.weight_in[:, : self.features]) + at_time)
-        parts = hidden.split(HIDDEN, -1)
+        weight_in, bias_in = self.weight_in[:, : self.features], self.at_time(time)
+        if use_kernels(self.backend, features):
+            return kernels.refine(features, weight_in, bias_in, list(self.weights_out), list(self.biases_out))
+        parts = torch.relu(F.linear(features, weight_in, bias_in)).split(HIDDEN, -1)
         return [F.linear(h, w, b) for h, w, b in zip(parts, self.weights_out, self.biases_out, strict=True)]
+
+    def at_time(self, time: Tensor) -> Tensor:
+        """What gamma(t), the same for all Gaussians, adds to every hidden unit: one vector, not 20 more columns."""
+        return F.linear(encode_time(time), self.weight_in[:, self.features :], self.bias_in)

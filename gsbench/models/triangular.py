@@ -16,6 +16,9 @@ from gsbench.scenes.scene import Points
 # Where position, time and direction stand among the rows of the triangular factor.
 FACTOR_ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
 WIDTH = {"p": 3, "t": 1, "d": 3}
+# Adam's steps of 0.05 on a logarithm have no end where the gradient has none, as for a scale that is infinite for all
+# one can see; e^+-16 = 1e+-7 is as good as infinite or zero, and its square is a float32.
+LOG_DIAGONAL_MAX = 16.0
 EXPONENT_MAX = 80.0  # exp(-80) = 2e-35: beyond, f is 0
 TIME_CORRELATION = 0.05  # split in time where |S_pt| is above this part of the scene's extent ..
 TIME_SCALE = 0.25  # .. and sqrt(S_t) above this part of the clip (7DGS, section 4.4)
@@ -121,12 +124,12 @@ class TriangularModel(GaussianModel):
         children = {"means": raw["means"] + torch.where(in_time, 0, (T_pp @ z[..., None])[..., 0])}
         T_pp = torch.where(in_time[..., None], T_pp, T_pp / SHRINK)
         if "time" in self.observes:
-            # z standard deviations along t, and what p and d are expected to be there: S_(p,d,t),t / sqrt(S_t)
-            path = (factor @ factor[:, 6, :, None])[..., 0] / factor[:, 6].norm(dim=-1, keepdim=True)
-            path = path * torch.where(in_time, z[:, :1], 0)
-            children["means"] = children["means"] + path[:, :3]
-            children["directions"] = raw["directions"] + path[:, 3:6]
-            children["times"] = raw["times"] + path[:, 6:]
+            # z standard deviations along t, though no more than z clips: a child seen at any (t, d) is where its parent
+            # was, for K (q - mu_q) loses K_t dt and mu_p gains it.
+            sigma = factor[:, 6].norm(dim=-1, keepdim=True).clamp(max=1)
+            dt = torch.where(in_time, z[:, :1] * sigma, 0)
+            children["means"] = children["means"] + gain[..., -1] * dt
+            children["times"] = raw["times"] + dt
             T_qq = torch.cat([T_qq[:, :-1], torch.where(in_time[..., None], T_qq[:, -1:] / SHRINK, T_qq[:, -1:])], 1)
         p_rows = torch.cat([gain @ T_qq, T_pp], -1)
         q_rows = torch.cat([T_qq, T_pp.new_zeros(len(T_qq), T_qq.shape[1], 3)], -1)
@@ -136,7 +139,8 @@ class TriangularModel(GaussianModel):
 
     def factors(self, raw: Raw) -> Tensor:
         """The triangular factor with its rows sorted to (p, d, t), [N, n, n]."""
-        L = triangular(raw["log_diagonal"], raw["off_diagonal"], row_scaled=self.row_scaled)
+        log_diagonal = raw["log_diagonal"].clamp(-LOG_DIAGONAL_MAX, LOG_DIAGONAL_MAX)
+        L = triangular(log_diagonal, raw["off_diagonal"], row_scaled=self.row_scaled)
         return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
 
     def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:

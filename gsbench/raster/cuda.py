@@ -1,11 +1,11 @@
-"""The rasterizer on the GPU: the same picture as `reference`, by the kernels of `gsbench.kernels.cuda`, float32 only."""
+"""The rasterizer on the GPU: the picture of `reference`, in float32, by the kernels of `gsbench.kernels.cuda`."""
 
 import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.cuda import available, cuda, plain, pointers, stream
-from gsbench.kernels.cuda.raster import MAX_ITEMS, Blend, Project, View, bin_tiles
+from gsbench.kernels.cuda.raster import MAX_ITEMS, View, bin_tiles, blend, project
 from gsbench.raster import RasterInfo, RasterOutput, check_values
 
 
@@ -26,8 +26,9 @@ def draw(
         raise InputError(f"raster backend 'cuda': expected float32 tensors on a CUDA device, got {means.dtype} on "
                          f"{means.device}; backend 'reference' takes any")  # fmt: skip
     try:
-        return splat(means, factors, opacities, colors, viewmats, Ks, background,
-                     View(width, height, near, far, eps2d, antialias))  # fmt: skip
+        with torch.cuda.device(means.device):
+            return splat(means, factors, opacities, colors, viewmats, Ks, background,
+                         View(width, height, near, far, eps2d, antialias))  # fmt: skip
     except torch.OutOfMemoryError as error:
         C, N, D = colors.shape
         raise torch.OutOfMemoryError(
@@ -52,10 +53,10 @@ def splat(
     values = plain(means, factors, opacities, colors, viewmats, Ks, background)
     cuda().flag_values(N, C, colors.numel(), D, *pointers(*values, flags), stream(means))
 
-    means2d, roots, depths, half_sizes = Project.apply(means, factors, opacities, viewmats, Ks, view)
+    means2d, roots, depths, half_sizes = project(means, factors, opacities, viewmats, Ks, view)
     bins, flagged = bin_tiles(means2d, roots, depths, half_sizes, view.width, view.height, flags)
     if flagged:  # looked at on the device, so that only a bad picture waits for the words
         check_values(means, factors, opacities, colors, viewmats, Ks, background)
-    image, alpha = Blend.apply(means2d, roots, colors, background, bins, view)
+    image, alpha = blend(means2d, roots, colors, background, bins, view)
     radii = half_sizes.amax(-1).ceil_().int()
     return RasterOutput(image, alpha, RasterInfo(radii, means2d, depths, len(bins.ids)))

@@ -1,4 +1,4 @@
-"""The rasterizer on the CPU's native kernels: the same picture as `reference`, hundreds of times faster, float32 only."""
+"""The rasterizer on the native CPU kernels: the picture of `reference`, in float32 and much faster."""
 
 import torch
 from torch import Tensor

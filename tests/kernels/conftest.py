@@ -1,4 +1,4 @@
-"""Where the CUDA kernels run: on a GPU where there is one, else on the CPU by the shim, built once a session."""
+"""Fixtures for tests of the compiled kernels, those of the CPU and those of CUDA."""
 
 import importlib.util
 import os
@@ -11,20 +11,46 @@ from pathlib import Path
 import pytest
 import torch
 
-import gsbench.kernels.cuda as kernels
+from gsbench import kernels
+from gsbench.kernels import cuda
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
+def pytest_ignore_collect(collection_path: Path) -> bool | None:
+    """Tests of the CPU's kernels are skipped where those were not built."""
+    return None if kernels.available() or "cuda" in collection_path.name else True
+
+
+@pytest.fixture(params=kernels.native().instruction_sets() if kernels.available() else [])
+def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Runs the test once with each instruction set that this machine has."""
+    best = kernels.native().instruction_sets()[-1]
+    kernels.use_instruction_set(request.param)
+    yield request.param
+    kernels.use_instruction_set(best)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Puts the number of threads back."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="session")
 def cuda_device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """`cuda`, or `cpu` with the kernels replaced by those of the shim. Skips without the tools to build that."""
-    if kernels.available():
+    """Where the CUDA kernels run: `cuda`, or `cpu` with the kernels replaced by those of the shim (cuda_shim.h).
+
+    The shim is built once a session, or kept in the folder GSBENCH_SHIM_BUILD. Skips without the tools to build it.
+    """
+    if cuda.available():
         yield "cuda"
         return
     if not all(map(shutil.which, ("cmake", "ninja", "c++"))):
         pytest.skip("needs a GPU and the built extension, or cmake, ninja and a C++ compiler for the shim")
-    folder = Path(os.environ.get("GSBENCH_SHIM_BUILD", tmp_path_factory.mktemp("cuda_shim")))
+    folder = Path(os.environ.get("GSBENCH_SHIM_BUILD") or tmp_path_factory.mktemp("cuda_shim"))
     options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Release", f"-DPython_EXECUTABLE={sys.executable}"]
     for command in (["cmake", "-S", str(ROOT), "-B", str(folder), *options],
                     ["cmake", "--build", str(folder), "--target", "_cuda"]):  # fmt: skip
@@ -33,9 +59,8 @@ def cuda_device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     spec = importlib.util.spec_from_file_location("_cuda", next(folder.glob("_cuda.*.so")))
     assert spec is not None
     assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    built, kernels._cuda = kernels._cuda, module
-    torch.set_num_threads(1)
-    yield "cpu"
-    kernels._cuda = built
+    shim = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(shim)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cuda, "_cuda", shim)
+        yield "cpu"

@@ -8,10 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small import CAMERA, EXTENT, MODELS, VARIANTS, N, fresh, lively, raw, seeded
-from torch import Tensor
+from torch import Tensor, nn
 
 from gsbench.errors import InputError
 from gsbench.models import Stage, build
+from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
@@ -125,6 +126,21 @@ def test_slice_at_its_own_mean_is_the_gaussian(variant: str) -> None:
         sliced = model.slice(mean - 3 * direction, time)
         torch.testing.assert_close(sliced.means[i], mean)
         torch.testing.assert_close(sliced.opacities[i], torch.sigmoid(model.splats["opacities"][i]))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_colors_are_seen_from_the_camera(variant: str) -> None:
+    """Catches a colour looked up in the direction to the camera, or to where the Gaussian is not at that time."""
+    model = lively(variant)
+    sliced = model.slice(CAMERA, 0.5)
+    d = nn.functional.normalize(sliced.means - CAMERA, dim=-1)
+    values = model.refined(torch.tensor(0.5, dtype=torch.float64))
+    coefficients = torch.cat([values["sh0"].flatten(1, -2), values["shN"]], 1)
+    if variant.startswith("4dgs"):
+        expected = sh_time_colors(coefficients.unflatten(1, (-1, 16)), d, 3, 0.5 - values["times"][:, 0])
+    else:
+        expected = sh_colors(coefficients, d, 3)
+    torch.testing.assert_close(sliced.colors, expected)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

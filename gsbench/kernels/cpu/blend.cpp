@@ -1,4 +1,5 @@
 // Blending splats into pictures, front to back, tile by tile.
+#include "buffer.h"
 #include "isa.h"
 #include "tile.h"
 

@@ -2,6 +2,7 @@
 //
 // A pair of tile and splat writes its sums to a place of its own, and each splat adds up its pairs in their order, so
 // that the result has the same bits for any number of threads.
+#include "buffer.h"
 #include "isa.h"
 #include "tile.h"
 

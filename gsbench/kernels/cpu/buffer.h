@@ -1,4 +1,4 @@
-// Scratch memory, aligned to cache lines; std::vector would be shared between the instruction sets by the linker.
+// Scratch memory of a thread, aligned to cache lines; std::vector would be shared between the instruction sets by the linker.
 #pragma once
 
 #include <cstddef>
@@ -7,8 +7,20 @@
 
 #include "../math/scalar.h"
 
+#if defined(_OPENMP)
+#include <omp.h>
+#endif
+
 namespace gsb {
 inline namespace GSB_ISA {
+
+inline int thread_index() {
+#if defined(_OPENMP)
+    return omp_get_thread_num();
+#else
+    return 0;
+#endif
+}
 
 template <class T>
 class Buffer {

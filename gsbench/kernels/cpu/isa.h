@@ -14,6 +14,12 @@ void fill_tiles(const BinArgs&, const int64_t* offsets, int32_t* ids);
 void blend(const BlendArgs&, const Picture&);
 void blend_backward(const BlendArgs&, const Picture&, const BlendGrads&);
 double l1_ssim(const SimilarityArgs&);
+void observe_triangular(const TriangularArgs&, const Observation&);
+void observe_triangular_backward(const TriangularArgs&, const Observation& grads, TriangularGrads&);
+void show_colors(const ColorArgs&, float* colors);
+void show_colors_backward(const ColorArgs&, const ColorGrads&);
+void refine(const RefineArgs&, float* out);
+void refine_backward(const RefineArgs&, const float* grads, const RefineGrads&);
 
 }  // namespace GSB_ISA
 }  // namespace gsb

@@ -61,6 +61,58 @@ struct SimilarityArgs {
     int threads;
 };
 
+// Gaussians with a triangular factor over (p, d) or (p, t, d), observed from a place and at a time (6DGS, 7DGS).
+struct TriangularArgs {
+    int64_t N;
+    bool conditioned_first, row_scaled;
+    float half, lambda_d, lambda_t, time, center[3];
+    const float *means, *directions, *times;  // [N, 3] [N, 3] [N], null: time is not observed
+    const float *log_diagonal, *off_diagonal;  // [N, n] [N, n (n - 1) / 2]
+    const float* opacities;                    // [N] logits
+    int threads;
+};
+
+struct TriangularGrads {
+    float *means, *directions, *times, *log_diagonal, *off_diagonal, *opacities;
+    float lambdas[2];  // of direction and time
+};
+
+// The 3D Gaussians that an observation leaves, or their gradients.
+struct Observation {
+    float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
+};
+
+// Colours by spherical harmonics in the direction from `center`, times `waves` frequencies of time.
+struct ColorArgs {
+    int64_t N;
+    int degree, bases, waves;        // bases: harmonics stored for each frequency
+    const float *sh0, *shN;          // [N, 3] [N, waves * bases - 1, 3]
+    const float *means, *opacities;  // [N, 3] [N]: one below 1/255 is not drawn, and has no colour
+    const float* times;              // [N], null: colours do not change
+    float time, center[3];
+    int threads;
+};
+
+struct ColorGrads {
+    const float* colors;
+    float *sh0, *shN, *means, *times;
+};
+
+// Perceptrons features x 64 x width, one for each of `networks`, on every Gaussian (AGR).
+struct RefineArgs {
+    int64_t N;
+    int features_width, networks, outputs;  // outputs: the sum of widths
+    const int* widths;
+    const float* features;               // [N, features_width]
+    const float *weight_in, *bias_in;    // [networks * 64, features_width] [networks * 64]
+    const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
+    int threads;
+};
+
+struct RefineGrads {
+    float *features, *weight_in, *bias_in, *weight_out, *bias_out;
+};
+
 struct Kernels {
     const char* isa;
     void (*project)(const ProjectArgs&, const Splats&);
@@ -70,6 +122,12 @@ struct Kernels {
     void (*blend)(const BlendArgs&, const Picture&);
     void (*blend_backward)(const BlendArgs&, const Picture&, const BlendGrads&);
     double (*l1_ssim)(const SimilarityArgs&);
+    void (*observe_triangular)(const TriangularArgs&, const Observation&);
+    void (*observe_triangular_backward)(const TriangularArgs&, const Observation& grads, TriangularGrads&);
+    void (*show_colors)(const ColorArgs&, float* colors);
+    void (*show_colors_backward)(const ColorArgs&, const ColorGrads&);
+    void (*refine)(const RefineArgs&, float* out);
+    void (*refine_backward)(const RefineArgs&, const float* grads, const RefineGrads&);
 };
 
 constexpr int TILE = 16;  // pixels a side

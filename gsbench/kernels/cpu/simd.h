@@ -38,6 +38,12 @@ GSB_HD inline Vec& operator-=(Vec& a, Vec b) { return a = a - b; }
 GSB_HD inline Mask operator>(Vec a, Vec b) { return b < a; }
 GSB_HD inline Mask operator>=(Vec a, Vec b) { return b <= a; }
 
+// To the nearest integer, where |x| < 2^22: beyond the point where a float has no fraction, adding rounds.
+GSB_HD inline Vec round(Vec x) {
+    constexpr float no_fraction = 12582912.0f;  // 1.5 * 2^23
+    return (x + no_fraction) - no_fraction;
+}
+
 GSB_HD inline Vec load_first(const float* p, int n) { return n == LANES ? Vec::load(p) : gather(p, 1, n); }
 
 // log2 by the series of atanh on mantissas in [0.75, 1.5): relative error 1e-7 where the result is not near zero.

@@ -3,12 +3,7 @@
 
 #include "../math/blending.h"
 #include "bins.h"
-#include "buffer.h"
 #include "simd.h"
-
-#if defined(_OPENMP)
-#include <omp.h>
-#endif
 
 namespace gsb {
 inline namespace GSB_ISA {
@@ -21,14 +16,6 @@ constexpr int AHEAD = 4;      // splats whose records are fetched before they ar
 // Of a lane in its block, and of a block in its tile.
 alignas(64) constexpr float COLUMN[LANES] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
 alignas(64) constexpr float ROW[LANES] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
-
-inline int thread_index() {
-#if defined(_OPENMP)
-    return omp_get_thread_num();
-#else
-    return 0;
-#endif
-}
 
 // A splat as blending reads it: one cache line.
 struct alignas(64) Record {

@@ -15,7 +15,8 @@ def l1_ssim(
     ssim_weight: float,
 ) -> Tensor:  # []
     """The same value as `gsbench.train.losses.photometric`, differentiable in `image`."""
-    loss: Tensor = _L1SSIM.apply(image, target, ssim_weight)
+    with torch.cuda.device_of(image):
+        loss: Tensor = _L1SSIM.apply(image, target, ssim_weight)
     return loss
 
 

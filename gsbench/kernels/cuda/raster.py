@@ -29,14 +29,19 @@ class View(NamedTuple):
     antialias: bool
 
 
-class Project(torch.autograd.Function):
-    """means, factors, opacities, viewmats, Ks, view -> means2d [C, N, 2], roots [C, N, 4], depths [C, N],
-    half_sizes [C, N, 2].
+def project(
+    means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, view: View
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Project Gaussians: means2d [C, N, 2], roots [C, N, 4], depths [C, N], half_sizes [C, N, 2].
 
-    `roots` are p, q, r of the inverse 2D covariance's triangular root (math/projection.h) and the opacity; `half_sizes`,
-    where alpha >= 1/255, have no gradient.
-    """  # fmt: skip
+    `roots` are p, q, r of the inverse 2D covariance's triangular root (math/projection.h), and the opacity;
+    `half_sizes`, beyond which alpha < 1/255, have no gradient.
+    """
+    out: tuple[Tensor, Tensor, Tensor, Tensor] = _Project.apply(means, factors, opacities, viewmats, Ks, view)
+    return out
 
+
+class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
         *tensors, view = inputs
@@ -106,9 +111,15 @@ def bin_tiles(
     return Bins(offsets, ids), flagged
 
 
-class Blend(torch.autograd.Function):
-    """means2d, roots, colors [1 or C, N, D], background [D], bins, view -> image [C, H, W, D], alpha [C, H, W, 1]."""
+def blend(
+    means2d: Tensor, roots: Tensor, colors: Tensor, background: Tensor, bins: Bins, view: View
+) -> tuple[Tensor, Tensor]:
+    """Blend each tile's splats: image [C, H, W, D], alpha [C, H, W, 1]; colours are [1, N, D] for all or [C, N, D]."""
+    out: tuple[Tensor, Tensor] = _Blend.apply(means2d, roots, colors, background, bins, view)
+    return out
 
+
+class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
         *tensors, bins, view = inputs
@@ -133,9 +144,9 @@ class Blend(torch.autograd.Function):
         g_image, g_alpha = (None if g is None else g.contiguous() for g in grads)
         sums = means2d.new_zeros(C * N, GEOMETRY + D)
         out = [torch.empty_like(x) for x in (means2d, roots, colors)]
-        cuda().blend_backward(*ctx.sizes, *pointers(means2d, roots, colors, background, *bins),
-                              ctx.view.width, ctx.view.height,
-                              *pointers(transmittance, stop, g_image, g_alpha, sums, *out), stream(means2d))  # fmt: skip
+        cuda().blend_backward(*ctx.sizes, *pointers(means2d, roots, colors, background, *bins), ctx.view.width,
+                              ctx.view.height, *pointers(transmittance, stop, g_image, g_alpha, sums, *out),
+                              stream(means2d))  # fmt: skip
         g_background = None
         if ctx.needs_input_grad[3] and g_image is not None:
             g_background = (g_image * transmittance[..., None]).sum((0, 1, 2))

@@ -9,6 +9,13 @@
 #define GSB_HD __attribute__((always_inline))  // a vector that crosses a call goes through memory
 #endif
 
+// Small loops over the entries of a matrix: unrolled, so that the entries stay in registers.
+#if defined(__GNUC__) && !defined(__clang__) && !defined(__CUDACC__)
+#define GSB_UNROLL _Pragma("GCC unroll 16")
+#else
+#define GSB_UNROLL _Pragma("unroll")
+#endif
+
 // The same sources are compiled once for each instruction set: a namespace each, so that the linker keeps them apart.
 #ifndef GSB_ISA
 #define GSB_ISA portable
@@ -23,6 +30,7 @@ GSB_HD inline float max(float a, float b) { return a > b ? a : b; }
 GSB_HD inline float sqrt(float x) { return ::sqrtf(x); }
 GSB_HD inline float exp2(float x) { return ::exp2f(x); }
 GSB_HD inline float log2(float x) { return ::log2f(x); }
+GSB_HD inline float round(float x) { return ::rintf(x); }
 GSB_HD inline float reciprocal(float x) { return 1.0f / x; }
 
 constexpr float LOG2_E = 1.44269504f;
@@ -31,6 +39,11 @@ constexpr float LN_2 = 0.693147181f;
 template <class T>
 GSB_HD inline T exp(T x) {
     return exp2(x * LOG2_E);
+}
+
+template <class T>
+GSB_HD inline T sigmoid(T x) {
+    return T(1.0f) / (T(1.0f) + exp(T(0.0f) - x));
 }
 
 template <class T>

@@ -1,0 +1,98 @@
+// Slices of Gaussians with triangular factors, sixteen at a time; the mathematics is math/triangular.h.
+#include "../math/triangular.h"
+
+#include "buffer.h"
+#include "isa.h"
+#include "rows.h"
+
+namespace gsb {
+inline namespace GSB_ISA {
+namespace {
+
+constexpr int64_t CHUNK = 512;  // Gaussians a task; the gradients of lambda are summed by chunks
+
+TriangularModel model_of(const TriangularArgs& a) {
+    return {a.conditioned_first, a.row_scaled, a.half, a.lambda_d, a.lambda_t,
+            {a.center[0], a.center[1], a.center[2]}, a.time};
+}
+
+template <bool TIME>
+GSB_HD inline void load(const TriangularArgs& a, int64_t i, int n, TriangularParameters<Vec, TIME>& p) {
+    gather_row(a.means, i, n, p.mean);
+    gather_row(a.directions, i, n, p.direction);
+    if constexpr (TIME) p.time = load_first(a.times + i, n);
+    gather_row(a.log_diagonal, i, n, p.log_diagonal);
+    gather_row(a.off_diagonal, i, n, p.off_diagonal);
+    p.opacity = load_first(a.opacities + i, n);
+}
+
+GSB_HD inline void load(const Observation& o, int64_t i, int n, Observed<Vec>& out) {
+    gather_row(o.means, i, n, out.mean);
+    gather_matrix(o.factors, i, n, out.factor);
+    out.opacity = load_first(o.opacities + i, n);
+}
+
+template <bool TIME>
+void observe(const TriangularArgs& a, const Observation& out) {
+    const TriangularModel model = model_of(a);
+#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
+    for (int64_t i = 0; i < a.N; i += LANES) {
+        const int n = lanes_from(i, a.N);
+        TriangularParameters<Vec, TIME> raw;
+        load<TIME>(a, i, n, raw);
+        TriangularGaussian<Vec, TIME> gaussian(model, raw);
+        const Observed<Vec> seen = gaussian.observe();
+        scatter_row(seen.mean, out.means, i, n);
+        scatter_matrix(seen.factor, out.factors, i, n);
+        store_first(seen.opacity, out.opacities + i, n);
+    }
+}
+
+template <bool TIME>
+void observe_backward(const TriangularArgs& a, const Observation& grads, TriangularGrads& out) {
+    const TriangularModel model = model_of(a);
+    const int64_t chunks = (a.N + CHUNK - 1) / CHUNK;
+    Buffer<float> lambdas(static_cast<size_t>(chunks) * 2);
+#pragma omp parallel for num_threads(a.threads) schedule(static) if (chunks > 1)
+    for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+        const int64_t end = (chunk + 1) * CHUNK < a.N ? (chunk + 1) * CHUNK : a.N;
+        Vec lambda_d(0.0f), lambda_t(0.0f);
+        for (int64_t i = chunk * CHUNK; i < end; i += LANES) {
+            const int n = lanes_from(i, end);
+            TriangularParameters<Vec, TIME> raw, g;
+            Observed<Vec> given;
+            load<TIME>(a, i, n, raw);
+            load(grads, i, n, given);
+            TriangularGaussian<Vec, TIME> gaussian(model, raw);
+            gaussian.observe();
+            gaussian.vjp(given, g);
+            scatter_row(g.mean, out.means, i, n);
+            scatter_row(g.direction, out.directions, i, n);
+            if constexpr (TIME) store_first(g.time, out.times + i, n);
+            scatter_row(g.log_diagonal, out.log_diagonal, i, n);
+            scatter_row(g.off_diagonal, out.off_diagonal, i, n);
+            store_first(g.opacity, out.opacities + i, n);
+            lambda_d += g.lambda_d;  // lanes past the end were given zero
+            lambda_t += g.lambda_t;
+        }
+        lambdas[static_cast<size_t>(chunk) * 2] = sum(lambda_d);
+        lambdas[static_cast<size_t>(chunk) * 2 + 1] = sum(lambda_t);
+    }
+    double totals[2] = {};
+    for (size_t k = 0; k < static_cast<size_t>(chunks) * 2; ++k) totals[k % 2] += lambdas[k];
+    out.lambdas[0] = static_cast<float>(totals[0]);
+    out.lambdas[1] = static_cast<float>(totals[1]);
+}
+
+}  // namespace
+
+void observe_triangular(const TriangularArgs& a, const Observation& out) {
+    a.times ? observe<true>(a, out) : observe<false>(a, out);
+}
+
+void observe_triangular_backward(const TriangularArgs& a, const Observation& grads, TriangularGrads& out) {
+    a.times ? observe_backward<true>(a, grads, out) : observe_backward<false>(a, grads, out);
+}
+
+}  // namespace GSB_ISA
+}  // namespace gsb

@@ -1,0 +1,186 @@
+// One Gaussian over position, direction and maybe time with a triangular factor (6DGS, 7DGS): its slice, and backwards.
+#pragma once
+
+#include "harmonics.h"
+#include "slicing.h"
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+constexpr float EXPONENT_MAX = 80.0f;  // exp(-80) = 2e-35: beyond, nothing is left of a Gaussian
+
+// What is the same for all Gaussians of a model.
+struct TriangularModel {
+    bool conditioned_first;  // rows of the factor are (d, t, p); else (p, t, d), as in the paper
+    bool row_scaled;         // entries below the diagonal are (2 sigmoid(x) - 1) times their row's diagonal
+    float half;              // of f_dir's exponent: 1/2 (7DGS eq. 12) or 1 (6DGS)
+    float lambda_d, lambda_t;
+    float center[3], time;  // where from and when it is observed
+};
+
+// The Gaussian a rasterizer draws.
+template <class T>
+struct Observed {
+    T mean[3], factor[3][3], opacity;
+};
+
+template <class T, bool TIME>
+struct TriangularParameters {
+    static constexpr int K = TIME ? 4 : 3, N = K + 3, OFF = N * (N - 1) / 2;
+    T mean[3], direction[3], time, log_diagonal[N], off_diagonal[OFF], opacity;  // the last a logit
+    T lambda_d, lambda_t;                                                        // in gradients only
+};
+
+template <class T, bool TIME>
+struct TriangularGaussian {
+    using Parameters = TriangularParameters<T, TIME>;
+    static constexpr int K = Parameters::K, N = Parameters::N;
+
+    const TriangularModel& model;
+    const Parameters& raw;
+    T L[N][N];  // the factor, lower triangle
+    Reflections<T, K> reflections;
+    Reduced<T, K> t;
+    Vec3<T> offset;  // camera to mean
+    T white[K], delta_t, spread_t, gate, opacity;
+
+    GSB_HD TriangularGaussian(const TriangularModel& model, const Parameters& raw) : model(model), raw(raw) {}
+
+    // The factor's row of each row of (d, t, p).
+    GSB_HD int row(int i) const { return model.conditioned_first ? i : i < 3 ? N - 3 + i : i < K ? 3 : i - K; }
+
+    GSB_HD Observed<T> observe() {
+        const T zero(0.0f);
+        make_factor();
+        if (model.conditioned_first) {
+            GSB_UNROLL for (int i = 0; i < K; ++i) {
+                GSB_UNROLL for (int j = 0; j < K; ++j) t.qq[i][j] = j <= i ? L[i][j] : zero;
+            }
+            GSB_UNROLL for (int i = 0; i < 3; ++i) {
+                GSB_UNROLL for (int j = 0; j < K; ++j) t.pq[i][j] = L[K + i][j];
+                GSB_UNROLL for (int j = 0; j < 3; ++j) t.pp[i][j] = j <= i ? L[K + i][K + j] : zero;
+            }
+        } else {
+            T rows[N][N];
+            for (int i = 0; i < N; ++i) {
+                for (int j = 0; j < N; ++j) rows[i][j] = j <= row(i) ? L[row(i)][j] : zero;
+            }
+            reflections.reduce(rows, t);
+        }
+        T delta[K];
+        offset = {raw.mean[0] - model.center[0], raw.mean[1] - model.center[1], raw.mean[2] - model.center[2]};
+        const Vec3<T> d = Unit<T>(offset).direction;
+        delta[0] = d.x - raw.direction[0];
+        delta[1] = d.y - raw.direction[1];
+        delta[2] = d.z - raw.direction[2];
+        if constexpr (TIME) delta[3] = T(model.time) - raw.time;
+        whiten(t, delta, white);
+        T exponent = (white[0] * white[0] + white[1] * white[1] + white[2] * white[2]) * (model.half * model.lambda_d);
+        if constexpr (TIME) {
+            spread_t = zero;
+            GSB_UNROLL for (int j = 0; j < K; ++j) spread_t = spread_t + t.qq[3][j] * t.qq[3][j];
+            spread_t = sqrt(spread_t);
+            delta_t = delta[3] / spread_t;
+            exponent = exponent + delta_t * delta_t * (0.5f * model.lambda_t);
+        }
+        // What is too far from the query to be seen stays where it is, lest its huge numbers reach a gradient.
+        const auto seen = exponent < T(EXPONENT_MAX);
+        gate = select(seen, exp(zero - exponent), zero);
+        GSB_UNROLL for (int i = 0; i < K; ++i) white[i] = select(seen, white[i], zero);
+        if constexpr (TIME) delta_t = select(seen, delta_t, zero);
+        opacity = sigmoid(raw.opacity);
+
+        Observed<T> out;
+        const Vec3<T> moved = moved_mean(t, {raw.mean[0], raw.mean[1], raw.mean[2]}, white);
+        out.mean[0] = moved.x;
+        out.mean[1] = moved.y;
+        out.mean[2] = moved.z;
+        GSB_UNROLL for (int i = 0; i < 3; ++i) {
+            GSB_UNROLL for (int j = 0; j < 3; ++j) out.factor[i][j] = t.pp[i][j];
+        }
+        out.opacity = opacity * gate;
+        return out;
+    }
+
+    // After `observe`.
+    GSB_HD void vjp(const Observed<T>& g, Parameters& out) const {
+        const T zero(0.0f);
+        Reduced<T, K> g_t;
+        g_t.zero();
+        GSB_UNROLL for (int i = 0; i < 3; ++i) {
+            GSB_UNROLL for (int j = 0; j < 3; ++j) g_t.pp[i][j] = g.factor[i][j];
+        }
+        out.opacity = g.opacity * gate * opacity * (T(1.0f) - opacity);
+        const T g_exponent = zero - g.opacity * opacity * gate;
+        const T squares = white[0] * white[0] + white[1] * white[1] + white[2] * white[2];
+        out.lambda_d = g_exponent * squares * model.half;
+        T g_white[K];
+        GSB_UNROLL for (int i = 0; i < K; ++i) {
+            g_white[i] = i < 3 ? g_exponent * white[i] * (2.0f * model.half * model.lambda_d) : zero;
+        }
+        moved_mean_vjp(t, white, {g.mean[0], g.mean[1], g.mean[2]}, g_white, g_t);
+        const auto seen = gate > zero;
+        GSB_UNROLL for (int i = 0; i < K; ++i) g_white[i] = select(seen, g_white[i], zero);
+        whiten_vjp(t, white, g_white, g_t);  // now that of delta
+        out.lambda_t = out.time = zero;
+        if constexpr (TIME) {
+            out.lambda_t = g_exponent * delta_t * delta_t * 0.5f;
+            const T g_distance = g_exponent * delta_t * model.lambda_t / spread_t;
+            out.time = zero - g_white[3] - g_distance;
+            const T g_spread = g_distance * delta_t / spread_t;
+            GSB_UNROLL for (int j = 0; j < K; ++j) g_t.qq[3][j] = g_t.qq[3][j] - g_spread * t.qq[3][j];
+        }
+        const Vec3<T> g_offset = Unit<T>(offset).vjp({g_white[0], g_white[1], g_white[2]});
+        out.mean[0] = g.mean[0] + g_offset.x;
+        out.mean[1] = g.mean[1] + g_offset.y;
+        out.mean[2] = g.mean[2] + g_offset.z;
+        GSB_UNROLL for (int i = 0; i < 3; ++i) out.direction[i] = zero - g_white[i];
+        factor_vjp(g_t, out);
+    }
+
+private:
+    GSB_HD void make_factor() {
+        int at = 0;
+        GSB_UNROLL for (int i = 0; i < N; ++i) {
+            L[i][i] = exp(raw.log_diagonal[i]);
+            GSB_UNROLL for (int j = 0; j < i; ++j) {
+                const T x = raw.off_diagonal[at++];
+                L[i][j] = model.row_scaled ? (sigmoid(x) * 2.0f - 1.0f) * L[i][i] : x;
+            }
+        }
+    }
+
+    GSB_HD void factor_vjp(const Reduced<T, K>& g_t, Parameters& out) const {
+        T g_L[N][N];
+        if (model.conditioned_first) {
+            GSB_UNROLL for (int i = 0; i < N; ++i) {
+                GSB_UNROLL for (int j = 0; j <= i; ++j) {
+                    g_L[i][j] = i < K ? g_t.qq[i][j] : j < K ? g_t.pq[i - K][j] : g_t.pp[i - K][j - K];
+                }
+            }
+        } else {
+            T g_rows[N][N];
+            reflections.vjp(g_t, g_rows);
+            for (int i = 0; i < N; ++i) {
+                for (int j = 0; j <= row(i); ++j) g_L[row(i)][j] = g_rows[i][j];
+            }
+        }
+        int at = 0;
+        GSB_UNROLL for (int i = 0; i < N; ++i) {
+            T g_diagonal = g_L[i][i];
+            GSB_UNROLL for (int j = 0; j < i; ++j, ++at) {
+                if (model.row_scaled) {
+                    const T s = sigmoid(raw.off_diagonal[at]);
+                    g_diagonal = g_diagonal + g_L[i][j] * (s * 2.0f - 1.0f);
+                    out.off_diagonal[at] = g_L[i][j] * L[i][i] * s * (T(1.0f) - s) * 2.0f;
+                } else {
+                    out.off_diagonal[at] = g_L[i][j];
+                }
+            }
+            out.log_diagonal[i] = g_diagonal * L[i][i];
+        }
+    }
+};
+
+}  // namespace GSB_ISA
+}  // namespace gsb

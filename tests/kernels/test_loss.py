@@ -1,0 +1,62 @@
+"""The fused training loss against the one written in torch."""
+
+import pytest
+import torch
+
+from gsbench.errors import InputError
+from gsbench.kernels.loss import l1_ssim
+from gsbench.train.losses import photometric
+
+SIZES = [(1, 1), (3, 40), (17, 33), (48, 16), (90, 61)]
+
+
+def pictures(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Two that differ, and are equal in a few rows, where |a - b| has no slope."""
+    g = torch.Generator().manual_seed(height)
+    a = torch.rand(height, width, 3, generator=g)
+    b = (a + 0.2 * torch.randn(a.shape, generator=g)).clamp(0, 1)
+    b[:2] = a[:2]
+    return a, b
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_value_and_gradient(height: int, width: int, ssim_weight: float) -> None:
+    """Catches a wrong window, padding, edge or derivative, in pictures smaller than the window too."""
+    a, b = pictures(height, width)
+    exact, fused = a.double().requires_grad_(), a.clone().requires_grad_()
+    expected = photometric(exact, b.double(), ssim_weight)
+    actual = l1_ssim(fused, b, ssim_weight)
+    (3 * expected).backward()
+    (3 * actual).backward()
+    assert actual.item() == pytest.approx(expected.item(), rel=1e-5, abs=1e-6)
+    assert fused.grad is not None
+    assert exact.grad is not None
+    torch.testing.assert_close(fused.grad.double(), exact.grad, rtol=1e-3, atol=2e-5 * exact.grad.abs().max().item())
+    assert l1_ssim(a, b, ssim_weight).item() == actual.item()  # without a gradient: the same value
+
+
+@pytest.mark.usefixtures("threads")
+def test_same_bits_for_any_number_of_threads() -> None:
+    """Catches strips of the picture that see other neighbours, or sums in another order."""
+    a, b = pictures(90, 61)
+    results = []
+    for number in (1, 2, 7):
+        torch.set_num_threads(number)
+        image = a.clone().requires_grad_()
+        loss = l1_ssim(image, b, 0.2)
+        loss.backward()
+        results.append((loss.detach(), image.grad))
+    assert all(torch.equal(x, y) for other in results[1:] for x, y in zip(results[0], other, strict=True))
+
+
+def test_errors() -> None:
+    """Catches pictures of different size or type that would be read past their end."""
+    a, b = pictures(8, 8)
+    with pytest.raises(InputError, match="of one size"):
+        l1_ssim(a, b[1:], 0.2)
+    with pytest.raises(InputError, match="float32"):
+        l1_ssim(a.double(), b.double(), 0.2)
+    with pytest.raises(InputError, match="no gradient by target"):
+        l1_ssim(a, b.requires_grad_(), 0.2)

@@ -1,0 +1,172 @@
+"""Fused slicing, colours and refinement against the models written in torch."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.kernels.observe import observe_triangular, show_colors
+from gsbench.kernels.refine import refine
+from gsbench.models.appearance import sh_colors, sh_time_colors
+from gsbench.models.base import unit
+from gsbench.models.refinement import Refinement
+from gsbench.models.triangular import TriangularModel
+
+VARIANTS: list[tuple[bool, dict[str, Any]]] = [
+    (True, {}),
+    (True, {"factor_order": "paper"}),
+    (True, {"row_scaled": True}),
+    (False, {}),
+    (False, {"factor_order": "paper", "row_scaled": True, "directional_half": False}),
+]
+
+
+class Model(TriangularModel):
+    """6D, or 7D if it observes time."""
+
+    observes = ("direction",)
+    centers = ("means", "directions")
+
+
+class TimedModel(Model):
+    observes = ("time", "direction")  # type: ignore[assignment]
+
+
+def model_and_raw(timed: bool, options: dict[str, Any], dtype: torch.dtype) -> tuple[Model, dict[str, Tensor]]:
+    g = torch.Generator().manual_seed(1)
+    n, N = 7 if timed else 6, 37
+    raw = {"means": torch.randn(N, 3, generator=g), "directions": torch.randn(N, 3, generator=g),
+           "log_diagonal": 0.3 * torch.randn(N, n, generator=g) - 0.5,
+           "off_diagonal": 0.5 * torch.randn(N, n * (n - 1) // 2, generator=g),
+           "opacities": 2 * torch.randn(N, generator=g)}  # fmt: skip
+    raw["log_diagonal"][3:6] = -4.0  # so narrow that next to nothing is left of them
+    if timed:
+        raw["times"] = torch.rand(N, 1, generator=g)
+    model = (TimedModel if timed else Model)(lambda_d=0.3, lambda_t=0.5 if timed else None, **options)
+    model.log_modulation.requires_grad_(True)
+    return model.to(dtype), {k: v.to(dtype).requires_grad_() for k, v in raw.items()}
+
+
+def gradients(outputs: list[Tensor], inputs: list[Tensor]) -> list[Tensor]:
+    g = torch.Generator().manual_seed(2)
+    weights = [torch.randn(x.shape, generator=g).to(x) for x in outputs]
+    return list(torch.autograd.grad(outputs, inputs, weights))
+
+
+def assert_same(actual: list[Tensor], expected: list[Tensor]) -> None:
+    for a, b in zip(actual, expected, strict=True):
+        assert (a - b).norm() <= 1e-4 * b.norm() + 1e-7
+        assert ((a == 0) == (b.float() == 0)).float().mean() > 0.999
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize(("timed", "options"), VARIANTS)
+def test_slice(timed: bool, options: dict[str, Any]) -> None:
+    """Catches a wrong row order, reflection, gate or derivative of any parameter, in every instruction set."""
+    center = torch.tensor([0.3, -0.2, -3.0])
+    exact, raw = model_and_raw(timed, options, torch.float64)
+    seen = exact.condition(raw, center.double(), torch.tensor(0.4, dtype=torch.float64))
+    expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
+    model, single = model_and_raw(timed, options, torch.float32)
+    lambdas = list(model.log_modulation.parameters())
+    actual = list(observe_triangular(
+        single["means"], single["directions"], single.get("times"), single["log_diagonal"], single["off_diagonal"],
+        single["opacities"], center, 0.4, model.modulation("direction"), model.modulation("time") if timed else None,
+        conditioned_first=options.get("factor_order") != "paper", row_scaled=model.row_scaled,
+        directional_half=model.directional_half,
+    ))  # fmt: skip
+    assert_same(actual, expected)
+    assert_same(gradients(actual, [*single.values(), *lambdas]),
+                gradients(expected, [*raw.values(), *exact.log_modulation.parameters()]))  # fmt: skip
+
+
+def color_inputs(waves: int, dtype: torch.dtype) -> list[Tensor]:
+    g = torch.Generator().manual_seed(3)
+    N = 21
+    shapes = [(N, 1, 3), (N, 16 * waves - 1, 3), (N, 3), (N, 1)]
+    return [torch.randn(shape, generator=g).to(dtype).requires_grad_() for shape in shapes]
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("waves", [1, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colors(degree: int, waves: int) -> None:
+    """Catches a wrong harmonic, wave or derivative, and coefficients of degrees not yet in use that get a gradient."""
+    center, opacities = torch.tensor([0.1, 0.2, -2.0]), torch.ones(21)
+    sh0, shN, means, times = color_inputs(waves, torch.float64)
+    directions = unit(means - center.double())
+    all_of = torch.cat([sh0, shN], 1)
+    if waves == 1:
+        expected, inputs = sh_colors(all_of, directions, degree), 3
+    else:
+        expected, inputs = sh_time_colors(all_of.unflatten(1, (waves, 16)), directions, degree, 0.7 - times[:, 0]), 4
+    single = color_inputs(waves, torch.float32)
+    actual = show_colors(*single[:3], opacities, center, degree, single[3] if waves > 1 else None, 0.7, waves)
+    assert_same([actual], [expected])
+    g_exact = torch.autograd.grad(expected, (sh0, shN, means, times)[:inputs], torch.ones_like(expected),
+                                  materialize_grads=True)  # fmt: skip
+    assert_same(list(torch.autograd.grad(actual, single[:inputs], torch.ones_like(actual))), list(g_exact))
+
+
+def test_what_cannot_be_drawn_has_no_color() -> None:
+    """Catches culling that is not exact: colours are left out only below 1/255, and then get no gradient."""
+    sh0, shN, means, _ = color_inputs(1, torch.float32)
+    opacities = torch.full((21,), 0.99 / 255)
+    opacities[::5] = 1.01 / 255
+    colors = show_colors(sh0, shN, means, opacities, torch.zeros(3), 3)
+    everything = show_colors(sh0, shN, means, torch.ones(21), torch.zeros(3), 3)
+    assert torch.equal(colors[::5], everything[::5])
+    (gradient,) = torch.autograd.grad(colors, shN, torch.ones_like(colors))
+    hidden = opacities < 1 / 255
+    assert not colors[hidden].any()
+    assert not gradient[hidden].any()
+    assert gradient[~hidden].any()
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("N", [1, 127, 300])
+@pytest.mark.parametrize("widths", [[3, 1, 3, 28], [3, 7], [3, 3, 21]])
+def test_refinement(N: int, widths: list[int]) -> None:
+    """Catches a block's edge that is lost, a network that reads another's weights, and any wrong gradient."""
+    g = torch.Generator().manual_seed(N)
+    exact = Refinement(sum(widths[:-1]), widths, g).double()
+    with torch.no_grad():
+        for parameter in exact.parameters():
+            parameter.add_(0.2 * torch.randn(parameter.shape, generator=g))
+    features = torch.randn(N, sum(widths[:-1]), generator=g, dtype=torch.float64).requires_grad_()
+    expected = exact(features, torch.tensor(0.37, dtype=torch.float64))
+
+    single = Refinement(sum(widths[:-1]), widths, g)
+    single.load_state_dict(exact.state_dict())
+    inputs = features.detach().float().requires_grad_()
+    at_time = single.at_time(torch.tensor(0.37))
+    weight = single.weight_in[:, : single.features]
+    actual = refine(inputs, weight, at_time, list(single.weights_out), list(single.biases_out))
+    for a, b in zip(actual, expected, strict=True):
+        torch.testing.assert_close(a.double(), b, rtol=1e-5, atol=1e-5)
+    assert_same(gradients(actual, [inputs, *single.parameters()]),
+                gradients(expected, [features, *exact.parameters()]))  # fmt: skip
+
+
+def test_no_gaussians() -> None:
+    """Catches a loop that runs once over nothing."""
+    out = refine(torch.empty(0, 3), torch.ones(128, 3), torch.ones(128), [torch.ones(3, 64), torch.ones(7, 64)],
+                 [torch.ones(3), torch.ones(7)])  # fmt: skip
+    assert [x.shape for x in out] == [(0, 3), (0, 7)]
+    assert show_colors(torch.empty(0, 1, 3), torch.empty(0, 15, 3), torch.empty(0, 3), torch.empty(0),
+                       torch.zeros(3), 3).shape == (0, 3)  # fmt: skip
+
+
+def test_errors() -> None:
+    """Catches arrays that do not fit, which a kernel would read past their end."""
+    sh0, shN, means, _ = color_inputs(1, torch.float32)
+    with pytest.raises(InputError, match="coefficients"):
+        show_colors(sh0, shN[:, :7], means, torch.ones(21), torch.zeros(3), 3)
+    with pytest.raises(InputError, match="means of shape"):
+        show_colors(sh0, shN, means[:5], torch.ones(5), torch.zeros(3), 3)
+    with pytest.raises(InputError, match="no gradient by center"):
+        show_colors(sh0, shN, means, torch.ones(21), torch.zeros(3).requires_grad_(), 3)
+    with pytest.raises(InputError, match="refine: expected"):
+        refine(torch.ones(4, 3), torch.ones(64, 3), torch.ones(64), [torch.ones(3, 32)], [torch.ones(3)])

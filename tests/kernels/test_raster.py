@@ -1,0 +1,188 @@
+"""The native rasterizer against a brute-force picture, the reference's gradients in float64, and its own promises."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from raster.cases import camera, case, gaussians, names
+from raster.oracle import paint
+from torch import Tensor
+
+from gsbench import kernels
+from gsbench.errors import InputError
+from gsbench.raster import RasterOutput, rasterize
+
+DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background")
+
+
+def single(name: str) -> dict[str, Any]:
+    arguments = case(name, torch.float32)
+    arguments.setdefault("background", torch.full((arguments["colors"].shape[-1],), 0.3))
+    return arguments
+
+
+def differentiate(arguments: dict[str, Any], backend: str, undecided: Tensor) -> tuple[RasterOutput, dict[str, Tensor]]:
+    """A picture, and the gradients of a random sum over the pixels that rounding cannot decide otherwise."""
+    inputs = {k: v.clone().requires_grad_(k in DIFFERENTIABLE) if isinstance(v, Tensor) else v
+              for k, v in arguments.items()}  # fmt: skip
+    output = rasterize(**inputs, backend=backend)
+    output.info.means2d.retain_grad()
+    g = torch.Generator().manual_seed(1)
+    weight = torch.randn(output.image.shape, generator=g).to(output.image) * ~undecided[..., None]
+    weight_alpha = torch.randn(output.alpha.shape, generator=g).to(output.image) * ~undecided[..., None]
+    ((output.image * weight).sum() + (output.alpha * weight_alpha).sum()).backward()
+    gradients = {k: inputs[k].grad for k in DIFFERENTIABLE}
+    gradients["means2d"] = output.info.means2d.grad
+    return output, {k: torch.zeros(()) if v is None else v for k, v in gradients.items()}
+
+
+def undecided_pixels(arguments: dict[str, Any]) -> Tensor:
+    arrays = {k: v.double().numpy() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+    return torch.from_numpy(paint(**arrays).slack <= 1e-3)
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("name", names())
+def test_picture(name: str) -> None:
+    """Catches any rule of the picture that differs, a bound that loses a pixel, and a wrong rounding in one ISA."""
+    arguments = single(name)
+    arrays = {k: v.double().numpy() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+    picture = paint(**arrays)
+    output = rasterize(**arguments, backend="cpu")
+    decided = picture.slack > 1e-3
+    np.testing.assert_allclose(output.image.numpy()[decided], picture.image[decided], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(output.alpha.numpy()[decided], picture.alpha[decided], rtol=0, atol=1e-4)
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("name", names())
+def test_gradients(name: str) -> None:
+    """Catches a wrong gradient of any input: by size, by direction, and by which entries are zero."""
+    arguments = single(name)
+    undecided = undecided_pixels(arguments)
+    exact = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+    _, expected = differentiate(exact, "reference", undecided)
+    _, actual = differentiate(arguments, "cpu", undecided)
+    for key, truth in expected.items():
+        got = actual[key].double()
+        scale = truth.norm()
+        assert (got - truth).norm() <= 1e-3 * scale + 1e-6, key
+        if scale > 1e-6:
+            assert torch.nn.functional.cosine_similarity(got.flatten(), truth.flatten(), 0) > 0.9999, key
+        noise = 1e-6 * (truth.abs().max() if truth.numel() else 0) + 1e-9
+        assert not ((got == 0) & (truth.abs() > noise)).any(), f"{key}: a gradient is missing"
+        assert not ((truth == 0) & (got.abs() > noise)).any(), f"{key}: a gradient should be zero"
+
+
+@pytest.mark.parametrize("name", names())
+def test_info(name: str) -> None:
+    """Catches radii, means or depths that differ from the reference's: density control lives on them."""
+    arguments = single(name)
+    expected, actual = (rasterize(**arguments, backend=backend).info for backend in ("reference", "cpu"))
+    assert actual.radii.dtype == torch.int32
+    assert (actual.radii - expected.radii).abs().le(1 + 1e-5 * expected.radii).all()
+    assert ((actual.radii > 0) == (expected.radii > 0)).float().mean() > 0.95 or not len(arguments["means"])
+    drawn = actual.radii > 0
+    torch.testing.assert_close(actual.means2d[drawn], expected.means2d[drawn], rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(actual.depths, expected.depths, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels", "opaque_stack"])
+def test_same_bits_for_any_number_of_threads(name: str) -> None:
+    """Catches sums whose order depends on who comes first."""
+    arguments = single(name)
+    if name == "random":  # several tiles and several tasks of every loop
+        g = torch.Generator().manual_seed(0)
+        scene = gaussians(g, 3000, size=0.05) | camera(150, 100) | {"background": torch.ones(3)}
+        arguments = {k: v.float() if isinstance(v, Tensor) else v for k, v in scene.items()}
+    none = torch.zeros(len(arguments["viewmats"]), arguments["height"], arguments["width"], dtype=torch.bool)
+    results = []
+    for number in (1, 2, 5):
+        torch.set_num_threads(number)
+        output, gradients = differentiate(arguments, "cpu", none)
+        results.append([output.image, output.alpha, *gradients.values()])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_layouts_do_not_matter() -> None:
+    """Catches memory read in the wrong order: transposed factors, expanded colours, strided means."""
+    arguments = single("three_cameras")
+    N = len(arguments["means"])
+    arguments["colors"] = arguments["colors"][0]
+    expected = rasterize(**arguments, backend="cpu").image
+    strided = arguments | {
+        "factors": arguments["factors"].mT.contiguous().mT,
+        "means": torch.cat([arguments["means"], torch.ones(N, 2)], 1)[:, :3],
+        "colors": arguments["colors"].expand(3, N, 3),
+        "viewmats": arguments["viewmats"].mT.contiguous().mT,
+    }
+    assert torch.equal(rasterize(**strided, backend="cpu").image, expected)
+
+
+def test_shared_colors_collect_the_gradient_of_every_camera() -> None:
+    """Catches a gradient of shared colours that keeps only one camera's part."""
+    arguments = single("three_cameras") | {"colors": torch.rand(30, 3)}
+    none = undecided_pixels(arguments) & False
+    _, shared = differentiate(arguments, "cpu", none)
+    _, separate = differentiate(arguments | {"colors": arguments["colors"].repeat(3, 1, 1)}, "cpu", none)
+    torch.testing.assert_close(shared["colors"], separate["colors"].sum(0))
+
+
+def test_what_it_cannot_do_is_said() -> None:
+    """Catches a crash or a silent wrong result where the backend has limits the reference has not."""
+    arguments = single("random")
+    double = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+    with pytest.raises(InputError, match="float32"):
+        rasterize(**double, backend="cpu")
+    with pytest.raises(InputError, match="no gradient by Ks"):
+        rasterize(**arguments | {"Ks": arguments["Ks"].requires_grad_()}, backend="cpu")
+
+
+def test_a_request_beyond_memory_fails_by_message() -> None:
+    """Catches the process being killed: 100,000 Gaussians that each cover a 4k picture, before 2,000 cameras."""
+    g = torch.Generator().manual_seed(0)
+    scene = gaussians(g, 100_000, size=20.0) | camera(3840, 2160)
+    arguments = {k: v.float() if isinstance(v, Tensor) else v for k, v in scene.items()}
+    with pytest.raises(InputError, match=r"GiB|pairs"):
+        rasterize(**arguments, backend="cpu")
+    few = single("random") | {"width": 3840, "height": 2160}
+    many = few | {"viewmats": few["viewmats"].repeat(2000, 1, 1), "Ks": few["Ks"].repeat(2000, 1, 1)}
+    with pytest.raises(InputError, match="GiB"):
+        rasterize(**many, backend="cpu")
+
+
+def test_extension_refuses_wrong_arrays() -> None:
+    """Catches a kernel that reads past an array: the last door checks type, layout and size itself."""
+    native = kernels.native()
+    good = [torch.rand(4, 3), torch.rand(4, 3, 3), torch.rand(4), torch.eye(4)[None], torch.eye(3)[None]]
+    rest = [8, 8, 0.01, 100.0, 0.3, False, 1]
+    out = [torch.empty(1, 4, 2), torch.empty(1, 4, 3), torch.empty(1, 4), torch.empty(1, 4), torch.empty(1, 4, 2)]
+    native.project(*good, *rest, *out)
+    for i, bad in [(0, torch.rand(4, 3).double()), (0, torch.rand(3, 4).mT), (1, torch.rand(4, 9))]:
+        with pytest.raises(TypeError):
+            native.project(*[bad if k == i else x for k, x in enumerate(good)], *rest, *out)
+    with pytest.raises(ValueError, match="disagree on N"):
+        native.project(good[0], good[1], torch.rand(3), *good[3:], *rest, *out)
+    with pytest.raises(ValueError, match="C x N"):
+        native.project(*good, *rest, torch.empty(1, 3, 2), *out[1:])
+
+
+@pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels"])
+def test_operations_keep_torch_s_rules(name: str) -> None:
+    """Catches an operation that aliases, mutates or misdeclares its outputs, so that torch.compile would be wrong."""
+    from gsbench.kernels import raster
+
+    a = single(name)
+    inputs = [a[k].requires_grad_() for k in ("means", "factors", "opacities", "viewmats")]
+    rest = (a["Ks"], a["width"], a["height"], 0.01, 1e10, 0.3, False)
+    checks = ("test_schema", "test_autograd_registration", "test_faketensor")
+    torch.library.opcheck(raster.project, (*inputs, *rest), test_utils=checks)
+    means2d, roots, opacities, depths, half_sizes = (x.detach() for x in raster.project(*inputs, *rest))
+    offsets, ids = raster.bin_tiles(means2d, depths, half_sizes, a["width"], a["height"])
+    colors = a["colors"] if a["colors"].dim() == 3 else a["colors"][None]
+    blended = [x.requires_grad_() for x in (means2d, roots, opacities)]
+    torch.library.opcheck(raster.blend, (*blended, half_sizes, colors, a["background"], offsets, ids, a["width"],
+                                         a["height"]), test_utils=checks)  # fmt: skip
