@@ -16,6 +16,7 @@
 #define __host__
 #define __shared__ static  // blocks run one at a time, and a block's fibers share it
 #define __launch_bounds__(...)
+#define __grid_constant__
 
 struct dim3 {
     unsigned x, y, z;

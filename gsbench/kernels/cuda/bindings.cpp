@@ -1,6 +1,7 @@
 // The door between Python and the CUDA kernels. Tensors cross as addresses, not as arrays: a DLPack capsule costs
 // microseconds for each, as much as the kernels themselves take. gsbench/kernels/cuda/*.py checks what it passes.
 #include <nanobind/nanobind.h>
+#include <nanobind/stl/vector.h>
 
 #include "kernels.h"
 #include "sort.h"
@@ -96,6 +97,77 @@ void blend_backward(int64_t N, int64_t C, int D, bool color_per_camera, Address 
         {nullptr, nullptr, transmittance, stop}, {g_image, g_alpha, sums, out_means2d, out_roots, out_colors}, stream);
 }
 
+gsb::cuda::TriangularArgs triangular_args(int64_t N, bool conditioned_first, bool row_scaled, float half, float time,
+                                          Address lambda_d, Address lambda_t, Address center, Address means,
+                                          Address directions, Address times, Address log_diagonal, Address off_diagonal,
+                                          Address opacities) {
+    return {N, conditioned_first, row_scaled, half, time, lambda_d, lambda_t, center, means, directions, times,
+            log_diagonal, off_diagonal, opacities};
+}
+
+void observe_triangular(int64_t N, bool conditioned_first, bool row_scaled, float half, float time, Address lambda_d,
+                        Address lambda_t, Address center, Address means, Address directions, Address times,
+                        Address log_diagonal, Address off_diagonal, Address opacities, Address out_means,
+                        Address out_factors, Address out_opacities, Address stream) {
+    gsb::cuda::observe_triangular(
+        triangular_args(N, conditioned_first, row_scaled, half, time, lambda_d, lambda_t, center, means, directions,
+                        times, log_diagonal, off_diagonal, opacities),
+        {out_means, out_factors, out_opacities}, stream);
+}
+
+void observe_triangular_backward(int64_t N, bool conditioned_first, bool row_scaled, float half, float time,
+                                 Address lambda_d, Address lambda_t, Address center, Address means, Address directions,
+                                 Address times, Address log_diagonal, Address off_diagonal, Address opacities,
+                                 Address g_means, Address g_factors, Address g_opacities, Address out_means,
+                                 Address out_directions, Address out_times, Address out_log_diagonal,
+                                 Address out_off_diagonal, Address out_opacities, Address out_lambdas, Address stream) {
+    gsb::cuda::observe_triangular_backward(
+        triangular_args(N, conditioned_first, row_scaled, half, time, lambda_d, lambda_t, center, means, directions,
+                        times, log_diagonal, off_diagonal, opacities),
+        {g_means, g_factors, g_opacities},
+        {out_means, out_directions, out_times, out_log_diagonal, out_off_diagonal, out_opacities, out_lambdas}, stream);
+}
+
+void show_colors(int64_t N, int degree, int bases, int waves, Address sh0, Address shN, Address means,
+                 Address opacities, Address times, Address center, float time, Address colors, Address stream) {
+    gsb::cuda::show_colors({N, degree, bases, waves, sh0, shN, means, opacities, times, center, time}, colors, stream);
+}
+
+void show_colors_backward(int64_t N, int degree, int bases, int waves, Address sh0, Address shN, Address means,
+                          Address opacities, Address times, Address center, float time, Address g_colors,
+                          Address out_sh0, Address out_shN, Address out_means, Address out_times, Address stream) {
+    gsb::cuda::show_colors_backward({N, degree, bases, waves, sh0, shN, means, opacities, times, center, time},
+                                    {g_colors, out_sh0, out_shN, out_means, out_times}, stream);
+}
+
+gsb::cuda::RefineArgs refine_args(int64_t N, int features_width, const std::vector<int>& widths, Address features,
+                                  Address weight_in, Address bias_in, Address weight_out, Address bias_out) {
+    using namespace gsb::cuda;
+    if (features_width >= MAX_FEATURES || widths.size() > MAX_NETWORKS) throw nb::value_error("networks too large");
+    RefineArgs args{N, features_width, static_cast<int>(widths.size()), 0, {}, features, weight_in, bias_in, weight_out,
+                    bias_out};
+    for (size_t k = 0; k < widths.size(); ++k) {
+        if (widths[k] > MAX_WIDTH) throw nb::value_error("networks too large");
+        args.outputs += args.widths[k] = widths[k];
+    }
+    return args;
+}
+
+void refine(int64_t N, int features_width, const std::vector<int>& widths, Address features, Address weight_in,
+            Address bias_in, Address weight_out, Address bias_out, Address out, Address stream) {
+    gsb::cuda::refine(refine_args(N, features_width, widths, features, weight_in, bias_in, weight_out, bias_out), out,
+                      stream);
+}
+
+void refine_backward(int64_t N, int features_width, const std::vector<int>& widths, Address features, Address weight_in,
+                     Address bias_in, Address weight_out, Address bias_out, Address g_out, Address out_features,
+                     Address out_weight_in, Address out_bias_in, Address out_weight_out, Address out_bias_out,
+                     Address stream) {
+    gsb::cuda::refine_backward(
+        refine_args(N, features_width, widths, features, weight_in, bias_in, weight_out, bias_out), g_out,
+        {out_features, out_weight_in, out_bias_in, out_weight_out, out_bias_out}, stream);
+}
+
 void l1_ssim(int height, int width, Address image, Address target, float ssim_weight, Address loss, Address derivatives,
              Address grad, Address stream) {
     gsb::cuda::l1_ssim({height, width, image, target, ssim_weight, loss, derivatives, grad}, stream);
@@ -113,5 +185,14 @@ NB_MODULE(GSB_MODULE, m) {
     m.def("fill_tiles", &fill_tiles);
     m.def("blend", &blend);
     m.def("blend_backward", &blend_backward);
+    m.def("observe_triangular", &observe_triangular);
+    m.def("observe_triangular_backward", &observe_triangular_backward);
+    m.def("show_colors", &show_colors);
+    m.def("show_colors_backward", &show_colors_backward);
+    m.def("refine", &refine);
+    m.def("refine_backward", &refine_backward);
+    m.attr("MAX_FEATURES") = gsb::cuda::MAX_FEATURES - 1;
+    m.attr("MAX_NETWORKS") = gsb::cuda::MAX_NETWORKS;
+    m.attr("MAX_WIDTH") = gsb::cuda::MAX_WIDTH;
     m.def("l1_ssim", &l1_ssim);
 }

@@ -80,6 +80,60 @@ struct SimilarityArgs {
     float* grad;         // [H, W, 3]
 };
 
+// Gaussians with a triangular factor over (p, d) or (p, t, d), observed from a place and at a time (6DGS, 7DGS).
+struct TriangularArgs {
+    int64_t N;
+    bool conditioned_first, row_scaled;
+    float half, time;
+    const float *lambda_d, *lambda_t, *center;  // [1] [1] [3]
+    const float *means, *directions, *times;    // [N, 3] [N, 3] [N], null: time is not observed
+    const float *log_diagonal, *off_diagonal;   // [N, n] [N, n (n - 1) / 2]
+    const float* opacities;                     // [N] logits
+};
+
+struct TriangularGrads {
+    float *means, *directions, *times, *log_diagonal, *off_diagonal, *opacities;
+    float* lambdas;  // [2] of direction and time, zero on entry; null: not wanted
+};
+
+// The 3D Gaussians that an observation leaves, or their gradients.
+struct Observation {
+    float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
+};
+
+// Colours by spherical harmonics in the direction from `center`, times `waves` frequencies of time.
+struct ColorArgs {
+    int64_t N;
+    int degree, bases, waves;        // bases: harmonics stored for each frequency
+    const float *sh0, *shN;          // [N, 3] [N, waves * bases - 1, 3]
+    const float *means, *opacities;  // [N, 3] [N]: one below 1/255 is not drawn, and has no colour
+    const float* times;              // [N], null: colours do not change
+    const float* center;             // [3]
+    float time;
+};
+
+struct ColorGrads {
+    const float* colors;
+    float *sh0, *shN, *means, *times;  // zero on entry
+};
+
+// Perceptrons features x 64 x width, one for each of `networks`, on every Gaussian (AGR).
+constexpr int MAX_NETWORKS = 4, MAX_FEATURES = 8, MAX_WIDTH = 28;
+
+struct RefineArgs {
+    int64_t N;
+    int features_width, networks, outputs;  // outputs: the sum of widths
+    int widths[MAX_NETWORKS];
+    const float* features;               // [N, features_width]
+    const float *weight_in, *bias_in;    // [networks * 64, features_width] [networks * 64]
+    const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
+};
+
+struct RefineGrads {
+    float* features;                                     // [networks, N, features_width], to be added up
+    float *weight_in, *bias_in, *weight_out, *bias_out;  // zero on entry
+};
+
 // Bit k of `flags` is set where the k-th array has a value that is not finite, or out of range: means, factors,
 // opacities, colors, viewmats, Ks, background.
 struct Values {
@@ -102,6 +156,15 @@ void fill_tiles(const BinArgs&, const uint32_t* order, const int64_t* ends, int6
 
 void blend(const BlendArgs&, const Picture&, Stream);
 void blend_backward(const BlendArgs&, const Picture&, const BlendGrads&, Stream);
+
+void observe_triangular(const TriangularArgs&, const Observation&, Stream);
+void observe_triangular_backward(const TriangularArgs&, const Observation& grads, const TriangularGrads&, Stream);
+
+void show_colors(const ColorArgs&, float* colors, Stream);
+void show_colors_backward(const ColorArgs&, const ColorGrads&, Stream);
+
+void refine(const RefineArgs&, float* out, Stream);
+void refine_backward(const RefineArgs&, const float* grads, const RefineGrads&, Stream);
 
 int similarity_blocks(int height, int width);
 void l1_ssim(const SimilarityArgs&, Stream);
