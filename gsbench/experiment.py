@@ -51,6 +51,7 @@ def run(composed: DictConfig) -> Record:
     this = identify(composed)
     config = this.config
     model = models.build(config.model.name, agr=config.agr, sh_degree=config.model.sh_degree, **config.model.options)
+    model.backend = config.raster.backend
     scene = load_scene(config)
     done = finished(this, scene)
     if done is not None:

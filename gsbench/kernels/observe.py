@@ -11,6 +11,7 @@ from torch.library import custom_op
 
 from gsbench.errors import InputError
 from gsbench.kernels import native, threads
+from gsbench.kernels.cuda import observe as on_cuda
 
 
 def observe_triangular(
@@ -21,7 +22,7 @@ def observe_triangular(
     off_diagonal: Tensor,  # [N, n (n - 1) / 2]
     opacities: Tensor,  # [N] logits
     center: Tensor,  # [3]
-    time: float | None,
+    time: Tensor | None,  # []
     lambda_d: Tensor,  # []
     lambda_t: Tensor | None,  # []
     *,
@@ -36,7 +37,7 @@ def observe_triangular(
     (d, t, p), else (p, t, d).
 
     Raises:
-        InputError: not float32 on the CPU, shapes that do not fit, or a gradient by `center` is asked for.
+        InputError: not float32 on one device, shapes that do not fit, or a gradient by `center` is asked for.
     """
     N, n = len(means), 6 if times is None else 7
     empty = means.new_empty(0)
@@ -48,7 +49,7 @@ def observe_triangular(
     _check("observe_triangular", arrays)
     return _observe(
         means, directions, empty if times is None else times[:, 0], log_diagonal, off_diagonal, opacities, center,
-        time or 0.0, lambda_d, means.new_ones(()) if lambda_t is None else lambda_t,
+        empty if time is None or times is None else time, lambda_d, empty if lambda_t is None else lambda_t,
         0.5 if directional_half else 1.0, conditioned_first, row_scaled,
     )  # fmt: skip
 
@@ -56,12 +57,12 @@ def observe_triangular(
 @custom_op("gsbench::observe_triangular", mutates_args=())
 def _observe(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
-    center: Tensor, time: float, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
+    center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
     row_scaled: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     out = means.new_empty(len(means), 3), means.new_empty(len(means), 3, 3), means.new_empty(len(means))
     arrays = _plain(means, directions, times, log_diagonal, off_diagonal, opacities, center)
-    native().observe_triangular(*arrays, time, lambda_d.item(), lambda_t.item(), half, conditioned_first, row_scaled,
+    native().observe_triangular(*arrays, *map(_number, (time, lambda_d, lambda_t)), half, conditioned_first, row_scaled,
                                 threads(), *out)  # fmt: skip
     return out
 
@@ -75,14 +76,14 @@ def _(means: Tensor, *_: Any) -> tuple[Tensor, Tensor, Tensor]:
 @custom_op("gsbench::observe_triangular_backward", mutates_args=())
 def _observe_backward(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
-    center: Tensor, lambda_d: Tensor, lambda_t: Tensor, time: float, half: float, conditioned_first: bool,
+    center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
     row_scaled: bool, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     arrays = _plain(means, directions, times, log_diagonal, off_diagonal, opacities)
     out = tuple(x.new_empty(x.shape) for x in arrays)
     lambdas = means.new_empty(2)
     native().observe_triangular_backward(
-        *arrays, *_plain(center), time, lambda_d.item(), lambda_t.item(), half, conditioned_first, row_scaled,
+        *arrays, *_plain(center), *map(_number, (time, lambda_d, lambda_t)), half, conditioned_first, row_scaled,
         threads(), *_plain(g_means, g_factors, g_opacities), *out, lambdas,
     )  # fmt: skip
     return out[0], out[1], out[2], out[3], out[4], out[5], lambdas
@@ -94,15 +95,17 @@ def _(*arrays: Any) -> tuple[Tensor, ...]:
 
 
 def _observe_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # noqa: ARG001
-    ctx.save_for_backward(*inputs[:7], *inputs[8:10])
-    ctx.rest = inputs[7], *inputs[10:]
+    ctx.save_for_backward(*inputs[:10])
+    ctx.rest = inputs[10:]
 
 
 def _observe_gradient(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
     *g, lambdas = _observe_backward(*ctx.saved_tensors, *ctx.rest, *grads)
-    return *g, None, None, lambdas[0], lambdas[1], None, None, None
+    return *g, None, None, lambdas[0], lambdas[1] if ctx.needs_input_grad[9] else None, None, None, None
 
 
+_observe.register_kernel("cuda")(on_cuda.observe)
+_observe_backward.register_kernel("cuda")(on_cuda.observe_backward)
 _observe.register_autograd(_observe_gradient, setup_context=_observe_context)
 
 
@@ -123,7 +126,7 @@ def show_colors(
     opacity is below 1/255. K harmonics are stored a frequency, (degree + 1)^2 of them are used.
 
     Raises:
-        InputError: not float32 on the CPU, or shapes that do not fit.
+        InputError: not float32 on one device, or shapes that do not fit.
     """
     N, all_of = len(means), shN.shape[1] + 1 if shN.dim() == 3 else 0
     arrays = {"sh0": (sh0, (N, 1, 3)), "shN": (shN, (N, all_of - 1, 3)), "means": (means, (N, 3)),
@@ -181,7 +184,14 @@ def _show_gradient(ctx: Any, g_colors: Tensor) -> tuple[Tensor | None, ...]:
     return g[0], g[1], g[2], None, g[3], None, None, None, None
 
 
+_show.register_kernel("cuda")(on_cuda.show)
+_show_backward.register_kernel("cuda")(on_cuda.show_backward)
 _show.register_autograd(_show_gradient, setup_context=_show_context)
+
+
+def _number(tensor: Tensor) -> float:
+    """The value of a scalar, 0 of an empty tensor."""
+    return float(tensor.item()) if tensor.numel() else 0.0
 
 
 def _plain(*tensors: Tensor) -> tuple[Tensor, ...]:
@@ -193,8 +203,9 @@ def _check(operation: str, arrays: dict[str, tuple[Tensor, tuple[int, ...]]]) ->
     for name, (tensor, shape) in arrays.items():
         if tuple(tensor.shape) != shape:
             raise InputError(f"{operation}: expected {name} of shape {list(shape)}, got {list(tensor.shape)}")
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise InputError(f"{operation}: expected {name} as float32 on the CPU, got {tensor.dtype} on "
-                             f"{tensor.device}")  # fmt: skip
+        device = arrays["means"][0].device
+        if tensor.dtype != torch.float32 or tensor.device != device or device.type not in ("cpu", "cuda"):
+            raise InputError(f"{operation}: expected {name} as float32 on the CPU or a GPU, all on one, got "
+                             f"{tensor.dtype} on {tensor.device}")  # fmt: skip
     if arrays["center"][0].requires_grad:
         raise InputError(f"{operation} has no gradient by center: detach it")

@@ -13,8 +13,10 @@ import torch
 from torch import Tensor, nn
 
 from gsbench.errors import InputError, did_you_mean
+from gsbench.kernels.observe import show_colors
 from gsbench.models.appearance import sh_colors
 from gsbench.models.refinement import Refinement
+from gsbench.raster import choose_backend
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
 
@@ -56,6 +58,7 @@ class GaussianModel(nn.Module, ABC):
     observes: ClassVar[tuple[str, ...]] = ()  # of "time", "direction"
     centers: ClassVar[tuple[str, ...]] = ("means",)  # raw parameters that are means: AGR reads and moves these ..
     shape: ClassVar[tuple[str, ...]]  # .. and moves these, which make the factor
+    backend = "auto"  # who slices, paints and refines: as of `gsbench.raster.rasterize`
 
     def __init__(self, *, agr: bool = False, sh_degree: int = 3) -> None:
         """Make a model without Gaussians; `initialise` gives it some, `load_state` others.
@@ -142,9 +145,23 @@ class GaussianModel(nn.Module, ABC):
             raise InputError(f"{type(self).__name__}: expected a time in [0, 1], got none: this model observes time")
         t = None if time is None else camera_center.new_tensor(time)
         raw = self.refined(t)
-        means, factors, gate = self.condition(raw, camera_center, t)
-        colors = self.show(raw, unit(means - camera_center), t)
-        return Gaussians3D(means, factors, torch.sigmoid(raw["opacities"]) * gate, colors)
+        means, factors, opacities = self.observe(raw, camera_center, t)
+        return Gaussians3D(means, factors, opacities, self.paint(raw, means, opacities, camera_center, t))
+
+    def observe(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Means, factors and opacities of a slice; models with a kernel for it call that instead."""
+        means, factors, gate = self.condition(raw, camera_center, time)
+        return means, factors, torch.sigmoid(raw["opacities"]) * gate
+
+    def paint(self, raw: Raw, means: Tensor, opacities: Tensor, camera_center: Tensor, time: Tensor | None) -> Tensor:
+        """Colours of a slice; the kernel leaves out what `opacities` say cannot be drawn."""
+        if type(self).show is GaussianModel.show and self.uses_kernels(means):
+            return show_colors(raw["sh0"], raw["shN"], means, opacities, camera_center, self.stage.sh_degree)
+        return self.show(raw, unit(means - camera_center), time)
+
+    def uses_kernels(self, tensor: Tensor) -> bool:
+        """Whether the native kernels serve this model's tensors and were not switched off."""
+        return choose_backend(self.backend, tensor.device.type, tensor.dtype) != "reference"
 
     def refined(self, time: Tensor | None) -> Raw:
         """Raw parameters after AGR: raw + phi(f) (7DGS eq. 15), on log-diagonals before the exp."""
@@ -152,7 +169,7 @@ class GaussianModel(nn.Module, ABC):
         if self.refinement is None or not self.stage.refine or time is None:
             return raw
         features = torch.cat([raw[name] for name in self.centers], -1)
-        *centers, shape = self.refinement(features, time)
+        *centers, shape = self.refinement(features, time, native=self.uses_kernels(features))
         for name, residual in zip(self.centers, centers, strict=True):
             raw[name] = raw[name] + residual
         parts = shape.split([raw[name].shape[-1] for name in self.shape], -1)

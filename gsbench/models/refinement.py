@@ -6,6 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from gsbench.kernels.refine import refine
+
 OCTAVES = 10  # K of the time encoding
 HIDDEN = 64
 
@@ -36,11 +38,14 @@ class Refinement(nn.Module):
         self.weights_out = nn.ParameterList([nn.Parameter(torch.zeros(width, HIDDEN)) for width in outputs])
         self.biases_out = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in outputs])
 
-    def forward(self, features: Tensor, time: Tensor) -> list[Tensor]:
-        """Residuals, one [N, c] for each output, of N feature rows [N, features] at one time []."""
+    def forward(self, features: Tensor, time: Tensor, *, native: bool = False) -> list[Tensor]:
+        """Residuals, one [N, c] for each output, of N feature rows [N, features] at one time [].
+
+        With `native`, by the CPU kernel (float32), which never writes a hidden layer to memory.
+        """
         weight_in, bias_in = self.weight_in[:, : self.features], self.at_time(time)
-        if use_kernels(self.backend, features):
-            return kernels.refine(features, weight_in, bias_in, list(self.weights_out), list(self.biases_out))
+        if native:
+            return refine(features, weight_in, bias_in, list(self.weights_out), list(self.biases_out))
         parts = torch.relu(F.linear(features, weight_in, bias_in)).split(HIDDEN, -1)
         return [F.linear(h, w, b) for h, w, b in zip(parts, self.weights_out, self.biases_out, strict=True)]
 

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
+from gsbench.kernels.observe import observe_triangular
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
 from gsbench.models.factors import triangular, triangular_parameters
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
@@ -104,6 +105,26 @@ class TriangularModel(GaussianModel):
         else:
             means, factors, _ = slice_gaussians(mean, factor, query, scheme=self.scheme)
         return Conditioned(means, factors, gate)
+
+    def observe(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """The square-root scheme by the native kernel, where it serves."""
+        if self.scheme != "square_root" or not self.uses_kernels(raw["means"]):
+            return super().observe(raw, camera_center, time)
+        return observe_triangular(
+            raw["means"],
+            raw["directions"],
+            raw["times"] if "time" in self.observes else None,
+            raw["log_diagonal"],
+            raw["off_diagonal"],
+            raw["opacities"],
+            camera_center,
+            time,
+            self.modulation("direction"),
+            self.modulation("time") if "time" in self.observes else None,
+            conditioned_first=self.is_reduced,
+            row_scaled=self.row_scaled,
+            directional_half=self.directional_half,
+        )
 
     def scales(self) -> Tensor:
         """Largest standard deviation of the sliced Gaussian, which is the same at every t and d."""

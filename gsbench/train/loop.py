@@ -99,7 +99,9 @@ class Trainer:
                     raise DivergedError(f"step {step}: {error}") from None
                 output.info.means2d.retain_grad()
             with stages("loss"):
-                loss = photometric(output.image[0], view.image, train.ssim_weight) / len(views)
+                loss = photometric(output.image[0], view.image, train.ssim_weight, self.config.raster.backend) / len(
+                    views
+                )
                 total += loss.item()
             with stages("backward"):
                 loss.backward()

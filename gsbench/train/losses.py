@@ -6,16 +6,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.kernels import cuda
-from gsbench.kernels.cuda.loss import l1_ssim
+from gsbench.kernels.loss import l1_ssim
+from gsbench.raster import choose_backend
 
 WINDOW = 11
 SIGMA = 1.5
 
 
-def photometric(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """The training loss of one picture, [H, W, 3] and [H, W, 3] in [0, 1] -> []."""
-    if image.is_cuda and image.dtype == torch.float32 and cuda.available():
+def photometric(image: Tensor, target: Tensor, ssim_weight: float, backend: str = "auto") -> Tensor:
+    """The training loss of one picture, [H, W, 3] and [H, W, 3] in [0, 1] -> []; `backend` as of `rasterize`."""
+    if choose_backend(backend, image.device.type, image.dtype) != "reference":
         return l1_ssim(image, target, ssim_weight)
     loss = F.l1_loss(image, target)
     if ssim_weight == 0:

@@ -97,7 +97,7 @@ void blend_backward(int64_t N, int64_t C, int D, bool color_per_camera, Address 
         {nullptr, nullptr, transmittance, stop}, {g_image, g_alpha, sums, out_means2d, out_roots, out_colors}, stream);
 }
 
-gsb::cuda::TriangularArgs triangular_args(int64_t N, bool conditioned_first, bool row_scaled, float half, float time,
+gsb::cuda::TriangularArgs triangular_args(int64_t N, bool conditioned_first, bool row_scaled, float half, Address time,
                                           Address lambda_d, Address lambda_t, Address center, Address means,
                                           Address directions, Address times, Address log_diagonal, Address off_diagonal,
                                           Address opacities) {
@@ -105,7 +105,7 @@ gsb::cuda::TriangularArgs triangular_args(int64_t N, bool conditioned_first, boo
             log_diagonal, off_diagonal, opacities};
 }
 
-void observe_triangular(int64_t N, bool conditioned_first, bool row_scaled, float half, float time, Address lambda_d,
+void observe_triangular(int64_t N, bool conditioned_first, bool row_scaled, float half, Address time, Address lambda_d,
                         Address lambda_t, Address center, Address means, Address directions, Address times,
                         Address log_diagonal, Address off_diagonal, Address opacities, Address out_means,
                         Address out_factors, Address out_opacities, Address stream) {
@@ -115,7 +115,7 @@ void observe_triangular(int64_t N, bool conditioned_first, bool row_scaled, floa
         {out_means, out_factors, out_opacities}, stream);
 }
 
-void observe_triangular_backward(int64_t N, bool conditioned_first, bool row_scaled, float half, float time,
+void observe_triangular_backward(int64_t N, bool conditioned_first, bool row_scaled, float half, Address time,
                                  Address lambda_d, Address lambda_t, Address center, Address means, Address directions,
                                  Address times, Address log_diagonal, Address off_diagonal, Address opacities,
                                  Address g_means, Address g_factors, Address g_opacities, Address out_means,

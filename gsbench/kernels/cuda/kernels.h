@@ -84,11 +84,11 @@ struct SimilarityArgs {
 struct TriangularArgs {
     int64_t N;
     bool conditioned_first, row_scaled;
-    float half, time;
-    const float *lambda_d, *lambda_t, *center;  // [1] [1] [3]
-    const float *means, *directions, *times;    // [N, 3] [N, 3] [N], null: time is not observed
-    const float *log_diagonal, *off_diagonal;   // [N, n] [N, n (n - 1) / 2]
-    const float* opacities;                     // [N] logits
+    float half;
+    const float *time, *lambda_d, *lambda_t, *center;  // [1] [1] [1] [3]
+    const float *means, *directions, *times;           // [N, 3] [N, 3] [N], null: time is not observed
+    const float *log_diagonal, *off_diagonal;          // [N, n] [N, n (n - 1) / 2]
+    const float* opacities;                            // [N] logits
 };
 
 struct TriangularGrads {

@@ -6,35 +6,36 @@ which the kernels know that time is not observed.
 
 from torch import Tensor
 
+from gsbench.errors import InputError
 from gsbench.kernels.cuda import cuda, plain, pointers, stream
 
 
 def observe(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
-    center: Tensor, time: float, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
+    center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
     row_scaled: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Means [N, 3], factors [N, 3, 3] and opacities [N] of a slice; empty `times`: time is not observed."""
     N = len(means)
     out = means.new_empty(N, 3), means.new_empty(N, 3, 3), means.new_empty(N)
-    arrays = plain(lambda_d, lambda_t, center, means, directions, times, log_diagonal, off_diagonal, opacities)
-    cuda().observe_triangular(N, conditioned_first, row_scaled, half, time, *pointers(*arrays), *pointers(*out),
+    arrays = plain(time, lambda_d, lambda_t, center, means, directions, times, log_diagonal, off_diagonal, opacities)
+    cuda().observe_triangular(N, conditioned_first, row_scaled, half, *pointers(*arrays), *pointers(*out),
                               stream(means))  # fmt: skip
     return out
 
 
 def observe_backward(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
-    center: Tensor, lambda_d: Tensor, lambda_t: Tensor, time: float, half: float, conditioned_first: bool,
+    center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
     row_scaled: bool, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of the first six, and of (lambda_d, lambda_t) [2]."""
-    arrays = plain(lambda_d, lambda_t, center, means, directions, times, log_diagonal, off_diagonal, opacities)
+    arrays = plain(time, lambda_d, lambda_t, center, means, directions, times, log_diagonal, off_diagonal, opacities)
     out = tuple(x.new_empty(x.shape) for x in (means, directions, times, log_diagonal, off_diagonal, opacities))
     lambdas = means.new_zeros(2)
     given = plain(g_means, g_factors, g_opacities)
-    cuda().observe_triangular_backward(len(means), conditioned_first, row_scaled, half, time, *pointers(*arrays),
-                                       *pointers(*given), *pointers(*out), *pointers(lambdas), stream(means))  # fmt: skip
+    cuda().observe_triangular_backward(len(means), conditioned_first, row_scaled, half, *pointers(*arrays),
+                                       *pointers(*given, *out, lambdas), stream(means))  # fmt: skip
     return out[0], out[1], out[2], out[3], out[4], out[5], lambdas
 
 
@@ -55,10 +56,10 @@ def show_backward(
     time: float, degree: int, waves: int, g_colors: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of sh0, shN, means and times."""
-    arrays = plain(sh0, shN, means, opacities, times, center)
+    *arrays, given = plain(sh0, shN, means, opacities, times, center, g_colors)
     out = tuple(x.new_zeros(x.shape) for x in (sh0, shN, means, times))
     cuda().show_colors_backward(len(means), degree, _bases(shN, waves), waves, *pointers(*arrays), time,
-                                *pointers(*plain(g_colors), *out), stream(means))  # fmt: skip
+                                *pointers(given, *out), stream(means))  # fmt: skip
     return out[0], out[1], out[2], out[3]
 
 
@@ -66,6 +67,11 @@ def refine(
     features: Tensor, weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int]
 ) -> Tensor:
     """Outputs [N, sum of widths] of the perceptrons."""
+    limits = cuda()
+    if features.shape[1] > limits.MAX_FEATURES or len(widths) > limits.MAX_NETWORKS or max(widths) > limits.MAX_WIDTH:
+        raise InputError(f"refine: expected on a GPU at most {limits.MAX_NETWORKS} networks of at most "
+                         f"{limits.MAX_FEATURES} features and at most {limits.MAX_WIDTH} outputs, got {len(widths)}, "
+                         f"{features.shape[1]} and {max(widths)}")  # fmt: skip
     arrays = plain(features, weight_in, bias_in, weight_out, bias_out)
     out = features.new_empty(len(features), len(weight_out))
     cuda().refine(*features.shape, widths, *pointers(*arrays, out), stream(features))
@@ -77,10 +83,10 @@ def refine_backward(
     g_out: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of the first five."""
-    arrays = plain(features, weight_in, bias_in, weight_out, bias_out)
+    arrays = plain(features, weight_in, bias_in, weight_out, bias_out, g_out)
     by_network = features.new_empty(len(widths), *features.shape)
     out = tuple(x.new_zeros(x.shape) for x in (weight_in, bias_in, weight_out, bias_out))
-    cuda().refine_backward(*features.shape, widths, *pointers(*arrays, *plain(g_out), by_network, *out),
+    cuda().refine_backward(*features.shape, widths, *pointers(*arrays, by_network, *out),
                            stream(features))  # fmt: skip
     return by_network.sum(0), out[0], out[1], out[2], out[3]
 

@@ -7,10 +7,10 @@ namespace gsb::cuda {
 namespace {
 
 // CONDITIONED is known to the compiler: where the factor is triangular in the right order, no reflection is compiled in.
-template <bool CONDITIONED>
+template <bool TIME, bool CONDITIONED>
 __device__ TriangularModel model_of(const TriangularArgs& a) {
-    const float lambda_t = a.lambda_t ? *a.lambda_t : 0.0f;
-    return {CONDITIONED, a.row_scaled, a.half, *a.lambda_d, lambda_t, {a.center[0], a.center[1], a.center[2]}, a.time};
+    return {CONDITIONED, a.row_scaled, a.half, *a.lambda_d, TIME ? *a.lambda_t : 0.0f,
+            {a.center[0], a.center[1], a.center[2]}, TIME ? *a.time : 0.0f};
 }
 
 template <int COUNT>
@@ -39,7 +39,7 @@ template <bool TIME, bool CONDITIONED>
 __global__ void observe_kernel(TriangularArgs a, Observation out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    const TriangularModel model = model_of<CONDITIONED>(a);
+    const TriangularModel model = model_of<TIME, CONDITIONED>(a);
     const auto raw = parameters<TIME>(a, i);
     const Observed<float> seen = TriangularGaussian<float, TIME>(model, raw).observe();
     store_row(seen.mean, out.means, i);
@@ -52,7 +52,7 @@ __global__ void observe_backward_kernel(TriangularArgs a, Observation grads, Tri
     const int64_t i = global_thread();
     TriangularParameters<float, TIME> g{};
     if (i < a.N) {
-        const TriangularModel model = model_of<CONDITIONED>(a);
+        const TriangularModel model = model_of<TIME, CONDITIONED>(a);
         const auto raw = parameters<TIME>(a, i);
         TriangularGaussian<float, TIME> gaussian(model, raw);
         gaussian.observe();

@@ -7,6 +7,7 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
+constexpr float LOG_DIAGONAL_MAX = 16.0f;  // a logarithm beyond acts as this one does
 constexpr float EXPONENT_MAX = 80.0f;  // exp(-80) = 2e-35: beyond, nothing is left of a Gaussian
 
 // What is the same for all Gaussians of a model.
@@ -142,7 +143,7 @@ private:
     GSB_HD void make_factor() {
         int at = 0;
         GSB_UNROLL for (int i = 0; i < N; ++i) {
-            L[i][i] = exp(raw.log_diagonal[i]);
+            L[i][i] = exp(clamp(raw.log_diagonal[i], T(-LOG_DIAGONAL_MAX), T(LOG_DIAGONAL_MAX)));
             GSB_UNROLL for (int j = 0; j < i; ++j) {
                 const T x = raw.off_diagonal[at++];
                 L[i][j] = model.row_scaled ? (sigmoid(x) * 2.0f - 1.0f) * L[i][i] : x;
@@ -177,7 +178,8 @@ private:
                     out.off_diagonal[at] = g_L[i][j];
                 }
             }
-            out.log_diagonal[i] = g_diagonal * L[i][i];
+            const T size = max(raw.log_diagonal[i], T(0.0f) - raw.log_diagonal[i]);
+            out.log_diagonal[i] = select(size <= T(LOG_DIAGONAL_MAX), g_diagonal * L[i][i], T(0.0f));
         }
     }
 };
