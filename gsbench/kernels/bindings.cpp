@@ -297,6 +297,15 @@ void refine_backward(In<-1, -1> features, In<-1, -1> weight_in, In<-1> bias_in, 
                                                  out_weight_out.data(), out_bias_out.data()});
 }
 
+float roofline_flops(int64_t rounds) { return active->roofline_flops(rounds); }
+
+float roofline_alphas(int64_t rounds) { return active->roofline_alphas(rounds); }
+
+void roofline_triad(Out<-1> a, In<-1> b, In<-1> c) {
+    expect_all(size(a.size()), "their length", b.size(), c.size());
+    active->roofline_triad(a.data(), b.data(), c.data(), size(a.size()));
+}
+
 // Binds f so that no argument is converted or copied: what does not fit is refused.
 template <class Result, class... Args>
 void define(nb::module_& m, const char* name, Result (*f)(Args...)) {
@@ -323,4 +332,7 @@ NB_MODULE(_native, m) {
     define(m, "show_colors_backward", show_colors_backward);
     define(m, "refine", refine);
     define(m, "refine_backward", refine_backward);
+    define(m, "roofline_flops", roofline_flops);
+    define(m, "roofline_triad", roofline_triad);
+    define(m, "roofline_alphas", roofline_alphas);
 }

@@ -30,8 +30,7 @@ class DensityControl:
     @torch.no_grad()
     def observe(self, info: RasterInfo, width: int, height: int, views: int) -> None:
         """Add one view's gradients, of a loss that is a mean over `views`, in units of half the picture (NDC)."""
-        if info.means2d.grad is None:
-            return
+        assert info.means2d.grad is not None, "call info.means2d.retain_grad() before backward()"
         half_picture = info.means2d.new_tensor([width / 2, height / 2])
         self.gradient += (info.means2d.grad * half_picture * views).norm(dim=-1).sum(0)
         self.seen += (info.radii > 0).sum(0)

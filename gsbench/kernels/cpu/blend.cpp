@@ -15,109 +15,110 @@ struct TileJob {
     int64_t tile;         // of all cameras' tiles
     int64_t camera;
     int tx, ty;
-    float* color;  // scratch, [D][256]
+    float* state;  // scratch, see Blocks
 };
 
-// The tile's colours over the background, from planes in the order of blocks to the rows of the picture.
-template <int D>
-void write_picture(const TileJob& job, const TileGrid& grid) {
-    const BlendArgs& a = job.args;
-    const int channels = D ? D : a.D;
-    float* T = job.out.transmittance + job.tile * TILE_PIXELS;
-    alignas(64) float alpha[TILE_PIXELS];
-    for (int at = 0; at < TILE_PIXELS; at += LANES) {
-        const Vec signed_left = Vec::load(T + at), left = max(signed_left, -signed_left);
-        left.store(T + at);
-        (Vec(1.0f) - left).store(alpha + at);
-        for (int k = 0; k < channels; ++k) {
-            float* color = job.color + k * TILE_PIXELS + at;
-            (Vec::load(color) + left * a.background[k]).store(color);
-        }
-    }
-    each_row(grid, [&](int at, int x, int y, int n) {
-        const int64_t pixel = (job.camera * a.height + y) * a.width + x;
-        float* image = job.out.image + pixel * channels;
-        if (D && n == BLOCK) {  // the same as below, unrolled
-            for (int i = 0; i < BLOCK; ++i) {
-                job.out.alpha[pixel + i] = alpha[at + i];
-                for (int k = 0; k < D; ++k) image[i * D + k] = job.color[k * TILE_PIXELS + at + i];
-            }
-            return;
-        }
-        for (int i = 0; i < n; ++i) {
-            job.out.alpha[pixel + i] = alpha[at + i];
-            for (int k = 0; k < channels; ++k) image[i * channels + k] = job.color[k * TILE_PIXELS + at + i];
-        }
-    });
-}
+// The state of a tile's pixels: block by block the transmittance and D sums of colour, so that no two of them are a
+// multiple of 4 kB apart. A pixel that is done, or outside of the picture, has transmittance <= 0.
+struct Blocks {
+    float* state;
+    int channels;
+
+    float* transmittance(int b) const { return state + b * (1 + channels) * LANES; }
+    float* color(int b) const { return transmittance(b) + LANES; }
+    static size_t size(int channels) { return static_cast<size_t>(1 + channels) * TILE_PIXELS; }
+};
 
 // One splat, the i-th of its tile, over one block. False: no pixel of the block is left to blend.
 template <int D>
-GSB_HD inline bool blend_block(const TileJob& job, const TileGrid& grid, int64_t i, int32_t id, int b, float* T,
-                               float* stop) {
-    const Record& s = job.records[id];
-    const int channels = D ? D : job.args.D, at = b * LANES;
-    const float* c = D == 3 ? s.color : job.colors + static_cast<int64_t>(id) * channels;
+GSB_HD inline bool blend_block(const Record& s, const float* color, int channels, const TileGrid& grid, int64_t i,
+                               uint32_t b, Blocks blocks, float* stop) {
     const Vec zero(0.0f);
+    float *T = blocks.transmittance(static_cast<int>(b)), *sums = blocks.color(static_cast<int>(b));
     const Falloff<Vec> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s.p, s.q, s.r, s.opacity);
-    const Vec before = Vec::load(T + at), after = before - before * f.alpha;
+    const Vec before = Vec::load(T), after = before - before * f.alpha;
     const Mask seen = f.alpha >= Vec(ALPHA_MIN), enough = after >= Vec(TRANSMITTANCE_MIN);
     const Mask blended = seen & enough;
     const Vec weight = select(blended, before * f.alpha, zero);
-    for (int k = 0; k < channels; ++k) {
-        float* sums = job.color + k * TILE_PIXELS + at;
-        (Vec::load(sums) + weight * c[k]).store(sums);
+    for (int k = 0; k < (D ? D : channels); ++k) {
+        (Vec::load(sums + k * LANES) + weight * color[k]).store(sums + k * LANES);
     }
     const Vec left = select(blended, after, before);
     const Mask ends = seen & !enough & (before > zero);
     if (!any(ends)) {
-        left.store(T + at);
+        left.store(T);
         return true;
     }
     const Vec marked = select(ends, -before, left);
-    marked.store(T + at);
-    select(ends, Vec(static_cast<float>(i)), Vec::load(stop + at)).store(stop + at);
+    marked.store(T);
+    select(ends, Vec(static_cast<float>(i)), Vec::load(stop + b * LANES)).store(stop + b * LANES);
     return any(marked > zero);
 }
 
-// D channels, 0: as many as the arguments say. A pixel that is done, or outside, has transmittance <= 0.
+// The tile's colours over the background to the picture, and its state for backward.
+template <int D>
+void write_picture(const TileJob& job, const TileGrid& grid, Blocks blocks) {
+    const BlendArgs& a = job.args;
+    const int channels = D ? D : a.D;
+    alignas(64) int32_t places[LANES];
+    for (int i = 0; i < LANES; ++i) places[i] = grid.places[i] * channels;
+    const Places pixels(grid.places), samples(places);
+    for (int b = 0; b < BLOCKS; ++b) {
+        const Vec signed_left = Vec::load(blocks.transmittance(b)), left = max(signed_left, -signed_left);
+        left.store(job.out.transmittance + job.tile * TILE_PIXELS + b * LANES);
+        const uint32_t inside = grid.inside(b);
+        if (!inside) continue;
+        const int64_t pixel = grid.first_pixel(b, job.camera, a.width, a.height);
+        scatter_at(Vec(1.0f) - left, job.out.alpha + pixel, pixels, inside);
+        for (int k = 0; k < channels; ++k) {
+            const Vec color = Vec::load(blocks.color(b) + k * LANES) + left * a.background[k];
+            scatter_at(color, job.out.image + pixel * channels + k, samples, inside);
+        }
+    }
+}
+
+// D channels, 0: as many as the arguments say.
 template <int D>
 void blend_tile(const TileJob& job) {
     const BlendArgs& a = job.args;
     const int channels = D ? D : a.D;
     const TileGrid grid(job.tx, job.ty, a.width, a.height);
+    const Blocks blocks{job.state, channels};
+    const Record* records = job.records;
+    const float* colors = job.colors;
     const int32_t* ids = a.ids + a.offsets[job.tile];
     const int64_t count = a.offsets[job.tile + 1] - a.offsets[job.tile];
-    float *T = job.out.transmittance + job.tile * TILE_PIXELS, *stop = job.out.stop + job.tile * TILE_PIXELS;
-    float* color = job.color;
-    for (int k = 0; k < channels * TILE_PIXELS; ++k) color[k] = 0.0f;
-    const Vec right(static_cast<float>(a.width)), bottom(static_cast<float>(a.height)), zero(0.0f);
+    float* stop = job.out.stop + job.tile * TILE_PIXELS;
+    __builtin_memset(job.state, 0, Blocks::size(channels) * sizeof(float));
     uint32_t alive = 0;
     for (int b = 0; b < BLOCKS; ++b) {
-        const Mask inside = (grid.lane_x[b & 3] < right) & (grid.lane_y[b >> 2] < bottom);
-        select(inside, Vec(1.0f), zero).store(T + b * LANES);
+        const Mask inside = (grid.lane_x[b & 3] < Vec(static_cast<float>(a.width))) &
+                            (grid.lane_y[b >> 2] < Vec(static_cast<float>(a.height)));
+        select(inside, Vec(1.0f), Vec(0.0f)).store(blocks.transmittance(b));
         Vec(static_cast<float>(count)).store(stop + b * LANES);
         alive |= static_cast<uint32_t>(any(inside)) << b;
     }
 
     // Which blocks a splat touches is found for many splats at once, before any is blended: the loop over a list of
     // (splat, block) has no branch to mispredict.
-    int32_t work[BATCH * BLOCKS + LANES];
+    uint32_t work[BATCH * BLOCKS + LANES];
     for (int64_t first = 0; first < count && alive; first += BATCH) {
         const int64_t end = first + BATCH < count ? first + BATCH : count;
         int items = 0;
         for (int64_t i = first; i < end; ++i) {
-            __builtin_prefetch(job.records + ids[i + AHEAD < count ? i + AHEAD : i]);
-            items += append_bits(grid.touched(job.records[ids[i]]) & alive, static_cast<int32_t>(i - first) * BLOCKS,
+            __builtin_prefetch(records + ids[i + AHEAD < count ? i + AHEAD : i]);
+            items += append_bits(grid.touched(records[ids[i]]) & alive, static_cast<uint32_t>(i - first) * BLOCKS,
                                  work + items);
         }
         for (int item = 0; item < items; ++item) {
             const int64_t i = first + work[item] / BLOCKS;
-            const int b = work[item] % BLOCKS;
-            if (!blend_block<D>(job, grid, i, ids[i], b, T, stop)) alive &= ~(1u << b);
+            const uint32_t b = work[item] % BLOCKS;
+            const Record& s = records[ids[i]];
+            const float* color = D == 3 ? s.color : colors + static_cast<int64_t>(ids[i]) * channels;
+            if (!blend_block<D>(s, color, channels, grid, i, b, blocks, stop)) alive &= ~(1u << b);
         }
     }
-    write_picture<D>(job, grid);
+    write_picture<D>(job, grid, blocks);
 }
 
 }  // namespace
@@ -125,7 +126,7 @@ void blend_tile(const TileJob& job) {
 void blend(const BlendArgs& a, const Picture& out) {
     const int across = tiles_along(a.width), tiles = across * tiles_along(a.height);
     Buffer<Record> records(static_cast<size_t>(a.N));
-    const size_t scratch_size = static_cast<size_t>(a.D) * TILE_PIXELS;
+    const size_t scratch_size = Blocks::size(a.D);
     Buffer<float> scratch(scratch_size * static_cast<size_t>(a.threads));
     for (int64_t c = 0; c < a.C; ++c) {
         make_records(a, c, records.data());

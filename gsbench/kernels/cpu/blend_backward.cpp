@@ -21,45 +21,49 @@ struct TileJob {
     const float* colors;
     int64_t tile, camera;
     int tx, ty;
-    float* g_color;     // scratch, [D][256]: gradient of the picture
-    float* color_sums;  // scratch, [D][16] or more
+    float* state;       // scratch, see Blocks
+    float* color_sums;  // scratch, [D][16]
     float* pair_sums;   // [pairs][6 + D]
     uint8_t* pair_seen;
     float* background;   // [D] of this tile
 };
 
-// The picture's gradient in the order of blocks, and what lies behind everything: the background's share of it.
+// The state of a tile's pixels, block by block: the transmittance behind what is still to come, the colour seen there
+// (as its product with the picture's gradient), where blending stopped, and the gradient of D channels.
+struct Blocks {
+    float* state;
+    int channels;
+
+    float* transmittance(int b) const { return state + b * (3 + channels) * LANES; }
+    float* behind(int b) const { return transmittance(b) + LANES; }
+    float* stop(int b) const { return transmittance(b) + 2 * LANES; }
+    float* gradient(int b) const { return transmittance(b) + 3 * LANES; }
+    static size_t size(int channels) { return static_cast<size_t>(3 + channels) * TILE_PIXELS; }
+};
+
+// The state behind all splats, where the background is seen; and the background's gradient.
 template <int D>
-void load_gradient(const TileJob& job, const TileGrid& grid, float* behind) {
+void load_state(const TileJob& job, const TileGrid& grid, Blocks blocks) {
     const BlendArgs& a = job.args;
     const int channels = D ? D : a.D;
-    const float* T = job.picture.transmittance + job.tile * TILE_PIXELS;
-    for (int k = 0; k < channels * TILE_PIXELS; ++k) job.g_color[k] = 0.0f;
-    for (int k = 0; k < TILE_PIXELS; ++k) behind[k] = 0.0f;
-    each_row(grid, [&](int at, int x, int y, int n) {
-        const int64_t pixel = (job.camera * a.height + y) * a.width + x;
-        const float *image = job.grads.image + pixel * channels, *alpha = job.grads.alpha + pixel;
-        if (D && n == BLOCK) {  // the same as below, unrolled
-            for (int i = 0; i < BLOCK; ++i) {
-                behind[at + i] = -alpha[i];
-                for (int k = 0; k < D; ++k) job.g_color[k * TILE_PIXELS + at + i] = image[i * D + k];
-            }
-            return;
+    alignas(64) int32_t places[LANES];
+    for (int i = 0; i < LANES; ++i) places[i] = grid.places[i] * channels;
+    const Places pixels(grid.places), samples(places);
+    for (int k = 0; k < channels; ++k) job.background[k] = 0.0f;
+    for (int b = 0; b < BLOCKS; ++b) {
+        const uint32_t inside = grid.inside(b);
+        const int64_t pixel = grid.first_pixel(b, job.camera, a.width, a.height), at = job.tile * TILE_PIXELS + b * LANES;
+        const Vec T = Vec::load(job.picture.transmittance + at);
+        T.store(blocks.transmittance(b));
+        Vec::load(job.picture.stop + at).store(blocks.stop(b));
+        Vec behind = inside ? -gather_at(job.grads.alpha + pixel, pixels, inside) : Vec(0.0f);
+        for (int k = 0; k < channels; ++k) {
+            const Vec g = inside ? gather_at(job.grads.image + pixel * channels + k, samples, inside) : Vec(0.0f);
+            g.store(blocks.gradient(b) + k * LANES);
+            behind += g * a.background[k];
+            job.background[k] += sum(g * T);
         }
-        for (int i = 0; i < n; ++i) {
-            behind[at + i] = -alpha[i];
-            for (int k = 0; k < channels; ++k) job.g_color[k * TILE_PIXELS + at + i] = image[i * channels + k];
-        }
-    });
-    for (int k = 0; k < channels; ++k) {
-        const float* g_color = job.g_color + k * TILE_PIXELS;
-        Vec total(0.0f);
-        for (int at = 0; at < TILE_PIXELS; at += LANES) {
-            const Vec g = Vec::load(g_color + at);
-            total += g * Vec::load(T + at);
-            (Vec::load(behind + at) + g * a.background[k]).store(behind + at);
-        }
-        job.background[k] = sum(total);
+        behind.store(blocks.behind(b));
     }
 }
 
@@ -80,69 +84,71 @@ void store_sums(const FalloffMoments<Vec>& m, const Vec* color, int channels, fl
     }
 }
 
-// One splat, the i-th of its tile, over the blocks it touches: its pair's sums, and the state of the pixels before it.
+// One splat, the i-th of its tile, over the blocks it touches: its sums; the pixels' state is then that before it.
 template <int D>
-GSB_HD inline void backward_splat(const TileJob& job, const TileGrid& grid, int64_t i, int32_t id, uint32_t blocks,
-                                  float* T, float* behind, Vec* color) {
-    const Record& s = job.records[id];
-    const int channels = D ? D : job.args.D;
-    const float *stop = job.picture.stop + job.tile * TILE_PIXELS,
-                *c = D == 3 ? s.color : job.colors + static_cast<int64_t>(id) * channels;
+GSB_HD inline void backward_splat(const Record& s, const float* c, int channels, const TileGrid& grid, int64_t i,
+                                  uint32_t touched, Blocks blocks, FalloffMoments<Vec>& moments, Vec* color) {
     const Vec position(static_cast<float>(i)), zero(0.0f);
-    FalloffMoments<Vec> moments{zero, zero, zero, zero, zero, zero};
-    for (int k = 0; k < channels; ++k) color[k] = zero;
-    for (; blocks; blocks &= blocks - 1) {
-        const int b = __builtin_ctz(blocks), at = b * LANES;
+    moments = {zero, zero, zero, zero, zero, zero};
+    for (int k = 0; k < (D ? D : channels); ++k) color[k] = zero;
+    for (; touched; touched &= touched - 1) {
+        const int b = __builtin_ctz(touched);
+        float *T = blocks.transmittance(b), *behind = blocks.behind(b);
         const Falloff<Vec> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s.p, s.q, s.r, s.opacity);
-        const Mask blended = (f.alpha >= Vec(ALPHA_MIN)) & (position < Vec::load(stop + at));
+        const Mask blended = (f.alpha >= Vec(ALPHA_MIN)) & (position < Vec::load(blocks.stop(b)));
         const Vec alpha = select(blended, f.alpha, zero);
-        const Vec before = Vec::load(T + at) * reciprocal(Vec(1.0f) - alpha);
+        const Vec before = Vec::load(T) * reciprocal(Vec(1.0f) - alpha);
         const Vec weight = alpha * before;
-        before.store(T + at);
+        before.store(T);
         Vec g(0.0f);  // of the splat's own colour
-        for (int k = 0; k < channels; ++k) {
-            const Vec g_color = Vec::load(job.g_color + k * TILE_PIXELS + at);
+        for (int k = 0; k < (D ? D : channels); ++k) {
+            const Vec g_color = Vec::load(blocks.gradient(b) + k * LANES);
             g += g_color * c[k];
             color[k] += weight * g_color;
         }
         // dC/dalpha = T (c - what is seen behind the splat); seen behind the next one nearer: a mix of the two.
-        const Vec back = Vec::load(behind + at), difference = g - back;
-        (back + alpha * difference).store(behind + at);
+        const Vec back = Vec::load(behind), difference = g - back;
+        (back + alpha * difference).store(behind);
         moments.add(f, select(f.free <= Vec(ALPHA_MAX), weight * difference, zero));
     }
-    const int64_t pair = s.pair(job.tx, job.ty);
-    store_sums<D>(moments, color, channels, job.pair_sums + pair * (GEOMETRY + channels));
-    job.pair_seen[pair] = 1;
 }
 
 template <int D>
 void backward_tile(const TileJob& job) {
     const BlendArgs& a = job.args;
+    const int channels = D ? D : a.D;
     const TileGrid grid(job.tx, job.ty, a.width, a.height);
+    const Blocks blocks{job.state, channels};
+    const Record* records = job.records;
     const int32_t* ids = a.ids + a.offsets[job.tile];
-    const float* stop = job.picture.stop + job.tile * TILE_PIXELS;
-    alignas(64) float T[TILE_PIXELS], behind[TILE_PIXELS], block_stop[BLOCKS];
-    load_gradient<D>(job, grid, behind);
-    __builtin_memcpy(T, job.picture.transmittance + job.tile * TILE_PIXELS, sizeof(T));
+    load_state<D>(job, grid, blocks);
+    alignas(64) float block_stop[BLOCKS];
     float last = 0.0f;
     for (int b = 0; b < BLOCKS; ++b) {
         block_stop[b] = 0.0f;
-        for (int lane = 0; lane < LANES; ++lane) block_stop[b] = max(block_stop[b], stop[b * LANES + lane]);
+        for (int lane = 0; lane < LANES; ++lane) block_stop[b] = max(block_stop[b], blocks.stop(b)[lane]);
         last = max(last, block_stop[b]);
     }
-    const Vec stops = Vec::load(block_stop), zero(0.0f);
+    const Vec stops = Vec::load(block_stop);
     Vec local[D ? D : 1];
     Vec* color = D ? local : reinterpret_cast<Vec*>(job.color_sums);
+    FalloffMoments<Vec> moments;
 
     uint32_t touched[BATCH];  // found for many splats at once, so that no branch waits for it
     for (int64_t end = static_cast<int64_t>(last); end > 0; end -= BATCH) {
         const int64_t first = end > BATCH ? end - BATCH : 0;
         for (int64_t i = end - 1; i >= first; --i) {
-            __builtin_prefetch(job.records + ids[i < AHEAD ? 0 : i - AHEAD]);
-            touched[i - first] = grid.touched(job.records[ids[i]]) & bits(Vec(static_cast<float>(i)) < stops);
+            __builtin_prefetch(records + ids[i < AHEAD ? 0 : i - AHEAD]);
+            touched[i - first] = grid.touched(records[ids[i]]) & bits(Vec(static_cast<float>(i)) < stops);
         }
         for (int64_t i = end - 1; i >= first; --i) {
-            if (touched[i - first]) backward_splat<D>(job, grid, i, ids[i], touched[i - first], T, behind, color);
+            if (!touched[i - first]) continue;
+            const Record& s = records[ids[i]];
+            const float* c = D == 3 ? s.color : job.colors + static_cast<int64_t>(ids[i]) * channels;
+            backward_splat<D>(s, c, channels, grid, i, touched[i - first], blocks, moments, color);
+            const int64_t pair = s.pair(job.tx, job.ty);
+            store_sums<D>(moments, color, channels, job.pair_sums + pair * (GEOMETRY + channels));
+            job.pair_seen[pair] = 1;
         }
     }
 }
@@ -186,21 +192,22 @@ void blend_backward(const BlendArgs& a, const Picture& picture, const BlendGrads
         most_pairs = pairs > most_pairs ? pairs : most_pairs;
     }
     Buffer<Record> records(static_cast<size_t>(a.N));
-    const size_t scratch_size = D * (TILE_PIXELS + LANES);
+    const size_t scratch_size = Blocks::size(a.D) + D * LANES;
     Buffer<float> scratch(scratch_size * threads), pair_sums(static_cast<size_t>(most_pairs) * (GEOMETRY + D));
     Buffer<uint8_t> pair_seen(static_cast<size_t>(most_pairs));
     Buffer<float> background(D * static_cast<size_t>(tiles));
     for (size_t k = 0; k < D; ++k) out.background[k] = 0.0f;
 
     for (int64_t c = 0; c < a.C; ++c) {
-        const int64_t pairs = make_records(a, c, records.data());
+        make_records(a, c, records.data());
+        const int64_t pairs = number_pairs(a, records.data());
         pair_seen.zero();
         const float* colors = a.colors + (a.color_per_camera ? c * a.N * a.D : 0);
 #pragma omp parallel for num_threads(a.threads) schedule(dynamic, 4)
         for (int tile = 0; tile < tiles; ++tile) {
             float* mine = scratch.data() + scratch_size * static_cast<size_t>(thread_index());
             const TileJob job{a, picture, out, records.data(), colors, c * tiles + tile, c, tile % across,
-                              tile / across, mine, mine + D * TILE_PIXELS, pair_sums.data(), pair_seen.data(),
+                              tile / across, mine, mine + Blocks::size(a.D), pair_sums.data(), pair_seen.data(),
                               background.data() + D * static_cast<size_t>(tile)};
             a.D == 3 ? backward_tile<3>(job) : backward_tile<0>(job);
         }

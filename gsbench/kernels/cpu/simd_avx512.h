@@ -68,12 +68,26 @@ GSB_HD inline Vec gather(const float* p, int stride, int n = LANES) {
 GSB_HD inline void scatter(Vec x, float* p, int stride, int n = LANES) {
     _mm512_mask_i32scatter_ps(p, first(n), strided(stride), x.v, 4);
 }
+
+// Sixteen offsets, for reading and writing p[offset] of the lanes whose bit is set.
+struct Places {
+    __m512i offset;
+
+    GSB_HD explicit Places(const int32_t* p) : offset(_mm512_loadu_si512(p)) {}
+};
+GSB_HD inline Vec gather_at(const float* p, Places places, uint32_t bits) {
+    return _mm512_mask_i32gather_ps(_mm512_setzero_ps(), static_cast<__mmask16>(bits), places.offset, p, 4);
+}
+GSB_HD inline void scatter_at(Vec x, float* p, Places places, uint32_t bits) {
+    _mm512_mask_i32scatter_ps(p, static_cast<__mmask16>(bits), places.offset, x.v, 4);
+}
+
 GSB_HD inline void store_first(Vec x, float* p, int n) { _mm512_mask_storeu_ps(p, first(n), x.v); }
 
 // Writes base + k for each bit k that is set, in order, and returns their number; 16 places are overwritten.
-GSB_HD inline int append_bits(uint32_t bits, int32_t base, int32_t* out) {
+GSB_HD inline int append_bits(uint32_t bits, uint32_t base, uint32_t* out) {
     const __m512i all = _mm512_add_epi32(_mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15),
-                                         _mm512_set1_epi32(base));
+                                         _mm512_set1_epi32(static_cast<int>(base)));
     _mm512_storeu_si512(out, _mm512_maskz_compress_epi32(static_cast<__mmask16>(bits), all));
     return __builtin_popcount(bits);
 }

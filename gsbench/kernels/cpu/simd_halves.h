@@ -177,12 +177,38 @@ GSB_HD inline void scatter(Vec x, float* p, int stride, int n = LANES) {
     x.store(lane);
     for (int i = 0; i < n; ++i) p[i * stride] = lane[i];
 }
+
+// Sixteen offsets, for reading and writing p[offset] of the lanes whose bit is set.
+struct Places {
+    const int32_t* offset;
+
+    GSB_HD explicit Places(const int32_t* p) : offset(p) {}
+};
+GSB_HD inline Vec gather_at(const float* p, Places places, uint32_t bits) {
+    alignas(64) float lane[LANES];
+    if (bits == 0xffff) {
+        GSB_UNROLL for (int i = 0; i < LANES; ++i) lane[i] = p[places.offset[i]];
+    } else {
+        for (int i = 0; i < LANES; ++i) lane[i] = bits >> i & 1 ? p[places.offset[i]] : 0.0f;
+    }
+    return Vec::load(lane);
+}
+GSB_HD inline void scatter_at(Vec x, float* p, Places places, uint32_t bits) {
+    alignas(64) float lane[LANES];
+    x.store(lane);
+    if (bits == 0xffff) {
+        GSB_UNROLL for (int i = 0; i < LANES; ++i) p[places.offset[i]] = lane[i];
+    } else {
+        for (; bits; bits &= bits - 1) p[places.offset[__builtin_ctz(bits)]] = lane[__builtin_ctz(bits)];
+    }
+}
+
 GSB_HD inline void store_first(Vec x, float* p, int n) { n == LANES ? x.store(p) : scatter(x, p, 1, n); }
 
 // Writes base + k for each bit k that is set, in order, and returns their number.
-GSB_HD inline int append_bits(uint32_t bits, int32_t base, int32_t* out) {
+GSB_HD inline int append_bits(uint32_t bits, uint32_t base, uint32_t* out) {
     int n = 0;
-    for (; bits; bits &= bits - 1) out[n++] = base + __builtin_ctz(bits);
+    for (; bits; bits &= bits - 1) out[n++] = base + static_cast<uint32_t>(__builtin_ctz(bits));
     return n;
 }
 

@@ -29,8 +29,8 @@ struct alignas(64) Record {
     int32_t pair(int tx, int ty) const { return first_pair + (ty - tile_y) * columns + (tx - tile_x); }
 };
 
-// The records of one camera's splats; returns the number of pairs.
-inline int64_t make_records(const BlendArgs& a, int64_t camera, Record* records) {
+// The records of one camera's splats; first_pair is left to `number_pairs`.
+inline void make_records(const BlendArgs& a, int64_t camera, Record* records) {
     const int64_t base = camera * a.N;
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > 1024)
     for (int64_t i = 0; i < a.N; ++i) {
@@ -57,9 +57,13 @@ inline int64_t make_records(const BlendArgs& a, int64_t camera, Record* records)
             for (int k = 0; k < 3; ++k) s.color[k] = color[k];
         }
     }
+}
+
+// Gives each splat the places of its pairs, all splats' in a row; returns their number.
+inline int64_t number_pairs(const BlendArgs& a, Record* records) {
     int64_t pairs = 0;
     for (int64_t i = 0; i < a.N; ++i) {
-        const int32_t count = records[i].first_pair;
+        const int32_t count = records[i].first_pair;  // as make_records left it
         records[i].first_pair = static_cast<int32_t>(pairs);
         pairs += count;
     }
@@ -68,9 +72,10 @@ inline int64_t make_records(const BlendArgs& a, int64_t camera, Record* records)
 
 // Where the pixels and blocks of one tile are.
 struct TileGrid {
-    int left, top, width, height;  // of the tile; of the part of it that is in the picture
-    Vec lane_x[4], lane_y[4];      // pixel centres of the block columns and rows
-    Vec block_x, block_y;          // first pixel centres of the sixteen blocks
+    int left, top, width, height;        // of the tile; of the part of it that is in the picture
+    Vec lane_x[4], lane_y[4];            // pixel centres of the block columns and rows
+    Vec block_x, block_y;                // first pixel centres of the sixteen blocks
+    alignas(64) int32_t places[LANES];   // a block's pixels, counted from its first in the picture
 
     TileGrid(int tx, int ty, int picture_width, int picture_height) : left(tx * TILE), top(ty * TILE) {
         width = picture_width - left < TILE ? picture_width - left : TILE;
@@ -82,29 +87,25 @@ struct TileGrid {
         }
         block_x = column * BLOCK + (static_cast<float>(left) + 0.5f);
         block_y = row * BLOCK + (static_cast<float>(top) + 0.5f);
+        for (int i = 0; i < LANES; ++i) places[i] = i / BLOCK * picture_width + i % BLOCK;
+    }
+
+    // Of a block: its first pixel in the picture, and which of its pixels are in the picture, one bit each.
+    int64_t first_pixel(int b, int64_t camera, int picture_width, int picture_height) const {
+        return (camera * picture_height + top + (b >> 2) * BLOCK) * picture_width + left + (b & 3) * BLOCK;
+    }
+    uint32_t inside(int b) const {
+        const Vec right(static_cast<float>(left + width)), bottom(static_cast<float>(top + height));
+        return bits((lane_x[b & 3] < right) & (lane_y[b >> 2] < bottom));
     }
 
     // Which blocks have a pixel that the splat may reach, one bit each.
-    uint32_t touched(const Record& s) const {
+    GSB_HD uint32_t touched(const Record& s) const {
         const Vec x0 = block_x - s.x, y0 = block_y - s.y;
         const Vec power = least_power<Vec>(x0, x0 + (BLOCK - 1), y0, y0 + (BLOCK - 1), s.p, s.q, s.r, s.foot_x, s.foot_y);
         return bits(power <= Vec(s.reach));
     }
 };
-
-// Calls f(at, x, y, n) for each row of up to four pixels that a block has in the picture: `at` is the row's place in
-// the order of blocks and lanes, (x, y) that of its first pixel in the picture.
-template <class F>
-inline void each_row(const TileGrid& grid, F f) {
-    for (int b = 0; b < BLOCKS; ++b) {
-        const int left = (b & 3) * BLOCK, top = (b >> 2) * BLOCK;
-        const int n = grid.width - left < BLOCK ? grid.width - left : BLOCK;
-        if (n <= 0) continue;
-        for (int row = 0; row < BLOCK && top + row < grid.height; ++row) {
-            f(b * LANES + row * BLOCK, grid.left + left, grid.top + top + row, n);
-        }
-    }
-}
 
 }  // namespace GSB_ISA
 }  // namespace gsb

@@ -1,0 +1,82 @@
+"""Measure every row, print a table as it grows, and write results/benchmarks/<name>.json and .md."""
+
+import argparse
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from benchmarks.roofline import UNITS, Limits, limits
+from benchmarks.rows import SECTIONS, Row
+from benchmarks.timing import measure
+
+from gsbench import kernels
+from gsbench.measure.atomic import write_atomically
+from gsbench.measure.provenance import git_commit, processor_name, versions
+
+HEADER = "| | median ms | p10 | p90 | wall ms | target ms | least ms by the machine's limit | ratio |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("sections", nargs="*", choices=[*SECTIONS, []], help="default: all")
+    parser.add_argument("--out", type=Path, default=Path("results/benchmarks"), help="folder of the results")
+    parser.add_argument("--name", default="cpu", help="of the two files")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    bounds = limits()
+    lines = ["# What the kernels cost", "", *conditions(bounds), ""]
+    print("\n".join(lines), flush=True)
+    results: list[dict[str, Any]] = []
+    for section in options.sections or SECTIONS:
+        start = [f"## {section}", "", HEADER, "| --- |" + " ---: |" * 7]
+        print("\n".join(start), flush=True)
+        lines += start
+        for row in SECTIONS[section]():
+            result = run(row, bounds)
+            results.append(result)
+            lines.append(line(result))
+            print(lines[-1], flush=True)
+        lines.append("")
+    machine = {"processor": processor_name(), "cores": os.cpu_count(), "load": os.getloadavg(),
+               "instruction_set": kernels.native().active(), "versions": versions(), "git_commit": git_commit(),
+               "limits": bounds._asdict()}  # fmt: skip
+    options.out.mkdir(parents=True, exist_ok=True)
+    content = json.dumps({"machine": machine, "rows": results}, indent=1)
+    write_atomically(options.out / f"{options.name}.json", content.encode())
+    write_atomically(options.out / f"{options.name}.md", "\n".join(lines).encode())
+
+
+def conditions(bounds: Limits) -> list[str]:
+    """Where and how: a measurement without its machine and load says little."""
+    rates = ", ".join(f"{value:.2f} {UNITS[name]}" for name, value in bounds._asdict().items())
+    return [
+        f"{processor_name()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start, instruction set "
+        f"{kernels.native().active()}, commit {git_commit()}.",
+        "",
+        f"Limits of one thread, measured in the same run: {rates}. Process-CPU milliseconds of one thread unless said;",
+        "the scene's recipe is benchmarks/scene.py. A ratio of 1 would be the limit itself; `reference` is torch.",
+    ]
+
+
+def run(row: Row, bounds: Limits) -> dict[str, Any]:
+    torch.set_num_threads(row.threads)
+    cost = measure(row.call)
+    torch.set_num_threads(1)
+    least = row.floor and row.floor[1] / getattr(bounds, row.floor[0]) / 1e6
+    return {"section": row.section, "name": row.name, "threads": row.threads, "target_ms": row.target_ms,
+            "least_ms": least, "limit": row.floor and row.floor[0], **cost._asdict()}  # fmt: skip
+
+
+def line(result: dict[str, Any]) -> str:
+    target, least = result["target_ms"], result["least_ms"]
+    met = "" if target is None else f"{target:g} {'met' if result['median'] <= target else 'missed'}"
+    limit = "" if least is None else f"{least:.2f} ({result['limit']})"
+    ratio = "" if least is None else f"{result['median'] / least:.1f}"
+    numbers = " | ".join(f"{result[key]:.2f}" for key in ("median", "p10", "p90", "wall"))
+    return f"| {result['name']} | {numbers} | {met} | {limit} | {ratio} |"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""The rows of the benchmark: each a name, what is called, the target where there is one, and the machine's limit."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from benchmarks.scene import camera, gaussians, model
+
+from gsbench.kernels.loss import l1_ssim
+from gsbench.raster import rasterize
+from gsbench.train.losses import photometric
+
+RASTER_TARGETS = {(10_000, 400): (2.8, 3.8), (100_000, 800): (30.0, 37.0)}  # ms forward, backward
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement."""
+
+    section: str
+    name: str
+    call: Callable[[], Any]
+    target_ms: float | None = None
+    floor: tuple[str, float] | None = None  # (which limit, units of it the call cannot do without)
+    threads: int = 1
+
+
+def raster() -> Iterator[Row]:
+    """Forward and backward of the rasterizer on the scene's recipe."""
+    for N in (2_000, 10_000, 50_000, 100_000):
+        for size in (128, 400, 800):
+            yield from raster_rows(N, size)
+    for N, size in RASTER_TARGETS:
+        yield from raster_rows(N, size, threads=2)
+
+
+def raster_rows(N: int, size: int, threads: int = 1) -> Iterator[Row]:
+    """Both directions at one size; the limit counts alphas of at least 1/255, the fewest any blender evaluates."""
+    inputs = [x.requires_grad_() for x in gaussians(N)]
+    viewmats, Ks = camera(size)
+
+    def forward() -> torch.Tensor:
+        return rasterize(*inputs, viewmats, Ks, size, size, backend="cpu").image
+
+    image = forward()
+    upstream = torch.ones_like(image)
+    alphas = useful_alphas(N, size)
+    targets = RASTER_TARGETS.get((N, size), (None, None)) if threads == 1 else (None, None)
+    name = f"{N // 1000}k / {size}x{size}" + (f", {threads} threads" if threads > 1 else "")
+    yield Row("raster", f"{name} forward", forward, targets[0], ("alphas", alphas), threads)
+    yield Row("raster", f"{name} backward", lambda: torch.autograd.grad(image, inputs, upstream, retain_graph=True),
+              targets[1], ("alphas", 2 * alphas), threads)  # fmt: skip
+
+
+@torch.no_grad()
+def useful_alphas(N: int, size: int) -> float:
+    """Pixels where a Gaussian's alpha is at least 1/255, were nothing in front of it: ellipses of power ln(255 o)."""
+    means, factors, opacities, _ = gaussians(N)
+    scale = size * 1.39 / (means[:, 2:3] + 4.0)
+    M = factors[:, :2] * scale[..., None]
+    cov = M @ M.mT + 0.3 * torch.eye(2)
+    return float((2 * torch.pi * (255 * opacities).log().clamp(min=0) * cov.det().sqrt()).sum())
+
+
+def observing() -> Iterator[Row]:
+    """Slices, colours and projection of 100k Gaussians, one after the other, and AGR."""
+    center = torch.tensor([0.0, 0.0, -4.0])
+    for name, agr in (("4dgs", False), ("6dgs", False), ("7dgs", False), ("7dgs", True)):
+        for backend in ("cpu", "reference"):
+            observed = model(name, 100_000, agr=agr)
+            observed.backend = backend
+            time = None if name == "6dgs" else 0.4
+            parameters = [p for p in observed.parameters() if p.requires_grad]
+            out = observed.slice(center, time)
+            upstream = [torch.ones_like(x) for x in out]
+            targets = (15.0, 25.0) if name == "7dgs" and not agr and backend == "cpu" else (None, None)
+            title = f"{name}{'+agr' if agr else ''} 100k slice and colours, {backend}"
+            values = sum(p.numel() for p in observed.splats.values())
+            yield Row("observe", f"{title} forward", lambda o=observed, t=time: o.slice(center, t), targets[0],
+                      ("bytes", 4 * values))  # fmt: skip
+            yield Row("observe", f"{title} backward", lambda o=out, p=parameters, u=upstream: torch.autograd.grad(
+                o, p, u, retain_graph=True, allow_unused=True), targets[1], ("bytes", 12 * values))  # fmt: skip
+    yield from refining()
+
+
+def refining() -> Iterator[Row]:
+    """AGR's four perceptrons on 100k 7D Gaussians."""
+    refinement = model("7dgs", 100_000, agr=True).refinement
+    assert refinement is not None
+    features = torch.randn(100_000, 7).requires_grad_()
+    multiplications = 100_000 * 64 * (4 * 7 + 35)
+    for native in (True, False):
+        out = refinement(features, torch.tensor(0.3), native=native)
+        upstream = [torch.ones_like(x) for x in out]
+        inputs = [features, *refinement.parameters()]
+        backend = "cpu" if native else "reference"
+        yield Row("agr", f"AGR 100k forward, {backend}",
+                  lambda n=native: refinement(features, torch.tensor(0.3), native=n), 20.0 if native else None,
+                  ("flops", 2 * multiplications))  # fmt: skip
+        yield Row("agr", f"AGR 100k backward, {backend}",
+                  lambda o=out, u=upstream: torch.autograd.grad(o, inputs, u, retain_graph=True),
+                  60.0 if native else None, ("flops", 6 * multiplications))  # fmt: skip
+
+
+def loss() -> Iterator[Row]:
+    """L1 + SSIM, forward and backward; eight separable filters of eleven taps along two axes."""
+    for size in (400, 800):
+        g = torch.Generator().manual_seed(0)
+        image, target = (torch.rand(size, size, 3, generator=g) for _ in range(2))
+        image.requires_grad_()
+        work = ("flops", 2.0 * 8 * 22 * 3 * size * size)
+        yield Row("loss", f"{size}x{size} forward + backward, cpu", lambda a=image, b=target: torch.autograd.grad(
+            l1_ssim(a, b, 0.2), a), 6.0 if size == 400 else None, work)  # fmt: skip
+        yield Row("loss", f"{size}x{size} forward + backward, reference", lambda a=image, b=target: torch.autograd.grad(
+            photometric(a, b, 0.2, "reference"), a), None, work)  # fmt: skip
+
+
+def step() -> Iterator[Row]:
+    """A whole training step: slice, raster, loss, backward, Adam, with 10k Gaussians at 400x400."""
+    viewmats, Ks = camera(400)
+    target = torch.rand(400, 400, 3, generator=torch.Generator().manual_seed(0))
+    for name, agr in (("3dgs", False), ("4dgs", False), ("6dgs", False), ("7dgs", False), ("7dgs", True)):
+        for backend in ("cpu", "reference"):
+            fitted = model(name, 10_000, agr=agr)
+            fitted.backend = backend
+            adam = torch.optim.Adam([p for p in fitted.parameters() if p.requires_grad], lr=1e-9, fused=True)
+
+            def call(fitted: Any = fitted, adam: Any = adam, backend: str = backend) -> None:
+                slice_ = fitted.slice(torch.tensor([0.0, 0.0, -4.0]), 0.4)
+                image = rasterize(*slice_, viewmats, Ks, 400, 400, backend=backend).image[0]
+                photometric(image, target, 0.2, backend).backward()
+                adam.step()
+                adam.zero_grad()
+
+            yield Row("step", f"{name}{'+agr' if agr else ''} 10k / 400x400, {backend}", call)
+
+
+SECTIONS = {"raster": raster, "observe": observing, "loss": loss, "step": step}

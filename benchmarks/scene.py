@@ -1,0 +1,47 @@
+"""The scene that speed is measured on, and the models that are sliced: a recipe, the same numbers everywhere."""
+
+import torch
+from torch import Tensor
+
+from gsbench.models import GaussianModel, build
+from gsbench.models.base import Stage
+from gsbench.scenes.scene import Points
+
+SIGMA = 0.0083  # median standard deviation along an axis: a mean 3-sigma radius of 5 pixels at 400 x 400
+SPREAD = 0.4  # of its logarithm
+DISTANCE = 4.0
+FOCAL = 1.39  # times the width: D-NeRF's field of view, 0.69
+
+
+def gaussians(N: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Means uniform in [-1, 1]^3, any rotation, log-normal scales, opacities uniform in [0.01, 0.99], any colours."""
+    g = torch.Generator().manual_seed(seed)
+    means = torch.rand(N, 3, generator=g) * 2 - 1
+    scales = torch.exp(torch.randn(N, 3, generator=g) * SPREAD) * SIGMA
+    rotations = torch.linalg.qr(torch.randn(N, 3, 3, generator=g))[0]
+    opacities = torch.rand(N, generator=g) * 0.98 + 0.01
+    return means, rotations * scales[:, None, :], opacities, torch.rand(N, 3, generator=g)
+
+
+def camera(size: int) -> tuple[Tensor, Tensor]:
+    """viewmats [1, 4, 4] and Ks [1, 3, 3] that look at the cube from DISTANCE, in a picture of `size` pixels."""
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = DISTANCE
+    K = torch.tensor([[FOCAL * size, 0, size / 2], [0, FOCAL * size, size / 2], [0, 0, 1]])
+    return viewmat[None], K[None]
+
+
+def model(name: str, N: int, *, agr: bool = False, seed: int = 0) -> GaussianModel:
+    """A model of N Gaussians at the size of `gaussians`, with correlations and colours that are not zero."""
+    g = torch.Generator().manual_seed(seed)
+    lambdas = {"6dgs": {"lambda_d": 0.05}, "7dgs": {"lambda_d": 0.05, "lambda_t": 0.05}}
+    made = build(name, agr=agr, sh_degree=3, **lambdas.get(name, {}))
+    made.initialise(Points(torch.rand(N, 3, generator=g) * 2 - 1, torch.rand(N, 3, generator=g)), 1.0, g)
+    with torch.no_grad():
+        for key, parameter in made.splats.items():
+            if key in ("off_diagonal", "shN"):
+                parameter.add_(0.02 * torch.randn(parameter.shape, generator=g))
+            if key == "opacities":
+                parameter.copy_(torch.randn(N, generator=g))
+    made.set_stage(Stage(3, refine=agr, tune_modulation=False))
+    return made
