@@ -16,7 +16,8 @@ help:  ## what there is to make
 setup: $(VENV)/installed  ## make .venv and install gsbench into it, with the pinned versions
 
 # Installed again whenever what is installed changes: the metadata, the pins, the native sources.
-$(VENV)/installed: pyproject.toml constraints.txt
+NATIVE := CMakeLists.txt $(shell find gsbench/kernels -name '*.cpp' -o -name '*.h' -o -name '*.cu')
+$(VENV)/installed: pyproject.toml constraints.txt $(NATIVE)
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \
 		{ echo "gsbench needs Python 3.11, 3.12 or 3.13; $(PYTHON) is $$($(PYTHON) --version). Try make PYTHON=python3.12"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

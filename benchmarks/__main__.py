@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
 from benchmarks.roofline import UNITS, Limits, limits
 from benchmarks.rows import SECTIONS, Row
 from benchmarks.timing import measure
-
 from gsbench import kernels
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.provenance import git_commit, processor_name, versions

@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import torch
-from benchmarks.timing import measure
 
+from benchmarks.timing import measure
 from gsbench.kernels import native
 
 LANES = 16

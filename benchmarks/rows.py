@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from benchmarks.scene import camera, gaussians, model
 
+from benchmarks.scene import camera, gaussians, model
 from gsbench.kernels.loss import l1_ssim
 from gsbench.raster import rasterize
 from gsbench.train.losses import photometric
@@ -99,7 +99,7 @@ def refining() -> Iterator[Row]:
                   lambda n=native: refinement(features, torch.tensor(0.3), native=n), 20.0 if native else None,
                   ("flops", 2 * multiplications))  # fmt: skip
         yield Row("agr", f"AGR 100k backward, {backend}",
-                  lambda o=out, u=upstream: torch.autograd.grad(o, inputs, u, retain_graph=True),
+                  lambda o=out, u=upstream, i=inputs: torch.autograd.grad(o, i, u, retain_graph=True),
                   60.0 if native else None, ("flops", 6 * multiplications))  # fmt: skip
 
 

@@ -220,6 +220,40 @@ void observe_triangular_backward(In<-1, 3> means, In<-1, 3> directions, In<-1> t
     out_lambdas.data()[1] = grads.lambdas[1];
 }
 
+gsb::RotatedArgs rotated_args(const In<-1, 3>& means, const In<-1>& times, const In<-1, 4>& scales,
+                              const In<-1, 4>& left, const In<-1, 4>& right, const In<-1>& opacities, double time,
+                              double lambda_t, int threads) {
+    const int64_t N = size(means.shape(0));
+    expect_all(N, "N", times.shape(0), scales.shape(0), left.shape(0), right.shape(0), opacities.shape(0));
+    const Frame frame(1, 1, threads);
+    return {N, static_cast<float>(lambda_t), static_cast<float>(time), means.data(), times.data(), scales.data(),
+            left.data(), right.data(), opacities.data(), threads};
+}
+
+void observe_rotated(In<-1, 3> means, In<-1> times, In<-1, 4> scales, In<-1, 4> left, In<-1, 4> right, In<-1> opacities,
+                     double time, double lambda_t, int threads, Out<-1, 3> out_means, Out<-1, 3, 3> out_factors,
+                     Out<-1> out_opacities) {
+    const auto args = rotated_args(means, times, scales, left, right, opacities, time, lambda_t, threads);
+    expect_all(args.N, "N", out_means.shape(0), out_factors.shape(0), out_opacities.shape(0));
+    nb::gil_scoped_release release;
+    active->observe_rotated(args, {out_means.data(), out_factors.data(), out_opacities.data()});
+}
+
+double observe_rotated_backward(In<-1, 3> means, In<-1> times, In<-1, 4> scales, In<-1, 4> left, In<-1, 4> right,
+                                In<-1> opacities, double time, double lambda_t, int threads, Out<-1, 3> g_means,
+                                Out<-1, 3, 3> g_factors, Out<-1> g_opacities, Out<-1, 3> out_means, Out<-1> out_times,
+                                Out<-1, 4> out_scales, Out<-1, 4> out_left, Out<-1, 4> out_right,
+                                Out<-1> out_opacities) {
+    const auto args = rotated_args(means, times, scales, left, right, opacities, time, lambda_t, threads);
+    expect_all(args.N, "N", g_means.shape(0), g_factors.shape(0), g_opacities.shape(0), out_means.shape(0),
+               out_times.shape(0), out_scales.shape(0), out_left.shape(0), out_right.shape(0), out_opacities.shape(0));
+    gsb::RotatedGrads grads{out_means.data(), out_times.data(), out_scales.data(), out_left.data(), out_right.data(),
+                            out_opacities.data(), 0.0f};
+    nb::gil_scoped_release release;
+    active->observe_rotated_backward(args, {g_means.data(), g_factors.data(), g_opacities.data()}, grads);
+    return grads.lambda_t;
+}
+
 gsb::ColorArgs color_args(const In<-1, -1, 3>& sh0, const In<-1, -1, 3>& shN, const In<-1, 3>& means,
                           const In<-1>& opacities, const In<-1>& times, const In<3>& center, double time, int degree,
                           int waves, int threads) {
@@ -328,6 +362,8 @@ NB_MODULE(_native, m) {
     define(m, "l1_ssim", l1_ssim);
     define(m, "observe_triangular", observe_triangular);
     define(m, "observe_triangular_backward", observe_triangular_backward);
+    define(m, "observe_rotated", observe_rotated);
+    define(m, "observe_rotated_backward", observe_rotated_backward);
     define(m, "show_colors", show_colors);
     define(m, "show_colors_backward", show_colors_backward);
     define(m, "refine", refine);

@@ -6,6 +6,10 @@
 #pragma once
 
 #include "math/blending.h"
+#include "math/harmonics.h"
 #include "math/projection.h"
+#include "math/rotated.h"
 #include "math/scalar.h"
 #include "math/similarity.h"
+#include "math/slicing.h"
+#include "math/triangular.h"

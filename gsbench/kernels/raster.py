@@ -13,6 +13,7 @@ from torch.library import custom_op
 
 from gsbench.errors import InputError
 from gsbench.kernels import native, threads
+from gsbench.kernels.arrays import plain, rows_like
 from gsbench.kernels.memory import require
 
 TILE = 16  # as kernels.h has it
@@ -35,7 +36,7 @@ def project(
     C, N = len(viewmats), len(means)
     shapes = ((C, N, 2), (C, N, 3), (C, N), (C, N), (C, N, 2))
     out = tuple(means.new_empty(shape) for shape in shapes)
-    native().project(*_plain(means, factors, opacities, viewmats, Ks),
+    native().project(*plain(means, factors, opacities, viewmats, Ks),
                      width, height, near, far, eps2d, antialias, threads(), *out)  # fmt: skip
     return out[0], out[1], out[2], out[3], out[4]
 
@@ -53,11 +54,11 @@ def project_backward(
     g_means2d: Tensor, g_roots: Tensor, g_opacities: Tensor, g_depths: Tensor, cameras: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of means, factors, opacities and, if `cameras`, viewmats (else empty)."""
-    out = (_rows_like(means), _rows_like(factors), _rows_like(opacities),
+    out = (rows_like(means), rows_like(factors), rows_like(opacities),
            viewmats.new_empty(len(viewmats) if cameras else 0, 4, 4))  # fmt: skip
     native().project_backward(
-        *_plain(means, factors, opacities, viewmats, Ks), width, height, near, far, eps2d, antialias, threads(),
-        *_plain(g_means2d, g_roots, g_opacities, g_depths), *out,
+        *plain(means, factors, opacities, viewmats, Ks), width, height, near, far, eps2d, antialias, threads(),
+        *plain(g_means2d, g_roots, g_opacities, g_depths), *out,
     )  # fmt: skip
     return out
 
@@ -65,7 +66,7 @@ def project_backward(
 @project_backward.register_fake
 def _(means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, *rest: Any) -> tuple[Tensor, ...]:
     cameras = viewmats.new_empty(len(viewmats) if rest[-1] else 0, 4, 4)
-    return _rows_like(means), _rows_like(factors), _rows_like(opacities), cameras
+    return rows_like(means), rows_like(factors), rows_like(opacities), cameras
 
 
 def _project_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -91,7 +92,7 @@ project.register_autograd(_project_gradient, setup_context=_project_context)
 @custom_op("gsbench::bin_tiles", mutates_args=())
 def bin_tiles(means2d: Tensor, depths: Tensor, half_sizes: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
     """Each tile's Gaussians, front to back, ties by index: offsets [C * tiles + 1] int64, ids [pairs] int32."""
-    splats = _plain(means2d, depths, half_sizes)
+    splats = plain(means2d, depths, half_sizes)
     offsets = means2d.new_empty(len(means2d) * count_tiles(width, height) + 1, dtype=torch.int64)
     pairs = native().count_tiles(*splats, width, height, threads(), offsets)
     if pairs > MAX_PAIRS:
@@ -120,7 +121,7 @@ def blend(
     `colors` are [1, N, D] for all cameras or [C, N, D].
     """
     out = _blend_outputs(means2d, colors, width, height)
-    native().blend(*_plain(means2d, roots, opacities, half_sizes, colors, background),
+    native().blend(*plain(means2d, roots, opacities, half_sizes, colors, background),
                    offsets, ids, width, height, threads(), *out)  # fmt: skip
     return out
 
@@ -145,17 +146,17 @@ def blend_backward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of means2d, roots, opacities, colors and background."""
     inputs = means2d, roots, opacities, colors, background
-    out = tuple(_rows_like(x) for x in inputs)
+    out = tuple(rows_like(x) for x in inputs)
     require(4 * len(ids) * (6 + colors.shape[-1]), f"the gradients of {len(ids)} pairs of a tile and a Gaussian")
-    native().blend_backward(*_plain(means2d, roots, opacities, half_sizes, colors, background), offsets, ids,
-                            width, height, threads(), *_plain(transmittance, stop, g_image, g_alpha), *out)  # fmt: skip
+    native().blend_backward(*plain(means2d, roots, opacities, half_sizes, colors, background), offsets, ids,
+                            width, height, threads(), *plain(transmittance, stop, g_image, g_alpha), *out)  # fmt: skip
     return out[0], out[1], out[2], out[3], out[4]
 
 
 @blend_backward.register_fake
 def _(means2d: Tensor, roots: Tensor, opacities: Tensor, _half: Tensor, colors: Tensor, background: Tensor,
       *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
-    return tuple(_rows_like(x) for x in (means2d, roots, opacities, colors, background))
+    return tuple(rows_like(x) for x in (means2d, roots, opacities, colors, background))
 
 
 def _blend_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -175,13 +176,3 @@ def _blend_gradient(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...
 
 
 blend.register_autograd(_blend_gradient, setup_context=_blend_context)
-
-
-def _plain(*tensors: Tensor) -> tuple[Tensor, ...]:
-    """The same values in rows, without their graph, which may not cross DLPack."""
-    return tuple(t.detach().contiguous() for t in tensors)
-
-
-def _rows_like(tensor: Tensor) -> Tensor:
-    """Memory of the same shape, row by row whatever the strides of `tensor`."""
-    return tensor.new_empty(tensor.shape)

@@ -8,6 +8,7 @@ from torch.library import custom_op
 
 from gsbench.errors import InputError
 from gsbench.kernels import native, threads
+from gsbench.kernels.arrays import plain, rows_like
 from gsbench.kernels.cuda import observe as on_cuda
 
 HIDDEN = 64
@@ -46,7 +47,7 @@ def _refine(
     features: Tensor, weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int]
 ) -> Tensor:
     out = features.new_empty(len(features), len(weight_out))
-    native().refine(*_plain(features, weight_in, bias_in, weight_out, bias_out), widths, threads(), out)
+    native().refine(*plain(features, weight_in, bias_in, weight_out, bias_out), widths, threads(), out)
     return out
 
 
@@ -60,15 +61,15 @@ def _refine_backward(
     features: Tensor, weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int],
     g_out: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    arrays = _plain(features, weight_in, bias_in, weight_out, bias_out)
-    out = tuple(x.new_empty(x.shape) for x in arrays)
-    native().refine_backward(*arrays, widths, threads(), *_plain(g_out), *out)
+    arrays = plain(features, weight_in, bias_in, weight_out, bias_out)
+    out = tuple(rows_like(x) for x in arrays)
+    native().refine_backward(*arrays, widths, threads(), *plain(g_out), *out)
     return out[0], out[1], out[2], out[3], out[4]
 
 
 @_refine_backward.register_fake
 def _(*arrays: Any) -> tuple[Tensor, ...]:
-    return tuple(x.new_empty(x.shape) for x in arrays[:5])
+    return tuple(rows_like(x) for x in arrays[:5])
 
 
 def _context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # noqa: ARG001
@@ -83,8 +84,3 @@ def _gradient(ctx: Any, g_out: Tensor) -> tuple[Tensor | None, ...]:
 _refine.register_kernel("cuda")(on_cuda.refine)
 _refine_backward.register_kernel("cuda")(on_cuda.refine_backward)
 _refine.register_autograd(_gradient, setup_context=_context)
-
-
-def _plain(*tensors: Tensor) -> tuple[Tensor, ...]:
-    """The same values in rows, without their graph, which may not cross DLPack."""
-    return tuple(t.detach().contiguous() for t in tensors)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from gsbench.errors import InputError, did_you_mean
-from gsbench.kernels.observe import show_colors
+from gsbench.kernels.colors import show_colors
 from gsbench.models.appearance import sh_colors
 from gsbench.models.refinement import Refinement
 from gsbench.raster import choose_backend

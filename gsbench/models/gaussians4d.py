@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.colors import MAX_WAVES, show_colors
+from gsbench.kernels.slices import observe_rotated
 from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register
 from gsbench.models.factors import rotation4d
@@ -64,6 +66,30 @@ class Gaussians4DModel(GaussianModel):
         )
         gate = torch.exp(-0.5 * self.modulation("time") * mahalanobis(factor[:, 3:], time - raw["times"]))
         return Conditioned(mean, factor3, torch.where(gate > TIME_GATE_MIN, gate, 0.0))
+
+    def observe(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """The square-root scheme by the native kernel, where it serves."""
+        if self.scheme != "square_root" or not self.uses_kernels(raw["means"]):
+            return super().observe(raw, camera_center, time)
+        assert time is not None
+        return observe_rotated(
+            raw["means"],
+            raw["times"],
+            raw["scales"],
+            raw["left_quats"],
+            raw["right_quats"],
+            raw["opacities"],
+            time,
+            self.modulation("time"),
+        )
+
+    def paint(self, raw: Raw, means: Tensor, opacities: Tensor, camera_center: Tensor, time: Tensor | None) -> Tensor:
+        """4DSH by the native kernel, where it serves."""
+        if self.time_degree >= MAX_WAVES or not self.uses_kernels(means):
+            return super().paint(raw, means, opacities, camera_center, time)
+        assert time is not None
+        sh0, degree, waves = raw["sh0"].flatten(1, 2), self.stage.sh_degree, self.time_degree + 1
+        return show_colors(sh0, raw["shN"], means, opacities, camera_center, degree, raw["times"], time, waves)
 
     def initial_colors(self, dc: Tensor) -> Raw:
         """4DSH coefficients [N, time_degree + 1, K, 3]: only the constant one is not zero."""

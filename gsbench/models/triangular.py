@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
-from gsbench.kernels.observe import observe_triangular
+from gsbench.kernels.slices import observe_triangular
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
 from gsbench.models.factors import triangular, triangular_parameters
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten

@@ -4,6 +4,7 @@ import functools
 import importlib
 import importlib.util
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -98,7 +99,11 @@ def choose_backend(backend: str, device: str = "cpu", dtype: torch.dtype = torch
     """
     if backend == "auto":
         native = {"cpu": native_available, "cuda": cuda_available}.get(device)
-        return device if native and dtype == torch.float32 and native() else "reference"
+        if native and dtype == torch.float32 and native():
+            return device
+        if device == "cuda" and dtype == torch.float32:
+            _warn_slow()
+        return "reference"
     if backend not in _MODULES:
         raise InputError(f"raster backend '{backend}' is not known. {did_you_mean(backend, ['auto', *_MODULES])}")
     if backend == "cpu" and not native_available():
@@ -118,6 +123,13 @@ def native_available() -> bool:
 def cuda_available() -> bool:
     """Whether the CUDA kernels are part of this installation and there is a device to run them."""
     return _built("gsbench.kernels._cuda") and torch.cuda.is_available()
+
+
+@functools.cache
+def _warn_slow() -> None:
+    """Say once a process that a GPU is used without its kernels."""
+    warnings.warn("the CUDA kernels are not built in this installation: the GPU runs the reference backend, in torch, "
+                  "which is slow; see docs/gpu.md", stacklevel=2)  # fmt: skip
 
 
 @functools.cache

@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cstdlib>
 #include <memory>
 #include <numeric>
 #include <stdexcept>
@@ -71,8 +72,11 @@ bool release(size_t begin, size_t end, State state) {
 
 void run_block() {
     const size_t count = block->fibers.size();
+    // Where a barrier is missing, what a thread sees of another's work depends on which of them goes first.
+    const bool reversed = std::getenv("GSBENCH_SHIM_REVERSED") != nullptr;
     for (;;) {
-        for (Fiber& fiber : block->fibers) {
+        for (size_t i = 0; i < count; ++i) {
+            Fiber& fiber = block->fibers[reversed ? count - 1 - i : i];
             if (fiber.state != State::ready) continue;
             thread = &fiber.thread;
             swapcontext(&block->scheduler, &fiber.context);

@@ -1,7 +1,8 @@
 // CUDA on the CPU, as far as gsbench/kernels/cuda uses it: the threads of a block are fibers that take turns.
 //
 // A fiber runs until it needs the others: at a barrier, or where its warp exchanges values. Blocks run one after the
-// other. This proves what a kernel computes, not that it is free of races, nor how fast it is.
+// other. This proves what a kernel computes, not how fast it is, nor that it is free of races: of those it finds such as
+// show when fibers take turns in one order and then in the other (GSBENCH_SHIM_REVERSED).
 #pragma once
 
 #include <cmath>

@@ -104,6 +104,26 @@ def test_many_tiles_and_rounds(cuda_device: str) -> None:
                            gradients(exact, lambda a: rasterize(**a, backend="reference"), weight))  # fmt: skip
 
 
+@pytest.mark.parametrize("name", ["random", "opaque_stack", "three_cameras", "five_channels"])
+def test_order_of_threads_does_not_matter(name: str, cuda_device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a missing barrier: by the shim, a thread would read what another has not written yet, or has over."""
+    if cuda_device != "cpu":
+        pytest.skip("the order of threads can be chosen on the shim only; on a GPU, racecheck looks for races")
+    arguments, found = case(name, torch.float32), []
+    image, target = torch.rand(40, 20, 3).requires_grad_(), torch.rand(40, 20, 3)
+    for reversed_ in (False, True):
+        if reversed_:
+            monkeypatch.setenv("GSBENCH_SHIM_REVERSED", "1")
+        output = draw(arguments, cuda_device)
+        every = torch.ones(output.alpha.shape[:-1])
+        grads = gradients(arguments, lambda a: draw(a, cuda_device), every)
+        loss = l1_ssim(image, target, 0.2)
+        (g_image,) = torch.autograd.grad(loss, image)
+        found.append([output.image, output.alpha, loss, g_image, *grads.values()])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [("means", torch.nan, "means: expected finite"), ("factors", torch.inf, "factors: expected finite"),

@@ -6,21 +6,23 @@ from typing import Any
 
 import pytest
 import torch
-from test_observe import VARIANTS, assert_same, color_inputs, gradients, model_and_raw
+from test_observe import VARIANTS, assert_same, color_inputs, gradients, model_and_raw, rotated
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels import observe, refine
+from gsbench.kernels import colors, refine, slices
 from gsbench.kernels.cuda import observe as on_cuda
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
 from gsbench.models.refinement import Refinement
 
 OPERATIONS = {
-    observe._observe: on_cuda.observe,
-    observe._observe_backward: on_cuda.observe_backward,
-    observe._show: on_cuda.show,
-    observe._show_backward: on_cuda.show_backward,
+    slices._observe: on_cuda.observe,
+    slices._observe_backward: on_cuda.observe_backward,
+    slices._rotated: on_cuda.rotated,
+    slices._rotated_backward: on_cuda.rotated_backward,
+    colors._show: on_cuda.show,
+    colors._show_backward: on_cuda.show_backward,
     refine._refine: on_cuda.refine,
     refine._refine_backward: on_cuda.refine_backward,
 }
@@ -52,7 +54,7 @@ def test_slice(timed: bool, options: dict[str, Any], move: Move) -> None:
     model, _ = model_and_raw(timed, options, torch.float32)
     single = {name: move(value) for name, value in raw.items()}
     lambdas = {name: move(value) for name, value in model.log_modulation.items()}
-    actual = list(observe.observe_triangular(
+    actual = list(slices.observe_triangular(
         single["means"], single["directions"], single.get("times"), single["log_diagonal"], single["off_diagonal"],
         single["opacities"], move(center), move(torch.tensor(0.4)), lambdas["direction"].exp(),
         lambdas["time"].exp() if timed else None, conditioned_first=options.get("factor_order") != "paper",
@@ -63,6 +65,21 @@ def test_slice(timed: bool, options: dict[str, Any], move: Move) -> None:
     weights = torch.Generator().manual_seed(2)
     given = [move(torch.randn(x.shape, generator=weights)) for x in actual]
     assert_same(back(list(torch.autograd.grad(actual, [*single.values(), *lambdas.values()], given))), wanted)
+
+
+def test_rotated_slice(move: Move) -> None:
+    """Catches a wrong sign of a quaternion's matrix, row order, gate or derivative of any parameter."""
+    exact, raw = rotated(torch.float64)
+    seen = exact.condition(raw, torch.zeros(3, dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64))
+    expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
+    single = [move(x) for x in raw.values()]
+    log_lambda = move(exact.log_modulation["time"])
+    actual = list(slices.observe_rotated(*single, move(torch.tensor(0.4)), log_lambda.exp()))
+    assert_same(back(actual), expected)
+    g = torch.Generator().manual_seed(2)
+    given = [move(torch.randn(x.shape, generator=g)) for x in actual]
+    assert_same(back(list(torch.autograd.grad(actual, [*single, log_lambda], given))),
+                gradients(expected, [*raw.values(), exact.log_modulation["time"]]))  # fmt: skip
 
 
 @pytest.mark.parametrize("waves", [1, 3])
@@ -80,8 +97,8 @@ def test_colors(degree: int, waves: int, move: Move) -> None:
     expected = expected * (opacities > 1 / 255).double()[:, None]
     used = 3 if waves == 1 else 4
     single = [move(x) for x in inputs]
-    actual = observe.show_colors(*single[:3], move(opacities), move(center), degree,
-                                 single[3] if waves > 1 else None, 0.7, waves)  # fmt: skip
+    actual = colors.show_colors(*single[:3], move(opacities), move(center), degree,
+                                single[3] if waves > 1 else None, move(torch.tensor(0.7)), waves)  # fmt: skip
     assert_same([actual.cpu()], [expected])
     wanted = torch.autograd.grad(expected.sum(), inputs[:used], materialize_grads=True)
     assert_same(back(list(torch.autograd.grad(actual.sum(), single[:used]))), list(wanted))

@@ -7,10 +7,12 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.observe import observe_triangular, show_colors
+from gsbench.kernels.colors import show_colors
 from gsbench.kernels.refine import refine
+from gsbench.kernels.slices import observe_rotated, observe_triangular
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
+from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.gaussians6d import Gaussians6DModel
 from gsbench.models.gaussians7d import Gaussians7DModel
 from gsbench.models.refinement import Refinement
@@ -81,6 +83,31 @@ def test_slice(timed: bool, options: dict[str, Any]) -> None:
                 gradients(expected, [*raw.values(), *exact.log_modulation.parameters()]))  # fmt: skip
 
 
+def rotated(dtype: torch.dtype) -> tuple[Gaussians4DModel, dict[str, Tensor]]:
+    g = torch.Generator().manual_seed(4)
+    N = 45
+    raw = {"means": torch.randn(N, 3, generator=g), "times": torch.rand(N, 1, generator=g),
+           "scales": 0.5 * torch.randn(N, 4, generator=g) - 1, "left_quats": torch.randn(N, 4, generator=g),
+           "right_quats": torch.randn(N, 4, generator=g), "opacities": 2 * torch.randn(N, generator=g)}  # fmt: skip
+    model = Gaussians4DModel(lambda_t=0.7)
+    model.log_modulation.requires_grad_(True)
+    return model.to(dtype), {k: v.to(dtype).requires_grad_() for k, v in raw.items()}
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_rotated_slice() -> None:
+    """Catches a wrong sign of a quaternion's matrix, row order, gate or derivative of any parameter."""
+    exact, raw = rotated(torch.float64)
+    seen = exact.condition(raw, torch.zeros(3, dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64))
+    expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
+    assert 0 < (seen.gate == 0).sum() < len(seen.gate)  # some are gated away
+    model, single = rotated(torch.float32)
+    actual = list(observe_rotated(*single.values(), torch.tensor(0.4), model.modulation("time")))
+    assert_same(actual, expected)
+    assert_same(gradients(actual, [*single.values(), *model.log_modulation.parameters()]),
+                gradients(expected, [*raw.values(), *exact.log_modulation.parameters()]))  # fmt: skip
+
+
 def color_inputs(waves: int, dtype: torch.dtype) -> list[Tensor]:
     g = torch.Generator().manual_seed(3)
     N = 21
@@ -102,7 +129,8 @@ def test_colors(degree: int, waves: int) -> None:
     else:
         expected, inputs = sh_time_colors(all_of.unflatten(1, (waves, 16)), directions, degree, 0.7 - times[:, 0]), 4
     single = color_inputs(waves, torch.float32)
-    actual = show_colors(*single[:3], opacities, center, degree, single[3] if waves > 1 else None, 0.7, waves)
+    timed = (single[3], torch.tensor(0.7)) if waves > 1 else (None, None)
+    actual = show_colors(*single[:3], opacities, center, degree, *timed, waves)
     assert_same([actual], [expected])
     g_exact = torch.autograd.grad(expected, (sh0, shN, means, times)[:inputs], torch.ones_like(expected),
                                   materialize_grads=True)  # fmt: skip

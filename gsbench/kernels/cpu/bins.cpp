@@ -38,6 +38,20 @@ Key* radix_sort(Key* keys, Key* spare, int64_t n) {
     return keys;
 }
 
+// Calls f(i, rect) for each splat of a camera that has tiles.
+template <class F>
+void each_rect(const BinArgs& a, int64_t camera, F f) {
+    const float *means2d = a.means2d + camera * a.N * 2, *half_sizes = a.half_sizes + camera * a.N * 2;
+    for (int64_t i = 0; i < a.N; i += LANES) {
+        const int n = lanes_from(i, a.N);
+        TileRect rects[LANES];
+        tile_rects(means2d, half_sizes, i, n, a.width, a.height, rects);
+        for (int k = 0; k < n; ++k) {
+            if (rects[k].count() > 0) f(i + k, rects[k]);
+        }
+    }
+}
+
 }  // namespace
 
 // offsets [C * tiles + 1]: where each tile's list starts. Returns the length of all lists.
@@ -49,14 +63,12 @@ int64_t count_tiles(const BinArgs& a, int64_t* offsets) {
     Buffer<int64_t> corners(static_cast<size_t>(across + 1) * (down + 1));
     for (int64_t c = 0; c < a.C; ++c) {
         corners.zero();
-        for (int64_t i = c * a.N; i < (c + 1) * a.N; ++i) {
-            const TileRect r = tile_rect(a.means2d + i * 2, a.half_sizes + i * 2, a.width, a.height);
-            if (r.count() == 0) continue;
+        each_rect(a, c, [&](int64_t, const TileRect& r) {
             ++corners[static_cast<size_t>(r.y0) * (across + 1) + r.x0];
             --corners[static_cast<size_t>(r.y0) * (across + 1) + r.x1];
             --corners[static_cast<size_t>(r.y1) * (across + 1) + r.x0];
             ++corners[static_cast<size_t>(r.y1) * (across + 1) + r.x1];
-        }
+        });
         for (int y = 0; y < down; ++y) {
             int64_t row = 0;
             for (int x = 0; x < across; ++x) {
@@ -78,19 +90,14 @@ void fill_tiles(const BinArgs& a, const int64_t* offsets, int32_t* ids) {
     Buffer<int64_t> cursors(static_cast<size_t>(tiles));
     Buffer<TileRect> rects(static_cast<size_t>(a.N));
     for (int64_t c = 0; c < a.C; ++c) {
-        const float *means2d = a.means2d + c * a.N * 2, *half_sizes = a.half_sizes + c * a.N * 2;
         const int64_t* begin = offsets + c * tiles;
         int64_t n = 0;
-        for (int64_t i = 0; i < a.N; ++i) {
-            if (tile_rect(means2d + i * 2, half_sizes + i * 2, a.width, a.height).count() == 0) continue;
+        each_rect(a, c, [&](int64_t i, const TileRect& r) {
+            rects[static_cast<size_t>(i)] = r;
             std::memcpy(&keys[static_cast<size_t>(n)].depth, a.depths + c * a.N + i, sizeof(float));
             keys[static_cast<size_t>(n++)].id = static_cast<int32_t>(i);
-        }
+        });
         const Key* sorted = radix_sort(keys.data(), spare.data(), n);
-        for (int64_t k = 0; k < n; ++k) {
-            const int64_t i = sorted[k].id;
-            rects[static_cast<size_t>(k)] = tile_rect(means2d + i * 2, half_sizes + i * 2, a.width, a.height);
-        }
         std::memcpy(cursors.data(), begin, sizeof(int64_t) * static_cast<size_t>(tiles));
         // A task walks all splats but deals to its own rows of tiles, so that every list keeps the depth order.
         const int tasks = a.threads < down ? a.threads : down;
@@ -104,7 +111,7 @@ void fill_tiles(const BinArgs& a, const int64_t* offsets, int32_t* ids) {
             };
             const int low = first_row(task), high = first_row(task + 1);
             for (int64_t k = 0; k < n; ++k) {
-                const TileRect r = rects[static_cast<size_t>(k)];
+                const TileRect r = rects[static_cast<size_t>(sorted[k].id)];
                 const int y0 = r.y0 > low ? r.y0 : low, y1 = r.y1 < high ? r.y1 : high;
                 for (int y = y0; y < y1; ++y) {
                     int64_t* row = &cursors[static_cast<size_t>(y) * across];

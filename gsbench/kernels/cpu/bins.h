@@ -1,11 +1,10 @@
 // The rectangle of tiles that a splat can touch: binning and blending must agree on it to the last tile.
 #pragma once
 
-#include <cmath>
 #include <cstdint>
 
-#include "../math/scalar.h"
 #include "kernels.h"
+#include "rows.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
@@ -16,26 +15,36 @@ struct TileRect {
     int64_t count() const { return static_cast<int64_t>(x1 - x0) * (y1 - y0); }
 };
 
-// The tiles from the first pixel centre at or after low to the last at or before high; bounded as floats, since the
-// bounds of a huge splat overflow integers.
-inline void tile_span(float low, float high, int pixels, int& begin, int& end) {
-    const float first = max(std::ceil(low - 0.5f), 0.0f);
-    const float last = min(std::floor(high - 0.5f), static_cast<float>(pixels - 1));
-    if (!(first <= last)) {
-        begin = end = 0;
-        return;
-    }
-    begin = static_cast<int>(first) / TILE;
-    end = static_cast<int>(last) / TILE + 1;
+constexpr float FARTHEST = 1e6f;  // pixels: what is beyond any picture may be as far as a float counts exactly
+
+GSB_HD inline Vec floor(Vec x) {
+    const Vec nearest = round(x);
+    return nearest - select(nearest > x, Vec(1.0f), Vec(0.0f));
 }
 
-inline TileRect tile_rect(const float* mean2d, const float* half_size, int width, int height) {
-    TileRect r{0, 0, 0, 0};
-    if (half_size[0] > 0.0f) {
-        tile_span(mean2d[0] - half_size[0], mean2d[0] + half_size[0], width, r.x0, r.x1);
-        tile_span(mean2d[1] - half_size[1], mean2d[1] + half_size[1], height, r.y0, r.y1);
+// The tiles from the first pixel centre at or after low to the last at or before high, half open.
+GSB_HD inline void tile_span(Vec low, Vec high, int pixels, float* begin, float* end) {
+    const Vec bounded_low = clamp(low, Vec(-FARTHEST), Vec(FARTHEST)), bounded_high = clamp(high, Vec(-FARTHEST), Vec(FARTHEST));
+    const Vec first = max(-floor(Vec(0.5f) - bounded_low), Vec(0.0f));
+    const Vec last = min(floor(bounded_high - 0.5f), Vec(static_cast<float>(pixels - 1)));
+    const Mask some = first <= last;
+    select(some, floor(first * (1.0f / TILE)), Vec(0.0f)).store(begin);
+    select(some, floor(last * (1.0f / TILE)) + 1.0f, Vec(0.0f)).store(end);
+}
+
+// Of the splats i .. i + n - 1; a splat that is not drawn has half sizes of zero, and no tiles.
+inline void tile_rects(const float* means2d, const float* half_sizes, int64_t i, int n, int width, int height,
+                       TileRect (&out)[LANES]) {
+    Vec mean[2], half[2];
+    gather_row(means2d, i, n, mean);
+    gather_row(half_sizes, i, n, half);
+    const Mask drawn = half[0] > Vec(0.0f);
+    alignas(64) float x0[LANES], x1[LANES], y0[LANES], y1[LANES];
+    tile_span(select(drawn, mean[0] - half[0], Vec(1.0f)), select(drawn, mean[0] + half[0], Vec(0.0f)), width, x0, x1);
+    tile_span(mean[1] - half[1], mean[1] + half[1], height, y0, y1);
+    for (int k = 0; k < LANES; ++k) {
+        out[k] = {static_cast<int>(x0[k]), static_cast<int>(y0[k]), static_cast<int>(x1[k]), static_cast<int>(y1[k])};
     }
-    return r;
 }
 
 }  // namespace GSB_ISA

@@ -29,9 +29,9 @@ struct Blocks {
     static size_t size(int channels) { return static_cast<size_t>(1 + channels) * TILE_PIXELS; }
 };
 
-// One splat, the i-th of its tile, over one block. False: no pixel of the block is left to blend.
+// One splat, the i-th of its tile, over one block.
 template <int D>
-GSB_HD inline bool blend_block(const Record& s, const float* color, int channels, const TileGrid& grid, int64_t i,
+GSB_HD inline void blend_block(const Record& s, const float* color, int channels, const TileGrid& grid, int64_t i,
                                uint32_t b, Blocks blocks, float* stop) {
     const Vec zero(0.0f);
     float *T = blocks.transmittance(static_cast<int>(b)), *sums = blocks.color(static_cast<int>(b));
@@ -43,16 +43,8 @@ GSB_HD inline bool blend_block(const Record& s, const float* color, int channels
     for (int k = 0; k < (D ? D : channels); ++k) {
         (Vec::load(sums + k * LANES) + weight * color[k]).store(sums + k * LANES);
     }
-    const Vec left = select(blended, after, before);
-    const Mask ends = seen & !enough & (before > zero);
-    if (!any(ends)) {
-        left.store(T);
-        return true;
-    }
-    const Vec marked = select(ends, -before, left);
-    marked.store(T);
-    select(ends, Vec(static_cast<float>(i)), Vec::load(stop + b * LANES)).store(stop + b * LANES);
-    return any(marked > zero);
+    select(blended, after, negative_where(seen, before)).store(T);  // seen and not blended: the pixel ends here
+    store_where(seen & !enough & (before > zero), Vec(static_cast<float>(i)), stop + b * LANES);
 }
 
 // The tile's colours over the background to the picture, and its state for backward.
@@ -70,9 +62,13 @@ void write_picture(const TileJob& job, const TileGrid& grid, Blocks blocks) {
         if (!inside) continue;
         const int64_t pixel = grid.first_pixel(b, job.camera, a.width, a.height);
         scatter_at(Vec(1.0f) - left, job.out.alpha + pixel, pixels, inside);
+        const auto shown = [&](int k) { return Vec::load(blocks.color(b) + k * LANES) + left * a.background[k]; };
+        if (D == 3 && inside == ALL_LANES) {
+            store_rgb(shown(0), shown(1), shown(2), job.out.image + pixel * 3, static_cast<int64_t>(a.width) * 3);
+            continue;
+        }
         for (int k = 0; k < channels; ++k) {
-            const Vec color = Vec::load(blocks.color(b) + k * LANES) + left * a.background[k];
-            scatter_at(color, job.out.image + pixel * channels + k, samples, inside);
+            scatter_at(shown(k), job.out.image + pixel * channels + k, samples, inside);
         }
     }
 }
@@ -115,7 +111,11 @@ void blend_tile(const TileJob& job) {
             const uint32_t b = work[item] % BLOCKS;
             const Record& s = records[ids[i]];
             const float* color = D == 3 ? s.color : colors + static_cast<int64_t>(ids[i]) * channels;
-            if (!blend_block<D>(s, color, channels, grid, i, b, blocks, stop)) alive &= ~(1u << b);
+            blend_block<D>(s, color, channels, grid, i, b, blocks, stop);
+        }
+        for (uint32_t rest = alive; rest; rest &= rest - 1) {
+            const int b = __builtin_ctz(rest);
+            if (!any(Vec::load(blocks.transmittance(b)) > Vec(0.0f))) alive &= ~(1u << b);
         }
     }
     write_picture<D>(job, grid, blocks);

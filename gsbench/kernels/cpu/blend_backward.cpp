@@ -57,8 +57,11 @@ void load_state(const TileJob& job, const TileGrid& grid, Blocks blocks) {
         T.store(blocks.transmittance(b));
         Vec::load(job.picture.stop + at).store(blocks.stop(b));
         Vec behind = inside ? -gather_at(job.grads.alpha + pixel, pixels, inside) : Vec(0.0f);
+        Vec rgb[3];
+        const bool whole = D == 3 && inside == ALL_LANES;
+        if (whole) load_rgb(job.grads.image + pixel * 3, static_cast<int64_t>(a.width) * 3, rgb);
         for (int k = 0; k < channels; ++k) {
-            const Vec g = inside ? gather_at(job.grads.image + pixel * channels + k, samples, inside) : Vec(0.0f);
+            const Vec g = whole ? rgb[k] : inside ? gather_at(job.grads.image + pixel * channels + k, samples, inside) : Vec(0.0f);
             g.store(blocks.gradient(b) + k * LANES);
             behind += g * a.background[k];
             job.background[k] += sum(g * T);

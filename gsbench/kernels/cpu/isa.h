@@ -16,6 +16,8 @@ void blend_backward(const BlendArgs&, const Picture&, const BlendGrads&);
 double l1_ssim(const SimilarityArgs&);
 void observe_triangular(const TriangularArgs&, const Observation&);
 void observe_triangular_backward(const TriangularArgs&, const Observation& grads, TriangularGrads&);
+void observe_rotated(const RotatedArgs&, const Observation&);
+void observe_rotated_backward(const RotatedArgs&, const Observation& grads, RotatedGrads&);
 void show_colors(const ColorArgs&, float* colors);
 void show_colors_backward(const ColorArgs&, const ColorGrads&);
 void refine(const RefineArgs&, float* out);

@@ -77,6 +77,19 @@ struct TriangularGrads {
     float lambdas[2];  // of direction and time
 };
 
+// Gaussians over (x, y, z, t) with the factor M_left M_right diag(exp scales), observed at a time (4DGS).
+struct RotatedArgs {
+    int64_t N;
+    float lambda_t, time;
+    const float *means, *times, *scales, *left, *right, *opacities;  // [N, 3] [N] [N, 4] [N, 4] [N, 4] [N] logits
+    int threads;
+};
+
+struct RotatedGrads {
+    float *means, *times, *scales, *left, *right, *opacities;
+    float lambda_t;
+};
+
 // The 3D Gaussians that an observation leaves, or their gradients.
 struct Observation {
     float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
@@ -124,6 +137,8 @@ struct Kernels {
     double (*l1_ssim)(const SimilarityArgs&);
     void (*observe_triangular)(const TriangularArgs&, const Observation&);
     void (*observe_triangular_backward)(const TriangularArgs&, const Observation& grads, TriangularGrads&);
+    void (*observe_rotated)(const RotatedArgs&, const Observation&);
+    void (*observe_rotated_backward)(const RotatedArgs&, const Observation& grads, RotatedGrads&);
     void (*show_colors)(const ColorArgs&, float* colors);
     void (*show_colors_backward)(const ColorArgs&, const ColorGrads&);
     void (*refine)(const RefineArgs&, float* out);

@@ -8,6 +8,8 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
+alignas(64) constexpr float INDEX[LANES] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+
 // How many of the rows i, i + 1, .. of `size` a vector holds.
 GSB_HD inline int lanes_from(int64_t i, int64_t size) { return static_cast<int>(size - i < LANES ? size - i : LANES); }
 

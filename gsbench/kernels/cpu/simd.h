@@ -9,6 +9,7 @@ namespace gsb {
 inline namespace GSB_ISA {
 
 constexpr int LANES = 16;
+constexpr uint32_t ALL_LANES = 0xffff;
 
 // The polynomial of least relative error (1.5e-7 in float) for 2^r, 0 <= r < 1, exact at 0.
 template <class T>

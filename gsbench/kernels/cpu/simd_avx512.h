@@ -36,6 +36,12 @@ GSB_HD inline Mask operator!(Mask a) { return {static_cast<__mmask16>(~a.m)}; }
 GSB_HD inline bool any(Mask a) { return a.m != 0; }
 GSB_HD inline uint32_t bits(Mask a) { return a.m; }
 GSB_HD inline Vec select(Mask m, Vec yes, Vec no) { return _mm512_mask_mov_ps(no.v, m.m, yes.v); }
+// -|x| where m, x elsewhere.
+GSB_HD inline Vec negative_where(Mask m, Vec x) {
+    const __m512i bits = _mm512_castps_si512(x.v);
+    return _mm512_castsi512_ps(_mm512_mask_or_epi32(bits, m.m, bits, _mm512_set1_epi32(INT32_MIN)));
+}
+GSB_HD inline void store_where(Mask m, Vec x, float* p) { _mm512_mask_storeu_ps(p, m.m, x.v); }
 GSB_HD inline Vec min(Vec a, Vec b) { return _mm512_min_ps(a.v, b.v); }
 GSB_HD inline Vec max(Vec a, Vec b) { return _mm512_max_ps(a.v, b.v); }
 GSB_HD inline Vec sqrt(Vec a) { return _mm512_sqrt_ps(a.v); }
@@ -80,6 +86,29 @@ GSB_HD inline Vec gather_at(const float* p, Places places, uint32_t bits) {
 }
 GSB_HD inline void scatter_at(Vec x, float* p, Places places, uint32_t bits) {
     _mm512_mask_i32scatter_ps(p, static_cast<__mmask16>(bits), places.offset, x.v, 4);
+}
+
+
+// Four rows of four pixels of three channels, `stride` floats apart.
+GSB_HD inline void store_rgb(Vec r, Vec g, Vec b, float* out, int64_t stride) {
+    for (int row = 0; row < 4; ++row) {
+        const __m512i at = _mm512_set1_epi32(4 * row);
+        const __m512i rg = _mm512_setr_epi32(0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 0, 0, 0, 0);
+        const __m512i rgb = _mm512_add_epi32(_mm512_setr_epi32(0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 0, 0, 0, 0),
+                                             _mm512_maskz_mov_epi32(0x924, at));
+        const __m512 two = _mm512_permutex2var_ps(r.v, _mm512_add_epi32(rg, at), g.v);
+        _mm512_mask_storeu_ps(out + row * stride, 0xfff, _mm512_permutex2var_ps(two, rgb, b.v));
+    }
+}
+GSB_HD inline void load_rgb(const float* in, int64_t stride, Vec (&channels)[3]) {
+    __m512 rows[4];
+    for (int row = 0; row < 4; ++row) rows[row] = _mm512_maskz_loadu_ps(0xfff, in + row * stride);
+    for (int k = 0; k < 3; ++k) {
+        const __m512i pick = _mm512_add_epi32(
+            _mm512_setr_epi32(0, 3, 6, 9, 16, 19, 22, 25, 0, 3, 6, 9, 16, 19, 22, 25), _mm512_set1_epi32(k));
+        channels[k] = _mm512_shuffle_f32x4(_mm512_permutex2var_ps(rows[0], pick, rows[1]),
+                                           _mm512_permutex2var_ps(rows[2], pick, rows[3]), 0x44);
+    }
 }
 
 GSB_HD inline void store_first(Vec x, float* p, int n) { _mm512_mask_storeu_ps(p, first(n), x.v); }

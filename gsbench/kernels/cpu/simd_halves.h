@@ -162,6 +162,9 @@ using Vec = Pair<Pair<Register>>;
 using Mask = Vec::Mask;
 static_assert(Vec::size == LANES);
 
+// -|x| where m, x elsewhere.
+GSB_HD inline Vec negative_where(Mask m, Vec x) { return select(m, min(x, Vec(0.0f) - x), x); }
+GSB_HD inline void store_where(Mask m, Vec x, float* p) { select(m, x, Vec::load(p)).store(p); }
 GSB_HD inline bool any(Mask m) { return bits(m) != 0; }
 GSB_HD inline Vec reciprocal(Vec x) { return Vec(1.0f) / x; }
 
@@ -186,7 +189,7 @@ struct Places {
 };
 GSB_HD inline Vec gather_at(const float* p, Places places, uint32_t bits) {
     alignas(64) float lane[LANES];
-    if (bits == 0xffff) {
+    if (bits == ALL_LANES) {
         GSB_UNROLL for (int i = 0; i < LANES; ++i) lane[i] = p[places.offset[i]];
     } else {
         for (int i = 0; i < LANES; ++i) lane[i] = bits >> i & 1 ? p[places.offset[i]] : 0.0f;
@@ -196,11 +199,30 @@ GSB_HD inline Vec gather_at(const float* p, Places places, uint32_t bits) {
 GSB_HD inline void scatter_at(Vec x, float* p, Places places, uint32_t bits) {
     alignas(64) float lane[LANES];
     x.store(lane);
-    if (bits == 0xffff) {
+    if (bits == ALL_LANES) {
         GSB_UNROLL for (int i = 0; i < LANES; ++i) p[places.offset[i]] = lane[i];
     } else {
         for (; bits; bits &= bits - 1) p[places.offset[__builtin_ctz(bits)]] = lane[__builtin_ctz(bits)];
     }
+}
+
+
+// Four rows of four pixels of three channels, `stride` floats apart.
+GSB_HD inline void store_rgb(Vec r, Vec g, Vec b, float* out, int64_t stride) {
+    alignas(64) float lane[3][LANES];
+    r.store(lane[0]);
+    g.store(lane[1]);
+    b.store(lane[2]);
+    GSB_UNROLL for (int i = 0; i < LANES; ++i) {
+        for (int k = 0; k < 3; ++k) out[i / 4 * stride + i % 4 * 3 + k] = lane[k][i];
+    }
+}
+GSB_HD inline void load_rgb(const float* in, int64_t stride, Vec (&channels)[3]) {
+    alignas(64) float lane[3][LANES];
+    GSB_UNROLL for (int i = 0; i < LANES; ++i) {
+        for (int k = 0; k < 3; ++k) lane[k][i] = in[i / 4 * stride + i % 4 * 3 + k];
+    }
+    for (int k = 0; k < 3; ++k) channels[k] = Vec::load(lane[k]);
 }
 
 GSB_HD inline void store_first(Vec x, float* p, int n) { n == LANES ? x.store(p) : scatter(x, p, 1, n); }

@@ -11,7 +11,7 @@ inline namespace GSB_ISA {
 constexpr int BLOCKS = 16, BLOCK = 4;
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int BATCH = 64;     // splats whose blocks are found at once
-constexpr int AHEAD = 4;      // splats whose records are fetched before they are needed
+constexpr int AHEAD = 16;     // splats whose records are fetched before they are needed
 
 // Of a lane in its block, and of a block in its tile.
 alignas(64) constexpr float COLUMN[LANES] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
@@ -29,33 +29,40 @@ struct alignas(64) Record {
     int32_t pair(int tx, int ty) const { return first_pair + (ty - tile_y) * columns + (tx - tile_x); }
 };
 
+inline Record make_record(const BlendArgs& a, int64_t camera, int64_t i, const TileRect& rect) {
+    const int64_t at = camera * a.N + i;
+    const float *mean = a.means2d + at * 2, *root = a.roots + at * 3;
+    Record s{};
+    s.x = mean[0];
+    s.y = mean[1];
+    s.p = root[0];
+    s.q = root[1];
+    s.r = root[2];
+    s.opacity = a.opacities[at];
+    const float reach = a.half_sizes[at * 2] * s.p;
+    s.reach = reach * reach;
+    s.foot_y = -s.q / s.r;
+    s.foot_x = -s.q * s.r / (s.p * s.p + s.q * s.q);
+    s.first_pair = static_cast<int32_t>(rect.count());
+    s.tile_x = rect.x0;
+    s.tile_y = rect.y0;
+    s.columns = rect.x1 - rect.x0;
+    if (a.D == 3) {
+        const float* color = a.colors + (a.color_per_camera ? at : i) * 3;
+        for (int k = 0; k < 3; ++k) s.color[k] = color[k];
+    }
+    return s;
+}
+
 // The records of one camera's splats; first_pair is left to `number_pairs`.
 inline void make_records(const BlendArgs& a, int64_t camera, Record* records) {
     const int64_t base = camera * a.N;
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > 1024)
-    for (int64_t i = 0; i < a.N; ++i) {
-        const float *mean = a.means2d + (base + i) * 2, *root = a.roots + (base + i) * 3;
-        const float* half = a.half_sizes + (base + i) * 2;
-        const TileRect rect = tile_rect(mean, half, a.width, a.height);
-        Record& s = records[i];
-        s.x = mean[0];
-        s.y = mean[1];
-        s.p = root[0];
-        s.q = root[1];
-        s.r = root[2];
-        s.opacity = a.opacities[base + i];
-        const float reach = half[0] * s.p;
-        s.reach = reach * reach;
-        s.foot_x = -s.q * s.r / (s.p * s.p + s.q * s.q);
-        s.foot_y = -s.q / s.r;
-        s.first_pair = static_cast<int32_t>(rect.count());
-        s.tile_x = rect.x0;
-        s.tile_y = rect.y0;
-        s.columns = rect.x1 - rect.x0;
-        if (a.D == 3) {
-            const float* color = a.colors + ((a.color_per_camera ? base : 0) + i) * 3;
-            for (int k = 0; k < 3; ++k) s.color[k] = color[k];
-        }
+    for (int64_t first = 0; first < a.N; first += LANES) {
+        const int n = lanes_from(first, a.N);
+        TileRect rects[LANES];
+        tile_rects(a.means2d + base * 2, a.half_sizes + base * 2, first, n, a.width, a.height, rects);
+        for (int k = 0; k < n; ++k) records[first + k] = make_record(a, camera, first + k, rects[k]);
     }
 }
 

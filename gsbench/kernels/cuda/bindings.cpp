@@ -128,13 +128,30 @@ void observe_triangular_backward(int64_t N, bool conditioned_first, bool row_sca
         {out_means, out_directions, out_times, out_log_diagonal, out_off_diagonal, out_opacities, out_lambdas}, stream);
 }
 
+void observe_rotated(int64_t N, Address time, Address lambda_t, Address means, Address times, Address scales,
+                     Address left, Address right, Address opacities, Address out_means, Address out_factors,
+                     Address out_opacities, Address stream) {
+    gsb::cuda::observe_rotated({N, time, lambda_t, means, times, scales, left, right, opacities},
+                               {out_means, out_factors, out_opacities}, stream);
+}
+
+void observe_rotated_backward(int64_t N, Address time, Address lambda_t, Address means, Address times, Address scales,
+                              Address left, Address right, Address opacities, Address g_means, Address g_factors,
+                              Address g_opacities, Address out_means, Address out_times, Address out_scales,
+                              Address out_left, Address out_right, Address out_opacities, Address out_lambda_t,
+                              Address stream) {
+    gsb::cuda::observe_rotated_backward(
+        {N, time, lambda_t, means, times, scales, left, right, opacities}, {g_means, g_factors, g_opacities},
+        {out_means, out_times, out_scales, out_left, out_right, out_opacities, out_lambda_t}, stream);
+}
+
 void show_colors(int64_t N, int degree, int bases, int waves, Address sh0, Address shN, Address means,
-                 Address opacities, Address times, Address center, float time, Address colors, Address stream) {
+                 Address opacities, Address times, Address center, Address time, Address colors, Address stream) {
     gsb::cuda::show_colors({N, degree, bases, waves, sh0, shN, means, opacities, times, center, time}, colors, stream);
 }
 
 void show_colors_backward(int64_t N, int degree, int bases, int waves, Address sh0, Address shN, Address means,
-                          Address opacities, Address times, Address center, float time, Address g_colors,
+                          Address opacities, Address times, Address center, Address time, Address g_colors,
                           Address out_sh0, Address out_shN, Address out_means, Address out_times, Address stream) {
     gsb::cuda::show_colors_backward({N, degree, bases, waves, sh0, shN, means, opacities, times, center, time},
                                     {g_colors, out_sh0, out_shN, out_means, out_times}, stream);
@@ -187,6 +204,8 @@ NB_MODULE(GSB_MODULE, m) {
     m.def("blend_backward", &blend_backward);
     m.def("observe_triangular", &observe_triangular);
     m.def("observe_triangular_backward", &observe_triangular_backward);
+    m.def("observe_rotated", &observe_rotated);
+    m.def("observe_rotated_backward", &observe_rotated_backward);
     m.def("show_colors", &show_colors);
     m.def("show_colors_backward", &show_colors_backward);
     m.def("refine", &refine);

@@ -18,7 +18,7 @@ struct Weights {
     __device__ Weights(const ColorArgs& a, int64_t i)
         : unit({a.means[i * 3] - a.center[0], a.means[i * 3 + 1] - a.center[1], a.means[i * 3 + 2] - a.center[2]}) {
         used = harmonics(unit.direction, a.degree, Y);
-        waves_of(a.times ? a.time - a.times[i] : 0.0f, a.waves, cosines, sines);
+        waves_of(a.times ? *a.time - a.times[i] : 0.0f, a.waves, cosines, sines);
     }
 };
 

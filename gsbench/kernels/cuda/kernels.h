@@ -93,7 +93,19 @@ struct TriangularArgs {
 
 struct TriangularGrads {
     float *means, *directions, *times, *log_diagonal, *off_diagonal, *opacities;
-    float* lambdas;  // [2] of direction and time, zero on entry; null: not wanted
+    float* lambdas;  // [2] of direction and time, zero on entry
+};
+
+// 4D Gaussians with factor M_left M_right diag(exp scales), observed at a time (4DGS).
+struct RotatedArgs {
+    int64_t N;
+    const float *time, *lambda_t;                                      // [1] [1]
+    const float *means, *times, *scales, *left, *right, *opacities;  // [N, 3] [N] [N, 4] [N, 4] [N, 4] [N] logits
+};
+
+struct RotatedGrads {
+    float *means, *times, *scales, *left, *right, *opacities;
+    float* lambda_t;  // [1], zero on entry
 };
 
 // The 3D Gaussians that an observation leaves, or their gradients.
@@ -108,8 +120,7 @@ struct ColorArgs {
     const float *sh0, *shN;          // [N, 3] [N, waves * bases - 1, 3]
     const float *means, *opacities;  // [N, 3] [N]: one below 1/255 is not drawn, and has no colour
     const float* times;              // [N], null: colours do not change
-    const float* center;             // [3]
-    float time;
+    const float *center, *time;      // [3] [1]
 };
 
 struct ColorGrads {
@@ -159,6 +170,9 @@ void blend_backward(const BlendArgs&, const Picture&, const BlendGrads&, Stream)
 
 void observe_triangular(const TriangularArgs&, const Observation&, Stream);
 void observe_triangular_backward(const TriangularArgs&, const Observation& grads, const TriangularGrads&, Stream);
+
+void observe_rotated(const RotatedArgs&, const Observation&, Stream);
+void observe_rotated_backward(const RotatedArgs&, const Observation& grads, const RotatedGrads&, Stream);
 
 void show_colors(const ColorArgs&, float* colors, Stream);
 void show_colors_backward(const ColorArgs&, const ColorGrads&, Stream);

@@ -1,9 +1,10 @@
-"""What the operations of `gsbench.kernels.observe` and `.refine` do for tensors on the GPU.
+"""What the operations of `gsbench.kernels.slices`, `.colors` and `.refine` do for tensors on the GPU.
 
-lambda and the camera's centre are read on the device: nothing here waits for it. An empty tensor's address is 0, by
-which the kernels know that time is not observed.
+lambda, time and the camera's centre are read on the device: nothing here waits for it. An empty tensor's address is 0,
+by which the kernels know that time is not observed.
 """
 
+import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -39,27 +40,50 @@ def observe_backward(
     return out[0], out[1], out[2], out[3], out[4], out[5], lambdas
 
 
+def rotated(
+    means: Tensor, times: Tensor, scales: Tensor, left: Tensor, right: Tensor, opacities: Tensor,
+    time: Tensor, lambda_t: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Means [N, 3], factors [N, 3, 3] and opacities [N] of a slice of 4D Gaussians."""
+    N = len(means)
+    out = means.new_empty(N, 3), means.new_empty(N, 3, 3), means.new_empty(N)
+    arrays = plain(time, lambda_t, means, times, scales, left, right, opacities)
+    cuda().observe_rotated(N, *pointers(*arrays, *out), stream(means))
+    return out
+
+
+def rotated_backward(
+    means: Tensor, times: Tensor, scales: Tensor, left: Tensor, right: Tensor, opacities: Tensor, time: Tensor,
+    lambda_t: Tensor, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Gradients of the first six, and of lambda_t."""
+    arrays = plain(time, lambda_t, means, times, scales, left, right, opacities, g_means, g_factors, g_opacities)
+    out = tuple(x.new_empty(x.shape) for x in (means, times, scales, left, right, opacities))
+    g_lambda = torch.zeros_like(lambda_t)
+    cuda().observe_rotated_backward(len(means), *pointers(*arrays, *out, g_lambda), stream(means))
+    return out[0], out[1], out[2], out[3], out[4], out[5], g_lambda
+
+
 def show(
     sh0: Tensor, shN: Tensor, means: Tensor, opacities: Tensor, times: Tensor, center: Tensor,
-    time: float, degree: int, waves: int,
+    time: Tensor, degree: int, waves: int,
 ) -> Tensor:  # fmt: skip
     """Colours [N, 3]; empty `times`: they do not change."""
     colors = means.new_empty(len(means), 3)
-    arrays = plain(sh0, shN, means, opacities, times, center)
-    cuda().show_colors(len(means), degree, _bases(shN, waves), waves, *pointers(*arrays), time, *pointers(colors),
-                       stream(means))  # fmt: skip
+    arrays = plain(sh0, shN, means, opacities, times, center, time)
+    cuda().show_colors(len(means), degree, _bases(shN, waves), waves, *pointers(*arrays, colors), stream(means))
     return colors
 
 
 def show_backward(
     sh0: Tensor, shN: Tensor, means: Tensor, opacities: Tensor, times: Tensor, center: Tensor,
-    time: float, degree: int, waves: int, g_colors: Tensor,
+    time: Tensor, degree: int, waves: int, g_colors: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of sh0, shN, means and times."""
-    *arrays, given = plain(sh0, shN, means, opacities, times, center, g_colors)
+    arrays = plain(sh0, shN, means, opacities, times, center, time, g_colors)
     out = tuple(x.new_zeros(x.shape) for x in (sh0, shN, means, times))
-    cuda().show_colors_backward(len(means), degree, _bases(shN, waves), waves, *pointers(*arrays), time,
-                                *pointers(given, *out), stream(means))  # fmt: skip
+    cuda().show_colors_backward(len(means), degree, _bases(shN, waves), waves, *pointers(*arrays, *out),
+                                stream(means))  # fmt: skip
     return out[0], out[1], out[2], out[3]
 
 

@@ -1,7 +1,7 @@
 // Slices of Gaussians with triangular factors and their derivative, one a thread; the mathematics is math/triangular.h.
 #include "../math/triangular.h"
 
-#include "launch.h"
+#include "rows.h"
 
 namespace gsb::cuda {
 namespace {
@@ -11,16 +11,6 @@ template <bool TIME, bool CONDITIONED>
 __device__ TriangularModel model_of(const TriangularArgs& a) {
     return {CONDITIONED, a.row_scaled, a.half, *a.lambda_d, TIME ? *a.lambda_t : 0.0f,
             {a.center[0], a.center[1], a.center[2]}, TIME ? *a.time : 0.0f};
-}
-
-template <int COUNT>
-__device__ void load_row(const float* rows, int64_t i, float (&out)[COUNT]) {
-    GSB_UNROLL for (int k = 0; k < COUNT; ++k) out[k] = rows[i * COUNT + k];
-}
-
-template <int COUNT>
-__device__ void store_row(const float (&row)[COUNT], float* rows, int64_t i) {
-    GSB_UNROLL for (int k = 0; k < COUNT; ++k) rows[i * COUNT + k] = row[k];
 }
 
 template <bool TIME>
@@ -42,9 +32,7 @@ __global__ void observe_kernel(TriangularArgs a, Observation out) {
     const TriangularModel model = model_of<TIME, CONDITIONED>(a);
     const auto raw = parameters<TIME>(a, i);
     const Observed<float> seen = TriangularGaussian<float, TIME>(model, raw).observe();
-    store_row(seen.mean, out.means, i);
-    GSB_UNROLL for (int row = 0; row < 3; ++row) store_row(seen.factor[row], out.factors, i * 3 + row);
-    out.opacities[i] = seen.opacity;
+    store_observed(seen, out, i);
 }
 
 template <bool TIME, bool CONDITIONED>
@@ -56,11 +44,7 @@ __global__ void observe_backward_kernel(TriangularArgs a, Observation grads, Tri
         const auto raw = parameters<TIME>(a, i);
         TriangularGaussian<float, TIME> gaussian(model, raw);
         gaussian.observe();
-        Observed<float> given;
-        load_row(grads.means, i, given.mean);
-        GSB_UNROLL for (int row = 0; row < 3; ++row) load_row(grads.factors, i * 3 + row, given.factor[row]);
-        given.opacity = grads.opacities[i];
-        gaussian.vjp(given, g);
+        gaussian.vjp(load_observed(grads, i), g);
         store_row(g.mean, out.means, i);
         store_row(g.direction, out.directions, i);
         if constexpr (TIME) out.times[i] = g.time;
@@ -68,7 +52,6 @@ __global__ void observe_backward_kernel(TriangularArgs a, Observation grads, Tri
         store_row(g.off_diagonal, out.off_diagonal, i);
         out.opacities[i] = g.opacity;
     }
-    if (!out.lambdas) return;
     const float lambda_d = warp_sum(g.lambda_d), lambda_t = warp_sum(g.lambda_t);
     if (threadIdx.x % WARP == 0) {
         atomicAdd(out.lambdas, lambda_d);
@@ -85,10 +68,6 @@ void dispatch(const TriangularArgs& a, Run run) {
         a.conditioned_first ? run.template operator()<false, true>() : run.template operator()<false, false>();
     }
 }
-
-constexpr int SMALL_BLOCK = 128;  // a thread needs many registers
-
-unsigned small_blocks(int64_t N) { return static_cast<unsigned>((N + SMALL_BLOCK - 1) / SMALL_BLOCK); }
 
 }  // namespace
 

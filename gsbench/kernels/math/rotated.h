@@ -1,0 +1,137 @@
+// One Gaussian over position and time with a rotated factor (4DGS): its slice at a time, and backwards.
+#pragma once
+
+#include "slicing.h"
+#include "triangular.h"
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+constexpr float TIME_GATE_MIN = 0.05f;  // a Gaussian whose f_temp is not above this is not drawn (4DGS)
+
+template <class T>
+struct RotatedParameters {
+    T mean[3], time, scales[4], left[4], right[4], opacity;  // log scales; the last a logit
+    T lambda_t;                                              // in gradients only
+};
+
+// A quaternion at length 1, as torch normalises it.
+template <class T>
+struct UnitQuaternion {
+    T q[4], inverse_length;
+
+    GSB_HD explicit UnitQuaternion(const T (&raw)[4]) {
+        const T square = raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2] + raw[3] * raw[3];
+        inverse_length = T(1.0f) / max(sqrt(square), T(1e-12f));
+        GSB_UNROLL for (int i = 0; i < 4; ++i) q[i] = raw[i] * inverse_length;
+    }
+    GSB_HD void vjp(const T (&g)[4], T (&out)[4]) const {
+        const T along = g[0] * q[0] + g[1] * q[1] + g[2] * q[2] + g[3] * q[3];
+        GSB_UNROLL for (int i = 0; i < 4; ++i) out[i] = (g[i] - along * q[i]) * inverse_length;
+    }
+};
+
+// R = M_left(l) M_right(r) (4DGS eq. 7): entry (i, j) of either matrix is +- entry i xor j of its quaternion. Tables
+// within functions: those of a namespace do not exist on a GPU.
+GSB_HD constexpr float LEFT_SIGN(int i, int j) {
+    constexpr float table[4][4] = {{1, -1, -1, -1}, {1, 1, -1, 1}, {1, 1, 1, -1}, {1, -1, 1, 1}};
+    return table[i][j];
+}
+GSB_HD constexpr float RIGHT_SIGN(int i, int j) {
+    constexpr float table[4][4] = {{1, 1, 1, 1}, {-1, 1, -1, 1}, {-1, 1, 1, -1}, {-1, -1, 1, 1}};
+    return table[i][j];
+}
+
+template <class T>
+struct RotatedGaussian {
+    const RotatedParameters<T>& raw;
+    float lambda_t, observed;
+    UnitQuaternion<T> left, right;
+    T L[4][4], R[4][4], F[4][4], size[4];  // F = L R diag(size), rows (x, y, z, t)
+    Reflections<T, 1> reflections;
+    Reduced<T, 1> t;
+    T white[1], gate, opacity;
+
+    GSB_HD RotatedGaussian(const RotatedParameters<T>& raw, float lambda_t, float time)
+        : raw(raw), lambda_t(lambda_t), observed(time), left(raw.left), right(raw.right) {}
+
+    GSB_HD Observed<T> observe() {
+        const T zero(0.0f);
+        GSB_UNROLL for (int i = 0; i < 4; ++i) {
+            size[i] = exp(raw.scales[i]);
+            GSB_UNROLL for (int j = 0; j < 4; ++j) {
+                L[i][j] = left.q[i ^ j] * LEFT_SIGN(i, j);
+                R[i][j] = right.q[i ^ j] * RIGHT_SIGN(i, j);
+            }
+        }
+        T rows[4][4];  // t, then p
+        for (int i = 0; i < 4; ++i) {
+            for (int j = 0; j < 4; ++j) {
+                T sum = zero;
+                for (int k = 0; k < 4; ++k) sum = sum + L[i][k] * R[k][j];
+                F[i][j] = sum * size[j];
+                rows[(i + 1) % 4][j] = F[i][j];
+            }
+        }
+        reflections.reduce(rows, t);
+        const T delta[1] = {T(observed) - raw.time};
+        whiten(t, delta, white);
+        gate = exp(white[0] * white[0] * (-0.5f * lambda_t));
+        gate = select(gate > T(TIME_GATE_MIN), gate, zero);
+        opacity = sigmoid(raw.opacity);
+
+        Observed<T> out;
+        const Vec3<T> moved = moved_mean(t, {raw.mean[0], raw.mean[1], raw.mean[2]}, white);
+        out.mean[0] = moved.x;
+        out.mean[1] = moved.y;
+        out.mean[2] = moved.z;
+        for (int i = 0; i < 3; ++i) {
+            for (int j = 0; j < 3; ++j) out.factor[i][j] = t.pp[i][j];
+        }
+        out.opacity = opacity * gate;
+        return out;
+    }
+
+    // After `observe`.
+    GSB_HD void vjp(const Observed<T>& g, RotatedParameters<T>& out) const {
+        const T zero(0.0f);
+        Reduced<T, 1> g_t;
+        g_t.zero();
+        for (int i = 0; i < 3; ++i) {
+            for (int j = 0; j < 3; ++j) g_t.pp[i][j] = g.factor[i][j];
+            out.mean[i] = g.mean[i];
+        }
+        out.opacity = g.opacity * gate * opacity * (T(1.0f) - opacity);
+        const T g_exponent = zero - g.opacity * opacity * gate;
+        out.lambda_t = g_exponent * white[0] * white[0] * 0.5f;
+        T g_white[1] = {g_exponent * white[0] * lambda_t};
+        moved_mean_vjp(t, white, {g.mean[0], g.mean[1], g.mean[2]}, g_white, g_t);
+        whiten_vjp(t, white, g_white, g_t);  // now that of delta
+        out.time = zero - g_white[0];
+        T g_rows[4][4], g_M[4][4], g_left[4] = {zero, zero, zero, zero}, g_right[4] = {zero, zero, zero, zero};
+        reflections.vjp(g_t, g_rows);
+        for (int j = 0; j < 4; ++j) {
+            out.scales[j] = zero;
+            for (int i = 0; i < 4; ++i) {
+                out.scales[j] = out.scales[j] + g_rows[(i + 1) % 4][j] * F[i][j];
+                g_M[i][j] = g_rows[(i + 1) % 4][j] * size[j];
+            }
+        }
+        for (int i = 0; i < 4; ++i) {
+            for (int j = 0; j < 4; ++j) {
+                T g_L = zero, g_R = zero;
+                for (int k = 0; k < 4; ++k) {
+                    g_L = g_L + g_M[i][k] * R[j][k];
+                    g_R = g_R + L[k][i] * g_M[k][j];
+                }
+                g_left[i ^ j] = g_left[i ^ j] + g_L * LEFT_SIGN(i, j);
+                g_right[i ^ j] = g_right[i ^ j] + g_R * RIGHT_SIGN(i, j);
+            }
+        }
+        left.vjp(g_left, out.left);
+        right.vjp(g_right, out.right);
+    }
+};
+
+}  // namespace GSB_ISA
+}  // namespace gsb

@@ -1,0 +1,18 @@
+#!/bin/sh
+# Runs the kernel tests on kernels built with AddressSanitizer and UndefinedBehaviorSanitizer: any finding is a failure.
+# Usage: tests/kernels/sanitize.sh [python]
+set -eu
+cd "$(dirname "$0")/../.."
+python=${1:-python}
+build=build/sanitize
+cmake -S . -B $build -DCMAKE_BUILD_TYPE=RelWithDebInfo -DGSB_SANITIZE=address,undefined \
+    -DPython_EXECUTABLE="$(command -v "$python")"
+cmake --build $build
+rm -rf $build/site
+mkdir -p $build/site
+cp -r gsbench $build/site/
+cp $build/_native*.so $build/site/gsbench/kernels/
+# Python itself is not sanitized: the runtime is loaded first, and what the interpreter leaves behind is no leak of ours.
+LD_PRELOAD="$(c++ -print-file-name=libasan.so) $(c++ -print-file-name=libstdc++.so)" \
+    ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 OMP_NUM_THREADS=2 \
+    "$python" -m pytest tests/kernels -o "pythonpath=$build/site tests" -p no:cacheprovider
