@@ -7,7 +7,7 @@ MODELS := 3dgs,4dgs,6dgs,7dgs,7dgs_noagr
 # More overrides: make table1 ARGS="train.iterations=3000 seed=1"
 ARGS ?=
 
-.PHONY: table1 test test-all lint format setup clean
+.PHONY: help table1 test test-all bench sanitize lint format setup clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
@@ -35,6 +35,12 @@ test: lint  ## lint, types and all tests but the slow ones
 
 test-all: lint  ## the slow tests too
 	$(BIN)/python -m pytest -m 'slow or not slow'
+
+bench: setup  ## time every kernel against the machine's own limits; results/benchmarks/
+	$(BIN)/python -m benchmarks
+
+sanitize: setup  ## build the kernels with the address and undefined-behaviour sanitizers and run their tests
+	tests/kernels/sanitize.sh $(BIN)/python
 
 lint: setup  ## ruff and mypy
 	$(BIN)/ruff check .

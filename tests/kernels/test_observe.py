@@ -89,6 +89,7 @@ def rotated(dtype: torch.dtype) -> tuple[Gaussians4DModel, dict[str, Tensor]]:
     raw = {"means": torch.randn(N, 3, generator=g), "times": torch.rand(N, 1, generator=g),
            "scales": 0.5 * torch.randn(N, 4, generator=g) - 1, "left_quats": torch.randn(N, 4, generator=g),
            "right_quats": torch.randn(N, 4, generator=g), "opacities": 2 * torch.randn(N, generator=g)}  # fmt: skip
+    raw["scales"][:20] = -3.0  # short in time
     model = Gaussians4DModel(lambda_t=0.7)
     model.log_modulation.requires_grad_(True)
     return model.to(dtype), {k: v.to(dtype).requires_grad_() for k, v in raw.items()}

@@ -9,11 +9,14 @@
 #define GSB_HD __attribute__((always_inline))  // a vector that crosses a call goes through memory
 #endif
 
-// Small loops over the entries of a matrix: unrolled, so that the entries stay in registers.
-#if defined(__GNUC__) && !defined(__clang__) && !defined(__CUDACC__)
+// Small loops over the entries of a matrix: unrolled where there are registers to keep the entries in. Elsewhere that
+// would gain nothing, and take the compiler minutes.
+#if defined(__CUDACC__)
+#define GSB_UNROLL _Pragma("unroll")
+#elif defined(__AVX512F__) && !defined(__clang__)
 #define GSB_UNROLL _Pragma("GCC unroll 16")
 #else
-#define GSB_UNROLL _Pragma("unroll")
+#define GSB_UNROLL
 #endif
 
 // The same sources are compiled once for each instruction set: a namespace each, so that the linker keeps them apart.
