@@ -134,13 +134,13 @@ def test_a_scene_without_time_is_refused_by_models_of_time(tmp_path: Path) -> No
 def test_divergence_ends_as_a_record_and_the_rest_goes_on(square: Path, tmp_path: Path) -> None:
     """Catches a diverged run that is lost, hidden, or takes the sweep with it: one line, a record, exit code 1."""
     sweep = ["-m", *overrides(square, tmp_path), "model=3dgs", "seed=0,1"]
-    done = gsbench(*sweep, "model.lr.sh0.start=1e38")
+    done = gsbench(*sweep, "train.ssim_weight=1e39")
     assert done.returncode == 1
     found = [record.read(path) for path in record.find(tmp_path)]
     assert len(found) == 2
     for one in found:
         assert one.status == "diverged"
         assert one.reason is not None
-        assert one.reason.startswith("step 1: ")
+        assert one.reason.startswith("step 0: ")
         assert one.metrics is None
-    assert done.stderr.count("gsbench: error: square: diverged: step 1: ") == 2
+    assert done.stderr.count("gsbench: error: square: diverged: step 0: ") == 2
