@@ -13,7 +13,7 @@ cmake --build $build
 rm -rf $build/site
 mkdir -p $build/site
 cp -r gsbench $build/site/
-cp $build/_native*.so $build/site/gsbench/kernels/
+cp --remove-destination $build/_native*.so $build/site/gsbench/kernels/
 # Python itself is not sanitized: the runtime is loaded first, and what the interpreter leaves behind is no leak of ours.
 LD_PRELOAD="$(c++ -print-file-name=libasan.so) $(c++ -print-file-name=libstdc++.so)" \
     ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 OMP_NUM_THREADS=2 \
