@@ -13,7 +13,7 @@ from gsbench import models, scenes
 from gsbench.config import Config
 from gsbench.errors import InputError, did_you_mean
 from gsbench.measure import record as records
-from gsbench.measure.provenance import provenance
+from gsbench.measure.provenance import config_hash, provenance
 from gsbench.measure.quality import Quality, evaluate
 from gsbench.measure.record import Cost, Effects, Record
 from gsbench.measure.speed import peak_memory, reset_peak_memory, synchroniser, time_renders
@@ -163,7 +163,7 @@ def fit_and_measure(this: Run, scene: Scene, model: GaussianModel) -> Record:
     trainer = Trainer(model, scene, views, config)
 
     path = this.folder / checkpoint.FILE_NAME
-    hashes = (provenance(config=this.plain, data_hash="", threads=0).config_hash, scene.fingerprint)
+    hashes = (config_hash(this.plain), scene.fingerprint)
     state = checkpoint.load(path, *hashes, config.device) if config.resume else None
     if state is not None:
         trainer.load_state_dict(state)

@@ -20,17 +20,22 @@ def provenance(*, config: dict[str, Any], data_hash: str, threads: int, device: 
     `config` is the whole resolved config as plain JSON, `data_hash` the scene's fingerprint, `device` the GPU's name;
     None stands for the processor, by its name. Imports none of the packages whose versions it notes.
     """
-    canonical = json.dumps(config, sort_keys=True, separators=(",", ":"))
     return Provenance(
         git_commit=git_commit(),
         versions=versions(),
         device=device or processor_name(),
         threads=threads,
         config=config,
-        config_hash=hashlib.sha256(canonical.encode()).hexdigest(),
+        config_hash=config_hash(config),
         data_hash=data_hash,
         time=datetime.now(UTC).isoformat(timespec="seconds"),
     )
+
+
+def config_hash(config: dict[str, Any]) -> str:
+    """sha256 of a resolved config as plain JSON, whatever the order of its keys."""
+    canonical = json.dumps(config, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 import functools
 import importlib
-import importlib.util
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsbench import kernels
 from gsbench.errors import InputError, did_you_mean
 
 # A backend is a module with a function `draw` of this door's (checked) arguments.
@@ -94,19 +94,13 @@ def choose_backend(backend: str, device: str = "cpu", dtype: torch.dtype = torch
         InputError: no such backend, or it is not installed.
     """
     if backend == "auto":
-        return "cpu" if device == "cpu" and dtype == torch.float32 and native_available() else "reference"
+        return "cpu" if device == "cpu" and dtype == torch.float32 and kernels.available() else "reference"
     if backend not in _MODULES:
         raise InputError(f"raster backend '{backend}' is not known. {did_you_mean(backend, ['auto', *_MODULES])}")
-    if backend == "cpu" and not native_available():
+    if backend == "cpu" and not kernels.available():
         raise InputError("raster backend 'cpu' is not built in this installation: reinstall with a C++20 compiler, "
                          "or use raster.backend=reference")  # fmt: skip
     return backend
-
-
-@functools.cache
-def native_available() -> bool:
-    """Whether the native kernels are part of this installation."""
-    return importlib.util.find_spec("gsbench.kernels._native") is not None
 
 
 @functools.cache
