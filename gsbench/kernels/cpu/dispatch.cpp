@@ -4,7 +4,6 @@
 
 namespace gsb {
 
-#if defined(GSB_X86_LEVELS)
 namespace v2 {
 extern const Kernels table;
 }
@@ -14,25 +13,29 @@ extern const Kernels table;
 namespace v4 {
 extern const Kernels table;
 }
-#else
 namespace portable {
 extern const Kernels table;
 }
-#endif
 
 static std::vector<const Kernels*> usable() {
-#if defined(GSB_X86_LEVELS)
     std::vector<const Kernels*> out;
+#if defined(GSB_LEVEL_portable)
+    out.push_back(&portable::table);
+#endif
+#if defined(GSB_LEVEL_v2)
     if (__builtin_cpu_supports("ssse3") && __builtin_cpu_supports("sse4.2")) out.push_back(&v2::table);
+#endif
+#if defined(GSB_LEVEL_v3)
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) out.push_back(&v3::table);
+#endif
+#if defined(GSB_LEVEL_v4)
     if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
         __builtin_cpu_supports("avx512vl")) {
         out.push_back(&v4::table);
     }
-    return out;
-#else
-    return {&portable::table};
 #endif
+    if (out.empty()) throw std::runtime_error("this processor runs none of the instruction sets that gsbench was built for");
+    return out;
 }
 
 std::vector<std::string> instruction_sets() {
