@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+import gsbench  # noqa: F401  before torch: how its threads wait is settled as it loads
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
