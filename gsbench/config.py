@@ -114,6 +114,7 @@ class Config:
     seed: int = 0
     device: str = "cpu"
     agr: bool = "${model.agr}"  # type: ignore[assignment]
+    optim: str = "adam"  # or sparse_adam: what no view of a batch drew does not move
     results: str = "results"
     resume: bool = True  # go on from a checkpoint and keep finished runs of the same config; false: start over
     model: ModelConfig = field(default_factory=ModelConfig)

@@ -24,6 +24,7 @@ from gsbench.scenes import Scene
 from gsbench.scenes.points import random_points
 from gsbench.train import checkpoint
 from gsbench.train.loop import DivergedError, Trainer
+from gsbench.train.optim import OPTIMIZERS
 from gsbench.train.schedule import generator
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -84,6 +85,8 @@ def identify(composed: DictConfig) -> Run:
     if config.scene.eval_split not in SPLITS:
         raise InputError(f"scene.eval_split '{config.scene.eval_split}' is not known. "
                          f"{did_you_mean(config.scene.eval_split, SPLITS)}")  # fmt: skip
+    if config.optim not in OPTIMIZERS:
+        raise InputError(f"optim '{config.optim}' is not known. {did_you_mean(config.optim, OPTIMIZERS)}")
     for key in ("iterations", "recipe_iterations", "batch_size"):
         if getattr(config.train, key) < 1:
             raise InputError(f"train.{key}: expected at least 1, got {getattr(config.train, key)}")

@@ -331,6 +331,19 @@ void refine_backward(In<-1, -1> features, In<-1, -1> weight_in, In<-1> bias_in, 
                                                  out_weight_out.data(), out_bias_out.data()});
 }
 
+void adam(Out<-1, -1> parameters, In<-1, -1> gradients, Out<-1, -1> means, Out<-1, -1> squares,
+          Array<const bool, -1> drawn, double rate, double beta1, double beta2, double eps, double unbias1,
+          double unbias2, int threads) {
+    const int64_t N = size(parameters.shape(0)), width = size(parameters.shape(1));
+    expect_all(N * width, "N x width", gradients.size(), means.size(), squares.size());
+    expect_all(N, "N", drawn.shape(0));
+    const Frame frame(1, 1, threads);
+    const auto f = [](double x) { return static_cast<float>(x); };
+    nb::gil_scoped_release release;
+    active->adam({N, width, drawn.data(), gradients.data(), parameters.data(), means.data(), squares.data(),
+                  {f(rate), f(beta1), f(beta2), f(eps), f(unbias1), f(unbias2)}, threads});
+}
+
 float roofline_flops(int64_t rounds) { return active->roofline_flops(rounds); }
 
 float roofline_alphas(int64_t rounds) { return active->roofline_alphas(rounds); }
@@ -368,6 +381,7 @@ NB_MODULE(_native, m) {
     define(m, "show_colors_backward", show_colors_backward);
     define(m, "refine", refine);
     define(m, "refine_backward", refine_backward);
+    define(m, "adam", adam);
     define(m, "roofline_flops", roofline_flops);
     define(m, "roofline_triad", roofline_triad);
     define(m, "roofline_alphas", roofline_alphas);

@@ -50,7 +50,7 @@ class Trainer:
         self.config = config
         self.background = torch.tensor(scene.background, device=config.device)
         self.schedule = Schedule(train, config.model.sh_degree, config.agr)
-        self.optimizer = Optimizer(model, config.model, scene.extent, train.iterations)
+        self.optimizer = Optimizer(model, config.model, scene.extent, train.iterations, config.optim)
         self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity)
         self.stages = Stages(config.device)
         self.curve = Curve()
@@ -89,6 +89,7 @@ class Trainer:
         self.model.set_stage(self.schedule.stage(step))
         views = [self.scene.train[i] for i in batch(step, len(self.scene.train), train.batch_size, self.config.seed)]
         total = 0.0
+        drawn = torch.zeros(len(self.model), dtype=torch.bool, device=self.config.device)
         for view in views:
             with stages("slice"):
                 gaussians = self.model.slice(view.camera.center, view.time)
@@ -107,9 +108,10 @@ class Trainer:
                 loss.backward()
             with stages("density"):
                 self.density.observe(output.info, view.camera.width, view.camera.height, len(views))
+                drawn |= (output.info.radii > 0).any(0)
         self._check_finite(total)
         with stages("optimizer"):
-            self.optimizer.step(step)
+            self.optimizer.step(step, drawn)
         with stages("density"):
             if self.schedule.densifies(step):
                 self.density.densify(generator(self.config.seed, step), self.schedule.has_reset(step))

@@ -1,18 +1,29 @@
 """Adam with a learning rate a parameter, whose moments follow the Gaussians when density control moves rows."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from gsbench.config import LearningRate, ModelConfig
 from gsbench.errors import InputError, did_you_mean
+from gsbench.kernels.adam import adam
 from gsbench.models import GaussianModel
+
+OPTIMIZERS = ("adam", "sparse_adam")
 
 
 class Optimizer:
-    """torch.optim.Adam over a model's parameter groups (eps 1e-15, as 3DGS)."""
+    """torch.optim.Adam over a model's parameter groups (eps 1e-15, as 3DGS).
 
-    def __init__(self, model: GaussianModel, config: ModelConfig, extent: float, iterations: int) -> None:
-        """One group for each name of `model.groups()`.
+    `adam` moves what no view of a batch drew by the momentum it has left; `sparse_adam` leaves it, and its moments,
+    alone (Mallick et al. 2024, Taming 3DGS). Where everything is drawn the two are the same.
+    """
+
+    def __init__(
+        self, model: GaussianModel, config: ModelConfig, extent: float, iterations: int, kind: str = "adam"
+    ) -> None:
+        """One group for each name of `model.groups()`; `kind` is one of OPTIMIZERS.
 
         Raises:
             InputError: a parameter without a learning rate, or a rate for a parameter no variant of the model has.
@@ -25,18 +36,45 @@ class Optimizer:
             if name not in {*groups, "refinement", "modulation"}:
                 raise InputError(f"model.lr: model '{config.name}' has no '{name}'. {did_you_mean(name, groups)}")
         self.rates = {name: config.lr[name] for name in groups}
+        self.model = model
         self.extent = extent
         self.iterations = iterations
+        self.is_sparse = kind == "sparse_adam"
         self.adam = torch.optim.Adam(
             [{"params": parameters, "name": name} for name, parameters in groups.items()], lr=0.0, eps=1e-15, fused=True
         )
 
-    def step(self, step: int) -> None:
-        """Update everything that has a gradient, at the rates of this step, and drop the gradients."""
+    def step(
+        self,
+        step: int,
+        drawn: Tensor,  # [N] bool
+    ) -> None:
+        """Update what has a gradient, at the rates of this step, and drop the gradients.
+
+        `drawn`: which Gaussians some view of the batch drew; the others have no gradient.
+        """
         for group in self.adam.param_groups:
             group["lr"] = rate_at(self.rates[group["name"]], step / self.iterations, self.extent)
+            if self.is_sparse and group["name"] in self.model.splats:
+                self._step_rows(group, drawn)
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
+
+    def _step_rows(self, group: dict[str, Any], drawn: Tensor) -> None:
+        (parameter,) = group["params"]
+        if parameter.grad is None:
+            return
+        state = self.adam.state[parameter]
+        if not state:  # in the layout of torch.optim.Adam
+            state["step"] = torch.zeros((), device=parameter.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        state["step"] += 1
+        update = adam if self.model.uses_kernels(parameter) else adam_reference
+        moments = state["exp_avg"], state["exp_avg_sq"]
+        with torch.no_grad():
+            update(parameter, parameter.grad, *moments, drawn, group["lr"], list(group["betas"]), group["eps"],
+                   int(state["step"]))  # fmt: skip
+        parameter.grad = None
 
     def follow(self, model: GaussianModel, rows: Tensor, fresh: Tensor) -> None:
         """Move Adam's moments as `model.select(rows)` moved the Gaussians; those `fresh` start from zero."""
@@ -61,3 +99,17 @@ def rate_at(rate: LearningRate, progress: float, extent: float) -> float:
     if rate.end is None:
         return rate.start * scale
     return float(rate.start ** (1 - progress) * rate.end**progress * scale)
+
+
+def adam_reference(
+    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, drawn: Tensor, rate: float, betas: list[float],
+    eps: float, step: int,
+) -> None:  # fmt: skip
+    """`gsbench.kernels.adam.adam` in torch."""
+    rows = drawn.nonzero()[:, 0]
+    g = gradient[rows]
+    m = mean[rows].lerp(g, 1 - betas[0])
+    v = square[rows].lerp(g.square(), 1 - betas[1])
+    denominator = v.sqrt() * (1 - betas[1] ** step) ** -0.5 + eps
+    parameter[rows] -= m * (rate / (1 - betas[0] ** step)) / denominator
+    mean[rows], square[rows] = m, v

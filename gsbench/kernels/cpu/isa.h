@@ -22,6 +22,7 @@ void show_colors(const ColorArgs&, float* colors);
 void show_colors_backward(const ColorArgs&, const ColorGrads&);
 void refine(const RefineArgs&, float* out);
 void refine_backward(const RefineArgs&, const float* grads, const RefineGrads&);
+void adam(const AdamArgs&);
 float roofline_flops(int64_t rounds);
 void roofline_triad(float* a, const float* b, const float* c, int64_t n);
 float roofline_alphas(int64_t rounds);

@@ -3,6 +3,8 @@
 
 #include <cstdint>
 
+#include "../math/adam.h"
+
 namespace gsb {
 
 // Gaussians before cameras. N Gaussians, C cameras; gradients are named grad_ and may be null where said so.
@@ -126,6 +128,16 @@ struct RefineGrads {
     float *features, *weight_in, *bias_in, *weight_out, *bias_out;
 };
 
+// Adam on the rows [N, width] of a parameter that are `drawn`.
+struct AdamArgs {
+    int64_t N, width;
+    const bool* drawn;                    // [N]
+    const float* gradients;               // [N, width], as are ..
+    float *parameters, *means, *squares;  // .. the values, and Adam's moments
+    AdamRule rule;
+    int threads;
+};
+
 struct Kernels {
     const char* isa;
     void (*project)(const ProjectArgs&, const Splats&);
@@ -143,6 +155,7 @@ struct Kernels {
     void (*show_colors_backward)(const ColorArgs&, const ColorGrads&);
     void (*refine)(const RefineArgs&, float* out);
     void (*refine_backward)(const RefineArgs&, const float* grads, const RefineGrads&);
+    void (*adam)(const AdamArgs&);
     float (*roofline_flops)(int64_t rounds);
     void (*roofline_triad)(float* a, const float* b, const float* c, int64_t n);
     float (*roofline_alphas)(int64_t rounds);
