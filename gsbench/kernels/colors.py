@@ -10,7 +10,8 @@ from torch.library import custom_op
 
 from gsbench.errors import InputError
 from gsbench.kernels import native, threads
-from gsbench.kernels.arrays import check, check_constant, plain, rows_like
+from gsbench.kernels.arrays import check, check_constant, number, plain, rows_like
+from gsbench.kernels.cuda import observe as on_cuda
 
 MAX_WAVES = 8  # as math/harmonics.h has it
 
@@ -23,7 +24,7 @@ def show_colors(
     center: Tensor,  # [3]
     degree: int,
     times: Tensor | None = None,  # [N, 1]
-    time: float = 0.0,
+    time: Tensor | None = None,  # []
     waves: int = 1,
 ) -> Tensor:  # [N, 3]
     """Colours max(0, sum beta_nlm cos(2 pi n (t - mu_t)) Y_lm(d) + 0.5), d the direction from `center` to the mean.
@@ -32,7 +33,7 @@ def show_colors(
     opacity is below 1/255. K harmonics are stored a frequency, (degree + 1)^2 of them are used.
 
     Raises:
-        InputError: not float32 on the CPU, or shapes that do not fit.
+        InputError: not float32 on one device, or shapes that do not fit.
     """
     N, all_of = len(means), shN.shape[1] + 1 if shN.dim() == 3 else 0
     arrays = {"sh0": (sh0, (N, 1, 3)), "shN": (shN, (N, all_of - 1, 3)), "means": (means, (N, 3)),
@@ -44,19 +45,21 @@ def show_colors(
     if not 0 <= degree <= 3 or not 1 <= waves <= MAX_WAVES or all_of % waves or all_of // waves < (degree + 1) ** 2:
         raise InputError(f"show_colors: expected degree 0 to 3 and 1 to 8 frequencies with (degree + 1)^2 coefficients "
                          f"each, got degree={degree}, waves={waves} and {all_of} coefficients")  # fmt: skip
-    if waves > 1 and times is None:
-        raise InputError("show_colors: expected times, as colours change with them (waves > 1)")
-    mu_t = means.new_empty(0) if times is None or waves == 1 else times[:, 0]
-    return _show(sh0, shN, means, opacities.detach(), mu_t, center, time, degree, waves)
+    if waves == 1:
+        times, time = means.new_empty(0, 1), means.new_empty(0)
+    if times is None or time is None:
+        raise InputError("show_colors: expected times and a time, as colours change with them (waves > 1)")
+    return _show(sh0, shN, means, opacities.detach(), times[:, 0], center, time, degree, waves)
 
 
 @custom_op("gsbench::show_colors", mutates_args=())
 def _show(
     sh0: Tensor, shN: Tensor, means: Tensor, opacities: Tensor, times: Tensor, center: Tensor,
-    time: float, degree: int, waves: int,
+    time: Tensor, degree: int, waves: int,
 ) -> Tensor:  # fmt: skip
     colors = means.new_empty(len(means), 3)
-    native().show_colors(*plain(sh0, shN, means, opacities, times, center), time, degree, waves, threads(), colors)
+    arrays = plain(sh0, shN, means, opacities, times, center)
+    native().show_colors(*arrays, number(time), degree, waves, threads(), colors)
     return colors
 
 
@@ -68,11 +71,11 @@ def _(_sh0: Tensor, _shN: Tensor, means: Tensor, *_: Any) -> Tensor:
 @custom_op("gsbench::show_colors_backward", mutates_args=())
 def _show_backward(
     sh0: Tensor, shN: Tensor, means: Tensor, opacities: Tensor, times: Tensor, center: Tensor,
-    time: float, degree: int, waves: int, g_colors: Tensor,
+    time: Tensor, degree: int, waves: int, g_colors: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     out = tuple(rows_like(x) for x in (sh0, shN, means, times))
-    native().show_colors_backward(*plain(sh0, shN, means, opacities, times, center), time, degree, waves, threads(),
-                                  *plain(g_colors), *out)  # fmt: skip
+    native().show_colors_backward(*plain(sh0, shN, means, opacities, times, center), number(time), degree, waves,
+                                  threads(), *plain(g_colors), *out)  # fmt: skip
     return out[0], out[1], out[2], out[3]
 
 
@@ -82,8 +85,8 @@ def _(sh0: Tensor, shN: Tensor, means: Tensor, _opacities: Tensor, times: Tensor
 
 
 def _show_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # noqa: ARG001
-    ctx.save_for_backward(*inputs[:6])
-    ctx.rest = inputs[6:]
+    ctx.save_for_backward(*inputs[:7])
+    ctx.rest = inputs[7:]
 
 
 def _show_gradient(ctx: Any, g_colors: Tensor) -> tuple[Tensor | None, ...]:
@@ -91,4 +94,6 @@ def _show_gradient(ctx: Any, g_colors: Tensor) -> tuple[Tensor | None, ...]:
     return g[0], g[1], g[2], None, g[3], None, None, None, None
 
 
+_show.register_kernel("cuda")(on_cuda.show)
+_show_backward.register_kernel("cuda")(on_cuda.show_backward)
 _show.register_autograd(_show_gradient, setup_context=_show_context)

@@ -8,6 +8,7 @@ from torch.library import custom_op
 
 from gsbench.errors import InputError
 from gsbench.kernels import native, threads
+from gsbench.kernels.cuda import loss as on_cuda
 
 
 def l1_ssim(
@@ -20,16 +21,19 @@ def l1_ssim(
     Same value as `gsbench.train.losses.photometric`; the gradient is computed along with it, where one is wanted.
 
     Raises:
-        InputError: not two float32 pictures of one size on the CPU, or a gradient by `target` is asked for.
+        InputError: not two float32 pictures of one size on one device, or a gradient by `target` is asked for.
     """
     for name, tensor in {"image": image, "target": target}.items():
         if tensor.dim() != 3 or tensor.shape[-1] != 3 or tensor.shape != image.shape or not tensor.numel():
             raise InputError(f"l1_ssim: expected image and target [H, W, 3] of one size, got {list(image.shape)} and "
                              f"{list(target.shape)}")  # fmt: skip
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise InputError(f"l1_ssim: expected {name} as float32 on the CPU, got {tensor.dtype} on {tensor.device}")
+        if tensor.dtype != torch.float32 or tensor.device != image.device or tensor.device.type not in ("cpu", "cuda"):
+            raise InputError(f"l1_ssim: expected {name} as float32 on the CPU or a GPU, as the other picture, got "
+                             f"{tensor.dtype} on {tensor.device}")  # fmt: skip
     if target.requires_grad:
         raise InputError("l1_ssim has no gradient by target: detach it")
+    if image.is_cuda:
+        return on_cuda.l1_ssim(image, target, ssim_weight)
     loss, _ = _l1_ssim(image, target, ssim_weight, image.requires_grad and torch.is_grad_enabled())
     return loss
 

@@ -9,6 +9,7 @@ from torch.library import custom_op
 from gsbench.errors import InputError
 from gsbench.kernels import native, threads
 from gsbench.kernels.arrays import plain, rows_like
+from gsbench.kernels.cuda import observe as on_cuda
 
 HIDDEN = 64
 
@@ -25,7 +26,7 @@ def refine(
     What does not change from Gaussian to Gaussian, as gamma(t), belongs into `bias_in`.
 
     Raises:
-        InputError: not float32 on the CPU, or shapes that do not fit.
+        InputError: not float32 on one device, or shapes that do not fit.
     """
     widths = [len(w) for w in weights_out]
     rows, F = HIDDEN * len(widths), features.shape[-1]
@@ -33,9 +34,10 @@ def refine(
     shapes += [(w, (c, HIDDEN)) for w, c in zip(weights_out, widths, strict=True)]
     shapes += [(b, (c,)) for b, c in zip(biases_out, widths, strict=True)]
     for tensor, shape in shapes:
-        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise InputError(f"refine: expected {list(shape)} float32 on the CPU, got {list(tensor.shape)} "
-                             f"{tensor.dtype} on {tensor.device}")  # fmt: skip
+        here = tensor.device == features.device and tensor.device.type in ("cpu", "cuda")
+        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or not here:
+            raise InputError(f"refine: expected {list(shape)} float32 on the CPU or a GPU, all on one, got "
+                             f"{list(tensor.shape)} {tensor.dtype} on {tensor.device}")  # fmt: skip
     out = _refine(features, weight_in, bias_in, torch.cat(weights_out), torch.cat(biases_out), widths)
     return list(out.split(widths, -1))
 
@@ -79,4 +81,6 @@ def _gradient(ctx: Any, g_out: Tensor) -> tuple[Tensor | None, ...]:
     return *_refine_backward(*ctx.saved_tensors, ctx.widths, g_out), None
 
 
+_refine.register_kernel("cuda")(on_cuda.refine)
+_refine_backward.register_kernel("cuda")(on_cuda.refine_backward)
 _refine.register_autograd(_gradient, setup_context=_context)

@@ -6,7 +6,8 @@ from torch import Tensor
 from torch.library import custom_op
 
 from gsbench.kernels import native, threads
-from gsbench.kernels.arrays import check, check_constant, plain, rows_like
+from gsbench.kernels.arrays import check, check_constant, number, plain, rows_like
+from gsbench.kernels.cuda import observe as on_cuda
 
 
 def observe_triangular(
@@ -17,7 +18,7 @@ def observe_triangular(
     off_diagonal: Tensor,  # [N, n (n - 1) / 2]
     opacities: Tensor,  # [N] logits
     center: Tensor,  # [3]
-    time: float | None,
+    time: Tensor | None,  # []
     lambda_d: Tensor,  # []
     lambda_t: Tensor | None,  # []
     *,
@@ -32,7 +33,7 @@ def observe_triangular(
     (d, t, p), else (p, t, d).
 
     Raises:
-        InputError: not float32 on the CPU, shapes that do not fit, or a gradient by `center` is asked for.
+        InputError: not float32 on one device, shapes that do not fit, or a gradient by `center` is asked for.
     """
     N, n = len(means), 6 if times is None else 7
     empty = means.new_empty(0)
@@ -45,7 +46,7 @@ def observe_triangular(
     check_constant("observe_triangular", "center", center)
     return _observe(
         means, directions, empty if times is None else times[:, 0], log_diagonal, off_diagonal, opacities, center,
-        time or 0.0, lambda_d, means.new_ones(()) if lambda_t is None else lambda_t,
+        empty if time is None or times is None else time, lambda_d, empty if lambda_t is None else lambda_t,
         0.5 if directional_half else 1.0, conditioned_first, row_scaled,
     )  # fmt: skip
 
@@ -53,12 +54,12 @@ def observe_triangular(
 @custom_op("gsbench::observe_triangular", mutates_args=())
 def _observe(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
-    center: Tensor, time: float, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
+    center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
     row_scaled: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     out = means.new_empty(len(means), 3), means.new_empty(len(means), 3, 3), means.new_empty(len(means))
     arrays = plain(means, directions, times, log_diagonal, off_diagonal, opacities, center)
-    native().observe_triangular(*arrays, time, lambda_d.item(), lambda_t.item(), half, conditioned_first, row_scaled,
+    native().observe_triangular(*arrays, *map(number, (time, lambda_d, lambda_t)), half, conditioned_first, row_scaled,
                                 threads(), *out)  # fmt: skip
     return out
 
@@ -72,14 +73,14 @@ def _(means: Tensor, *_: Any) -> tuple[Tensor, Tensor, Tensor]:
 @custom_op("gsbench::observe_triangular_backward", mutates_args=())
 def _observe_backward(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
-    center: Tensor, lambda_d: Tensor, lambda_t: Tensor, time: float, half: float, conditioned_first: bool,
+    center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
     row_scaled: bool, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     arrays = plain(means, directions, times, log_diagonal, off_diagonal, opacities)
     out = tuple(rows_like(x) for x in arrays)
     lambdas = means.new_empty(2)
     native().observe_triangular_backward(
-        *arrays, *plain(center), time, lambda_d.item(), lambda_t.item(), half, conditioned_first, row_scaled,
+        *arrays, *plain(center), *map(number, (time, lambda_d, lambda_t)), half, conditioned_first, row_scaled,
         threads(), *plain(g_means, g_factors, g_opacities), *out, lambdas,
     )  # fmt: skip
     return out[0], out[1], out[2], out[3], out[4], out[5], lambdas
@@ -91,15 +92,17 @@ def _(*arrays: Any) -> tuple[Tensor, ...]:
 
 
 def _observe_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # noqa: ARG001
-    ctx.save_for_backward(*inputs[:7], *inputs[8:10])
-    ctx.rest = inputs[7], *inputs[10:]
+    ctx.save_for_backward(*inputs[:10])
+    ctx.rest = inputs[10:]
 
 
 def _observe_gradient(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
     *g, lambdas = _observe_backward(*ctx.saved_tensors, *ctx.rest, *grads)
-    return *g, None, None, lambdas[0], lambdas[1], None, None, None
+    return *g, None, None, lambdas[0], lambdas[1] if ctx.needs_input_grad[9] else None, None, None, None
 
 
+_observe.register_kernel("cuda")(on_cuda.observe)
+_observe_backward.register_kernel("cuda")(on_cuda.observe_backward)
 _observe.register_autograd(_observe_gradient, setup_context=_observe_context)
 
 
@@ -110,7 +113,7 @@ def observe_rotated(
     left_quats: Tensor,  # [N, 4]
     right_quats: Tensor,  # [N, 4]
     opacities: Tensor,  # [N] logits
-    time: float,
+    time: Tensor,  # []
     lambda_t: Tensor,  # []
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Slice 4D Gaussians F = M_left M_right diag(exp scales) at `time`: means [N, 3], factors [N, 3, 3], opacities [N].
@@ -119,7 +122,7 @@ def observe_rotated(
     in the opacities, zero where it is not above 0.05 (4DGS).
 
     Raises:
-        InputError: not float32 on the CPU, or shapes that do not fit.
+        InputError: not float32 on one device, or shapes that do not fit.
     """
     N = len(means)
     check("observe_rotated", {"means": (means, (N, 3)), "times": (times, (N, 1)), "scales": (scales, (N, 4)),
@@ -131,11 +134,11 @@ def observe_rotated(
 @custom_op("gsbench::observe_rotated", mutates_args=())
 def _rotated(
     means: Tensor, times: Tensor, scales: Tensor, left: Tensor, right: Tensor, opacities: Tensor,
-    time: float, lambda_t: Tensor,
+    time: Tensor, lambda_t: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     out = means.new_empty(len(means), 3), means.new_empty(len(means), 3, 3), means.new_empty(len(means))
     native().observe_rotated(
-        *plain(means, times, scales, left, right, opacities), time, lambda_t.item(), threads(), *out
+        *plain(means, times, scales, left, right, opacities), number(time), number(lambda_t), threads(), *out
     )
     return out
 
@@ -148,29 +151,30 @@ def _(means: Tensor, *_: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 @custom_op("gsbench::observe_rotated_backward", mutates_args=())
 def _rotated_backward(
-    means: Tensor, times: Tensor, scales: Tensor, left: Tensor, right: Tensor, opacities: Tensor, lambda_t: Tensor,
-    time: float, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
+    means: Tensor, times: Tensor, scales: Tensor, left: Tensor, right: Tensor, opacities: Tensor, time: Tensor,
+    lambda_t: Tensor, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     arrays = plain(means, times, scales, left, right, opacities)
     out = tuple(rows_like(x) for x in arrays)
-    g_lambda = native().observe_rotated_backward(*arrays, time, lambda_t.item(), threads(),
+    g_lambda = native().observe_rotated_backward(*arrays, number(time), number(lambda_t), threads(),
                                                  *plain(g_means, g_factors, g_opacities), *out)  # fmt: skip
     return out[0], out[1], out[2], out[3], out[4], out[5], means.new_tensor(g_lambda)
 
 
 @_rotated_backward.register_fake
 def _(*arrays: Any) -> tuple[Tensor, ...]:
-    return tuple(rows_like(x) for x in arrays[:7])
+    return *(rows_like(x) for x in arrays[:6]), rows_like(arrays[7])
 
 
 def _rotated_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # noqa: ARG001
-    ctx.save_for_backward(*inputs[:6], inputs[7])
-    ctx.time = inputs[6]
+    ctx.save_for_backward(*inputs)
 
 
 def _rotated_gradient(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-    *g, g_lambda = _rotated_backward(*ctx.saved_tensors, ctx.time, *grads)
+    *g, g_lambda = _rotated_backward(*ctx.saved_tensors, *grads)
     return *g, None, g_lambda
 
 
+_rotated.register_kernel("cuda")(on_cuda.rotated)
+_rotated_backward.register_kernel("cuda")(on_cuda.rotated_backward)
 _rotated.register_autograd(_rotated_gradient, setup_context=_rotated_context)

@@ -161,7 +161,7 @@ class GaussianModel(nn.Module, ABC):
 
     def uses_kernels(self, tensor: Tensor) -> bool:
         """Whether the native kernels serve this model's tensors and were not switched off."""
-        return choose_backend(self.backend, tensor.device.type, tensor.dtype) == "cpu"
+        return choose_backend(self.backend, tensor.device.type, tensor.dtype) != "reference"
 
     def refined(self, time: Tensor | None) -> Raw:
         """Raw parameters after AGR: raw + phi(f) (7DGS eq. 15), on log-diagonals before the exp."""

@@ -79,7 +79,7 @@ class Gaussians4DModel(GaussianModel):
             raw["left_quats"],
             raw["right_quats"],
             raw["opacities"],
-            time.item(),
+            time,
             self.modulation("time"),
         )
 
@@ -89,7 +89,7 @@ class Gaussians4DModel(GaussianModel):
             return super().paint(raw, means, opacities, camera_center, time)
         assert time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.stage.sh_degree, self.time_degree + 1
-        return show_colors(sh0, raw["shN"], means, opacities, camera_center, degree, raw["times"], time.item(), waves)
+        return show_colors(sh0, raw["shN"], means, opacities, camera_center, degree, raw["times"], time, waves)
 
     def initial_colors(self, dc: Tensor) -> Raw:
         """4DSH coefficients [N, time_degree + 1, K, 3]: only the constant one is not zero."""

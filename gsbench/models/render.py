@@ -1,11 +1,17 @@
 """One picture of a model: slice it, draw the slice."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from torch import Tensor
 
-from gsbench.config import RasterConfig
 from gsbench.models.base import GaussianModel, Gaussians3D
 from gsbench.raster import RasterOutput, rasterize
 from gsbench.scenes.scene import Camera
+
+if TYPE_CHECKING:  # the configuration needs hydra, which building and drawing a model does not
+    from gsbench.config import RasterConfig
 
 
 def draw(gaussians: Gaussians3D, camera: Camera, background: Tensor, config: RasterConfig) -> RasterOutput:

@@ -118,7 +118,7 @@ class TriangularModel(GaussianModel):
             raw["off_diagonal"],
             raw["opacities"],
             camera_center,
-            time.item() if time is not None else None,
+            time,
             self.modulation("direction"),
             self.modulation("time") if "time" in self.observes else None,
             conditioned_first=self.is_reduced,

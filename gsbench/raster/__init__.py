@@ -3,6 +3,7 @@
 import functools
 import importlib
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from gsbench import kernels
 from gsbench.errors import InputError, did_you_mean
 
 # A backend is a module with a function `draw` of this door's (checked) arguments.
-_MODULES = {"reference": "gsbench.raster.reference", "cpu": "gsbench.raster.native"}
+_MODULES = {"reference": "gsbench.raster.reference", "cpu": "gsbench.raster.native", "cuda": "gsbench.raster.cuda"}
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def rasterize(
         near: Gaussians whose mean is nearer than this are not drawn.
         far: nor are those farther than this.
         eps2d: added to the diagonal of the projected covariance, pixels^2.
-        backend: `reference` (torch), `cpu` (native), or `auto`, the fastest that serves the tensors' device.
+        backend: `reference` (torch), `cpu` and `cuda` (native), or `auto`, the fastest that serves the tensors' device.
         antialias: scale opacities by the area that `eps2d` added (Mip-Splatting's 2D filter).
 
     Raises:
@@ -83,7 +84,10 @@ def rasterize(
         colors = colors.expand(len(viewmats), *colors.shape)
     if background is None:
         background = colors.new_zeros(colors.shape[-1])
-    draw = _backend(choose_backend(backend, means.device.type, means.dtype))
+    backend = choose_backend(backend, means.device.type, means.dtype)
+    if backend != "cuda":  # which looks at the values itself, without waiting for the device
+        check_values(means, factors, opacities, colors, viewmats, Ks, background)
+    draw = _backend(backend)
     return draw(means, factors, opacities, colors, viewmats, Ks, width, height, background, near, far, eps2d, antialias)
 
 
@@ -94,13 +98,28 @@ def choose_backend(backend: str, device: str = "cpu", dtype: torch.dtype = torch
         InputError: no such backend, or it is not installed.
     """
     if backend == "auto":
-        return "cpu" if device == "cpu" and dtype == torch.float32 and kernels.available() else "reference"
+        native = {"cpu": kernels.available, "cuda": cuda.available}.get(device)
+        if native and dtype == torch.float32 and native():
+            return device
+        if device == "cuda" and dtype == torch.float32:
+            _warn_slow()
+        return "reference"
     if backend not in _MODULES:
         raise InputError(f"raster backend '{backend}' is not known. {did_you_mean(backend, ['auto', *_MODULES])}")
     if backend == "cpu" and not kernels.available():
         raise InputError("raster backend 'cpu' is not built in this installation: reinstall with a C++20 compiler, "
                          "or use raster.backend=reference")  # fmt: skip
+    if backend == "cuda" and not cuda_available():
+        why = "no CUDA device was found" if _built("gsbench.kernels._cuda") else "it is not built in this installation"
+        raise InputError(f"raster backend 'cuda': {why}; use raster.backend=auto or reference")
     return backend
+
+
+@functools.cache
+def _warn_slow() -> None:
+    """Say once a process that a GPU is used without its kernels."""
+    warnings.warn("the CUDA kernels are not built in this installation: the GPU runs the reference backend, in torch, "
+                  "which is slow; see docs/gpu.md", stacklevel=2)  # fmt: skip
 
 
 @functools.cache
@@ -132,17 +151,26 @@ def _check(
             raise InputError(f"{name}: expected {means.dtype} as means are (a float type), got {tensor.dtype}")
         if tensor.device != means.device:
             raise InputError(f"{name}: expected on {means.device} as means are, got {tensor.device}")
-        # A sum is one pass; only when it is not finite is each value looked at (a finite sum hides no NaN).
-        if not torch.isfinite(tensor.detach().sum()) and not torch.isfinite(tensor).all():
-            row = int((~torch.isfinite(tensor)).flatten().nonzero()[0])
-            raise InputError(f"{name}: expected finite values, got {tensor.flatten()[row].item()} at flat index {row}")
     if D < 1 or C < 1:
         raise InputError(f"colors, viewmats: expected at least one channel and one camera, got D={D}, C={C}")
     if not all(isinstance(size, int) and size >= 1 for size in (width, height)):
         raise InputError(f"expected a picture of at least 1x1 whole pixels, got width={width}, height={height}")
     if not 0 < near < far or not 0 <= eps2d < math.inf:
         raise InputError(f"expected 0 < near < far and eps2d >= 0, got near={near}, far={far}, eps2d={eps2d}")
-    low, high = opacities.detach().aminmax() if N else (0, 0)
+
+
+def check_values(
+    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, background: Tensor,
+) -> None:  # fmt: skip
+    """Raise InputError unless every value is finite, opacities are in [0, 1] and focal lengths positive."""
+    tensors = {"means": means, "factors": factors, "opacities": opacities, "colors": colors,
+               "viewmats": viewmats, "Ks": Ks, "background": background}  # fmt: skip
+    for name, tensor in tensors.items():
+        # A sum is one pass; only when it is not finite is each value looked at (a finite sum hides no NaN).
+        if not torch.isfinite(tensor.detach().sum()) and not torch.isfinite(tensor).all():
+            row = int((~torch.isfinite(tensor)).flatten().nonzero()[0])
+            raise InputError(f"{name}: expected finite values, got {tensor.flatten()[row].item()} at flat index {row}")
+    low, high = opacities.detach().aminmax() if len(means) else (0, 0)
     if low < 0 or high > 1:
         raise InputError(f"opacities: expected values in [0, 1], got {low} to {high}")
     if (Ks.detach()[:, [0, 1], [0, 1]] <= 0).any():

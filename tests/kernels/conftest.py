@@ -1,15 +1,25 @@
-"""Fixtures for tests of the compiled kernels; all of them are skipped where the extension was not built."""
+"""Fixtures for tests of the compiled kernels, those of the CPU and those of CUDA."""
 
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
 
 from gsbench import kernels
+from gsbench.kernels import cuda
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
-def pytest_ignore_collect() -> bool | None:
-    return None if kernels.available() else True
+def pytest_ignore_collect(collection_path: Path) -> bool | None:
+    """Tests of the CPU's kernels are skipped where those were not built."""
+    return None if kernels.available() or "cuda" in collection_path.name else True
 
 
 @pytest.fixture(params=kernels.native().instruction_sets() if kernels.available() else [])
@@ -27,3 +37,30 @@ def threads() -> Iterator[None]:
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def cuda_device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Where the CUDA kernels run: `cuda`, or `cpu` with the kernels replaced by those of the shim (cuda_shim.h).
+
+    The shim is built once a session, or kept in the folder GSBENCH_SHIM_BUILD. Skips without the tools to build it.
+    """
+    if cuda.available():
+        yield "cuda"
+        return
+    if not all(map(shutil.which, ("cmake", "ninja", "c++"))):
+        pytest.skip("needs a GPU and the built extension, or cmake, ninja and a C++ compiler for the shim")
+    folder = Path(os.environ.get("GSBENCH_SHIM_BUILD") or tmp_path_factory.mktemp("cuda_shim"))
+    options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Release", f"-DPython_EXECUTABLE={sys.executable}"]
+    for command in (["cmake", "-S", str(ROOT), "-B", str(folder), *options],
+                    ["cmake", "--build", str(folder), "--target", "_cuda"]):  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    spec = importlib.util.spec_from_file_location("_cuda", next(folder.glob("_cuda.*.so")))
+    assert spec is not None
+    assert spec.loader is not None
+    shim = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(shim)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cuda, "_cuda", shim)
+        yield "cpu"

@@ -73,7 +73,8 @@ def test_slice(timed: bool, options: dict[str, Any]) -> None:
     lambdas = list(model.log_modulation.parameters())
     actual = list(observe_triangular(
         single["means"], single["directions"], single.get("times"), single["log_diagonal"], single["off_diagonal"],
-        single["opacities"], center, 0.4, model.modulation("direction"), model.modulation("time") if timed else None,
+        single["opacities"], center, torch.tensor(0.4), model.modulation("direction"),
+        model.modulation("time") if timed else None,
         conditioned_first=options.get("factor_order") != "paper", row_scaled=model.row_scaled,
         directional_half=model.directional_half,
     ))  # fmt: skip
@@ -102,7 +103,7 @@ def test_rotated_slice() -> None:
     expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
     assert 0 < (seen.gate == 0).sum() < len(seen.gate)  # some are gated away
     model, single = rotated(torch.float32)
-    actual = list(observe_rotated(*single.values(), 0.4, model.modulation("time")))
+    actual = list(observe_rotated(*single.values(), torch.tensor(0.4), model.modulation("time")))
     assert_same(actual, expected)
     assert_same(gradients(actual, [*single.values(), *model.log_modulation.parameters()]),
                 gradients(expected, [*raw.values(), *exact.log_modulation.parameters()]))  # fmt: skip
@@ -129,7 +130,8 @@ def test_colors(degree: int, waves: int) -> None:
     else:
         expected, inputs = sh_time_colors(all_of.unflatten(1, (waves, 16)), directions, degree, 0.7 - times[:, 0]), 4
     single = color_inputs(waves, torch.float32)
-    actual = show_colors(*single[:3], opacities, center, degree, single[3] if waves > 1 else None, 0.7, waves)
+    timed = (single[3], torch.tensor(0.7)) if waves > 1 else (None, None)
+    actual = show_colors(*single[:3], opacities, center, degree, *timed, waves)
     assert_same([actual], [expected])
     g_exact = torch.autograd.grad(expected, (sh0, shN, means, times)[:inputs], torch.ones_like(expected),
                                   materialize_grads=True)  # fmt: skip

@@ -10,10 +10,18 @@ constexpr int MAX_BASIS = 16;  // degree 3
 constexpr int MAX_WAVES = 8;   // frequencies of time, the constant one included
 
 constexpr float SH_0 = 0.28209479177387814f, SH_1 = 0.4886025119029199f;
-constexpr float SH_2[5] = {1.0925484305920792f, -1.0925484305920792f, 0.31539156525252005f, -1.0925484305920792f,
-                           0.5462742152960396f};
-constexpr float SH_3[7] = {-0.5900435899266435f, 2.890611442640554f,   -0.4570457994644658f, 0.3731763325901154f,
-                           -0.4570457994644658f, 1.445305721320277f,   -0.5900435899266435f};
+
+// Tables within functions: those of a namespace do not exist on a GPU.
+GSB_HD constexpr float SH_2(int m) {
+    constexpr float table[5] = {1.0925484305920792f, -1.0925484305920792f, 0.31539156525252005f, -1.0925484305920792f,
+                                0.5462742152960396f};
+    return table[m];
+}
+GSB_HD constexpr float SH_3(int m) {
+    constexpr float table[7] = {-0.5900435899266435f, 2.890611442640554f,  -0.4570457994644658f, 0.3731763325901154f,
+                                -0.4570457994644658f, 1.445305721320277f, -0.5900435899266435f};
+    return table[m];
+}
 
 // Y_lm up to `degree` of a unit direction, in 3DGS' order and signs; returns how many.
 template <class T>
@@ -27,20 +35,20 @@ GSB_HD inline int harmonics(const Vec3<T>& d, int degree, T (&Y)[MAX_BASIS]) {
     }
     const T xx = x * x, yy = y * y, zz = z * z;
     if (degree > 1) {
-        Y[4] = x * y * SH_2[0];
-        Y[5] = y * z * SH_2[1];
-        Y[6] = (zz * 2.0f - xx - yy) * SH_2[2];
-        Y[7] = x * z * SH_2[3];
-        Y[8] = (xx - yy) * SH_2[4];
+        Y[4] = x * y * SH_2(0);
+        Y[5] = y * z * SH_2(1);
+        Y[6] = (zz * 2.0f - xx - yy) * SH_2(2);
+        Y[7] = x * z * SH_2(3);
+        Y[8] = (xx - yy) * SH_2(4);
     }
     if (degree > 2) {
-        Y[9] = y * (xx * 3.0f - yy) * SH_3[0];
-        Y[10] = x * y * z * SH_3[1];
-        Y[11] = y * (zz * 4.0f - xx - yy) * SH_3[2];
-        Y[12] = z * (zz * 2.0f - (xx + yy) * 3.0f) * SH_3[3];
-        Y[13] = x * (zz * 4.0f - xx - yy) * SH_3[4];
-        Y[14] = z * (xx - yy) * SH_3[5];
-        Y[15] = x * (xx - yy * 3.0f) * SH_3[6];
+        Y[9] = y * (xx * 3.0f - yy) * SH_3(0);
+        Y[10] = x * y * z * SH_3(1);
+        Y[11] = y * (zz * 4.0f - xx - yy) * SH_3(2);
+        Y[12] = z * (zz * 2.0f - (xx + yy) * 3.0f) * SH_3(3);
+        Y[13] = x * (zz * 4.0f - xx - yy) * SH_3(4);
+        Y[14] = z * (xx - yy) * SH_3(5);
+        Y[15] = x * (xx - yy * 3.0f) * SH_3(6);
     }
     return (degree + 1) * (degree + 1);
 }
@@ -52,14 +60,14 @@ GSB_HD inline Vec3<T> harmonics_vjp(const Vec3<T>& d, int degree, const T (&g)[M
     Vec3<T> out{T(0.0f), T(0.0f), T(0.0f)};
     if (degree > 0) out = {g[3] * -SH_1, g[1] * -SH_1, g[2] * SH_1};
     if (degree > 1) {
-        const T g4 = g[4] * SH_2[0], g5 = g[5] * SH_2[1], g6 = g[6] * (2.0f * SH_2[2]), g7 = g[7] * SH_2[3];
-        const T g8 = g[8] * (2.0f * SH_2[4]);
+        const T g4 = g[4] * SH_2(0), g5 = g[5] * SH_2(1), g6 = g[6] * (2.0f * SH_2(2)), g7 = g[7] * SH_2(3);
+        const T g8 = g[8] * (2.0f * SH_2(4));
         out += {y * g4 + z * g7 + x * (g8 - g6), x * g4 + z * g5 - y * (g6 + g8), y * g5 + x * g7 + z * g6 * 2.0f};
     }
     if (degree > 2) {
         const T xx = x * x, yy = y * y, zz = z * z, xy = x * y, xz = x * z, yz = y * z;
-        const T g9 = g[9] * SH_3[0], g10 = g[10] * SH_3[1], g11 = g[11] * SH_3[2], g12 = g[12] * SH_3[3];
-        const T g13 = g[13] * SH_3[4], g14 = g[14] * SH_3[5], g15 = g[15] * SH_3[6];
+        const T g9 = g[9] * SH_3(0), g10 = g[10] * SH_3(1), g11 = g[11] * SH_3(2), g12 = g[12] * SH_3(3);
+        const T g13 = g[13] * SH_3(4), g14 = g[14] * SH_3(5), g15 = g[15] * SH_3(6);
         out += {xy * g9 * 6.0f + yz * g10 - xy * g11 * 2.0f - xz * g12 * 6.0f + (zz * 4.0f - xx * 3.0f - yy) * g13 +
                     xz * g14 * 2.0f + (xx - yy) * g15 * 3.0f,
                 (xx - yy) * g9 * 3.0f + xz * g10 + (zz * 4.0f - xx - yy * 3.0f) * g11 - yz * g12 * 6.0f -

@@ -31,10 +31,16 @@ struct UnitQuaternion {
     }
 };
 
-// R = M_left(l) M_right(r) (4DGS eq. 7): entry (i, j) of either matrix is +- one entry of its quaternion.
-constexpr int QUATERNION_ENTRY[4][4] = {{0, 1, 2, 3}, {1, 0, 3, 2}, {2, 3, 0, 1}, {3, 2, 1, 0}};
-constexpr float LEFT_SIGN[4][4] = {{1, -1, -1, -1}, {1, 1, -1, 1}, {1, 1, 1, -1}, {1, -1, 1, 1}};
-constexpr float RIGHT_SIGN[4][4] = {{1, 1, 1, 1}, {-1, 1, -1, 1}, {-1, 1, 1, -1}, {-1, -1, 1, 1}};
+// R = M_left(l) M_right(r) (4DGS eq. 7): entry (i, j) of either matrix is +- entry i xor j of its quaternion. Tables
+// within functions: those of a namespace do not exist on a GPU.
+GSB_HD constexpr float LEFT_SIGN(int i, int j) {
+    constexpr float table[4][4] = {{1, -1, -1, -1}, {1, 1, -1, 1}, {1, 1, 1, -1}, {1, -1, 1, 1}};
+    return table[i][j];
+}
+GSB_HD constexpr float RIGHT_SIGN(int i, int j) {
+    constexpr float table[4][4] = {{1, 1, 1, 1}, {-1, 1, -1, 1}, {-1, 1, 1, -1}, {-1, -1, 1, 1}};
+    return table[i][j];
+}
 
 template <class T>
 struct RotatedGaussian {
@@ -54,8 +60,8 @@ struct RotatedGaussian {
         GSB_UNROLL for (int i = 0; i < 4; ++i) {
             size[i] = exp(raw.scales[i]);
             GSB_UNROLL for (int j = 0; j < 4; ++j) {
-                L[i][j] = left.q[QUATERNION_ENTRY[i][j]] * LEFT_SIGN[i][j];
-                R[i][j] = right.q[QUATERNION_ENTRY[i][j]] * RIGHT_SIGN[i][j];
+                L[i][j] = left.q[i ^ j] * LEFT_SIGN(i, j);
+                R[i][j] = right.q[i ^ j] * RIGHT_SIGN(i, j);
             }
         }
         T rows[4][4];  // t, then p
@@ -118,9 +124,8 @@ struct RotatedGaussian {
                     g_L = g_L + g_M[i][k] * R[j][k];
                     g_R = g_R + L[k][i] * g_M[k][j];
                 }
-                const int entry = QUATERNION_ENTRY[i][j];
-                g_left[entry] = g_left[entry] + g_L * LEFT_SIGN[i][j];
-                g_right[entry] = g_right[entry] + g_R * RIGHT_SIGN[i][j];
+                g_left[i ^ j] = g_left[i ^ j] + g_L * LEFT_SIGN(i, j);
+                g_right[i ^ j] = g_right[i ^ j] + g_R * RIGHT_SIGN(i, j);
             }
         }
         left.vjp(g_left, out.left);

@@ -1,0 +1,116 @@
+// From splats to each tile's list of them, front to back: sort by depth, list the tiles each one reaches, sort stably
+// by tile. A warp takes a splat, its lanes the tiles within the splat's bounds.
+#include "launch.h"
+#include "reach.h"
+#include "sort.h"
+
+namespace gsb::cuda {
+namespace {
+
+__global__ void key_kernel(BinArgs a, uint32_t* keys, uint32_t* indices) {
+    const int64_t s = global_thread();
+    if (s >= a.N * a.C) return;
+    // The bits of positive floats sort as the floats do.
+    keys[s] = a.half_sizes[s * 2] > 0.0f ? __float_as_uint(a.depths[s]) : 0xffffffffu;
+    indices[s] = static_cast<uint32_t>(s);
+}
+
+struct Span {
+    int begin, end;
+};
+
+// The tiles from the first pixel centre at or after low to the last at or before high; bounded as floats, since the
+// bounds of a huge splat overflow integers.
+__device__ Span tile_span(float low, float high, int pixels) {
+    const float first = max(ceilf(low - 0.5f), 0.0f);
+    const float last = min(floorf(high - 0.5f), static_cast<float>(pixels - 1));
+    if (!(first <= last)) return {0, 0};
+    return {static_cast<int>(first) / TILE, static_cast<int>(last) / TILE + 1};
+}
+
+// Calls visit(lane reaches a tile, its index, lanes that do) for 32 tiles at a time, by all lanes of a warp.
+template <class Visit>
+__device__ void each_tile(const BinArgs& a, int64_t s, Visit visit) {
+    const float2 half = reinterpret_cast<const float2*>(a.half_sizes)[s];
+    if (!(half.x > 0.0f)) return;
+    const float2 mean = reinterpret_cast<const float2*>(a.means2d)[s];
+    const Reach reach(mean, reinterpret_cast<const float4*>(a.roots)[s]);
+    const Span columns = tile_span(mean.x - half.x, mean.x + half.x, a.width);
+    const Span rows = tile_span(mean.y - half.y, mean.y + half.y, a.height);
+    const int across = columns.end - columns.begin, count = across * (rows.end - rows.begin);
+    for (int first = 0; first < count; first += WARP) {
+        const int nth = first + static_cast<int>(threadIdx.x) % WARP;
+        const int x = columns.begin + nth % across, y = rows.begin + nth / across;
+        const bool reached = nth < count && reach.touches(x * TILE, y * TILE, TILE, TILE);
+        visit(reached, y * tiles_along(a.width) + x, __ballot_sync(ALL_LANES, reached));
+    }
+}
+
+__global__ void count_kernel(BinArgs a, const uint32_t* order, int64_t* counts) {
+    const int64_t k = global_thread() / WARP;
+    if (k >= a.N * a.C) return;
+    int64_t count = 0;
+    each_tile(a, order[k], [&](bool, int, unsigned reached) { count += __popc(reached); });
+    if (threadIdx.x % WARP == 0) counts[k] = count;
+}
+
+__global__ void fill_kernel(BinArgs a, const uint32_t* order, const int64_t* ends, int64_t no_tile, uint32_t* tiles,
+                            uint32_t* splats) {
+    const int64_t k = global_thread() / WARP;
+    if (k >= a.N * a.C) return;
+    const unsigned lane = threadIdx.x % WARP;
+    const int64_t end = ends[k], s = order[k];
+    int64_t at = k > 0 ? ends[k - 1] : 0;
+    const int64_t first_tile = s / a.N * tiles_along(a.width) * tiles_along(a.height);
+    each_tile(a, s, [&](bool reached, int tile, unsigned others) {
+        const int64_t mine = at + __popc(others & ((1u << lane) - 1));
+        if (reached && mine < end) {
+            tiles[mine] = static_cast<uint32_t>(first_tile + tile);
+            splats[mine] = static_cast<uint32_t>(s);
+        }
+        at += __popc(others);
+    });
+    // The same test compiled twice may round differently: what was counted and is not found now goes to no tile.
+    for (int64_t rest = at + lane; rest < end; rest += WARP) {
+        tiles[rest] = static_cast<uint32_t>(no_tile);
+        splats[rest] = static_cast<uint32_t>(s);
+    }
+}
+
+// Tile t's list is [offsets[t], offsets[t + 1]) of the sorted pairs.
+__global__ void offset_kernel(const uint32_t* tiles, int64_t pairs, int64_t count, int32_t* offsets) {
+    const int64_t k = global_thread();
+    if (k > pairs) return;
+    const int64_t before = k > 0 ? int64_t{tiles[k - 1]} : -1, here = k < pairs ? int64_t{tiles[k]} : count;
+    for (int64_t t = before + 1; t <= here && t <= count; ++t) offsets[t] = static_cast<int32_t>(k);
+}
+
+int bit_width(int64_t x) {
+    int bits = 0;
+    for (; x > 0; x >>= 1) ++bits;
+    return bits;
+}
+
+}  // namespace
+
+void count_tiles(const BinArgs& a, uint32_t* keys, uint32_t* indices, uint32_t* sorted_keys, uint32_t* order,
+                 int64_t* ends, void* scratch, size_t bytes, Stream stream) {
+    if (a.N * a.C == 0) return;
+    launch(key_kernel, blocks_for(a.N * a.C), THREADS, stream, a, keys, indices);
+    sort_pairs(scratch, bytes, keys, sorted_keys, indices, order, a.N * a.C, 32, stream);
+    launch(count_kernel, blocks_for(a.N * a.C * WARP), THREADS, stream, a, order, ends);
+    running_sum(scratch, bytes, ends, a.N * a.C, stream);
+}
+
+void fill_tiles(const BinArgs& a, const uint32_t* order, const int64_t* ends, int64_t pairs, uint32_t* tiles,
+                uint32_t* splats, uint32_t* sorted_tiles, uint32_t* ids, int32_t* offsets, void* scratch, size_t bytes,
+                Stream stream) {
+    const int64_t count = a.C * tiles_along(a.width) * tiles_along(a.height);
+    if (pairs > 0) {
+        launch(fill_kernel, blocks_for(a.N * a.C * WARP), THREADS, stream, a, order, ends, count, tiles, splats);
+        sort_pairs(scratch, bytes, tiles, sorted_tiles, splats, ids, pairs, bit_width(count), stream);
+    }
+    launch(offset_kernel, blocks_for(pairs + 1), THREADS, stream, sorted_tiles, pairs, count, offsets);
+}
+
+}  // namespace gsb::cuda

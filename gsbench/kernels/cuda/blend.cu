@@ -1,0 +1,53 @@
+// Blending splats into pictures, front to back: a warp a patch, a pixel a lane.
+#include "patch.h"
+
+namespace gsb::cuda {
+namespace {
+
+__global__ void __launch_bounds__(PATCHES * WARP) blend_kernel(BlendArgs a, Picture out, int first_channel) {
+    __shared__ StagedSplat shared[PATCHES][WARP];
+    StagedSplat* staged = shared[threadIdx.x / WARP];
+    const Patch patch(a, first_channel);
+    const float x = static_cast<float>(patch.x()) + 0.5f, y = static_cast<float>(patch.y()) + 0.5f;
+    bool open = patch.inside();
+    float T = 1.0f, color[CHANNELS] = {};
+    int stop = 0;
+    for (int first = 0; patch.begin + first < patch.end; first += WARP) {
+        if (!__any_sync(ALL_LANES, open)) break;
+        const int n = patch.stage(first, staged);
+        for (int i = 0; i < n; ++i) {
+            const StagedSplat& s = staged[i];
+            const Falloff<float> f(x - s.x, y - s.y, s.p, s.q, s.r, s.opacity);
+            if (!open || f.alpha < ALPHA_MIN) continue;
+            const float after = T - T * f.alpha;
+            if (after < TRANSMITTANCE_MIN) {
+                open = false;
+                continue;
+            }
+            for (int k = 0; k < CHANNELS; ++k) color[k] += T * f.alpha * s.color[k];
+            T = after;
+            stop = s.position + 1;
+        }
+        __syncwarp();
+    }
+    if (!patch.inside()) return;
+    const int64_t pixel = patch.pixel();
+    for (int k = 0; k < patch.count; ++k) {
+        const int channel = first_channel + k;
+        out.image[pixel * a.D + channel] = color[k] + T * a.background[channel];
+    }
+    out.alpha[pixel] = 1.0f - T;
+    out.transmittance[pixel] = T;
+    out.stop[pixel] = stop;
+}
+
+}  // namespace
+
+void blend(const BlendArgs& a, const Picture& out, Stream stream) {
+    const auto tiles = static_cast<unsigned>(a.C * tiles_along(a.width) * tiles_along(a.height));
+    for (int first = 0; first < a.D; first += CHANNELS) {
+        launch(blend_kernel, tiles, PATCHES * WARP, stream, a, out, first);
+    }
+}
+
+}  // namespace gsb::cuda

@@ -1,0 +1,97 @@
+// Colours of Gaussians and their derivative, one a thread; the mathematics is math/harmonics.h. What cannot be drawn is
+// left out.
+#include "../math/harmonics.h"
+
+#include "launch.h"
+
+namespace gsb::cuda {
+namespace {
+
+constexpr float TURN = 6.28318531f;
+
+// What a colour is made of: everything but the coefficients.
+struct Weights {
+    Unit<float> unit;
+    int used;  // harmonics
+    float Y[MAX_BASIS], cosines[MAX_WAVES], sines[MAX_WAVES];
+
+    __device__ Weights(const ColorArgs& a, int64_t i)
+        : unit({a.means[i * 3] - a.center[0], a.means[i * 3 + 1] - a.center[1], a.means[i * 3 + 2] - a.center[2]}) {
+        used = harmonics(unit.direction, a.degree, Y);
+        waves_of(a.times ? *a.time - a.times[i] : 0.0f, a.waves, cosines, sines);
+    }
+};
+
+// Coefficient k of Gaussian i, three channels: that of the constant is kept apart from the others.
+template <class F>
+__device__ F* coefficient(const ColorArgs& a, F* sh0, F* shN, int64_t i, int k) {
+    return k ? shN + (i * (a.waves * a.bases - 1) + k - 1) * 3 : sh0 + i * 3;
+}
+
+// Calls visit(coefficient's number, harmonic, wave) for all in use.
+template <class Visit>
+__device__ void each_coefficient(const ColorArgs& a, Visit visit) {
+    for (int wave = 0; wave < a.waves; ++wave) {
+        GSB_UNROLL for (int basis = 0; basis < MAX_BASIS; ++basis) {
+            if (basis < (a.degree + 1) * (a.degree + 1)) visit(wave * a.bases + basis, basis, wave);
+        }
+    }
+}
+
+__device__ void sum_colors(const ColorArgs& a, const Weights& w, int64_t i, float (&color)[3]) {
+    for (float& channel : color) channel = 0.5f;
+    each_coefficient(a, [&](int k, int basis, int wave) {
+        const float* p = coefficient(a, a.sh0, a.shN, i, k);
+        const float weight = w.Y[basis] * w.cosines[wave];
+        for (int channel = 0; channel < 3; ++channel) color[channel] += p[channel] * weight;
+    });
+}
+
+__global__ void color_kernel(ColorArgs a, float* colors) {
+    const int64_t i = global_thread();
+    if (i >= a.N) return;
+    float color[3] = {};
+    if (a.opacities[i] >= ALPHA_MIN) sum_colors(a, Weights(a, i), i, color);
+    for (int channel = 0; channel < 3; ++channel) colors[i * 3 + channel] = max(color[channel], 0.0f);
+}
+
+// The outputs are zero on entry: those of Gaussians that are not drawn, and of harmonics not in use, stay so.
+__global__ void color_backward_kernel(ColorArgs a, ColorGrads out) {
+    const int64_t i = global_thread();
+    if (i >= a.N || a.opacities[i] < ALPHA_MIN) return;
+    const Weights w(a, i);
+    float color[3], g[3], g_Y[MAX_BASIS] = {}, g_time = 0.0f;
+    sum_colors(a, w, i, color);
+    for (int channel = 0; channel < 3; ++channel) {
+        g[channel] = color[channel] >= 0.0f ? out.colors[i * 3 + channel] : 0.0f;
+    }
+    each_coefficient(a, [&](int k, int basis, int wave) {
+        const float* p = coefficient(a, a.sh0, a.shN, i, k);
+        float* g_p = coefficient(a, out.sh0, out.shN, i, k);
+        const float weight = w.Y[basis] * w.cosines[wave];
+        float along = 0.0f;
+        for (int channel = 0; channel < 3; ++channel) {
+            along += p[channel] * g[channel];
+            g_p[channel] = g[channel] * weight;
+        }
+        g_Y[basis] += along * w.cosines[wave];
+        g_time += along * w.Y[basis] * w.sines[wave] * (TURN * static_cast<float>(wave));  // by mu_t
+    });
+    const Vec3<float> g_mean = w.unit.vjp(harmonics_vjp(w.unit.direction, a.degree, g_Y));
+    out.means[i * 3] = g_mean.x;
+    out.means[i * 3 + 1] = g_mean.y;
+    out.means[i * 3 + 2] = g_mean.z;
+    if (a.times) out.times[i] = g_time;
+}
+
+}  // namespace
+
+void show_colors(const ColorArgs& a, float* colors, Stream stream) {
+    if (a.N > 0) launch(color_kernel, blocks_for(a.N), THREADS, stream, a, colors);
+}
+
+void show_colors_backward(const ColorArgs& a, const ColorGrads& out, Stream stream) {
+    if (a.N > 0) launch(color_backward_kernel, blocks_for(a.N), THREADS, stream, a, out);
+}
+
+}  // namespace gsb::cuda

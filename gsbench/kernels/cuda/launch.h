@@ -1,0 +1,49 @@
+// Starting a kernel. A build for the CPU (tests/kernels/cuda_shim.h) brings its own `launch`.
+#pragma once
+
+#include "../math.h"
+#include "kernels.h"
+
+#ifdef GSB_CUDA_SHIM
+#include "cuda_shim.h"
+#else
+#include <cuda_runtime.h>
+
+#include <stdexcept>
+#include <string>
+
+namespace gsb::cuda {
+
+inline void check(cudaError_t status) {
+    if (status != cudaSuccess) throw std::runtime_error(std::string("CUDA: ") + cudaGetErrorString(status));
+}
+
+// The parameters are those of the kernel, so that arguments convert as in a call.
+template <class... Parameters, class... Arguments>
+void launch(void (*kernel)(Parameters...), dim3 grid, dim3 block, Stream stream, Arguments... arguments) {
+    kernel<<<grid, block, 0, stream>>>(static_cast<Parameters>(arguments)...);
+    check(cudaGetLastError());
+}
+
+}  // namespace gsb::cuda
+#endif
+
+namespace gsb::cuda {
+
+constexpr int TILE = 16;  // pixels a side
+GSB_HD constexpr int tiles_along(int pixels) { return (pixels + TILE - 1) / TILE; }
+
+constexpr int THREADS = 256;  // of a block, where one thread does one thing
+constexpr int WARP = 32;
+constexpr unsigned ALL_LANES = 0xffffffffu;
+
+inline unsigned blocks_for(int64_t threads) { return static_cast<unsigned>((threads + THREADS - 1) / THREADS); }
+
+__device__ inline int64_t global_thread() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
+
+__device__ inline float warp_sum(float x) {
+    for (int offset = WARP / 2; offset > 0; offset /= 2) x += __shfl_xor_sync(ALL_LANES, x, offset);
+    return x;
+}
+
+}  // namespace gsb::cuda

@@ -1,0 +1,27 @@
+// Whether a splat reaches a rectangle of pixels with alpha >= 1/255 anywhere: exact, up to a margin for rounding.
+#pragma once
+
+#include "launch.h"
+
+namespace gsb::cuda {
+
+constexpr float POWER_MARGIN = 0.01f;  // on log2(255 opacity), lest rounding cut off a pixel
+
+struct Reach {
+    float x, y, p, q, r, foot_x, foot_y, most_power;
+
+    __device__ Reach(float2 mean, float4 root) : x(mean.x), y(mean.y), p(root.x), q(root.y), r(root.z) {
+        foot_y = -q / r;
+        foot_x = -q * r / (p * p + q * q);
+        most_power = log2f(255.0f * root.w) + POWER_MARGIN;
+    }
+
+    // By the centres of the pixels [left, left + width) x [top, top + height).
+    __device__ bool touches(int left, int top, int width, int height) const {
+        const float x0 = static_cast<float>(left) + 0.5f - x, y0 = static_cast<float>(top) + 0.5f - y;
+        return least_power(x0, x0 + static_cast<float>(width - 1), y0, y0 + static_cast<float>(height - 1), p, q, r,
+                           foot_x, foot_y) <= most_power;
+    }
+};
+
+}  // namespace gsb::cuda

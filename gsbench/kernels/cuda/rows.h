@@ -1,0 +1,38 @@
+// Rows of arrays to registers and back, for the kernels in which a thread slices one Gaussian.
+#pragma once
+
+#include "../math/triangular.h"
+
+#include "launch.h"
+
+namespace gsb::cuda {
+
+template <int COUNT>
+__device__ inline void load_row(const float* rows, int64_t i, float (&out)[COUNT]) {
+    GSB_UNROLL for (int k = 0; k < COUNT; ++k) out[k] = rows[i * COUNT + k];
+}
+
+template <int COUNT>
+__device__ inline void store_row(const float (&row)[COUNT], float* rows, int64_t i) {
+    GSB_UNROLL for (int k = 0; k < COUNT; ++k) rows[i * COUNT + k] = row[k];
+}
+
+__device__ inline void store_observed(const Observed<float>& seen, const Observation& out, int64_t i) {
+    store_row(seen.mean, out.means, i);
+    GSB_UNROLL for (int row = 0; row < 3; ++row) store_row(seen.factor[row], out.factors, i * 3 + row);
+    out.opacities[i] = seen.opacity;
+}
+
+__device__ inline Observed<float> load_observed(const Observation& o, int64_t i) {
+    Observed<float> out;
+    load_row(o.means, i, out.mean);
+    GSB_UNROLL for (int row = 0; row < 3; ++row) load_row(o.factors, i * 3 + row, out.factor[row]);
+    out.opacity = o.opacities[i];
+    return out;
+}
+
+constexpr int SMALL_BLOCK = 128;  // a thread needs many registers
+
+inline unsigned small_blocks(int64_t N) { return static_cast<unsigned>((N + SMALL_BLOCK - 1) / SMALL_BLOCK); }
+
+}  // namespace gsb::cuda

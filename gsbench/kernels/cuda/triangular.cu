@@ -1,0 +1,89 @@
+// Slices of Gaussians with triangular factors and their derivative, one a thread; the mathematics is math/triangular.h.
+#include "../math/triangular.h"
+
+#include "rows.h"
+
+namespace gsb::cuda {
+namespace {
+
+// CONDITIONED is known to the compiler: where the factor is triangular in the right order, no reflection is compiled in.
+template <bool TIME, bool CONDITIONED>
+__device__ TriangularModel model_of(const TriangularArgs& a) {
+    return {CONDITIONED, a.row_scaled, a.half, *a.lambda_d, TIME ? *a.lambda_t : 0.0f,
+            {a.center[0], a.center[1], a.center[2]}, TIME ? *a.time : 0.0f};
+}
+
+template <bool TIME>
+__device__ TriangularParameters<float, TIME> parameters(const TriangularArgs& a, int64_t i) {
+    TriangularParameters<float, TIME> p{};
+    load_row(a.means, i, p.mean);
+    load_row(a.directions, i, p.direction);
+    if constexpr (TIME) p.time = a.times[i];
+    load_row(a.log_diagonal, i, p.log_diagonal);
+    load_row(a.off_diagonal, i, p.off_diagonal);
+    p.opacity = a.opacities[i];
+    return p;
+}
+
+template <bool TIME, bool CONDITIONED>
+__global__ void observe_kernel(TriangularArgs a, Observation out) {
+    const int64_t i = global_thread();
+    if (i >= a.N) return;
+    const TriangularModel model = model_of<TIME, CONDITIONED>(a);
+    const auto raw = parameters<TIME>(a, i);
+    const Observed<float> seen = TriangularGaussian<float, TIME>(model, raw).observe();
+    store_observed(seen, out, i);
+}
+
+template <bool TIME, bool CONDITIONED>
+__global__ void observe_backward_kernel(TriangularArgs a, Observation grads, TriangularGrads out) {
+    const int64_t i = global_thread();
+    TriangularParameters<float, TIME> g{};
+    if (i < a.N) {
+        const TriangularModel model = model_of<TIME, CONDITIONED>(a);
+        const auto raw = parameters<TIME>(a, i);
+        TriangularGaussian<float, TIME> gaussian(model, raw);
+        gaussian.observe();
+        gaussian.vjp(load_observed(grads, i), g);
+        store_row(g.mean, out.means, i);
+        store_row(g.direction, out.directions, i);
+        if constexpr (TIME) out.times[i] = g.time;
+        store_row(g.log_diagonal, out.log_diagonal, i);
+        store_row(g.off_diagonal, out.off_diagonal, i);
+        out.opacities[i] = g.opacity;
+    }
+    const float lambda_d = warp_sum(g.lambda_d), lambda_t = warp_sum(g.lambda_t);
+    if (threadIdx.x % WARP == 0) {
+        atomicAdd(out.lambdas, lambda_d);
+        atomicAdd(out.lambdas + 1, lambda_t);
+    }
+}
+
+// Calls run<TIME, CONDITIONED>() as the arguments say.
+template <class Run>
+void dispatch(const TriangularArgs& a, Run run) {
+    if (a.times) {
+        a.conditioned_first ? run.template operator()<true, true>() : run.template operator()<true, false>();
+    } else {
+        a.conditioned_first ? run.template operator()<false, true>() : run.template operator()<false, false>();
+    }
+}
+
+}  // namespace
+
+void observe_triangular(const TriangularArgs& a, const Observation& out, Stream stream) {
+    if (a.N == 0) return;
+    dispatch(a, [&]<bool TIME, bool CONDITIONED>() {
+        launch(observe_kernel<TIME, CONDITIONED>, small_blocks(a.N), SMALL_BLOCK, stream, a, out);
+    });
+}
+
+void observe_triangular_backward(const TriangularArgs& a, const Observation& grads, const TriangularGrads& out,
+                                 Stream stream) {
+    if (a.N == 0) return;
+    dispatch(a, [&]<bool TIME, bool CONDITIONED>() {
+        launch(observe_backward_kernel<TIME, CONDITIONED>, small_blocks(a.N), SMALL_BLOCK, stream, a, grads, out);
+    });
+}
+
+}  // namespace gsb::cuda

@@ -1,0 +1,150 @@
+// The scheduler of cuda_shim.h, and sort.h by the standard library.
+#include "cuda_shim.h"
+
+#include <ucontext.h>
+
+#include <algorithm>
+#include <array>
+#include <cstdlib>
+#include <memory>
+#include <numeric>
+#include <stdexcept>
+#include <vector>
+
+#include "../../gsbench/kernels/cuda/sort.h"
+
+namespace gsb::cuda {
+namespace shim {
+
+const Thread* thread = nullptr;
+dim3 block_index, block_size, grid_size;
+
+namespace {
+
+constexpr size_t STACK = 64 * 1024;
+enum class State { ready, at_warp, at_barrier, done };
+
+struct Fiber {
+    Thread thread;
+    ucontext_t context;
+    std::unique_ptr<char[]> stack{new char[STACK]};
+    State state = State::ready;
+    uint32_t given = 0;
+};
+
+struct Block {
+    std::vector<Fiber> fibers;
+    std::vector<std::array<uint32_t, 32>> exchanged;  // by warp
+    ucontext_t scheduler;
+    const std::function<void()>* body = nullptr;
+};
+Block* block = nullptr;
+
+Fiber& current() { return block->fibers[thread->number]; }
+
+void wait(State state) {
+    Fiber& fiber = current();
+    fiber.state = state;
+    swapcontext(&fiber.context, &block->scheduler);
+}
+
+void enter() {
+    (*block->body)();
+    current().state = State::done;
+}
+
+// Lets fibers [begin, end) go on if all that live wait in `state`. Returns whether any does.
+bool release(size_t begin, size_t end, State state) {
+    bool any = false;
+    for (size_t i = begin; i < end; ++i) {
+        const State s = block->fibers[i].state;
+        if (s != state && s != State::done) return false;
+        any |= s == state;
+    }
+    for (size_t i = begin; i < end; ++i) {
+        Fiber& fiber = block->fibers[i];
+        const bool done = fiber.state == State::done;
+        if (state == State::at_warp) block->exchanged[begin / 32][i - begin] = done ? 0 : fiber.given;
+        if (!done) fiber.state = State::ready;
+    }
+    return any;
+}
+
+void run_block() {
+    const size_t count = block->fibers.size();
+    // Where a barrier is missing, what a thread sees of another's work depends on which of them goes first.
+    const bool reversed = std::getenv("GSBENCH_SHIM_REVERSED") != nullptr;
+    for (;;) {
+        for (size_t i = 0; i < count; ++i) {
+            Fiber& fiber = block->fibers[reversed ? count - 1 - i : i];
+            if (fiber.state != State::ready) continue;
+            thread = &fiber.thread;
+            swapcontext(&block->scheduler, &fiber.context);
+        }
+        bool progress = false;
+        for (size_t warp = 0; warp < count; warp += 32) {
+            progress |= release(warp, std::min(warp + 32, count), State::at_warp);
+        }
+        progress |= release(0, count, State::at_barrier);
+        if (progress) continue;
+        if (std::all_of(block->fibers.begin(), block->fibers.end(), [](auto& f) { return f.state == State::done; })) {
+            return;
+        }
+        throw std::runtime_error("shim: deadlock: some threads wait for the block and some for their warp");
+    }
+}
+
+}  // namespace
+
+void barrier() { wait(State::at_barrier); }
+
+const uint32_t* exchange(uint32_t mine) {
+    current().given = mine;
+    wait(State::at_warp);
+    return block->exchanged[thread->number / 32].data();
+}
+
+void run(dim3 grid, dim3 size, const std::function<void()>& body) {
+    Block b;
+    b.fibers = std::vector<Fiber>(size_t{size.x} * size.y * size.z);
+    b.exchanged.resize((b.fibers.size() + 31) / 32);
+    b.body = &body;
+    block = &b;
+    block_size = size, grid_size = grid;
+    const unsigned blocks = grid.x * grid.y * grid.z;
+    for (unsigned i = 0; i < blocks; ++i) {
+        block_index = {i % grid.x, i / grid.x % grid.y, i / (grid.x * grid.y)};
+        for (unsigned n = 0; n < b.fibers.size(); ++n) {
+            Fiber& fiber = b.fibers[n];
+            fiber.thread = {{n % size.x, n / size.x % size.y, n / (size.x * size.y)}, n};
+            fiber.state = State::ready;
+            getcontext(&fiber.context);
+            fiber.context.uc_stack.ss_sp = fiber.stack.get();
+            fiber.context.uc_stack.ss_size = STACK;
+            fiber.context.uc_link = &b.scheduler;
+            makecontext(&fiber.context, enter, 0);
+        }
+        run_block();
+    }
+}
+
+}  // namespace shim
+
+size_t scratch_bytes(int64_t) { return 0; }
+
+void sort_pairs(void*, size_t, const uint32_t* keys, uint32_t* sorted_keys, const uint32_t* values,
+                uint32_t* sorted_values, int64_t n, int bits, Stream) {
+    const uint32_t mask = bits < 32 ? (1u << bits) - 1 : ~0u;
+    std::vector<size_t> order(static_cast<size_t>(n));
+    std::iota(order.begin(), order.end(), size_t{0});
+    std::stable_sort(order.begin(), order.end(),
+                     [&](size_t a, size_t b) { return (keys[a] & mask) < (keys[b] & mask); });
+    for (size_t i = 0; i < order.size(); ++i) {
+        sorted_keys[i] = keys[order[i]];
+        sorted_values[i] = values[order[i]];
+    }
+}
+
+void running_sum(void*, size_t, int64_t* values, int64_t n, Stream) { std::partial_sum(values, values + n, values); }
+
+}  // namespace gsb::cuda

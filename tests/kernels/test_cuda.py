@@ -1,0 +1,157 @@
+"""The CUDA kernels against the reference, on a GPU or by the shim: pictures, gradients, the loss, bad input."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.kernels.cuda.loss import l1_ssim
+from gsbench.kernels.cuda.raster import View
+from gsbench.raster import RasterOutput, rasterize
+from gsbench.raster.cuda import splat
+from gsbench.train.losses import photometric
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "raster"))
+from cases import camera, case, gaussians, names
+from oracle import paint
+
+DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background")
+
+
+def draw(arguments: dict[str, Any], device: str) -> RasterOutput:
+    """`rasterize(.., backend="cuda")`; on the CPU past its door, which asks for a GPU."""
+    if device == "cuda":
+        return rasterize(**arguments, backend="cuda")
+    a = {"near": 0.01, "far": 1e10, "eps2d": 0.3, "antialias": False} | arguments
+    colors = a["colors"] if a["colors"].dim() == 3 else a["colors"].expand(len(a["viewmats"]), *a["colors"].shape)
+    background = a.get("background", colors.new_zeros(colors.shape[-1]))
+    view = View(a["width"], a["height"], a["near"], a["far"], a["eps2d"], a["antialias"])
+    return splat(a["means"], a["factors"], a["opacities"], colors, a["viewmats"], a["Ks"], background, view)
+
+
+def decided(arguments: dict[str, Any]) -> Tensor:
+    """Pixels where no rounding can flip a decision of the picture's rules, [C, H, W]."""
+    arrays = {k: v.double().numpy() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+    return torch.from_numpy(paint(**arrays).slack > 1e-3)
+
+
+@pytest.mark.parametrize("name", names())
+def test_picture_is_the_reference(name: str, cuda_device: str) -> None:
+    """Catches any wrong rule of the picture, a bound, tile or patch that loses a Gaussian, and a wrong order."""
+    expected = rasterize(**case(name), backend="reference")
+    output = draw(case(name, torch.float32, cuda_device), cuda_device)
+    sure = decided(case(name))
+    assert sure.double().mean() > 0.8
+    for got, want in ((output.image, expected.image), (output.alpha, expected.alpha)):
+        torch.testing.assert_close(got.cpu().double()[sure], want[sure], rtol=0, atol=1e-4)
+    assert output.info.radii.dtype == torch.int32
+    assert ((output.info.radii.cpu() - expected.info.radii).abs() <= 1).all()
+    torch.testing.assert_close(output.info.depths.cpu().double(), expected.info.depths, rtol=1e-5, atol=1e-5)
+    assert (output.info.pairs == 0) == (expected.info.pairs == 0)
+
+
+def gradients(arguments: dict[str, Any], output_of: Any, weight: Tensor) -> dict[str, Tensor]:
+    """Of a loss that feels every channel and the cover of the pixels with a weight, by every input."""
+    inputs = {k: arguments[k].clone().requires_grad_() for k in DIFFERENTIABLE if k in arguments}
+    output = output_of(arguments | inputs)
+    output.info.means2d.retain_grad()
+    weight = weight.to(output.image)[..., None]
+    waves = torch.arange(output.image.numel()).mul(0.05).sin().view_as(output.image).to(output.image)
+    (weight * (waves * output.image.square() + 0.3 * output.alpha.square())).sum().backward()
+    grads = {k: v.grad for k, v in inputs.items()} | {"means2d": output.info.means2d.grad}
+    assert all(g is not None and g.isfinite().all() for g in grads.values())
+    return {k: g.cpu().double() for k, g in grads.items()}
+
+
+def assert_gradients_close(got: dict[str, Tensor], want: dict[str, Tensor]) -> None:
+    """To 1e-3 by norm, and in direction."""
+    for name, expected in want.items():
+        size = expected.norm()
+        assert (got[name] - expected).norm() <= 1e-3 * size + 1e-7, name
+        if size > 1e-6:
+            assert torch.cosine_similarity(got[name].flatten(), expected.flatten(), dim=0) > 0.9999, name
+
+
+@pytest.mark.parametrize("name", names())
+def test_gradients_are_those_of_the_reference(name: str, cuda_device: str) -> None:
+    """Catches a wrong or missing derivative of any input, and sums that miss a patch, a lane or a camera."""
+    exact, single = case(name), case(name, torch.float32, cuda_device)
+    sure = decided(exact)
+    want = gradients(exact, lambda a: rasterize(**a, backend="reference"), sure)
+    got = gradients(single, lambda a: draw(a, cuda_device), sure)
+    assert_gradients_close(got, want)
+
+
+def test_many_tiles_and_rounds(cuda_device: str) -> None:
+    """Catches what shows only with more than 32 splats a tile and several tiles: staging rounds, offsets, sort keys."""
+    g = torch.Generator().manual_seed(3)
+    N, width, height = (20_000, 230, 170) if cuda_device == "cuda" else (300, 50, 40)
+    exact = gaussians(g, N, size=0.1) | camera(width, height) | {"background": torch.tensor([0.1, 0.5, 0.9])}
+    exact["opacities"] = exact["opacities"] * 0.3  # deep: many splats a pixel
+    exact = {k: v.double() if isinstance(v, Tensor) else v for k, v in exact.items()}
+    single = {k: v.to(cuda_device, torch.float32) if isinstance(v, Tensor) else v for k, v in exact.items()}
+    want, got = rasterize(**exact, backend="reference"), draw(single, cuda_device)
+    error = (got.image.cpu().double() - want.image).abs().amax(-1)
+    # A decision that rounding flips changes a pixel by up to 1/255: a handful of the millions made.
+    assert error.quantile(0.999) < 1e-4
+    assert error.max() < 1 / 255
+    weight = (error < 1e-4).double()
+    assert_gradients_close(gradients(single, lambda a: draw(a, cuda_device), weight),
+                           gradients(exact, lambda a: rasterize(**a, backend="reference"), weight))  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["random", "opaque_stack", "three_cameras", "five_channels"])
+def test_order_of_threads_does_not_matter(name: str, cuda_device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a missing barrier: by the shim, a thread would read what another has not written yet, or has over."""
+    if cuda_device != "cpu":
+        pytest.skip("the order of threads can be chosen on the shim only; on a GPU, racecheck looks for races")
+    arguments, found = case(name, torch.float32), []
+    image, target = torch.rand(40, 20, 3).requires_grad_(), torch.rand(40, 20, 3)
+    for reversed_ in (False, True):
+        if reversed_:
+            monkeypatch.setenv("GSBENCH_SHIM_REVERSED", "1")
+        output = draw(arguments, cuda_device)
+        every = torch.ones(output.alpha.shape[:-1])
+        grads = gradients(arguments, lambda a: draw(a, cuda_device), every)
+        loss = l1_ssim(image, target, 0.2)
+        (g_image,) = torch.autograd.grad(loss, image)
+        found.append([output.image, output.alpha, loss, g_image, *grads.values()])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [("means", torch.nan, "means: expected finite"), ("factors", torch.inf, "factors: expected finite"),
+     ("opacities", 1.5, "opacities: expected values in"), ("colors", -torch.inf, "colors: expected finite"),
+     ("viewmats", torch.nan, "viewmats: expected finite"), ("Ks", 0.0, "Ks: expected positive"),
+     ("background", torch.nan, "background: expected finite")],
+)  # fmt: skip
+def test_bad_values_are_named(name: str, value: float, said: str, cuda_device: str) -> None:
+    """Catches a value that is found late, as a picture of NaN, because the door does not wait for the device."""
+    arguments = case("three_cameras", torch.float32, cuda_device)
+    arguments[name].view(-1)[0] = value
+    with pytest.raises(InputError, match=said):
+        draw(arguments, cuda_device)
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (16, 16), (37, 50), (5, 70)])
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_loss_is_the_reference(height: int, width: int, weight: float, cuda_device: str) -> None:
+    """Catches a wrong window, border, weight or derivative, at sizes that are no multiple of a tile."""
+    g = torch.Generator().manual_seed(height)
+    target = torch.rand(height, width, 3, generator=g)
+    image = (target + 0.2 * torch.randn(height, width, 3, generator=g)).double().requires_grad_()
+    expected = photometric(image, target.double(), weight)
+    expected.backward()
+    single = image.detach().float().to(cuda_device).requires_grad_()
+    loss = l1_ssim(single, target.to(cuda_device), weight)
+    loss.backward()
+    assert abs(loss.item() - expected.item()) < 1e-5
+    assert_gradients_close({"image": single.grad.cpu().double()}, {"image": image.grad})
+    with torch.no_grad():
+        assert l1_ssim(single, target.to(cuda_device), weight).item() == loss.item()
