@@ -23,9 +23,10 @@ from gsbench.report.pictures import strip, write_png
 from gsbench.scenes import Scene
 from gsbench.scenes.points import random_points
 from gsbench.train import checkpoint
-from gsbench.train.loop import DivergedError, Trainer
+from gsbench.train.loop import Trainer
 from gsbench.train.optim import OPTIMIZERS
 from gsbench.train.schedule import generator
+from gsbench.train.watch import DivergedError
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 SPLITS = ("test", "val")

@@ -6,10 +6,12 @@ torch is imported only where a GPU is asked for, so that the record, and a table
 import statistics
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 from gsbench.errors import InputError
 
@@ -73,12 +75,14 @@ def time_renders(
 class Stages:
     """Seconds by stage of training: ``with stages("slice"): ...`` adds to that stage's sum.
 
-    On a GPU the device is waited for at both ends, so that work is charged to the stage that caused it.
+    On a GPU both ends are events in its queue of work, so that nothing is waited for before the sums are asked for, and
+    work is charged to the stage that caused it.
     """
 
     def __init__(self, device: str = "cpu") -> None:
-        self.seconds: dict[str, float] = {}
-        self._synchronise = synchroniser(device)
+        self._seconds: dict[str, float] = {}
+        self._clock: _Clock = _DeviceClock(device) if device.startswith("cuda") else _HostClock()
+        self._ended: deque[tuple[str, Any, Any]] = deque()  # name, start and end, not yet in the sums
         self._current: str | None = None
 
     @contextmanager
@@ -87,14 +91,25 @@ class Stages:
         if self._current is not None:
             raise InputError(f"stages: '{name}' was opened inside '{self._current}'; close that one first")
         self._current = name
-        self._synchronise()
-        start = time.perf_counter()
+        start = self._clock.mark()
         try:
             yield
         finally:
-            self._synchronise()
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            self._ended.append((name, start, self._clock.mark()))
             self._current = None
+            while self._ended and self._clock.has_passed(self._ended[0][2]):
+                self._add_one()
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """The sums so far; waits for the device."""
+        while self._ended:
+            self._add_one()
+        return self._seconds
+
+    def _add_one(self) -> None:
+        name, start, end = self._ended.popleft()
+        self._seconds[name] = self._seconds.get(name, 0.0) + self._clock.seconds(start, end)
 
     def state_dict(self) -> dict[str, float]:
         """The sums so far, for the checkpoint."""
@@ -102,7 +117,48 @@ class Stages:
 
     def load_state_dict(self, state: dict[str, float]) -> None:
         """Continue from the sums of a checkpoint."""
-        self.seconds = dict(state)
+        self._ended.clear()
+        self._seconds = dict(state)
+
+
+class _Clock(Protocol):
+    """Marks moments; `mark`s are its own."""
+
+    def mark(self) -> Any: ...
+    def has_passed(self, mark: Any) -> bool: ...
+    def seconds(self, start: Any, end: Any) -> float: ...
+
+
+class _HostClock:
+    def mark(self) -> float:
+        return time.perf_counter()
+
+    def has_passed(self, mark: float) -> bool:
+        return True
+
+    def seconds(self, start: float, end: float) -> float:
+        return end - start
+
+
+class _DeviceClock:
+    """Moments at which a GPU has done what it was given so far."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+
+    def mark(self) -> Any:
+        import torch
+
+        event = torch.cuda.Event(enable_timing=True)
+        event.record(torch.cuda.current_stream(self.device))
+        return event
+
+    def has_passed(self, mark: Any) -> bool:
+        return bool(mark.query())
+
+    def seconds(self, start: Any, end: Any) -> float:
+        end.synchronize()
+        return float(start.elapsed_time(end)) / 1000
 
 
 def reset_peak_memory(device: str = "cpu") -> None:

@@ -143,7 +143,7 @@ class GaussianModel(nn.Module, ABC):
         """
         if time is None and ("time" in self.observes or self.agr):
             raise InputError(f"{type(self).__name__}: expected a time in [0, 1], got none: this model observes time")
-        t = None if time is None else camera_center.new_tensor(time)
+        t = None if time is None else camera_center.new_full((), time)  # no copy from the host, which would wait for it
         raw = self.refined(t)
         means, factors, opacities = self.observe(raw, camera_center, t)
         return Gaussians3D(means, factors, opacities, self.paint(raw, means, opacities, camera_center, t))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsbench import kernels
 from gsbench.errors import InputError, did_you_mean
+from gsbench.kernels import cuda
 
 # A backend is a module with a function `draw` of this door's (checked) arguments.
 _MODULES = {"reference": "gsbench.raster.reference", "cpu": "gsbench.raster.native", "cuda": "gsbench.raster.cuda"}
@@ -95,31 +96,36 @@ def choose_backend(backend: str, device: str = "cpu", dtype: torch.dtype = torch
     """Resolve `auto` to the fastest backend installed for a device and dtype; check any other name.
 
     Raises:
-        InputError: no such backend, or it is not installed.
+        InputError: no such backend, it is not installed, or it does not draw on that device.
     """
     if backend == "auto":
         native = {"cpu": kernels.available, "cuda": cuda.available}.get(device)
-        if native and dtype == torch.float32 and native():
-            return device
-        if device == "cuda" and dtype == torch.float32:
-            _warn_slow()
-        return "reference"
+        if native is None or dtype != torch.float32:
+            return "reference"
+        if cuda.built() and not cuda.available():
+            _warn_once("no CUDA device was found: the CUDA kernels of this installation are idle, the CPU draws")
+        if device == "cuda" and not cuda.built():
+            _warn_once("the CUDA kernels are not built in this installation: the GPU draws by the reference backend, "
+                       "which is slow; see docs/gpu.md")  # fmt: skip
+        return device if native() else "reference"
     if backend not in _MODULES:
         raise InputError(f"raster backend '{backend}' is not known. {did_you_mean(backend, ['auto', *_MODULES])}")
     if backend == "cpu" and not kernels.available():
         raise InputError("raster backend 'cpu' is not built in this installation: reinstall with a C++20 compiler, "
                          "or use raster.backend=reference")  # fmt: skip
-    if backend == "cuda" and not cuda_available():
-        why = "no CUDA device was found" if _built("gsbench.kernels._cuda") else "it is not built in this installation"
+    if backend == "cuda" and not cuda.available():
+        why = "no CUDA device was found" if cuda.built() else "it is not built in this installation, see docs/gpu.md"
         raise InputError(f"raster backend 'cuda': {why}; use raster.backend=auto or reference")
+    if backend in ("cpu", "cuda") and device in ("cpu", "cuda") and backend != device:
+        raise InputError(f"raster backend '{backend}' does not draw on device '{device}': use device={backend}, "
+                         "or raster.backend=auto or reference")  # fmt: skip
     return backend
 
 
 @functools.cache
-def _warn_slow() -> None:
-    """Say once a process that a GPU is used without its kernels."""
-    warnings.warn("the CUDA kernels are not built in this installation: the GPU runs the reference backend, in torch, "
-                  "which is slow; see docs/gpu.md", stacklevel=2)  # fmt: skip
+def _warn_once(why: str) -> None:
+    """Say what `auto` falls back to, once a process."""
+    warnings.warn(f"raster backend 'auto': {why}", stacklevel=3)
 
 
 @functools.cache

@@ -20,21 +20,14 @@ def draw(
 
     Raises:
         InputError: not float32 on a GPU, a gradient by `Ks` is asked for, or a value is out of range.
-        torch.OutOfMemoryError: saying what was drawn and what to lower.
+        torch.OutOfMemoryError: naming the buffer, its size and what to lower.
     """
     if means.dtype != torch.float32 or not means.is_cuda or not available():
         raise InputError(f"raster backend 'cuda': expected float32 tensors on a CUDA device, got {means.dtype} on "
                          f"{means.device}; backend 'reference' takes any")  # fmt: skip
-    try:
-        with torch.cuda.device(means.device):
-            return splat(means, factors, opacities, colors, viewmats, Ks, background,
-                         View(width, height, near, far, eps2d, antialias))  # fmt: skip
-    except torch.OutOfMemoryError as error:
-        C, N, D = colors.shape
-        raise torch.OutOfMemoryError(
-            f"{means.device} while drawing {C} pictures of {width}x{height} with {D} channels from {N} Gaussians: use "
-            f"a smaller picture, fewer cameras at once or fewer Gaussians ({' '.join(str(error).split())[:120]})"
-        ) from None
+    with torch.cuda.device(means.device):
+        return splat(means, factors, opacities, colors, viewmats, Ks, background,
+                     View(width, height, near, far, eps2d, antialias))  # fmt: skip
 
 
 def splat(

@@ -31,8 +31,8 @@ class DensityControl:
     def observe(self, info: RasterInfo, width: int, height: int, views: int) -> None:
         """Add one view's gradients, of a loss that is a mean over `views`, in units of half the picture (NDC)."""
         assert info.means2d.grad is not None, "call info.means2d.retain_grad() before backward()"
-        half_picture = info.means2d.new_tensor([width / 2, height / 2])
-        self.gradient += (info.means2d.grad * half_picture * views).norm(dim=-1).sum(0)
+        x, y = info.means2d.grad.unbind(-1)  # scaled apart: a tensor of both sizes would be waited for on a GPU
+        self.gradient += (torch.stack([x * (width / 2), y * (height / 2)], -1) * views).norm(dim=-1).sum(0)
         self.seen += (info.radii > 0).sum(0)
 
     @torch.no_grad()

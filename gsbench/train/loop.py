@@ -23,10 +23,7 @@ from gsbench.train.density import DensityControl
 from gsbench.train.losses import photometric
 from gsbench.train.optim import Optimizer
 from gsbench.train.schedule import Schedule, batch, generator
-
-
-class DivergedError(RuntimeError):
-    """A loss or a gradient was not finite."""
+from gsbench.train.watch import DivergedError, Watch
 
 
 @dataclass
@@ -53,6 +50,9 @@ class Trainer:
         self.optimizer = Optimizer(model, config.model, scene.extent, train.iterations, config.optim)
         self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity)
         self.stages = Stages(config.device)
+        self.watch = Watch(config.device)
+        if config.device.startswith("cuda"):  # there a bad step is found later, and must not be applied meanwhile
+            self.optimizer.adam.found_inf = self.watch.skip  # type: ignore[attr-defined]
         self.curve = Curve()
         self.best = Best()
         self.step = 0
@@ -70,25 +70,27 @@ class Trainer:
             total=train.iterations, initial=self.step, desc=label, unit="it", mininterval=every, maxinterval=every
         ) as bar:
             while self.step < train.iterations:
-                loss = self._descend()
+                self._descend()
                 if self.schedule.measures(self.step):
                     self._measure()
                 self.step += 1
                 bar.update()
                 last = self.curve.last
                 shown = f"{last.psnr_val:.2f} dB" if last and last.psnr_val is not None else "-"
-                bar.set_postfix_str(f"loss {loss:.4f}, val {shown}, {len(self.model)} Gaussians", refresh=False)
+                bar.set_postfix_str(
+                    f"loss {self.watch.loss:.4f}, val {shown}, {len(self.model)} Gaussians", refresh=False
+                )
                 if time.monotonic() - saved >= 60 * train.checkpoint_minutes and self.step < train.iterations:
                     save(self.state_dict())
                     saved = time.monotonic()
         save(self.state_dict())
 
-    def _descend(self) -> float:
+    def _descend(self) -> None:
         """One step: the loss is the mean over a batch of views."""
         step, train, stages = self.step, self.config.train, self.stages
         self.model.set_stage(self.schedule.stage(step))
         views = [self.scene.train[i] for i in batch(step, len(self.scene.train), train.batch_size, self.config.seed)]
-        total = 0.0
+        losses = []
         drawn = torch.zeros(len(self.model), dtype=torch.bool, device=self.config.device)
         for view in views:
             with stages("slice"):
@@ -103,13 +105,13 @@ class Trainer:
                 loss = photometric(output.image[0], view.image, train.ssim_weight, self.config.raster.backend) / len(
                     views
                 )
-                total += loss.item()
+                losses.append(loss.detach())
             with stages("backward"):
                 loss.backward()
             with stages("density"):
                 self.density.observe(output.info, view.camera.width, view.camera.height, len(views))
                 drawn |= (output.info.radii > 0).any(0)
-        self._check_finite(total)
+        self.watch.see(step, torch.stack(losses).sum(), self.model.groups())
         with stages("optimizer"):
             self.optimizer.step(step, drawn)
         with stages("density"):
@@ -117,16 +119,6 @@ class Trainer:
                 self.density.densify(generator(self.config.seed, step), self.schedule.has_reset(step))
             if self.schedule.resets(step):
                 self.density.reset_opacities()
-        return total
-
-    def _check_finite(self, loss: float) -> None:
-        """Stop before a value that is not finite reaches a parameter."""
-        for name, parameters in self.model.groups().items():
-            gradients = [p.grad for p in parameters if p.grad is not None]
-            if not all(bool(g.sum().isfinite()) or bool(g.isfinite().all()) for g in gradients):
-                raise DivergedError(f"step {self.step}: the gradient of '{name}' is not finite (loss {loss})")
-        if not math.isfinite(loss):
-            raise DivergedError(f"step {self.step}: the loss is {loss}")
 
     def _measure(self) -> None:
         """Add a point to the curve; its cost is in no stage, so in no training time."""
@@ -153,7 +145,8 @@ class Trainer:
         return render(self.model, view.camera, view.time, self.background, self.config.raster)
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next step depends on, and all that was measured so far."""
+        """All that the next step depends on, and all that was measured so far; raises DivergedError as `run`."""
+        self.watch.look()
         return {
             "step": self.step,
             "model": self.model.state_dict(),

@@ -1,5 +1,6 @@
 """The CUDA kernels against the reference, on a GPU or by the shim: pictures, gradients, the loss, bad input."""
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -155,3 +156,33 @@ def test_loss_is_the_reference(height: int, width: int, weight: float, cuda_devi
     assert_gradients_close({"image": single.grad.cpu().double()}, {"image": image.grad})
     with torch.no_grad():
         assert l1_ssim(single, target.to(cuda_device), weight).item() == loss.item()
+
+
+def test_out_of_memory_names_the_buffer_and_the_process_lives_on(
+    cuda_device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches torch's own words, which say neither what the memory was for nor what to lower, and a broken state."""
+    arguments, empty = case("random", torch.float32, cuda_device), torch.empty
+    every = torch.ones(1, arguments["height"], arguments["width"])
+    asked, refused = 0, 0
+
+    def limited(*args: Any, **kwargs: Any) -> Tensor:
+        nonlocal asked
+        asked += 1
+        if asked == refused:
+            raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate")
+        return empty(*args, **kwargs)
+
+    monkeypatch.setattr(torch, "empty", limited)
+    expected = gradients(arguments, lambda a: draw(a, cuda_device), every)
+    buffers, count = set(), asked
+    for refused in range(1, count + 1):
+        asked = 0
+        with pytest.raises(torch.OutOfMemoryError) as error:
+            gradients(arguments, lambda a: draw(a, cuda_device), every)
+        said = re.fullmatch("(.+) need [0-9.]+ MiB on .+: lower the picture's size.+", str(error.value))
+        assert said, str(error.value)
+        buffers.add(said[1])
+    assert {"projected Gaussians", "lists of each tile's Gaussians", "pictures", "sums over pixels"} <= buffers
+    refused = 0
+    assert_gradients_close(gradients(arguments, lambda a: draw(a, cuda_device), every), expected)

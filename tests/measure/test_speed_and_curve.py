@@ -57,6 +57,44 @@ def test_stages_add_up_and_survive_a_resume(monkeypatch):
     assert stages.seconds["slice"] == 2.0
 
 
+def test_stages_wait_for_no_device_until_they_are_read(monkeypatch):
+    """Would catch a GPU that is waited for at every stage, and a stage that is lost or charged to another meanwhile."""
+    waits, done = [], 0
+
+    class Event:  # of a device that is late: it passes events only when it is waited for, or told to
+        count = 0
+
+        def __init__(self, enable_timing):
+            assert enable_timing
+
+        def record(self, stream):
+            Event.count += 1
+            self.number = Event.count
+
+        def query(self):
+            return self.number <= done
+
+        def synchronize(self):
+            waits.append(self.number)
+
+        def elapsed_time(self, end):
+            return 1000.0 * (end.number - self.number)
+
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: None)
+    stages = speed.Stages("cuda")
+    for name in ("slice", "raster", "slice"):
+        with stages(name):
+            pass
+    assert waits == []
+    done = 4  # the first two stages; the next to end adds them up
+    with stages("loss"):
+        pass
+    assert waits == [2, 4]  # which have passed
+    assert stages.seconds == {"slice": 2.0, "raster": 1.0, "loss": 1.0}
+    assert waits == [2, 4, 6, 8]
+
+
 def test_stages_do_not_nest():
     """Would catch seconds counted twice, so that stage_s adds up to more than train_s."""
     stages = speed.Stages()

@@ -1,12 +1,15 @@
 """What `rasterize` refuses: every fault is an InputError of one line that names the argument."""
 
+import warnings
 from typing import Any
 
 import pytest
 import torch
 from cases import case
 
+from gsbench import raster
 from gsbench.errors import InputError
+from gsbench.kernels import cuda
 from gsbench.raster import choose_backend, rasterize
 
 TENSORS = {"means": (40, 3), "factors": (40, 3, 3), "opacities": (40,), "colors": (40, 3),
@@ -103,6 +106,39 @@ def test_large_sums_are_finite() -> None:
 def test_values(changes: dict[str, Any], name: str) -> None:
     """Catches a number out of its range that would draw an empty or a wrong picture without a word."""
     refused(changes, name)
+
+
+def test_auto_says_once_that_the_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches kernels built for a GPU that is missing, or a GPU without its kernels, passed over in silence."""
+    raster._warn_once.cache_clear()
+    monkeypatch.setattr(cuda, "available", lambda: False)
+    monkeypatch.setattr(cuda, "built", lambda: True)
+    with pytest.warns(UserWarning, match="no CUDA device was found"):
+        fallback = choose_backend("auto", "cpu")
+    assert fallback in ("cpu", "reference")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert choose_backend("auto", "cpu") == fallback
+    monkeypatch.setattr(cuda, "built", lambda: False)
+    with pytest.warns(UserWarning, match="the CUDA kernels are not built"):
+        assert choose_backend("auto", "cuda") == "reference"
+    raster._warn_once.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("built", "device", "said"),
+    [(False, False, "not built in this installation"), (True, False, "no CUDA device was found"),
+     (True, True, "does not draw on device 'cpu': use device=cuda")],
+)  # fmt: skip
+def test_cuda_without_its_kernels_its_gpu_or_tensors_on_it(
+    built: bool, device: bool, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a run that asks for the GPU and finds out in the depths, or in the first picture, that it cannot."""
+    monkeypatch.setattr(cuda, "built", lambda: built)
+    monkeypatch.setattr(cuda, "available", lambda: device)
+    refused({"backend": "cuda"}, said)
+    with pytest.raises(InputError, match="raster backend 'cuda'"):
+        choose_backend("cuda", "cpu")
 
 
 def test_auto_falls_back_to_the_reference() -> None:

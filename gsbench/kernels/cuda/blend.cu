@@ -12,7 +12,7 @@ __global__ void __launch_bounds__(PATCHES * WARP) blend_kernel(BlendArgs a, Pict
     bool open = patch.inside();
     float T = 1.0f, color[CHANNELS] = {};
     int stop = 0;
-    for (int first = 0; patch.begin + first < patch.end; first += WARP) {
+    for (int first = 0; first < patch.size; first += WARP) {
         if (!__any_sync(ALL_LANES, open)) break;
         const int n = patch.stage(first, staged);
         for (int i = 0; i < n; ++i) {

@@ -8,8 +8,8 @@ namespace {
 constexpr int GEOMETRY = 6;
 constexpr int SUMS = GEOMETRY + CHANNELS;
 
-// The sum over the warp of nine values, lane l holding that of value `value_of(l)`. Eight of them are summed at once, each step of the
-// butterfly halving how many a lane is responsible for: 9 shuffles instead of 40, and 5 for the ninth.
+// The sum over the warp of nine values, lane l holding that of value `value_of(l)`. Eight of them are summed at once, each
+// step of the butterfly halving how many a lane is responsible for: 9 shuffles instead of 40, and 5 for the ninth.
 struct NineSums {
     static __device__ int value_of(int lane) { return lane % 4 == 0 ? lane / 4 : lane == 1 ? SUMS - 1 : -1; }
 

@@ -9,12 +9,14 @@
 #else
 #include <cuda_runtime.h>
 
+#include <new>
 #include <stdexcept>
 #include <string>
 
 namespace gsb::cuda {
 
 inline void check(cudaError_t status) {
+    if (status == cudaErrorMemoryAllocation) throw std::bad_alloc();  // MemoryError in Python, as torch's own is
     if (status != cudaSuccess) throw std::runtime_error(std::string("CUDA: ") + cudaGetErrorString(status));
 }
 

@@ -6,17 +6,17 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsbench.kernels.cuda import cuda, plain, pointers, stream
+from gsbench.kernels.cuda import allocate, cuda, on_device, plain, pointers, stream
 
 
+@on_device
 def l1_ssim(
     image: Tensor,  # [H, W, 3] float32
     target: Tensor,  # [H, W, 3] float32
     ssim_weight: float,
 ) -> Tensor:  # []
     """The same value as `gsbench.train.losses.photometric`, differentiable in `image`."""
-    with torch.cuda.device_of(image):
-        loss: Tensor = _L1SSIM.apply(image, target, ssim_weight)
+    loss: Tensor = _L1SSIM.apply(image, target, ssim_weight)
     return loss
 
 
@@ -28,7 +28,8 @@ class _L1SSIM(torch.autograd.Function):
         parts = image.new_empty(cuda().similarity_blocks(height, width))
         grad = scratch = None
         if ctx.needs_input_grad[0]:
-            grad, scratch = torch.empty_like(image), image.new_empty(3, channels, height, width)
+            grad = allocate("the gradient of the loss", image, *image.shape)
+            scratch = allocate("derivatives of SSIM", image, 3, channels, height, width)
             ctx.save_for_backward(grad)
         cuda().l1_ssim(height, width, *pointers(image, target), inputs[2], *pointers(parts, scratch, grad),
                        stream(image))  # fmt: skip

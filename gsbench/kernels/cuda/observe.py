@@ -8,23 +8,24 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.cuda import cuda, plain, pointers, stream
+from gsbench.kernels.cuda import allocate, cuda, on_device, plain, pointers, stream
 
 
+@on_device
 def observe(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
     center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
     row_scaled: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Means [N, 3], factors [N, 3, 3] and opacities [N] of a slice; empty `times`: time is not observed."""
-    N = len(means)
-    out = means.new_empty(N, 3), means.new_empty(N, 3, 3), means.new_empty(N)
+    out = _observation(means)
     arrays = plain(time, lambda_d, lambda_t, center, means, directions, times, log_diagonal, off_diagonal, opacities)
-    cuda().observe_triangular(N, conditioned_first, row_scaled, half, *pointers(*arrays), *pointers(*out),
+    cuda().observe_triangular(len(means), conditioned_first, row_scaled, half, *pointers(*arrays), *pointers(*out),
                               stream(means))  # fmt: skip
     return out
 
 
+@on_device
 def observe_backward(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
     center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
@@ -32,7 +33,9 @@ def observe_backward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of the first six, and of (lambda_d, lambda_t) [2]."""
     arrays = plain(time, lambda_d, lambda_t, center, means, directions, times, log_diagonal, off_diagonal, opacities)
-    out = tuple(x.new_empty(x.shape) for x in (means, directions, times, log_diagonal, off_diagonal, opacities))
+    out = tuple(
+        allocate(GRADIENTS, x, *x.shape) for x in (means, directions, times, log_diagonal, off_diagonal, opacities)
+    )
     lambdas = means.new_zeros(2)
     given = plain(g_means, g_factors, g_opacities)
     cuda().observe_triangular_backward(len(means), conditioned_first, row_scaled, half, *pointers(*arrays),
@@ -40,53 +43,57 @@ def observe_backward(
     return out[0], out[1], out[2], out[3], out[4], out[5], lambdas
 
 
+@on_device
 def rotated(
     means: Tensor, times: Tensor, scales: Tensor, left: Tensor, right: Tensor, opacities: Tensor,
     time: Tensor, lambda_t: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Means [N, 3], factors [N, 3, 3] and opacities [N] of a slice of 4D Gaussians."""
-    N = len(means)
-    out = means.new_empty(N, 3), means.new_empty(N, 3, 3), means.new_empty(N)
+    out = _observation(means)
     arrays = plain(time, lambda_t, means, times, scales, left, right, opacities)
-    cuda().observe_rotated(N, *pointers(*arrays, *out), stream(means))
+    cuda().observe_rotated(len(means), *pointers(*arrays, *out), stream(means))
     return out
 
 
+@on_device
 def rotated_backward(
     means: Tensor, times: Tensor, scales: Tensor, left: Tensor, right: Tensor, opacities: Tensor, time: Tensor,
     lambda_t: Tensor, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of the first six, and of lambda_t."""
     arrays = plain(time, lambda_t, means, times, scales, left, right, opacities, g_means, g_factors, g_opacities)
-    out = tuple(x.new_empty(x.shape) for x in (means, times, scales, left, right, opacities))
+    out = _like(means, times, scales, left, right, opacities)
     g_lambda = torch.zeros_like(lambda_t)
     cuda().observe_rotated_backward(len(means), *pointers(*arrays, *out, g_lambda), stream(means))
     return out[0], out[1], out[2], out[3], out[4], out[5], g_lambda
 
 
+@on_device
 def show(
     sh0: Tensor, shN: Tensor, means: Tensor, opacities: Tensor, times: Tensor, center: Tensor,
     time: Tensor, degree: int, waves: int,
 ) -> Tensor:  # fmt: skip
     """Colours [N, 3]; empty `times`: they do not change."""
-    colors = means.new_empty(len(means), 3)
+    colors = allocate("colours", means, len(means), 3)
     arrays = plain(sh0, shN, means, opacities, times, center, time)
     cuda().show_colors(len(means), degree, _bases(shN, waves), waves, *pointers(*arrays, colors), stream(means))
     return colors
 
 
+@on_device
 def show_backward(
     sh0: Tensor, shN: Tensor, means: Tensor, opacities: Tensor, times: Tensor, center: Tensor,
     time: Tensor, degree: int, waves: int, g_colors: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of sh0, shN, means and times."""
     arrays = plain(sh0, shN, means, opacities, times, center, time, g_colors)
-    out = tuple(x.new_zeros(x.shape) for x in (sh0, shN, means, times))
+    out = [x.zero_() for x in _like(sh0, shN, means, times)]
     cuda().show_colors_backward(len(means), degree, _bases(shN, waves), waves, *pointers(*arrays, *out),
                                 stream(means))  # fmt: skip
     return out[0], out[1], out[2], out[3]
 
 
+@on_device
 def refine(
     features: Tensor, weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int]
 ) -> Tensor:
@@ -97,22 +104,34 @@ def refine(
                          f"{limits.MAX_FEATURES} features and at most {limits.MAX_WIDTH} outputs, got {len(widths)}, "
                          f"{features.shape[1]} and {max(widths)}")  # fmt: skip
     arrays = plain(features, weight_in, bias_in, weight_out, bias_out)
-    out = features.new_empty(len(features), len(weight_out))
+    out = allocate("refinements", features, len(features), len(weight_out))
     cuda().refine(*features.shape, widths, *pointers(*arrays, out), stream(features))
     return out
 
 
+@on_device
 def refine_backward(
     features: Tensor, weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int],
     g_out: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of the first five."""
     arrays = plain(features, weight_in, bias_in, weight_out, bias_out, g_out)
-    by_network = features.new_empty(len(widths), *features.shape)
+    by_network = allocate("gradients of AGR's features", features, len(widths), *features.shape)
     out = tuple(x.new_zeros(x.shape) for x in (weight_in, bias_in, weight_out, bias_out))
     cuda().refine_backward(*features.shape, widths, *pointers(*arrays, by_network, *out),
                            stream(features))  # fmt: skip
     return by_network.sum(0), out[0], out[1], out[2], out[3]
+
+
+def _observation(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Means [N, 3], factors [N, 3, 3] and opacities [N], to be written."""
+    a, b, c = (allocate("a slice's Gaussians", means, len(means), *row) for row in ((3,), (3, 3), ()))
+    return a, b, c
+
+
+def _like(*parameters: Tensor) -> list[Tensor]:
+    """Gradients, to be written."""
+    return [allocate("gradients of a model's parameters", x, *x.shape) for x in parameters]
 
 
 def _bases(shN: Tensor, waves: int) -> int:

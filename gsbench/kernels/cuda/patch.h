@@ -24,7 +24,7 @@ struct Patch {
     const BlendArgs& args;
     int64_t camera;
     int lane, left, top;       // pixels
-    int begin, end;            // the tile's list
+    int begin, size;           // the tile's list
     int first_channel, count;  // what this launch blends
 
     __device__ Patch(const BlendArgs& a, int first_channel)
@@ -36,7 +36,7 @@ struct Patch {
         left = tile % tiles % across * TILE + patch % (TILE / PATCH_X) * PATCH_X;
         top = tile % tiles / across * TILE + patch / (TILE / PATCH_X) * PATCH_Y;
         begin = a.offsets[tile];
-        end = a.offsets[tile + 1];
+        size = a.offsets[tile + 1] - begin;
     }
 
     __device__ int x() const { return left + lane % PATCH_X; }
@@ -51,7 +51,7 @@ struct Patch {
         const int position = first + lane;
         bool reached = false;
         StagedSplat s;
-        if (begin + position < end) {
+        if (position < size) {
             s.id = args.ids[begin + position];
             const float2 mean = reinterpret_cast<const float2*>(args.means2d)[s.id];
             const float4 root = reinterpret_cast<const float4*>(args.roots)[s.id];

@@ -30,15 +30,17 @@ __device__ Projection<float> projection_of(const Gaussians& g, const Camera& cam
 }
 
 __global__ void project_kernel(Gaussians gaussians, Cameras cameras, Splats out) {
-    const int64_t i = global_thread(), c = blockIdx.y;
+    const int64_t i = global_thread();
     if (i >= gaussians.N) return;
-    const Camera camera = camera_of(cameras, c);
-    const Splat<float> s = projection_of(gaussians, camera, i).splat();
-    const int64_t at = c * gaussians.N + i;
-    reinterpret_cast<float2*>(out.means2d)[at] = {s.x, s.y};
-    reinterpret_cast<float4*>(out.roots)[at] = {s.p, s.q, s.r, s.opacity};
-    reinterpret_cast<float2*>(out.half_sizes)[at] = {s.half_x, s.half_y};
-    out.depths[at] = s.depth;
+    for (int64_t c = blockIdx.y; c < cameras.C; c += gridDim.y) {
+        const Camera camera = camera_of(cameras, c);
+        const Splat<float> s = projection_of(gaussians, camera, i).splat();
+        const int64_t at = c * gaussians.N + i;
+        reinterpret_cast<float2*>(out.means2d)[at] = {s.x, s.y};
+        reinterpret_cast<float4*>(out.roots)[at] = {s.p, s.q, s.r, s.opacity};
+        reinterpret_cast<float2*>(out.half_sizes)[at] = {s.half_x, s.half_y};
+        out.depths[at] = s.depth;
+    }
 }
 
 __device__ Splat<float> splat_grad(const SplatGrads& g, int64_t at) {
@@ -117,7 +119,8 @@ __global__ void flag_kernel(Ranges ranges, int64_t* flags) {
 
 void project(const Gaussians& gaussians, const Cameras& cameras, const Splats& out, Stream stream) {
     if (gaussians.N == 0) return;
-    const dim3 grid(blocks_for(gaussians.N), static_cast<unsigned>(cameras.C));
+    constexpr int64_t MOST_ROWS = 65535;  // of blocks; further cameras are taken in turns
+    const dim3 grid(blocks_for(gaussians.N), static_cast<unsigned>(cameras.C < MOST_ROWS ? cameras.C : MOST_ROWS));
     launch(project_kernel, grid, THREADS, stream, gaussians, cameras, out);
 }
 

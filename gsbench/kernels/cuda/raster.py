@@ -11,11 +11,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsbench.errors import InputError
-from gsbench.kernels.cuda import cuda, plain, pointers, stream
+from gsbench.kernels.cuda import allocate, cuda, plain, pointers, stream
 
 TILE = 16  # as launch.h has it
 MAX_ITEMS = (1 << 31) - 1  # splats, and pairs of a tile and a splat, are numbered by int32
 GEOMETRY = 6  # of a splat: x, y, p, q, r, opacity
+PAIRS = "lists of each tile's Gaussians"
 
 
 class View(NamedTuple):
@@ -47,7 +48,7 @@ class _Project(torch.autograd.Function):
         *tensors, view = inputs
         means, factors, opacities, viewmats, Ks = plain(*tensors)
         C, N = len(viewmats), len(means)
-        out = (means.new_empty(C, N, 2), means.new_empty(C, N, 4), means.new_empty(C, N), means.new_empty(C, N, 2))
+        out = tuple(allocate("projected Gaussians", means, C, N, *row) for row in ((2,), (4,), (), (2,)))
         cuda().project(N, *pointers(means, factors, opacities), C, *pointers(viewmats, Ks), *view,
                        *pointers(*out), stream(means))  # fmt: skip
         ctx.save_for_backward(means, factors, opacities, viewmats, Ks)
@@ -62,7 +63,7 @@ class _Project(torch.autograd.Function):
         means, factors, opacities, viewmats, Ks = ctx.saved_tensors
         C, N = len(viewmats), len(means)
         given = [None if g is None else g.contiguous() for g in grads[:3]]
-        out = [torch.empty_like(x) for x in (means, factors, opacities)]
+        out = [allocate("gradients of Gaussians", x, *x.shape) for x in (means, factors, opacities)]
         g_viewmats = torch.zeros_like(viewmats) if ctx.needs_input_grad[3] else None
         cuda().project_backward(N, *pointers(means, factors, opacities), C, *pointers(viewmats, Ks), *ctx.view,
                                 *pointers(*given, *out, g_viewmats), stream(means))  # fmt: skip
@@ -88,11 +89,10 @@ def bin_tiles(
     """
     C, N = depths.shape
     splats = plain(means2d, roots, depths, half_sizes)
-    device = depths.device
     arguments = (N, C, *pointers(*splats), width, height)
-    keys, indices, sorted_keys, order = torch.empty(4, C * N, dtype=torch.int32, device=device).unbind()
-    ends = torch.empty(C * N + 1, dtype=torch.int64, device=device)
-    scratch = torch.empty(cuda().scratch_bytes(C * N), dtype=torch.uint8, device=device)
+    keys, indices, sorted_keys, order = allocate("depths to sort", depths, 4, C * N, dtype=torch.int32).unbind()
+    ends = allocate("numbers of tiles", depths, C * N + 1, dtype=torch.int64)
+    scratch = _scratch(C * N, depths)
     cuda().count_tiles(*arguments, *pointers(keys, indices, sorted_keys, order, ends, scratch), len(scratch),
                        stream(depths))  # fmt: skip
     ends[-1:].copy_(flags)
@@ -101,14 +101,20 @@ def bin_tiles(
     if pairs > MAX_ITEMS:
         raise InputError(f"{pairs} pairs of a tile and a Gaussian are more than {MAX_ITEMS}: "
                          "draw fewer cameras at once, a smaller picture, or fewer large Gaussians")  # fmt: skip
-    tiles, unsorted, sorted_tiles, ids = torch.empty(4, pairs, dtype=torch.int32, device=device).unbind()
-    count = C * -(-width // TILE) * -(-height // TILE)
-    offsets = torch.empty(count + 1, dtype=torch.int32, device=device)
-    scratch = torch.empty(cuda().scratch_bytes(pairs), dtype=torch.uint8, device=device)
+    # Three are let go when this returns; the fourth, of its own, lives until backward.
+    tiles, unsorted, sorted_tiles = allocate(PAIRS, depths, 3, pairs, dtype=torch.int32).unbind()
+    ids = allocate(PAIRS, depths, pairs, dtype=torch.int32)
+    offsets = allocate("lists of tiles", depths, C * -(-width // TILE) * -(-height // TILE) + 1, dtype=torch.int32)
+    scratch = _scratch(pairs, depths)
     cuda().fill_tiles(*arguments, *pointers(order, ends), pairs,
                       *pointers(tiles, unsorted, sorted_tiles, ids, offsets, scratch), len(scratch),
                       stream(depths))  # fmt: skip
     return Bins(offsets, ids), flagged
+
+
+def _scratch(items: int, like: Tensor) -> Tensor:
+    """What sorting and summing so many items need."""
+    return allocate("scratch space to sort", like, cuda().scratch_bytes(items), dtype=torch.uint8)
 
 
 def blend(
@@ -126,8 +132,8 @@ class _Blend(torch.autograd.Function):
         means2d, roots, colors, background = plain(*tensors)
         (C, N, _), D = means2d.shape, colors.shape[-1]
         shape = C, view.height, view.width
-        image, alpha = means2d.new_empty(*shape, D), means2d.new_empty(*shape, 1)
-        transmittance, stop = means2d.new_empty(shape), means2d.new_empty(shape, dtype=torch.int32)
+        image, alpha = (allocate("pictures", means2d, *shape, channels) for channels in (D, 1))
+        transmittance, stop = (allocate("pictures", means2d, *shape, dtype=t) for t in (torch.float32, torch.int32))
         ctx.sizes = N, C, D, C > 1 and len(colors) == C
         ctx.view = view
         cuda().blend(*ctx.sizes, *pointers(means2d, roots, colors, background, *bins), view.width, view.height,
@@ -142,8 +148,8 @@ class _Blend(torch.autograd.Function):
         means2d, roots, colors, background, *bins, transmittance, stop = ctx.saved_tensors
         N, C, D, _ = ctx.sizes
         g_image, g_alpha = (None if g is None else g.contiguous() for g in grads)
-        sums = means2d.new_zeros(C * N, GEOMETRY + D)
-        out = [torch.empty_like(x) for x in (means2d, roots, colors)]
+        sums = allocate("sums over pixels", means2d, C * N, GEOMETRY + D).zero_()
+        out = [allocate("gradients of projected Gaussians", x, *x.shape) for x in (means2d, roots, colors)]
         cuda().blend_backward(*ctx.sizes, *pointers(means2d, roots, colors, background, *bins), ctx.view.width,
                               ctx.view.height, *pointers(transmittance, stop, g_image, g_alpha, sums, *out),
                               stream(means2d))  # fmt: skip
