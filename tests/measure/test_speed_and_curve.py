@@ -81,7 +81,7 @@ def test_stages_wait_for_no_device_until_they_are_read(monkeypatch):
             return 1000.0 * (end.number - self.number)
 
     monkeypatch.setattr(torch.cuda, "Event", Event)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: None)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda _: None)
     stages = speed.Stages("cuda")
     for name in ("slice", "raster", "slice"):
         with stages(name):

@@ -42,12 +42,16 @@ def test_a_bad_step_found_later_changes_nothing_meanwhile() -> None:
     adam = torch.optim.Adam([fitted], lr=0.1, fused=True)
     adam.found_inf = seen.skip  # type: ignore[attr-defined]
     before = []
-    with pytest.raises(DivergedError, match=r"step 6: the gradient of 'means' is not finite \(loss 6.0\)"):
+
+    def train() -> None:
         for step in range(1, 20):
             fitted.grad = torch.full((3,), math.nan if step == 6 else 1.0)
             before.append(fitted.detach().clone())
             seen.see(step, torch.tensor(float(step)), {"means": [fitted]})
             adam.step()
+
+    with pytest.raises(DivergedError, match=r"step 6: the gradient of 'means' is not finite \(loss 6.0\)"):
+        train()
     assert len(before) == 8  # steps 1 to 8, the second to be looked at
     assert not torch.equal(before[4], before[5])  # step 5 was applied ..
     assert torch.equal(before[5], before[6])  # .. step 6 was not ..

@@ -33,9 +33,7 @@ def observe_backward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of the first six, and of (lambda_d, lambda_t) [2]."""
     arrays = plain(time, lambda_d, lambda_t, center, means, directions, times, log_diagonal, off_diagonal, opacities)
-    out = tuple(
-        allocate(GRADIENTS, x, *x.shape) for x in (means, directions, times, log_diagonal, off_diagonal, opacities)
-    )
+    out = _like(means, directions, times, log_diagonal, off_diagonal, opacities)
     lambdas = means.new_zeros(2)
     given = plain(g_means, g_factors, g_opacities)
     cuda().observe_triangular_backward(len(means), conditioned_first, row_scaled, half, *pointers(*arrays),
