@@ -7,7 +7,10 @@ MODELS := 3dgs,4dgs,6dgs,7dgs,7dgs_noagr
 # More overrides: make table1 ARGS="train.iterations=3000 seed=1"
 ARGS ?=
 
-.PHONY: help table1 test test-all bench sanitize lint format setup clean
+# The CUDA kernels, compiled for five architectures, take minutes: made where a GPU is to run them. CUDA=on|auto|off.
+CUDA := $(if $(shell nvidia-smi -L 2> /dev/null),auto,off)
+
+.PHONY: help table1 test test-all bench gpu-check sanitize lint format setup clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
@@ -21,7 +24,8 @@ $(VENV)/installed: pyproject.toml constraints.txt $(NATIVE)
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \
 		{ echo "gsbench needs Python 3.11, 3.12 or 3.13; $(PYTHON) is $$($(PYTHON) --version). Try make PYTHON=python3.12"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+		--config-settings cmake.define.CUDA=$(CUDA) --editable '.[dev]'
 	touch $@
 
 table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR on the embedded scenes; print and write the table
@@ -38,6 +42,9 @@ test-all: lint  ## the slow tests too
 
 bench: setup  ## time every kernel against the machine's own limits; results/benchmarks/
 	$(BIN)/python -m benchmarks
+
+gpu-check:  ## on a machine with a GPU, offline: build, test, train, sanitize and time the CUDA kernels; results/benchmarks/
+	$(PYTHON) benchmarks/gpu_check.py $(ARGS)
 
 sanitize: setup  ## build the kernels with the address and undefined-behaviour sanitizers and run their tests
 	tests/kernels/sanitize.sh $(BIN)/python

@@ -1,5 +1,7 @@
 """The scene that speed is measured on, and the models that are sliced: a recipe, the same numbers everywhere."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -31,11 +33,11 @@ def camera(size: int) -> tuple[Tensor, Tensor]:
     return viewmat[None], K[None]
 
 
-def model(name: str, N: int, *, agr: bool = False, seed: int = 0) -> GaussianModel:
+def model(name: str, N: int, *, agr: bool = False, seed: int = 0, **options: Any) -> GaussianModel:
     """A model of N Gaussians at the size of `gaussians`, with correlations and colours that are not zero."""
     g = torch.Generator().manual_seed(seed)
     lambdas = {"6dgs": {"lambda_d": 0.05}, "7dgs": {"lambda_d": 0.05, "lambda_t": 0.05}}
-    made = build(name, agr=agr, sh_degree=3, **lambdas.get(name, {}))
+    made = build(name, agr=agr, sh_degree=3, **lambdas.get(name, {}) | options)
     made.initialise(Points(torch.rand(N, 3, generator=g) * 2 - 1, torch.rand(N, 3, generator=g)), 1.0, g)
     with torch.no_grad():
         for key, parameter in made.splats.items():

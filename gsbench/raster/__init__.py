@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsbench import kernels
 from gsbench.errors import InputError, did_you_mean
-from gsbench.kernels import cuda
+from gsbench.kernels import cuda as cuda_kernels  # `cuda` is this package's own module
 
 # A backend is a module with a function `draw` of this door's (checked) arguments.
 _MODULES = {"reference": "gsbench.raster.reference", "cpu": "gsbench.raster.native", "cuda": "gsbench.raster.cuda"}
@@ -99,12 +99,12 @@ def choose_backend(backend: str, device: str = "cpu", dtype: torch.dtype = torch
         InputError: no such backend, it is not installed, or it does not draw on that device.
     """
     if backend == "auto":
-        native = {"cpu": kernels.available, "cuda": cuda.available}.get(device)
+        native = {"cpu": kernels.available, "cuda": cuda_kernels.available}.get(device)
         if native is None or dtype != torch.float32:
             return "reference"
-        if cuda.built() and not cuda.available():
+        if cuda_kernels.built() and not cuda_kernels.available():
             _warn_once("no CUDA device was found: the CUDA kernels of this installation are idle, the CPU draws")
-        if device == "cuda" and not cuda.built():
+        if device == "cuda" and not cuda_kernels.built():
             _warn_once("the CUDA kernels are not built in this installation: the GPU draws by the reference backend, "
                        "which is slow; see docs/gpu.md")  # fmt: skip
         return device if native() else "reference"
@@ -113,8 +113,8 @@ def choose_backend(backend: str, device: str = "cpu", dtype: torch.dtype = torch
     if backend == "cpu" and not kernels.available():
         raise InputError("raster backend 'cpu' is not built in this installation: reinstall with a C++20 compiler, "
                          "or use raster.backend=reference")  # fmt: skip
-    if backend == "cuda" and not cuda.available():
-        why = "no CUDA device was found" if cuda.built() else "it is not built in this installation, see docs/gpu.md"
+    if backend == "cuda" and not cuda_kernels.available():
+        why = "no CUDA device was found" if cuda_kernels.built() else "it is not built here, see docs/gpu.md"
         raise InputError(f"raster backend 'cuda': {why}; use raster.backend=auto or reference")
     if backend in ("cpu", "cuda") and device in ("cpu", "cuda") and backend != device:
         raise InputError(f"raster backend '{backend}' does not draw on device '{device}': use device={backend}, "

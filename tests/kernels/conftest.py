@@ -43,7 +43,8 @@ def threads() -> Iterator[None]:
 def cuda_device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Where the CUDA kernels run: `cuda`, or `cpu` with the kernels replaced by those of the shim (cuda_shim.h).
 
-    The shim is built once a session, or kept in the folder GSBENCH_SHIM_BUILD. Skips without the tools to build it.
+    The shim is built once a session, or kept in the folder GSBENCH_SHIM_BUILD; with the sanitizers that GSBENCH_SANITIZE
+    names. Skips without the tools to build it.
     """
     if cuda.available():
         yield "cuda"
@@ -51,7 +52,8 @@ def cuda_device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     if not all(map(shutil.which, ("cmake", "ninja", "c++"))):
         pytest.skip("needs a GPU and the built extension, or cmake, ninja and a C++ compiler for the shim")
     folder = Path(os.environ.get("GSBENCH_SHIM_BUILD") or tmp_path_factory.mktemp("cuda_shim"))
-    options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Release", f"-DPython_EXECUTABLE={sys.executable}"]
+    options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Release", f"-DPython_EXECUTABLE={sys.executable}",
+               f"-DGSB_SANITIZE={os.environ.get('GSBENCH_SANITIZE', '')}"]  # fmt: skip
     for command in (["cmake", "-S", str(ROOT), "-B", str(folder), *options],
                     ["cmake", "--build", str(folder), "--target", "_cuda"]):  # fmt: skip
         done = subprocess.run(command, capture_output=True, text=True)

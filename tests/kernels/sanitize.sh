@@ -1,5 +1,6 @@
 #!/bin/sh
 # Runs the kernel tests on kernels built with AddressSanitizer and UndefinedBehaviorSanitizer: any finding is a failure.
+# The CUDA kernels, too, by the shim that runs them on the CPU.
 # Usage: tests/kernels/sanitize.sh [python]
 set -eu
 cd "$(dirname "$0")/../.."
@@ -8,13 +9,15 @@ build=build/sanitize
 # One instruction set, the best this machine has: the sources are the same, and sanitized ones compile slowly.
 level=$(grep -qs avx512dq /proc/cpuinfo && echo v4 || echo v3)
 cmake -S . -B $build -DCMAKE_BUILD_TYPE=RelWithDebInfo -DGSB_LEVELS="$level" -DGSB_SANITIZE=address,undefined \
-    -DPython_EXECUTABLE="$(command -v "$python")"
+    -DCUDA=off -DPython_EXECUTABLE="$(command -v "$python")"
 cmake --build $build
 rm -rf $build/site
 mkdir -p $build/site
 cp -r gsbench $build/site/
+rm -f $build/site/gsbench/kernels/_cuda*.so
 cp --remove-destination $build/_native*.so $build/site/gsbench/kernels/
 # Python itself is not sanitized: the runtime is loaded first, and what the interpreter leaves behind is no leak of ours.
 LD_PRELOAD="$(c++ -print-file-name=libasan.so) $(c++ -print-file-name=libstdc++.so)" \
     ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 OMP_NUM_THREADS=2 \
+    GSBENCH_SANITIZE=address,undefined \
     "$python" -m pytest tests/kernels -o "pythonpath=$build/site tests" -p no:cacheprovider
