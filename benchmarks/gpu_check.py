@@ -110,8 +110,8 @@ def everything(check: Check, capability: str) -> None:
         check.note("training", "left out: hydra is not installed")
     else:
         with tempfile.TemporaryDirectory() as results:
-            check.run("training", [python, "-m", "gsbench", "+exp=mini", "model=7dgs", "scene=moving-matte", "device=cuda",
-                                   "train.iterations=300", f"results={results}"], 90)  # fmt: skip
+            overrides = ["+exp=mini", "model=7dgs", "scene=moving-matte", "device=cuda", "train.iterations=300"]
+            check.run("training", [python, "-m", "gsbench", *overrides, f"results={results}"], 90)
     if importlib.util.find_spec("gsplat") is None:
         check.note("gsplat", "left out: gsplat is not installed, so its columns stay empty")
     check.run("benchmarks", [python, "-m", "benchmarks.gpu", "--out", str(check.out)], 240)

@@ -43,8 +43,8 @@ def threads() -> Iterator[None]:
 def cuda_device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Where the CUDA kernels run: `cuda`, or `cpu` with the kernels replaced by those of the shim (cuda_shim.h).
 
-    The shim is built once a session, or kept in the folder GSBENCH_SHIM_BUILD; GSBENCH_SANITIZE names sanitizers for it.
-    Skips without the tools to build it.
+    The shim is built once a session, or kept in the folder GSBENCH_SHIM_BUILD; with the sanitizers GSBENCH_SANITIZE
+    names. Skips without the tools to build it.
     """
     if cuda.available():
         yield "cuda"
