@@ -31,6 +31,8 @@ def adam(
     shape = tuple(parameter.shape)
     named = {"parameter": parameter, "gradient": gradient, "mean": mean, "square": square}
     check("adam", {name: (tensor, shape) for name, tensor in named.items()})
+    if parameter.device.type != "cpu" or drawn.device.type != "cpu":
+        raise InputError(f"adam: expected tensors on the CPU, got {parameter.device} and {drawn.device}")
     if drawn.shape != shape[:1] or drawn.dtype != torch.bool:
         raise InputError(f"adam: expected drawn as bool of shape {list(shape[:1])}, got {drawn.dtype} of shape "
                          f"{list(drawn.shape)}")  # fmt: skip
