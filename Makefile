@@ -7,7 +7,7 @@ MODELS := 3dgs,4dgs,6dgs,7dgs,7dgs_noagr
 # More overrides: make table1 ARGS="train.iterations=3000 seed=1"
 ARGS ?=
 
-.PHONY: help table1 test test-all bench sanitize lint format setup clean
+.PHONY: help table1 test test-all stability stability-long bench sanitize lint format setup clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
@@ -35,6 +35,13 @@ test: lint  ## lint, types and all tests but the slow ones
 
 test-all: lint  ## the slow tests too
 	$(BIN)/python -m pytest -m 'slow or not slow'
+
+stability: setup  ## hard cases against an oracle; results/stability/, fails where a default breaks its bound
+	$(BIN)/python -m gsbench.stability
+
+stability-long: setup  ## the same with long trainings, and 10,000 random hard cases from slice to gradient
+	$(BIN)/python -m gsbench.stability --long
+	$(BIN)/python -m pytest tests/stability -m slow
 
 bench: setup  ## time every kernel against the machine's own limits; results/benchmarks/
 	$(BIN)/python -m benchmarks

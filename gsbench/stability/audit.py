@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
-import numpy as np
 import torch
 from tqdm import tqdm
 
@@ -15,13 +14,13 @@ from gsbench.errors import InputError
 from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS
 from gsbench.raster import choose_backend
-from gsbench.stability import curves, population, slices
+from gsbench.stability import colors, curves, pictures, population, slices, trainings
 from gsbench.stability.cases import Bound, Cell, of_area
+from gsbench.stability.training_cases import LONG_STEPS
 
 BACKENDS = ("cpu", "cuda", "reference")
 MILLION = 1_000_000
 SUBTRACTING = 100_000  # Gaussians for the schemes that subtract: their failures are no rare event
-PERCENTILE = 0.999  # of the million's errors, that the bounds are about
 SEED = 0
 T = TypeVar("T")
 
@@ -34,6 +33,7 @@ class Audit:
     cells: list[Cell] = field(default_factory=list)
     verified: dict[str, float] = field(default_factory=dict)  # float64 against mpmath, by factor order
     conditions: list[curves.ConditionCurve] = field(default_factory=list)
+    accuracy: list[curves.Point] = field(default_factory=list)
     safety: list[curves.Cost] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -54,11 +54,16 @@ def present() -> list[str]:
     return found
 
 
-def run(million: int = MILLION) -> Audit:
-    """Everything, with a progress bar on stderr; `million` is how many hard slices are drawn."""
+def run(million: int = MILLION, *, long: bool = False) -> Audit:
+    """Everything, with a progress bar on stderr.
+
+    Args:
+        million: how many hard slices are drawn.
+        long: train for 2,000 steps where the short audit trains for 150.
+    """
     began = time.perf_counter()
     audit = Audit(present())
-    with tqdm(_steps(audit, million), desc="stability", file=sys.stderr) as steps:
+    with tqdm(_steps(audit, million, long), desc="stability", file=sys.stderr) as steps:
         for name, step in steps:
             steps.set_postfix_str(name)
             step()
@@ -66,20 +71,29 @@ def run(million: int = MILLION) -> Audit:
     return audit
 
 
-def _steps(audit: Audit, million: int) -> list[tuple[str, Callable[[], None]]]:
+def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Callable[[], None]]]:
     """What is to be done, as names and calls."""
     steps: list[tuple[str, Callable[[], None]]] = []
-    for case in of_area("slicing"):
-        steps.append((case.name, partial(_extend, audit.cells, partial(slices.judge, case, audit.backends))))
+
+    def add(name: str, found: list[T], more: Callable[[], Iterable[T]]) -> None:
+        steps.append((name, lambda: found.extend(more())))
+
+    fastest = audit.backends[0]
+    for area, judge in (("slicing", slices.judge), ("colour", colors.judge), ("projection", pictures.judge),
+                        ("blending", pictures.judge)):  # fmt: skip
+        for case in of_area(area):
+            add(case.name, audit.cells, partial(judge, case, audit.backends))
+    for case in of_area("training"):
+        more = {"steps": LONG_STEPS} if long and case.name == "learning_rates_times_30" else {}
+        add(case.name, audit.cells, partial(trainings.judge, case, fastest, **more))
+    for case in of_area("drift"):
+        add(case.name, audit.cells, partial(trainings.drift, case, fastest))
     for order in FACTOR_ORDERS:
         steps.append((f"hard slices, {order}", partial(hard_slices, audit, order, million)))
-    steps.append(("error by condition number", partial(_extend, audit.conditions, curves.by_condition)))
-    steps.append(("cost of safety", partial(_extend, audit.safety, partial(curves.safety, audit.backends))))
+    add("error by condition number", audit.conditions, curves.by_condition)
+    add("error by time", audit.accuracy, partial(curves.accuracy_for_time, audit.backends))
+    add("cost of safety", audit.safety, partial(curves.safety, audit.backends))
     return steps
-
-
-def _extend(found: list[T], more: Callable[[], Iterable[T]]) -> None:
-    found.extend(more())
 
 
 def hard_slices(audit: Audit, order: str, N: int) -> None:
@@ -93,13 +107,8 @@ def hard_slices(audit: Audit, order: str, N: int) -> None:
             start = time.perf_counter()
             errors = population.judge(hard.rows(slice(count)), known, order, scheme, backend)
             ms = 1e3 * (time.perf_counter() - start)
-            forward, gradient = (percentile(x) for x in (errors.cov, errors.gradient))
+            forward, gradient = (curves.percentile(x) for x in (errors.cov, errors.gradient))
             audit.cells.append(
                 Cell("population", f"hard_slices_{order}", "7dgs", scheme, backend, forward, gradient,
                      float(errors.bad.mean()), ms, Bound(), f"{count} slices")
             )  # fmt: skip
-
-
-def percentile(errors: population.Floats) -> float:
-    """The 99.9th percentile, what is not finite counted as infinitely wrong."""
-    return float(np.quantile(np.nan_to_num(errors, nan=np.inf), PERCENTILE, method="higher"))

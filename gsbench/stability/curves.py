@@ -1,4 +1,4 @@
-"""Error against condition number, and what the square-root scheme costs beside the two that subtract."""
+"""Error against condition number, error against time, and what the square-root scheme costs beside the others."""
 
 import itertools
 import time
@@ -7,18 +7,25 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from gsbench import kernels
 from gsbench.models import build
 from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS
-from gsbench.stability import population
+from gsbench.stability import picture_cases, pictures, population, slices
+from gsbench.stability.picture_cases import Arguments
 
 SPREAD = 40_000  # Gaussians of the curve by condition number
 DECADES = 8.0  # their factors' diagonals go down to 10^-DECADES, each Gaussian's to somewhere between that and 1
 BINS = np.arange(0, 13)  # powers of ten of the condition number
 LEAST = 50  # Gaussians in a bin, below which it is not shown
 TIMED = 100_000  # Gaussians of the comparison of costs
-REPEATS = 5
+REPEATS = 3
+SLICED = 20_000  # Gaussians, and ..
+DRAWN = 1_500  # .. Gaussians in a picture of so many pixels a side, of the accuracy-for-time curve
+PICTURE = 96
+PERCENTILE = 0.999  # of errors over a population, that bounds are about
 
 
 @dataclass(frozen=True)
@@ -41,6 +48,74 @@ class Cost:
     backend: str
     forward: float
     backward: float
+
+
+@dataclass(frozen=True)
+class Point:
+    """What accuracy costs: one way to do one thing."""
+
+    thing: str  # "slicing" or "picture"
+    way: str
+    error: float  # 99.9th percentile of a covariance; largest of a decided pixel
+    ms: float  # forward and backward
+
+
+def accuracy_for_time(backends: list[str]) -> Iterator[Point]:
+    """Slices of SLICED hard Gaussians and a picture of a crowd, in every scheme, precision and instruction set."""
+    hard = population.draw(torch.Generator().manual_seed(4), SLICED, "paper")
+    known = population.truth(hard, "paper")
+    for scheme in SCHEMES:
+        for dtype in (torch.float32, torch.float64):
+            yield _sliced(hard, known, scheme, "reference", dtype)
+    for backend in backends:
+        if backend != "reference":
+            yield _sliced(hard, known, "square_root", backend, torch.float32)
+    arguments = picture_cases.crowd(torch.Generator().manual_seed(5), DRAWN, 0.05)
+    scale = picture_cases.intrinsics(6 * picture_cases.FOCAL, 6 * picture_cases.FOCAL, PICTURE / 2, PICTURE / 2)
+    arguments |= {"width": PICTURE, "height": PICTURE, "Ks": scale}
+    truth = pictures.together(arguments)
+    for backend in backends:
+        if backend == "cpu":
+            active = kernels.native().active()
+            for level in kernels.native().instruction_sets():
+                kernels.use_instruction_set(level)
+                yield _drawn(arguments, truth, backend, torch.float32, f"cpu, {level}")
+            kernels.use_instruction_set(active)
+        else:
+            yield _drawn(arguments, truth, backend, torch.float32, f"{backend} float32")
+    yield _drawn(arguments, truth, "reference", torch.float64, "reference float64")
+
+
+def _sliced(hard: population.Hard, known: population.Truth, scheme: str, backend: str, dtype: torch.dtype) -> Point:
+    model = population.all_seen("paper", scheme, backend).to(dtype)
+    raw = {name: value.to(dtype).requires_grad_() for name, value in population.raw_parameters(hard).items()}
+    center, moment = torch.zeros(3, dtype=dtype), torch.tensor(0.0, dtype=dtype)
+
+    def both() -> Tensor:
+        mean, F, opacity = model.observe(raw, center, moment)
+        out = [mean, F, opacity]
+        torch.autograd.grad(out, list(raw.values()), [torch.ones_like(x) for x in out], allow_unused=True)
+        return F.detach().double()
+
+    F = both()
+    exact = torch.from_numpy(known.cov)
+    errors = ((F @ F.mT - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))).numpy()
+    precision = str(dtype).removeprefix("torch.")
+    return Point("slicing", f"{scheme} {backend} {precision}", percentile(errors), slices.fastest(both))
+
+
+def _drawn(arguments: Arguments, truth: pictures.Truth, backend: str, dtype: torch.dtype, way: str) -> Point:
+    image, _, decided, _ = truth
+    weights = pictures.weights(arguments)
+    cast = {name: value.to(dtype) if isinstance(value, Tensor) else value for name, value in arguments.items()}
+    got, _, _ = pictures.differentiate(cast, backend, *weights)
+    error = float(torch.where(decided, (got - image).abs().amax(-1), 0.0).max())
+    return Point("picture", way, error, slices.fastest(lambda: pictures.differentiate(cast, backend, *weights)))
+
+
+def percentile(errors: population.Floats) -> float:
+    """The 99.9th percentile, what is not finite counted as infinitely wrong."""
+    return float(np.quantile(np.nan_to_num(errors, nan=np.inf), PERCENTILE, method="higher"))
 
 
 def by_condition() -> Iterator[ConditionCurve]:

@@ -122,11 +122,14 @@ def alphas(x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[f
 def colors(x: Vector, layout: dict[str, int], center: Sequence[float], waves: int, time: float) -> Vector:
     """max(0, sum beta Y_lm(d) cos(2 pi n (t - mu_t)) + 1/2), degree 3 (3DGS; 4DGS eq. 12); x has means, times, sh.
 
-    Y_lm by the general formula, with associated Legendre functions of cos(theta): real harmonics in 3DGS' signs.
+    Y_lm by the general formula, with associated Legendre functions of cos(theta): real harmonics in 3DGS' signs. Where
+    d is undefined only the constant one is not zero, by definition.
     """
     raw = _unpack(x, layout)
     dx, dy, dz = unit([m - mpf(c) for m, c in zip(raw["means"], center, strict=True)])
-    basis = [_harmonic(degree, order, dx, dy, dz) for degree in range(4) for order in range(-degree, degree + 1)]
+    defined = any((dx, dy, dz))
+    basis = [_harmonic(degree, order, dx, dy, dz) if defined or degree == 0 else mpf(0)
+             for degree in range(4) for order in range(-degree, degree + 1)]  # fmt: skip
     cosines = [mp.cos(2 * mp.pi * n * (mpf(time) - raw["times"][0])) for n in range(waves)]
     Y = [c * y for c in cosines for y in basis]
     return [max(mpf(0), mp.fdot(Y, raw["sh"][channel::3]) + mpf(1) / 2) for channel in range(3)]

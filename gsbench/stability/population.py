@@ -182,15 +182,21 @@ def _relative(found: Floats, exact: Floats) -> float:
 
 def judge(hard: Hard, known: Truth, order: str, scheme: str, backend: str) -> Errors:
     """What 7DGS in float32 makes of hard slices."""
+    model = all_seen(order, scheme, backend)
+    w, W = weights(len(hard))
+    parts = [_judge(model, hard, known, w, W, slice(i, i + CHUNK)) for i in range(0, len(hard), CHUNK)]
+    cov, gradient, bad = (np.concatenate(x) for x in zip(*parts, strict=True))
+    return Errors(cov, gradient, bad)
+
+
+def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
+    """A 7DGS that gates nothing away."""
     model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme)
     assert isinstance(model, TriangularModel)
     model.backend = backend
     for name in ("direction", "time"):
         model.log_modulation[name] = nn.Parameter(torch.tensor(NEVER))
-    w, W = weights(len(hard))
-    parts = [_judge(model, hard, known, w, W, slice(i, i + CHUNK)) for i in range(0, len(hard), CHUNK)]
-    cov, gradient, bad = (np.concatenate(x) for x in zip(*parts, strict=True))
-    return Errors(cov, gradient, bad)
+    return model
 
 
 def _judge(
