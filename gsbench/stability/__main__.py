@@ -34,11 +34,13 @@ def show_spectrum(checkpoint: Path, folder: Path) -> int:
     from gsbench.stability import spectrum
 
     try:
-        found = spectrum.measure(checkpoint)
+        found, failures = spectrum.measure(checkpoint), spectrum.failures(checkpoint)
     except InputError as error:
         print(f"gsbench.stability: error: {error}", file=sys.stderr)
         return 2
     print(spectrum.report(found))
+    for scheme, (share, worst) in failures.items():
+        print(f"{scheme} in float32: {100 * share:.2f} % indefinite, 99th percentile of the error {worst:.1e}")
     print(f"Written: {spectrum.draw(found, folder, str(checkpoint.parent.name))}")
     return 0
 

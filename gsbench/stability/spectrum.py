@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.models.factors import rotation4d, sizes, triangular
-from gsbench.models.slicing import reduce
+from gsbench.models.slicing import reduce, subtract
 from gsbench.stability.plots import save
 from gsbench.stability.population import Floats
 from gsbench.train import checkpoint
@@ -25,11 +25,29 @@ def measure(path: Path) -> dict[str, Floats]:
     Raises:
         InputError: it is no checkpoint, or of a model that slices nothing.
     """
-    state: dict[str, Any] = checkpoint.read(path)[1].get("model", {})
-    splats = {name.removeprefix("splats."): value.double() for name, value in state.items() if name[:7] == "splats."}
-    joint, k = joint_factors(splats, path)
+    joint, k = joint_factors(_splats(path), path)
     sliced = reduce(joint).T_pp
     return {f"joint factor, {3 + k} x {3 + k}": _condition(joint), "sliced factor, 3 x 3": _condition(sliced)}
+
+
+def failures(path: Path) -> dict[str, tuple[float, float]]:
+    """Of each scheme that subtracts, in float32: share of the checkpoint's covariances it makes indefinite, and the
+    99th percentile of their relative error.
+    """  # fmt: skip
+    joint, _ = joint_factors(_splats(path), path)
+    exact = reduce(joint).T_pp
+    exact = exact @ exact.mT
+    found = {}
+    for scheme in ("schur", "cholesky"):
+        cov = subtract(joint.float(), scheme)[1].double()
+        error = (cov - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))
+        found[scheme] = (float((torch.linalg.eigvalsh(cov)[:, 0] < 0).double().mean()), float(error.quantile(0.99)))
+    return found
+
+
+def _splats(path: Path) -> dict[str, Tensor]:
+    state: dict[str, Any] = checkpoint.read(path)[1].get("model", {})
+    return {name.removeprefix("splats."): value.double() for name, value in state.items() if name[:7] == "splats."}
 
 
 def joint_factors(splats: dict[str, Tensor], path: Path) -> tuple[Tensor, int]:
