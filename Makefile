@@ -10,7 +10,7 @@ ARGS ?=
 # The CUDA kernels, compiled for five architectures, take minutes: made where a GPU is to run them. CUDA=on|auto|off.
 CUDA := $(if $(shell nvidia-smi -L 2> /dev/null),auto,off)
 
-.PHONY: help table1 test test-all bench gpu-check sanitize lint format setup clean
+.PHONY: help table1 test test-all stability stability-long bench gpu-check sanitize lint format setup clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
@@ -39,6 +39,13 @@ test: lint  ## lint, types and all tests but the slow ones
 
 test-all: lint  ## the slow tests too
 	$(BIN)/python -m pytest -m 'slow or not slow'
+
+stability: setup  ## hard cases against an oracle; results/stability/, fails where a default breaks its bound
+	$(BIN)/python -m gsbench.stability
+
+stability-long: setup  ## the same with long trainings, and 10,000 random hard cases from slice to gradient
+	$(BIN)/python -m gsbench.stability --long
+	$(BIN)/python -m pytest tests/stability -m slow
 
 bench: setup  ## time every kernel against the machine's own limits; results/benchmarks/
 	$(BIN)/python -m benchmarks

@@ -24,6 +24,12 @@ def entry(composed: DictConfig) -> None:
     """Run every scene that the config names; one that fails does not stop the others."""
     if OmegaConf.is_missing(composed, "experiment"):
         raise InputError(f"no experiment was chosen: add +exp=NAME. Valid: {', '.join(_group('exp'))}.")
+    if composed.experiment == "stability":  # the one experiment that is no run of a model on a scene
+        from gsbench.stability.__main__ import main as audit
+
+        if audit(["--out", str(Path(composed.results) / "stability")]):
+            _failures.append("stability: a default breaks its bound")
+        return
     if OmegaConf.is_missing(composed.data, "root"):
         raise InputError(f"data.root is not set: add data.root=PATH, the folder that holds the scenes of "
                          f"{composed.data.dataset} ({', '.join(composed.data.scenes)}), each with "

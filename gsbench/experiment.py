@@ -23,6 +23,7 @@ from gsbench.report.pictures import strip, write_png
 from gsbench.scenes import Scene
 from gsbench.scenes.points import random_points
 from gsbench.train import checkpoint
+from gsbench.train.diagnosis import explain
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import OPTIMIZERS
 from gsbench.train.schedule import generator
@@ -65,7 +66,7 @@ def run(composed: DictConfig) -> Record:
     try:
         record = fit_and_measure(this, scene, model)
     except DivergedError as error:
-        record = unfinished(this, scene, model, "diverged", str(error))
+        record = unfinished(this, scene, model, "diverged", f"{error}; {explain(model)}")
     except (MemoryError, torch.OutOfMemoryError) as error:
         record = unfinished(this, scene, model, "failed", f"out of memory: {_one_line(error)}")
     records.write(record, this.folder / records.FILE_NAME)

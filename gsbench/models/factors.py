@@ -4,7 +4,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsbench.kernels.thresholds import LOG_SIZE_MAX
 from gsbench.models.slicing import triangularise
+
+
+def sizes(logs: Tensor) -> Tensor:
+    """exp of log sizes of any shape, each held to +-LOG_SIZE_MAX; the gradient of one that is held is zero."""
+    return logs.clamp(-LOG_SIZE_MAX, LOG_SIZE_MAX).exp()
 
 
 def triangular(
@@ -21,7 +27,7 @@ def triangular(
         row_scaled: an entry is (2 sigmoid(x) - 1) times its row's diagonal, as some 6DGS code has it, not x itself.
     """
     n = log_diagonal.shape[-1]
-    diagonal = log_diagonal.exp()
+    diagonal = sizes(log_diagonal)
     rows = []
     for i, (below, d) in enumerate(zip(off_diagonal.split(list(range(n)), -1), diagonal.split(1, -1), strict=True)):
         entries = (2 * torch.sigmoid(below) - 1) * d if row_scaled else below

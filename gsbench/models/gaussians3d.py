@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register
-from gsbench.models.factors import rotation
+from gsbench.models.factors import rotation, sizes
 from gsbench.scenes.scene import Points
 
 
@@ -44,4 +44,4 @@ class Gaussians3DModel(GaussianModel):
     @staticmethod
     def factors(raw: Raw) -> Tensor:
         """R S, [N, 3, 3]."""
-        return rotation(raw["quats"]) * raw["scales"].exp()[:, None, :]
+        return rotation(raw["quats"]) * sizes(raw["scales"])[:, None, :]

@@ -9,13 +9,12 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.colors import MAX_WAVES, show_colors
 from gsbench.kernels.slices import observe_rotated
+from gsbench.kernels.thresholds import TIME_GATE_MIN
 from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register
-from gsbench.models.factors import rotation4d
+from gsbench.models.factors import rotation4d, sizes
 from gsbench.models.slicing import check_scheme, mahalanobis, slice_gaussians
 from gsbench.scenes.scene import Points
-
-TIME_GATE_MIN = 0.05  # a Gaussian whose f_temp is not above this is not drawn (4DGS, gaussian_renderer)
 
 
 @register("4dgs")
@@ -60,12 +59,16 @@ class Gaussians4DModel(GaussianModel):
     def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
         """Slice at t; f_temp = exp(-1/2 lambda_t (t - mu_t)^2 / S_t)."""
         assert time is not None
-        factor = self.factors(raw)
-        mean, factor3, _ = slice_gaussians(
-            torch.cat([raw["means"], raw["times"]], -1), factor, time[None], scheme=self.scheme
-        )
-        gate = torch.exp(-0.5 * self.modulation("time") * mahalanobis(factor[:, 3:], time - raw["times"]))
-        return Conditioned(mean, factor3, torch.where(gate > TIME_GATE_MIN, gate, 0.0))
+        factor, delta = _leading_first(self.factors(raw)), time - raw["times"]
+        # A Gaussian that is not drawn at this time stays at mu_p, as if it were seen at its own: else the huge numbers
+        # of one that is thin in time would reach a gradient as 0 x inf.
+        with torch.no_grad():
+            seen = self._gate(factor, delta) > TIME_GATE_MIN
+        mean = torch.cat([raw["means"], raw["times"]], -1)
+        query = torch.where(seen[:, None], time, raw["times"])
+        means, factors, _ = slice_gaussians(mean, factor, query, scheme=self.scheme)
+        gate = self._gate(factor, torch.where(seen[:, None], delta, 0.0))
+        return Conditioned(means, factors, torch.where(seen, gate, 0.0))
 
     def observe(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """The square-root scheme by the native kernel, where it serves."""
@@ -117,7 +120,24 @@ class Gaussians4DModel(GaussianModel):
             "scales": raw["scales"] - math.log(SHRINK),
         }
 
+    def _gate(self, factor: Tensor, delta: Tensor) -> Tensor:
+        """f_temp of factors [N, 4, 4], delta [N, 1] away in time, [N]."""
+        return torch.exp(-0.5 * self.modulation("time") * mahalanobis(factor[:, 3:], delta))
+
     @staticmethod
     def factors(raw: Raw) -> Tensor:
         """R S, [N, 4, 4]."""
-        return rotation4d(raw["left_quats"], raw["right_quats"]) * raw["scales"].exp()[:, None, :]
+        return rotation4d(raw["left_quats"], raw["right_quats"]) * sizes(raw["scales"])[:, None, :]
+
+
+def _leading_first(factor: Tensor) -> Tensor:
+    """Swap the columns of [N, 4, 4] so that the one that is largest in the row of t is the first; F F^T stays.
+
+    Columns differ by factors of 10^7 where a Gaussian is long in time, and a reflection is accurate in each of them,
+    not only in the largest, if it starts so (Powell and Reid 1969; Cox and Higham 1998).
+    """
+    largest = factor[:, 3].detach().abs().argmax(-1, keepdim=True)
+    columns = torch.arange(4, device=factor.device).repeat(len(factor), 1)
+    columns[:, :1] = largest
+    columns.scatter_(1, largest, 0)
+    return factor.gather(2, columns[:, None].expand_as(factor))

@@ -63,14 +63,20 @@ def slice_gaussians(
     check_scheme(scheme)
     if scheme == "square_root":
         return slice_reduced(mean, reduce(factor), query)
+    gain, cov = subtract(factor, scheme)
+    moved = mean[:, :3] + (gain @ (query - mean[:, 3:])[..., None])[..., 0]
+    return Slice(moved, _cholesky3(cov), gain)
+
+
+def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
+    """K and S_pp - K S_pq^T, [N, 3, k] and [N, 3, 3], by a scheme that forms S; the difference may be indefinite."""
     S = factor @ factor.mT
     S_pp, S_pq, S_qq = S[:, :3, :3], S[:, :3, 3:], S[:, 3:, 3:]
     if scheme == "schur":
         gain = S_pq @ torch.linalg.inv_ex(S_qq).inverse
     else:
         gain = torch.cholesky_solve(S_pq.mT, torch.linalg.cholesky_ex(S_qq).L).mT
-    moved = mean[:, :3] + (gain @ (query - mean[:, 3:])[..., None])[..., 0]
-    return Slice(moved, _cholesky3(S_pp - gain @ S_pq.mT), gain)
+    return gain, S_pp - gain @ S_pq.mT
 
 
 def check_scheme(scheme: str) -> None:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.slices import observe_triangular
+from gsbench.kernels.thresholds import EXPONENT_MAX
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
 from gsbench.models.factors import triangular, triangular_parameters
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
@@ -17,10 +18,6 @@ from gsbench.scenes.scene import Points
 # Where position, time and direction stand among the rows of the triangular factor.
 FACTOR_ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
 WIDTH = {"p": 3, "t": 1, "d": 3}
-# Adam's steps of 0.05 on a logarithm have no end where the gradient has none, as for a scale that is infinite for all
-# one can see; e^+-16 = 1e+-7 is as good as infinite or zero, and its square is a float32.
-LOG_DIAGONAL_MAX = 16.0
-EXPONENT_MAX = 80.0  # exp(-80) = 2e-35: beyond, f is 0
 TIME_CORRELATION = 0.05  # split in time where |S_pt| is above this part of the scene's extent ..
 TIME_SCALE = 0.25  # .. and sqrt(S_t) above this part of the clip (7DGS, section 4.4)
 
@@ -160,8 +157,7 @@ class TriangularModel(GaussianModel):
 
     def factors(self, raw: Raw) -> Tensor:
         """The triangular factor with its rows sorted to (p, d, t), [N, n, n]."""
-        log_diagonal = raw["log_diagonal"].clamp(-LOG_DIAGONAL_MAX, LOG_DIAGONAL_MAX)
-        L = triangular(log_diagonal, raw["off_diagonal"], row_scaled=self.row_scaled)
+        L = triangular(raw["log_diagonal"], raw["off_diagonal"], row_scaled=self.row_scaled)
         return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
 
     def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:

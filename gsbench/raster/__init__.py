@@ -67,7 +67,7 @@ def rasterize(
         opacities: in [0, 1].
         colors: any number D of channels, one set for all cameras or one a camera.
         viewmats: world to camera, rigid, OpenCV axes (x right, y down, z forward).
-        Ks: intrinsics in pixels; the first pixel's centre is (0.5, 0.5).
+        Ks: intrinsics [fx 0 cx; 0 fy cy; 0 0 1] in pixels; the first pixel's centre is (0.5, 0.5).
         width: of the picture, pixels.
         height: of the picture, pixels.
         background: colour behind everything; None is black.
@@ -181,3 +181,6 @@ def check_values(
         raise InputError(f"opacities: expected values in [0, 1], got {low} to {high}")
     if (Ks.detach()[:, [0, 1], [0, 1]] <= 0).any():
         raise InputError("Ks: expected positive focal lengths at [0, 0] and [1, 1]")
+    rest = Ks.detach()[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
+    if (rest != rest.new_tensor([0.0, 0.0, 0.0, 0.0, 1.0])).any():
+        raise InputError("Ks: expected [fx 0 cx; 0 fy cy; 0 0 1]: skew is not drawn, undistort the images without it")

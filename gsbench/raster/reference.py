@@ -84,18 +84,22 @@ def project(
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).unflatten(-1, (2, 3))
     M = J @ rotation @ factors  # [N, 2, 3]: the 2D covariance is M M^T, never formed from a 3D one
-    m1, m2 = M.unbind(-2)
+    # In units of the splat's own size: det is of the fourth degree in pixels, and leaves float32 for a splat of 10^9.
+    size = (M.detach().square().sum((-2, -1)) + eps2d).sqrt()
+    size = torch.where(size > 0, size, 1.0)
+    m1, m2 = (M / size[:, None, None]).unbind(-2)
+    eps = eps2d / size.square()
 
     xx, xy, yy = (m1 * m1).sum(-1), (m1 * m2).sum(-1), (m2 * m2).sum(-1)
     # det(M M^T + e I) by Lagrange's identity, |m1|^2 |m2|^2 - (m1 m2)^2 = |m1 x m2|^2: nothing cancels for a needle.
     area2 = torch.linalg.cross(m1, m2).square().sum(-1)
-    det = area2 + eps2d * (xx + yy) + eps2d**2
+    det = area2 + eps * (xx + yy) + eps**2
     drawn = drawn & (det > 0)
     det = torch.where(drawn, det, 1.0)
     # Factored (x given y, then y), power = |U d|^2 / 2 is a sum of squares. Multiplied out it would cancel: along a
     # needle 400 pixels long, pictures in float32 were off by 2e-3.
-    yy = torch.where(drawn, yy + eps2d, 1.0)
-    conics = torch.stack([yy, -xy, det.sqrt()], -1) / (yy * det).sqrt()[:, None]
+    yy = torch.where(drawn, yy + eps, 1.0)
+    conics = torch.stack([yy, -xy, det.sqrt()], -1) / (yy * det).sqrt()[:, None] / size[:, None]
     if antialias:
         ratio = torch.where(area2 > 0, area2, 1.0) / det
         opacities = torch.where(area2 > 0, opacities * ratio.sqrt(), 0.0)
@@ -103,7 +107,7 @@ def project(
     # alpha >= 1/255 only where power <= ln(255 opacity); that ellipse's bounding box has half sizes
     # sqrt(2 power cov_xx), sqrt(2 power cov_yy). A hundredth of a pixel more, lest rounding cut off a pixel.
     power = (255 * opacities.detach()).clamp(min=1).log()
-    half_sizes = (2 * power[:, None] * torch.stack([xx + eps2d, yy], -1).detach()).sqrt() + 0.01
+    half_sizes = (2 * power[:, None] * torch.stack([xx + eps, yy], -1).detach()).sqrt() * size[:, None] + 0.01
     inside = ((means2d + half_sizes > 0) & (means2d - half_sizes < means2d.new_tensor([width, height]))).all(-1)
     drawn = drawn & (opacities >= ALPHA_MIN) & inside
     return Splats(means2d, conics, opacities, means_c[:, 2], torch.where(drawn[:, None], half_sizes, 0.0))

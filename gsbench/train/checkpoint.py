@@ -29,11 +29,20 @@ def load(path: Path, config_hash: str, data_hash: str, device: str) -> dict[str,
     """
     if not path.exists():
         return None
+    found, state = read(path, device)
+    return state if found == (VERSION, config_hash, data_hash) else None
+
+
+def read(path: Path, device: str = "cpu") -> tuple[tuple[int, str, str], dict[str, Any]]:
+    """Read version, config hash and data hash, and the state, of the checkpoint at `path`, whatever it is of.
+
+    Raises:
+        InputError: it is no checkpoint.
+    """
     try:
         content = torch.load(path, map_location=device, weights_only=True)
-        found = (content["version"], content["config"], content["data"])
         state: dict[str, Any] = content["state"]
+        return (content["version"], content["config"], content["data"]), state
     except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: expected a checkpoint, got {reason}; delete it to start over") from None
-    return state if found == (VERSION, config_hash, data_hash) else None

@@ -39,7 +39,14 @@ class Trainer:
     """One model, one scene, one run. `step` counts finished steps; the state is exact between two of them."""
 
     def __init__(self, model: GaussianModel, scene: Scene, views: list[View], config: Config) -> None:
-        """Fit `model`, already initialised and on `config.device`, to `scene.train`; `views` is the evaluated split."""
+        """Fit `model`, already initialised and on `config.device`, to `scene.train`; `views` is the evaluated split.
+
+        Raises:
+            InputError: an image has a value that is not finite.
+        """
+        for view in scene.train:
+            if not view.image.isfinite().all():
+                raise InputError(f"{view.name}: expected an image of finite values, got NaN or inf: render it again")
         train = config.train
         self.model = model
         self.scene = scene

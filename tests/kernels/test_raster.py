@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 from raster.cases import camera, case, gaussians, names
-from raster.oracle import paint
 from torch import Tensor
 
 from gsbench import kernels
 from gsbench.errors import InputError
 from gsbench.raster import RasterOutput, rasterize
+from gsbench.stability.brute import paint
 
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background")
 
@@ -38,8 +38,8 @@ def differentiate(arguments: dict[str, Any], backend: str, undecided: Tensor) ->
 
 
 def undecided_pixels(arguments: dict[str, Any]) -> Tensor:
-    arrays = {k: v.double().numpy() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-    return torch.from_numpy(paint(**arrays).slack <= 1e-3)
+    exact = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+    return paint(**exact).slack <= 1e-3
 
 
 @pytest.mark.usefixtures("instruction_set")
@@ -47,12 +47,11 @@ def undecided_pixels(arguments: dict[str, Any]) -> Tensor:
 def test_picture(name: str) -> None:
     """Catches any rule of the picture that differs, a bound that loses a pixel, and a wrong rounding in one ISA."""
     arguments = single(name)
-    arrays = {k: v.double().numpy() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-    picture = paint(**arrays)
+    picture = paint(**{k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()})
     output = rasterize(**arguments, backend="cpu")
     decided = picture.slack > 1e-3
-    np.testing.assert_allclose(output.image.numpy()[decided], picture.image[decided], rtol=0, atol=1e-4)
-    np.testing.assert_allclose(output.alpha.numpy()[decided], picture.alpha[decided], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(output.image[decided], picture.image[decided], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(output.alpha[decided], picture.alpha[decided], rtol=0, atol=1e-4)
 
 
 @pytest.mark.usefixtures("instruction_set")

@@ -126,9 +126,9 @@ def test_4dgs(scheme: str) -> None:
     for i, mean in enumerate(values["means"]):
         F = rotor_factor(values["left_quats"][i], values["right_quats"][i], values["scales"][i])
         S, offset = F @ F.T, TIME - values["times"][i, 0]
-        means.append(mean + S[:3, 3] / S[3, 3] * offset)
-        covariances.append(S[:3, :3] - np.outer(S[:3, 3], S[:3, 3]) / S[3, 3])
         f = math.exp(-0.5 * offset**2 / S[3, 3])
+        means.append(mean + S[:3, 3] / S[3, 3] * offset * (f > 0.05))  # what is not drawn stays at mu_p
+        covariances.append(S[:3, :3] - np.outer(S[:3, 3], S[:3, 3]) / S[3, 3])
         opacities.append((f if f > 0.05 else 0.0) / (1 + math.exp(-values["opacities"][i])))
     agree(model.slice(CAMERA, TIME), np.stack(means), np.stack(covariances), np.array(opacities))
     assert 0 < opacities.count(0) < N

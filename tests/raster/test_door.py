@@ -99,6 +99,11 @@ def test_large_sums_are_finite() -> None:
         ({"opacities": torch.full((40,), -0.1).double()}, "opacities: expected values in [0, 1]"),
         ({"Ks": torch.diag(torch.tensor([-5.0, 5.0, 1.0])).double()[None]}, "Ks: expected positive focal lengths"),
         ({"Ks": torch.diag(torch.tensor([5.0, 0.0, 1.0])).double()[None]}, "Ks: expected positive focal lengths"),
+        ({"Ks": torch.tensor([[[5.0, 0.1, 8], [0, 5, 6], [0, 0, 1]]]).double()}, "skew is not drawn"),
+        (
+            {"Ks": torch.tensor([[[5.0, 0, 8], [0, 5, 6], [0, 0, 2]]]).double()},
+            "Ks: expected [fx 0 cx; 0 fy cy; 0 0 1]",
+        ),
         ({"backend": "refrence"}, "Did you mean 'reference'?"),
         ({"backend": ""}, "raster backend ''"),
     ],

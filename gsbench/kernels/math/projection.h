@@ -5,6 +5,8 @@
 //   det = |m1 x m2|^2 + eps2d (|m1|^2 + |m2|^2) + eps2d^2            (Lagrange's identity)
 //   power = w^2 + u^2,  w = p dx,  u = q dx + r dy                    (a triangular root of the inverse)
 // so a needle's falloff is exact to rounding and never negative. p, q, r are scaled to powers of two: alpha = o 2^-power.
+// det is of the fourth degree in pixels, and leaves float32 for a splat of 10^9: everything is in units of `size`, the
+// splat's own, which is a constant to the derivatives since the result does not depend on it.
 #pragma once
 
 #include "scalar.h"
@@ -61,7 +63,8 @@ struct Projection {
     T x, y, z, inv_z;  // camera space
     T tan_x, tan_y;    // clamped
     Vec3<T> j1, j2;    // rows of J W
-    Vec3<T> m1, m2;    // rows of M = J W F
+    Vec3<T> m1, m2;    // rows of M = J W F, over size
+    T size, unit, eps;  // pixels; 1 / size; eps2d over size^2
     T area2, xx, xy, yy, det, compensation;
 
     GSB_HD Projection(const Camera& camera, const Vec3<T>& mean, const Vec3<T> (&F)[3], T opacity)
@@ -87,14 +90,20 @@ struct Projection {
         j2 = (R[1] - R[2] * tan_y) * (inv_z * camera.fy);
         m1 = factor[0] * j1.x + factor[1] * j1.y + factor[2] * j1.z;
         m2 = factor[0] * j2.x + factor[1] * j2.y + factor[2] * j2.z;
+        const T square = dot(m1, m1) + dot(m2, m2) + camera.eps2d;
+        size = sqrt(select(square > zero, square, one));
+        unit = one / size;
+        eps = unit * unit * camera.eps2d;
+        m1 = m1 * unit;
+        m2 = m2 * unit;
 
         const Vec3<T> normal = cross(m1, m2);
         area2 = dot(normal, normal);
         const T traceless_xx = dot(m1, m1), traceless_yy = dot(m2, m2);
-        xx = traceless_xx + camera.eps2d;
-        yy = traceless_yy + camera.eps2d;
+        xx = traceless_xx + eps;
+        yy = traceless_yy + eps;
         xy = dot(m1, m2);
-        det = area2 + (traceless_xx + traceless_yy) * camera.eps2d + camera.eps2d * camera.eps2d;
+        det = area2 + (traceless_xx + traceless_yy) * eps + eps * eps;
         const auto solid = in_range & (det > zero);
         det = select(solid, det, one);
         xx = select(solid, xx, one);
@@ -103,15 +112,15 @@ struct Projection {
         Splat<T> s;
         s.x = x * inv_z * camera.fx + camera.cx;
         s.y = y * inv_z * camera.fy + camera.cy;
-        s.p = T(SQRT_HALF_LOG2_E) / sqrt(xx);
-        s.r = sqrt(xx / det) * SQRT_HALF_LOG2_E;
+        s.p = unit * SQRT_HALF_LOG2_E / sqrt(xx);
+        s.r = sqrt(xx / det) * (unit * SQRT_HALF_LOG2_E);
         s.q = zero - xy / xx * s.r;
         s.opacity = opacity * compensation;
         s.depth = depth;
         // alpha >= 1/255 only where power <= log2(255 o): that ellipse's bounding box.
         const T reach = log2(max(s.opacity * 255.0f, one)) * (1.0f / HALF_LOG2_E);
-        s.half_x = sqrt(reach * xx) + BOUNDS_MARGIN;
-        s.half_y = sqrt(reach * yy) + BOUNDS_MARGIN;
+        s.half_x = sqrt(reach * xx) * size + BOUNDS_MARGIN;
+        s.half_y = sqrt(reach * yy) * size + BOUNDS_MARGIN;
         const auto drawn = solid & (s.opacity >= T(ALPHA_MIN)) & (s.x + s.half_x > zero) & (s.y + s.half_y > zero) &
                            (s.x - s.half_x < T(camera.width)) & (s.y - s.half_y < T(camera.height));
         s.half_x = select(drawn, s.half_x, zero);
@@ -139,12 +148,12 @@ struct Projection {
             g_det = g_det - half / det;
         }
         g_area2 = g_area2 + g_det;
-        g_xx = g_xx + g_det * camera.eps2d;
-        const T g_yy = g_det * camera.eps2d;
+        g_xx = g_xx + g_det * eps;
+        const T g_yy = g_det * eps;
         // to m1, m2 and on to F and J W
         const Vec3<T> normal = cross(m1, m2);
-        const Vec3<T> g_m1 = m1 * (g_xx * 2.0f) + m2 * g_xy + cross(m2, normal) * (g_area2 * 2.0f);
-        const Vec3<T> g_m2 = m2 * (g_yy * 2.0f) + m1 * g_xy + cross(normal, m1) * (g_area2 * 2.0f);
+        const Vec3<T> g_m1 = (m1 * (g_xx * 2.0f) + m2 * g_xy + cross(m2, normal) * (g_area2 * 2.0f)) * unit;
+        const Vec3<T> g_m2 = (m2 * (g_yy * 2.0f) + m1 * g_xy + cross(normal, m1) * (g_area2 * 2.0f)) * unit;
         out.factor[0] = g_m1 * j1.x + g_m2 * j2.x;
         out.factor[1] = g_m1 * j1.y + g_m2 * j2.y;
         out.factor[2] = g_m1 * j1.z + g_m2 * j2.z;

@@ -7,8 +7,6 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-constexpr float TIME_GATE_MIN = 0.05f;  // a Gaussian whose f_temp is not above this is not drawn (4DGS)
-
 template <class T>
 struct RotatedParameters {
     T mean[3], time, scales[4], left[4], right[4], opacity;  // log scales; the last a logit
@@ -48,6 +46,7 @@ struct RotatedGaussian {
     float lambda_t, observed;
     UnitQuaternion<T> left, right;
     T L[4][4], R[4][4], F[4][4], size[4];  // F = L R diag(size), rows (x, y, z, t)
+    T leads[4];                            // 1 for the column that is largest in t, else 0
     Reflections<T, 1> reflections;
     Reduced<T, 1> t;
     T white[1], gate, opacity;
@@ -58,26 +57,34 @@ struct RotatedGaussian {
     GSB_HD Observed<T> observe() {
         const T zero(0.0f);
         GSB_UNROLL for (int i = 0; i < 4; ++i) {
-            size[i] = exp(raw.scales[i]);
+            size[i] = size_of(raw.scales[i]);
             GSB_UNROLL for (int j = 0; j < 4; ++j) {
                 L[i][j] = left.q[i ^ j] * LEFT_SIGN(i, j);
                 R[i][j] = right.q[i ^ j] * RIGHT_SIGN(i, j);
             }
         }
-        T rows[4][4];  // t, then p
         for (int i = 0; i < 4; ++i) {
             for (int j = 0; j < 4; ++j) {
                 T sum = zero;
                 for (int k = 0; k < 4; ++k) sum = sum + L[i][k] * R[k][j];
                 F[i][j] = sum * size[j];
-                rows[(i + 1) % 4][j] = F[i][j];
             }
         }
+        lead();
+        T rows[4][4];  // t, then p
+        for (int i = 0; i < 4; ++i) {
+            for (int j = 0; j < 4; ++j) rows[(i + 1) % 4][j] = F[i][j];
+        }
+        swap_columns(rows);
         reflections.reduce(rows, t);
         const T delta[1] = {T(observed) - raw.time};
         whiten(t, delta, white);
         gate = exp(white[0] * white[0] * (-0.5f * lambda_t));
-        gate = select(gate > T(TIME_GATE_MIN), gate, zero);
+        // What is not drawn stays where it is, lest its huge numbers reach a gradient.
+        const auto seen = gate > T(TIME_GATE_MIN);
+        gate = select(seen, gate, zero);
+        white[0] = select(seen, white[0], zero);
+        t.qq[0][0] = select(seen, t.qq[0][0], T(1.0f));
         opacity = sigmoid(raw.opacity);
 
         Observed<T> out;
@@ -106,16 +113,19 @@ struct RotatedGaussian {
         out.lambda_t = g_exponent * white[0] * white[0] * 0.5f;
         T g_white[1] = {g_exponent * white[0] * lambda_t};
         moved_mean_vjp(t, white, {g.mean[0], g.mean[1], g.mean[2]}, g_white, g_t);
+        g_white[0] = select(gate > zero, g_white[0], zero);
         whiten_vjp(t, white, g_white, g_t);  // now that of delta
         out.time = zero - g_white[0];
         T g_rows[4][4], g_M[4][4], g_left[4] = {zero, zero, zero, zero}, g_right[4] = {zero, zero, zero, zero};
         reflections.vjp(g_t, g_rows);
+        swap_columns(g_rows);
         for (int j = 0; j < 4; ++j) {
-            out.scales[j] = zero;
+            T along = zero;  // the gradient of log size is that of F's column along the column itself
             for (int i = 0; i < 4; ++i) {
-                out.scales[j] = out.scales[j] + g_rows[(i + 1) % 4][j] * F[i][j];
+                along = along + g_rows[(i + 1) % 4][j] * F[i][j];
                 g_M[i][j] = g_rows[(i + 1) % 4][j] * size[j];
             }
+            out.scales[j] = size_vjp(raw.scales[j], T(1.0f), along);
         }
         for (int i = 0; i < 4; ++i) {
             for (int j = 0; j < 4; ++j) {
@@ -130,6 +140,34 @@ struct RotatedGaussian {
         }
         left.vjp(g_left, out.left);
         right.vjp(g_right, out.right);
+    }
+
+private:
+    // Columns of F differ by factors of 10^7 where a Gaussian is long in time. A reflection is accurate in each of them,
+    // and not only in the largest, if it starts with the column that is largest in the row it clears (Powell and Reid
+    // 1969; Cox and Higham 1998). F F^T does not depend on the order of columns.
+    GSB_HD void lead() {
+        const T zero(0.0f), one(1.0f);
+        T most(-1.0f);
+        GSB_UNROLL for (int j = 0; j < 4; ++j) most = max(most, max(F[3][j], zero - F[3][j]));
+        T open(1.0f);
+        GSB_UNROLL for (int j = 0; j < 4; ++j) {
+            leads[j] = select(most <= max(F[3][j], zero - F[3][j]), open, zero);
+            open = open - leads[j];
+        }
+    }
+
+    // Swaps the first column with the leading one; twice, nothing is changed.
+    GSB_HD void swap_columns(T (&rows)[4][4]) const {
+        const T half(0.5f);
+        GSB_UNROLL for (int j = 1; j < 4; ++j) {
+            const auto swapped = leads[j] > half;
+            GSB_UNROLL for (int i = 0; i < 4; ++i) {
+                const T first = rows[i][0];
+                rows[i][0] = select(swapped, rows[i][j], first);
+                rows[i][j] = select(swapped, first, rows[i][j]);
+            }
+        }
     }
 };
 

@@ -2,13 +2,22 @@
 #pragma once
 
 #include "harmonics.h"
+#include "thresholds.h"
 #include "slicing.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
 
-constexpr float LOG_DIAGONAL_MAX = 16.0f;  // a logarithm beyond acts as this one does
-constexpr float EXPONENT_MAX = 80.0f;  // exp(-80) = 2e-35: beyond, nothing is left of a Gaussian
+// exp of a log size held to +-LOG_SIZE_MAX, and its derivative from the value, zero where it was held.
+template <class T>
+GSB_HD inline T size_of(T log) {
+    return exp(clamp(log, T(-LOG_SIZE_MAX), T(LOG_SIZE_MAX)));
+}
+
+template <class T>
+GSB_HD inline T size_vjp(T log, T size, T g) {
+    return select(max(log, T(0.0f) - log) <= T(LOG_SIZE_MAX), g * size, T(0.0f));
+}
 
 // What is the same for all Gaussians of a model.
 struct TriangularModel {
@@ -143,7 +152,7 @@ private:
     GSB_HD void make_factor() {
         int at = 0;
         GSB_UNROLL for (int i = 0; i < N; ++i) {
-            L[i][i] = exp(clamp(raw.log_diagonal[i], T(-LOG_DIAGONAL_MAX), T(LOG_DIAGONAL_MAX)));
+            L[i][i] = size_of(raw.log_diagonal[i]);
             GSB_UNROLL for (int j = 0; j < i; ++j) {
                 const T x = raw.off_diagonal[at++];
                 L[i][j] = model.row_scaled ? (sigmoid(x) * 2.0f - 1.0f) * L[i][i] : x;
@@ -178,8 +187,7 @@ private:
                     out.off_diagonal[at] = g_L[i][j];
                 }
             }
-            const T size = max(raw.log_diagonal[i], T(0.0f) - raw.log_diagonal[i]);
-            out.log_diagonal[i] = select(size <= T(LOG_DIAGONAL_MAX), g_diagonal * L[i][i], T(0.0f));
+            out.log_diagonal[i] = size_vjp(raw.log_diagonal[i], L[i][i], g_diagonal);
         }
     }
 };

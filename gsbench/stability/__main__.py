@@ -1,0 +1,49 @@
+"""``python -m gsbench.stability``: audit hard cases, write the page; exit with 1 where a default breaks its bound."""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from gsbench.errors import InputError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the audit, or look at a checkpoint; see `--help`."""
+    parser = argparse.ArgumentParser(prog="python -m gsbench.stability", description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("results/stability"), help="folder of the results")
+    parser.add_argument("--long", action="store_true", help="train for 2,000 steps at 30 times the learning rates")
+    parser.add_argument("--checkpoint", type=Path, metavar="FILE",
+                        help="no audit: the condition numbers in a trained model")  # fmt: skip
+    options = parser.parse_args(arguments)
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    if options.checkpoint:
+        return show_spectrum(options.checkpoint, options.out)
+    from gsbench.stability import audit, page  # imports torch
+
+    found = audit.run(long=options.long)
+    page.write(found, options.out)
+    print(page.table(found))
+    print(page.verdict(found))
+    print(f"Written: {options.out / 'page.md'}, table.md, table.csv, audit.json")
+    return 1 if found.broken else 0
+
+
+def show_spectrum(checkpoint: Path, folder: Path) -> int:
+    """Print and draw the condition numbers in a checkpoint; 2 where it is none."""
+    from gsbench.stability import spectrum
+
+    try:
+        found, failures = spectrum.measure(checkpoint), spectrum.failures(checkpoint)
+    except InputError as error:
+        print(f"gsbench.stability: error: {error}", file=sys.stderr)
+        return 2
+    print(spectrum.report(found))
+    for scheme, (share, worst) in failures.items():
+        print(f"{scheme} in float32: {100 * share:.2f} % indefinite, 99th percentile of the error {worst:.1e}")
+    print(f"Written: {spectrum.draw(found, folder, '/'.join(checkpoint.parts[-4:-1]))}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

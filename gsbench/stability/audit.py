@@ -1,0 +1,114 @@
+"""The audit: every case for every model, scheme and backend, a million hard slices, what accuracy and safety cost."""
+
+import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeVar
+
+import torch
+from tqdm import tqdm
+
+from gsbench.errors import InputError
+from gsbench.models.slicing import SCHEMES
+from gsbench.models.triangular import FACTOR_ORDERS
+from gsbench.raster import choose_backend
+from gsbench.stability import colors, curves, pictures, population, slices, trainings
+from gsbench.stability.cases import Bound, Cell, of_area
+from gsbench.stability.training_cases import LONG_STEPS
+
+BACKENDS = ("cpu", "cuda", "reference")
+MILLION = 1_000_000
+SUBTRACTING = 100_000  # Gaussians for the schemes that subtract: their failures are no rare event
+SEED = 0
+T = TypeVar("T")
+
+
+@dataclass
+class Audit:
+    """All that was found."""
+
+    backends: list[str]
+    cells: list[Cell] = field(default_factory=list)
+    verified: dict[str, float] = field(default_factory=dict)  # float64 against mpmath, by factor order
+    conditions: list[curves.ConditionCurve] = field(default_factory=list)
+    accuracy: list[curves.Point] = field(default_factory=list)
+    safety: list[curves.Cost] = field(default_factory=list)
+    seconds: float = 0.0
+
+    @property
+    def broken(self) -> list[Cell]:
+        """The cells where a default breaks its bound."""
+        return [cell for cell in self.cells if cell.is_default and not cell.holds]
+
+
+def present() -> list[str]:
+    """The backends of this installation on this machine."""
+    found = []
+    for name in BACKENDS:
+        try:
+            found.append(choose_backend(name, "cuda" if name == "cuda" else "cpu"))
+        except InputError:
+            continue
+    return found
+
+
+def run(million: int = MILLION, *, long: bool = False) -> Audit:
+    """Everything, with a progress bar on stderr.
+
+    Args:
+        million: how many hard slices are drawn.
+        long: train for 2,000 steps where the short audit trains for 150.
+    """
+    began = time.perf_counter()
+    audit = Audit(present())
+    with tqdm(_steps(audit, million, long), desc="stability", file=sys.stderr) as steps:
+        for name, step in steps:
+            steps.set_postfix_str(name)
+            step()
+    audit.seconds = time.perf_counter() - began
+    return audit
+
+
+def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Callable[[], None]]]:
+    """What is to be done, as names and calls."""
+    steps: list[tuple[str, Callable[[], None]]] = []
+
+    def add(name: str, found: list[T], more: Callable[[], Iterable[T]]) -> None:
+        steps.append((name, lambda: found.extend(more())))
+
+    fastest = audit.backends[0]
+    for area, judge in (("slicing", slices.judge), ("colour", colors.judge), ("projection", pictures.judge),
+                        ("blending", pictures.judge)):  # fmt: skip
+        for case in of_area(area):
+            add(case.name, audit.cells, partial(judge, case, audit.backends))
+    for case in of_area("training"):
+        more = {"steps": LONG_STEPS} if long and case.name == "learning_rates_times_30" else {}
+        add(case.name, audit.cells, partial(trainings.judge, case, fastest, **more))
+    for case in of_area("drift"):
+        add(case.name, audit.cells, partial(trainings.drift, case, fastest))
+    for order in FACTOR_ORDERS:
+        steps.append((f"hard slices, {order}", partial(hard_slices, audit, order, million)))
+    add("error by condition number", audit.conditions, curves.by_condition)
+    add("error by time", audit.accuracy, partial(curves.accuracy_for_time, audit.backends))
+    add("cost of safety", audit.safety, partial(curves.safety, audit.backends))
+    return steps
+
+
+def hard_slices(audit: Audit, order: str, N: int) -> None:
+    """7DGS on N random factors with diagonals to 1e-5; a cell's errors are the 99.9th percentiles."""
+    hard = population.draw(torch.Generator().manual_seed(SEED), N, order)
+    known = population.truth(hard, order)
+    audit.verified[order] = population.verify(hard, order)
+    for scheme in SCHEMES:
+        count = N if scheme == "square_root" else min(N, SUBTRACTING)
+        for backend in audit.backends if scheme == "square_root" else ["reference"]:
+            start = time.perf_counter()
+            errors = population.judge(hard.rows(slice(count)), known, order, scheme, backend)
+            ms = 1e3 * (time.perf_counter() - start)
+            forward, gradient = (curves.percentile(x) for x in (errors.cov, errors.gradient))
+            audit.cells.append(
+                Cell("population", f"hard_slices_{order}", "7dgs", scheme, backend, forward, gradient,
+                     float(errors.bad.mean()), ms, Bound(), f"{count} slices")
+            )  # fmt: skip

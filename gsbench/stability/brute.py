@@ -1,0 +1,128 @@
+"""The truth about pictures by brute force: float64, every Gaussian at every pixel, no tiles, no bounds, no code shared.
+
+Written from the rules of the picture (3DGS: Kerbl et al. 2023; EWA: Zwicker et al. 2001) and not from a rasterizer.
+Gradients are those of autograd through these lines.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+PRODUCTS = 1 << 21  # (Gaussian, pixel) products at a time: bounds memory
+Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`
+DIFFERENTIABLE = ("means", "factors", "opacities", "colors")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What the oracle saw."""
+
+    image: Tensor  # [C, H, W, D]
+    alpha: Tensor  # [C, H, W, 1]
+    touched: Tensor  # [C, N, H, W] bool: the Gaussian's alpha is at least 1/255 here
+    slack: Tensor  # [C, H, W] relative distance of the closest decision to its threshold: small ones may flip
+
+
+class _Splats(NamedTuple):
+    """Gaussians on the picture of one camera, front to back."""
+
+    order: Tensor  # [M] their numbers; what is out of range is left out
+    centers: Tensor  # [M, 2] pixels
+    covs: Tensor  # [M, 2, 2] pixels^2
+    opacities: Tensor  # [M]
+    colors: Tensor  # [M, D]
+
+
+def paint(
+    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, *, offsets2d: Tensor | None = None, background: Tensor | None = None, **options: Any,
+) -> Picture:  # fmt: skip
+    """Draw what `gsbench.raster.rasterize` is asked to, from float64 tensors; `offsets2d` [C, N, 2] moves centres."""
+    C, N, D = len(viewmats), len(means), colors.shape[-1]
+    background = torch.zeros(D).double() if background is None else background
+    image, alpha = means.new_zeros(C, height * width, D), means.new_zeros(C, height * width, 1)
+    touched, slack = torch.zeros(C, N, height * width, dtype=torch.bool), means.new_zeros(C, height * width)
+    for c in range(C):
+        own = colors if colors.dim() == 2 else colors[c]
+        moved = None if offsets2d is None else offsets2d[c]
+        splats = _project(means, factors, opacities, own, viewmats[c], Ks[c], width, height, moved, **options)
+        for at, pixels in _pixels(width, height, N):
+            image[c, at], alpha[c, at], some, slack[c, at] = _blend(splats, pixels, background)
+            touched[c, splats.order[:, None], at] = some
+    shape = (C, height, width)
+    return Picture(image.view(*shape, D), alpha.view(*shape, 1), touched.view(C, N, height, width), slack.view(shape))
+
+
+def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) -> dict[str, Tensor]:
+    """Gradients of the sum of weight [C, H, W, D] x image + weight_alpha [C, H, W, 1] x alpha, by DIFFERENTIABLE."""
+    inputs = {name: arguments[name].detach().requires_grad_() for name in DIFFERENTIABLE}
+    rest = {name: value for name, value in arguments.items() if name not in DIFFERENTIABLE}
+    viewmats, Ks, width, height = (rest.pop(name) for name in ("viewmats", "Ks", "width", "height"))
+    background = rest.pop("background", None)
+    background = weight.new_zeros(weight.shape[-1]) if background is None else background
+    for c in range(len(viewmats)):
+        for at, pixels in _pixels(width, height, len(inputs["means"])):
+            own = inputs["colors"] if inputs["colors"].dim() == 2 else inputs["colors"][c]
+            splats = _project(inputs["means"], inputs["factors"], inputs["opacities"], own, viewmats[c], Ks[c],
+                              width, height, None, **rest)  # fmt: skip
+            image, alpha, _, _ = _blend(splats, pixels, background)
+            loss = (image * weight[c].flatten(0, 1)[at]).sum() + (alpha * weight_alpha[c].flatten(0, 1)[at]).sum()
+            if loss.requires_grad:
+                loss.backward()
+    return {name: torch.zeros_like(x) if x.grad is None else x.grad for name, x in inputs.items()}
+
+
+def _pixels(width: int, height: int, N: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Numbers of some pixels [P] and their centres [P, 2], until all were given."""
+    for at in torch.arange(width * height).split(max(1, PRODUCTS // max(1, N))):
+        yield at, torch.stack([at % width, at // width], -1) + 0.5
+
+
+def _project(
+    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmat: Tensor, K: Tensor,
+    width: int, height: int, offsets: Tensor | None, near: float = 0.01, far: float = 1e10, eps2d: float = 0.3,
+    antialias: bool = False,
+) -> _Splats:  # fmt: skip
+    R = viewmat[:3, :3]
+    camera = means @ R.T + viewmat[:3, 3]
+    order = torch.sort(camera[:, 2].detach(), stable=True).indices
+    order = order[(camera[order, 2] > near) & (camera[order, 2] < far)]
+    x, y, z = camera[order].T
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    centers = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
+    # The Jacobian is taken at the mean, moved to at most 15 % of the picture outside of it (3DGS).
+    size = means.new_tensor([width, height])
+    u, v = ((centers.clamp(-0.15 * size, 1.15 * size) - K[:2, 2]) / torch.stack([fx, fy])).T
+    J = means.new_zeros(len(order), 2, 3)
+    J[:, 0, 0], J[:, 0, 2], J[:, 1, 1], J[:, 1, 2] = fx / z, -fx * u / z, fy / z, -fy * v / z
+    cov3 = R @ factors[order] @ factors[order].mT @ R.T
+    covs = J @ cov3 @ J.mT
+    blurred = covs + eps2d * torch.eye(2).double()
+    opacities = opacities[order]
+    if antialias:
+        opacities = opacities * (torch.linalg.det(covs).clamp(min=0) / torch.linalg.det(blurred)).sqrt()
+    centers = centers if offsets is None else centers + offsets[order]
+    return _Splats(order, centers, blurred, opacities, colors[order])
+
+
+def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Image [P, D], alpha [P, 1], touched [M, P] and slack [P] of some pixels."""
+    dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
+    xx, xy, yy = (splats.covs[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    power = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
+    a = (splats.opacities[:, None] * torch.exp(-power)).clamp(max=0.999)
+    touched = a >= 1 / 255
+    after = torch.where(touched, 1 - a, 1.0).cumprod(0)
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    blended = touched & (after >= 1e-4)
+    weight = torch.where(blended, a * before, 0.0)
+    alpha = weight.sum(0)[:, None]
+    image = weight.T @ splats.colors + (1 - alpha) * background
+    going = before >= 1e-4  # the first that would bring the light below this ends the pixel
+    distance = torch.where(going, (255 * a - 1).abs(), torch.inf)
+    distance = torch.where(going & touched, torch.minimum(distance, (after / 1e-4 - 1).abs()), distance)
+    slack = distance.amin(0) if len(distance) else torch.full((len(pixels),), torch.inf).double()
+    return image, alpha, touched & going, slack.detach()

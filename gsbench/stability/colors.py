@@ -1,0 +1,120 @@
+"""Hard colours and their judge: spherical harmonics and waves in time, beside mpmath."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from mpmath import mpf
+from torch import Generator, Tensor
+
+from gsbench.models import build
+from gsbench.stability import oracle
+from gsbench.stability.cases import Case, Cell, case, device_of
+from gsbench.stability.slices import fastest, worst
+
+COUNT = 3  # Gaussians a case
+WAVES = {"3dgs": 1, "4dgs": 3}
+COPIES = 1024  # of a case's Gaussians, where it is timed
+
+
+@dataclass
+class Shown:
+    """Gaussians of one model, and where they are looked at from, when."""
+
+    model: str
+    means: Tensor  # [COUNT, 3]
+    times: Tensor  # [COUNT, 1]
+    sh: Tensor  # [COUNT, waves x 16, 3]
+    center: Tensor
+    time: float = 0.4
+
+
+def ordinary(g: Generator, model: str) -> Shown:
+    """Colours of the size that training finds."""
+    sh = 0.3 * torch.randn(COUNT, 16 * WAVES[model], 3, generator=g)
+    return Shown(model, torch.randn(COUNT, 3, generator=g), torch.rand(COUNT, 1, generator=g), sh,
+                 torch.tensor([0.3, -0.2, -4.0]))  # fmt: skip
+
+
+@case("colour", "3dgs", "4dgs")
+def ordinary_colors(g: Generator, severity: float, model: str) -> Shown:  # noqa: ARG001
+    """Nothing: the floor that the other rows are read against."""
+    return ordinary(g, model)
+
+
+@case("colour", "3dgs", "4dgs")
+def seen_from_within(g: Generator, severity: float, model: str) -> Shown:
+    """The camera on a mean, and 10^-12 and 10^-6 beside it: the direction is 0/0, by definition 0, and its gradient."""
+    shown = ordinary(g, model)
+    aside = torch.tensor([0.0, 1e-12, 1e-6])[:, None] + 1 - severity
+    shown.center, shown.means = torch.zeros(3), aside * torch.tensor([[1.0, -2.0, 0.5]])
+    return shown
+
+
+@case("colour", "3dgs", "4dgs")
+def loud_harmonics(g: Generator, severity: float, model: str) -> Shown:
+    """Coefficients of 10^4: harmonics of degree 3 that cancel to a visible colour."""
+    shown = ordinary(g, model)
+    shown.sh *= 10 ** (4 * severity)
+    return shown
+
+
+@case("colour", "4dgs", forward=1e-3, gradient=1e-2)
+def far_in_time(g: Generator, severity: float, model: str) -> Shown:
+    """t - mu_t = 1000 periods: mu_t itself has an ulp of 6e-5 there, which is 8e-4 in the phase of the second wave."""
+    shown = ordinary(g, model)
+    shown.times += 1000 * severity
+    return shown
+
+
+def judge(found: Case, backends: list[str]) -> Iterator[Cell]:
+    """Every model and backend; errors relative to the brightest colour or 1, and to each gradient."""
+    for model in found.subjects:
+        shown = found(model=model)
+        g = torch.Generator().manual_seed(1)
+        weight = torch.randn(COUNT, 3, generator=g, dtype=torch.float64)
+        along = torch.randn(shown.sh[0].numel(), generator=g, dtype=torch.float64)
+        color, slope = truth(shown, weight, along)
+        for backend in backends:
+            got, gradient = differentiate(shown, backend, weight, 1)
+            gradient = torch.cat([gradient[:, :4], gradient[:, 4:] @ along[:, None]], 1)
+            bad = ~(got.isfinite().all(1) & gradient.isfinite().all(1))
+            ms = fastest(partial(differentiate, shown, backend, weight, COPIES))
+            yield Cell(
+                found.area, found.name, model, "-", backend, worst((got - color).abs() / color.max().clamp(min=1)),
+                worst((gradient - slope).norm(dim=1) / slope.norm(dim=1)), float(bad.double().mean()), ms, found.bound,
+            )  # fmt: skip
+
+
+def truth(shown: Shown, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
+    """Colours [COUNT, 3] and gradients [COUNT, 5]: by mean, time, and one direction of all coefficients at once."""
+    layout = {"means": 3, "times": 1, "sh": len(along)}
+    time = float(torch.tensor(shown.time))
+    colors, slopes = [], []
+    for i, w in enumerate(weight.tolist()):
+        sh = [mpf(x) for x in shown.sh[i].flatten().tolist()]
+
+        def exact(x: oracle.Vector, sh: oracle.Vector = sh) -> oracle.Vector:
+            moved = [a + x[4] * mpf(b) for a, b in zip(sh, along.tolist(), strict=True)]
+            return oracle.colors([*x[:4], *moved], layout, shown.center.tolist(), WAVES[shown.model], time)
+
+        at = [*shown.means[i].tolist(), *shown.times[i].tolist(), 0.0]
+        colors.append([float(v) for v in oracle.evaluate(exact, at)])
+        slopes.append([float(v) for v in oracle.gradient(exact, at, w)])
+    return torch.tensor(colors, dtype=torch.float64), torch.tensor(slopes, dtype=torch.float64)
+
+
+def differentiate(shown: Shown, backend: str, weight: Tensor, copies: int) -> tuple[Tensor, Tensor]:
+    """Colours [N, 3] and their gradients [N, 4 + coefficients], computed in float32."""
+    model, device = build(shown.model), device_of(backend)
+    model.backend = backend
+    rows = torch.arange(COUNT).repeat(copies)
+    inputs = [value[rows].requires_grad_() for value in (shown.means, shown.times, shown.sh)]
+    means, times, sh = (value.to(device) for value in inputs)
+    sh0 = sh[:, None, :1] if shown.model == "4dgs" else sh[:, :1]
+    raw = {"means": means, "times": times, "sh0": sh0, "shN": sh[:, 1:]}
+    moment = torch.tensor(shown.time, device=device)
+    color = model.paint(raw, means, torch.ones_like(means[:, 0]), shown.center.to(device), moment).cpu()
+    gradients = torch.autograd.grad(color.double(), inputs, weight.repeat(copies, 1), materialize_grads=True)
+    return color.detach().double(), torch.cat([g.flatten(1).double() for g in gradients], 1)

@@ -1,0 +1,167 @@
+"""Error against condition number, error against time, and what the square-root scheme costs beside the others."""
+
+import itertools
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsbench import kernels
+from gsbench.measure.speed import synchroniser
+from gsbench.models import build
+from gsbench.models.slicing import SCHEMES
+from gsbench.models.triangular import FACTOR_ORDERS
+from gsbench.stability import picture_cases, pictures, population, slices
+from gsbench.stability.cases import device_of
+from gsbench.stability.picture_cases import Arguments
+
+SPREAD = 40_000  # Gaussians of the curve by condition number
+DECADES = 8.0  # their factors' diagonals go down to 10^-DECADES, each Gaussian's to somewhere between that and 1
+BINS = np.arange(0, 13)  # powers of ten of the condition number
+LEAST = 50  # Gaussians in a bin, below which it is not shown
+TIMED = 100_000  # Gaussians of the comparison of costs
+REPEATS = 3
+SLICED = 20_000  # Gaussians, and ..
+DRAWN = 1_500  # .. Gaussians in a picture of so many pixels a side, of the accuracy-for-time curve
+PICTURE = 96
+PERCENTILE = 0.999  # of errors over a population, that bounds are about
+
+
+@dataclass(frozen=True)
+class ConditionCurve:
+    """Errors of one scheme by the condition number of the factor, in float32."""
+
+    scheme: str
+    condition: list[float]  # middle of each bin
+    median: list[float]
+    percentile99: list[float]
+    bad: list[float]  # share not finite or indefinite
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Milliseconds of slicing TIMED 7D Gaussians, medians over REPEATS."""
+
+    order: str
+    scheme: str
+    backend: str
+    forward: float
+    backward: float
+
+
+@dataclass(frozen=True)
+class Point:
+    """What accuracy costs: one way to do one thing."""
+
+    thing: str  # "slicing" or "picture"
+    way: str
+    error: float  # 99.9th percentile of a covariance; largest of a decided pixel
+    ms: float  # forward and backward
+
+
+def accuracy_for_time(backends: list[str]) -> Iterator[Point]:
+    """Slices of SLICED hard Gaussians and a picture of a crowd, in every scheme, precision and instruction set."""
+    hard = population.draw(torch.Generator().manual_seed(4), SLICED, "paper")
+    known = population.truth(hard, "paper")
+    for scheme in SCHEMES:
+        for dtype in (torch.float32, torch.float64):
+            yield _sliced(hard, known, scheme, "reference", dtype)
+    for backend in backends:
+        if backend != "reference":
+            yield _sliced(hard, known, "square_root", backend, torch.float32)
+    arguments = picture_cases.crowd(torch.Generator().manual_seed(5), DRAWN, 0.05)
+    scale = picture_cases.intrinsics(6 * picture_cases.FOCAL, 6 * picture_cases.FOCAL, PICTURE / 2, PICTURE / 2)
+    arguments |= {"width": PICTURE, "height": PICTURE, "Ks": scale}
+    truth = pictures.together(arguments)
+    for backend in backends:
+        if backend == "cpu":
+            active = kernels.native().active()
+            for level in kernels.native().instruction_sets():
+                kernels.use_instruction_set(level)
+                yield _drawn(arguments, truth, backend, torch.float32, f"cpu, {level}")
+            kernels.use_instruction_set(active)
+        else:
+            yield _drawn(arguments, truth, backend, torch.float32, f"{backend} float32")
+    yield _drawn(arguments, truth, "reference", torch.float64, "reference float64")
+
+
+def _sliced(hard: population.Hard, known: population.Truth, scheme: str, backend: str, dtype: torch.dtype) -> Point:
+    model = population.all_seen("paper", scheme, backend).to(dtype)
+    device = device_of(backend)
+    raw = {name: value.to(device, dtype).requires_grad_() for name, value in population.raw_parameters(hard).items()}
+    center, moment = torch.zeros(3, device=device, dtype=dtype), torch.zeros((), device=device, dtype=dtype)
+
+    def both() -> Tensor:
+        out = model.observe(raw, center, moment)
+        torch.autograd.grad(out, list(raw.values()), [torch.ones_like(x) for x in out], allow_unused=True)
+        synchroniser(device)()
+        return out[1].detach().cpu().double()
+
+    F = both()
+    exact = torch.from_numpy(known.cov)
+    errors = ((F @ F.mT - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))).numpy()
+    precision = str(dtype).removeprefix("torch.")
+    return Point("slicing", f"{scheme} {backend} {precision}", percentile(errors), slices.fastest(both))
+
+
+def _drawn(arguments: Arguments, truth: pictures.Truth, backend: str, dtype: torch.dtype, way: str) -> Point:
+    image, _, decided, _ = truth
+    weights = pictures.weights(arguments)
+    cast = {name: value.to(dtype) if isinstance(value, Tensor) else value for name, value in arguments.items()}
+    got, _, _ = pictures.differentiate(cast, backend, *weights)
+    error = float(torch.where(decided, (got - image).abs().amax(-1), 0.0).max())
+    return Point("picture", way, error, slices.fastest(lambda: pictures.differentiate(cast, backend, *weights)))
+
+
+def percentile(errors: population.Floats) -> float:
+    """The 99.9th percentile, what is not finite counted as infinitely wrong."""
+    return float(np.quantile(np.nan_to_num(errors, nan=np.inf), PERCENTILE, method="higher"))
+
+
+def by_condition() -> Iterator[ConditionCurve]:
+    """The paper's order of the factor, where every scheme has something to do; the backend is torch for all."""
+    order = "paper"
+    generator = torch.Generator().manual_seed(2)
+    decades = DECADES * torch.rand(SPREAD, 1, generator=generator, dtype=torch.float64)
+    hard = population.draw(generator, SPREAD, order, decades)
+    known = population.truth(hard, order)
+    condition = np.log10(np.linalg.cond(population.factor(hard)))
+    for scheme in SCHEMES:
+        errors = population.judge(hard, known, order, scheme, "reference")
+        cov = np.nan_to_num(errors.cov, nan=np.inf)
+        curve = ConditionCurve(scheme, [], [], [], [])
+        for low, high in itertools.pairwise(BINS):
+            inside = (low <= condition) & (condition < high)
+            if inside.sum() >= LEAST:
+                curve.condition.append(float(10 ** ((low + high) / 2)))
+                curve.median.append(float(np.quantile(cov[inside], 0.5, method="higher")))
+                curve.percentile99.append(float(np.quantile(cov[inside], 0.99, method="higher")))
+                curve.bad.append(float(errors.bad[inside].mean()))
+        yield curve
+
+
+def safety(backends: list[str]) -> Iterator[Cost]:
+    """Every scheme on every backend; schur and cholesky have no kernels and run in torch on all of them."""
+    for order in FACTOR_ORDERS:
+        hard = population.draw(torch.Generator().manual_seed(3), TIMED, order, 1.0)
+        for scheme in SCHEMES:
+            for backend in backends if scheme == "square_root" else ["reference"]:
+                model = build("7dgs", lambda_d=0.35, lambda_t=0.35, factor_order=order, scheme=scheme)
+                device, forward, backward = device_of(backend), [], []
+                wait = synchroniser(device)
+                model.backend = backend
+                model.to(device)
+                raw = {k: v.to(device).requires_grad_() for k, v in population.raw_parameters(hard).items()}
+                for _ in range(REPEATS):
+                    start = time.perf_counter()
+                    out = model.observe(raw, torch.zeros(3, device=device), torch.zeros((), device=device))
+                    wait()
+                    middle = time.perf_counter()
+                    torch.autograd.grad(out, list(raw.values()), [torch.ones_like(x) for x in out], allow_unused=True)
+                    wait()
+                    forward.append(1e3 * (middle - start))
+                    backward.append(1e3 * (time.perf_counter() - middle))
+                yield Cost(order, scheme, backend, float(np.median(forward)), float(np.median(backward)))

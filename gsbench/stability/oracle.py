@@ -1,0 +1,203 @@
+"""The truth about single Gaussians in mpmath: slices, splats, colours and gradients, from the textbook formulas.
+
+Nothing here is shared with what it judges: covariances are formed, inverted and subtracted as the papers write them,
+which is sound because it is done in DIGITS digits. The hardest case here (a factor with four diagonals of 1e-7) squares
+to a condition number of 1e56, so fifty digits would not do. A gradient is a central difference with a step of
+1e-30, whose error is 1e-60 of the third derivative.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from mpmath import mp, mpf
+
+DIGITS = 120
+STEP = mpf(10) ** -30
+LOG_SIZE_MAX = 16  # by definition, a logarithm of a size beyond acts as this one (docs/stability.md)
+TIME_GATE_MIN = mpf("0.05")  # 4DGS draws nothing whose f_temp is not above this
+UNDEFINED = mpf(10) ** -20  # |v|^2 of a vector too short to have a direction; it becomes zero
+
+Vector = list[Any]  # of mpf
+Matrix = list[Vector]
+Function = Callable[[Vector], Vector]
+
+
+def gradient(function: Function, at: Sequence[float], weights: Sequence[float], first: int | None = None) -> Vector:
+    """d(weights . function)/dx by central differences, one entry for each of the `first` (all) numbers of `at`."""
+    with mp.workdps(DIGITS):
+        x = [mpf(v) for v in at]
+        out = []
+        for i, value in enumerate(x[:first]):
+            sides = []
+            for moved in (value + STEP, value - STEP):
+                x[i] = moved
+                sides.append(mp.fdot(map(mpf, weights), function(x)))
+            x[i] = value
+            out.append((sides[0] - sides[1]) / (2 * STEP))
+        return out
+
+
+def evaluate(function: Function, at: Sequence[float]) -> Vector:
+    """function(at) in DIGITS digits."""
+    with mp.workdps(DIGITS):
+        return function([mpf(v) for v in at])
+
+
+# ---- slices: mean (3), covariance (9, by rows) and opacity of the 3D Gaussian that is drawn
+
+
+def slice_triangular(x: Vector, layout: dict[str, int], order: str, half: float, log_lambda: dict[str, float],
+                     center: Sequence[float], time: float | None) -> Vector:  # fmt: skip
+    """6DGS and 7DGS (7DGS eq. 9 to 12). `x` holds the raw parameters named in `layout`, each of so many numbers.
+
+    `order` names the variable of each row of the triangular factor, such as `dddtppp`.
+    """
+    raw = _unpack(x, layout)
+    n, below = len(order), iter(raw["off_diagonal"])
+    L = [[next(below) for _ in range(i)] + [_size(raw["log_diagonal"][i])] for i in range(n)]
+    S = [[mp.fdot(L[i][: min(i, j) + 1], L[j][: min(i, j) + 1]) for j in range(n)] for i in range(n)]
+    p, d, t = ([i for i in range(n) if order[i] == name] for name in "pdt")
+    direction = unit([m - mpf(c) for m, c in zip(raw["means"], center, strict=True)])
+    delta = [a - b for a, b in zip(direction, raw["directions"], strict=True)]
+    exponent = half * mp.exp(mpf(log_lambda["direction"])) * _mahalanobis(_block(S, d, d), delta)
+    if time is not None:
+        delta = [*delta, mpf(time) - raw["times"][0]]
+        exponent += mp.exp(mpf(log_lambda["time"])) * delta[3] ** 2 / S[t[0]][t[0]] / 2
+    mean, cov = _condition(S, p, d + t, raw["means"], delta)
+    return [*mean, *cov, mp.exp(-exponent) * _sigmoid(raw["opacities"][0])]
+
+
+def slice_rotated(x: Vector, layout: dict[str, int], log_lambda: dict[str, float], time: float) -> Vector:
+    """4DGS: S = (R s)(R s)^T, R = M_left(l) M_right(r) (4DGS eq. 5 to 9)."""
+    raw = _unpack(x, layout)
+    a, b, c, d = _normalised(raw["left_quats"])
+    p, q, r, s = _normalised(raw["right_quats"])
+    left = [[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]]
+    right = [[p, q, r, s], [-q, p, -s, r], [-r, s, p, -q], [-s, -r, q, p]]
+    size = [_size(x) for x in raw["scales"]]
+    F = [[mp.fdot(left[i], [row[j] for row in right]) * size[j] for j in range(4)] for i in range(4)]
+    S = [[mp.fdot(a, b) for b in F] for a in F]
+    delta = mpf(time) - raw["times"][0]
+    gate = mp.exp(-mp.exp(mpf(log_lambda["time"])) * delta**2 / S[3][3] / 2)
+    mean, cov = _condition(S, [0, 1, 2], [3], raw["means"], [delta])
+    return [*mean, *cov, gate * _sigmoid(raw["opacities"][0]) if gate > TIME_GATE_MIN else mpf(0)]
+
+
+def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vector) -> tuple[Vector, Vector]:
+    """mu_p + K delta and S_pp - K S_qp with K = S_pq S_qq^-1."""
+    S_pq = _block(S, p, q)
+    K = [_solve(_block(S, q, q), row) for row in S_pq]
+    moved = [m + mp.fdot(k, delta) for m, k in zip(mean, K, strict=True)]
+    return moved, [S[p[i]][p[j]] - mp.fdot(K[i], S_pq[j]) for i in range(3) for j in range(3)]
+
+
+# ---- splats: alpha of one Gaussian at pixels
+
+
+def alphas(x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[float]], size: tuple[int, int],
+           pixels: Sequence[tuple[float, float]], eps2d: float) -> Vector:  # fmt: skip
+    """opacity exp(-power) at pixel centres (EWA: Zwicker et al. 2001 eq. 29); x = mean (3), factor (9), opacity.
+
+    Neither held below 0.999 nor cut at 1/255: the caller leaves out what is near either.
+    """
+    mean, F, opacity = x[:3], [x[3:6], x[6:9], x[9:12]], x[12]
+    W = [[mpf(v) for v in row] for row in viewmat]
+    px, py, pz = (mp.fdot(row[:3], mean) + row[3] for row in W[:3])
+    (fx, _, cx), (_, fy, cy) = ([mpf(v) for v in row] for row in K[:2])
+    u, v = fx * px / pz + cx, fy * py / pz + cy
+    # The Jacobian is taken at the mean, moved to at most 15 % of the picture outside of it (3DGS).
+    tangents = [(min(max(u, -mpf(3) / 20 * size[0]), mpf(23) / 20 * size[0]) - cx) / fx,
+                (min(max(v, -mpf(3) / 20 * size[1]), mpf(23) / 20 * size[1]) - cy) / fy]  # fmt: skip
+    J = [[fx / pz, mpf(0), -fx * tangents[0] / pz], [mpf(0), fy / pz, -fy * tangents[1] / pz]]
+    M = [[mp.fsum(J[a][b] * W[b][c] * F[c][e] for b in range(3) for c in range(3)) for e in range(3)] for a in range(2)]
+    xx, xy, yy = (mp.fdot(M[a], M[b]) + (mpf(eps2d) if a == b else 0) for a, b in ((0, 0), (0, 1), (1, 1)))
+    determinant = xx * yy - xy * xy
+    powers = (((i - u) ** 2 * yy - 2 * (i - u) * (j - v) * xy + (j - v) ** 2 * xx) / determinant / 2 for i, j in pixels)
+    return [opacity * mp.exp(-power) for power in powers]
+
+
+# ---- colours
+
+
+def colors(x: Vector, layout: dict[str, int], center: Sequence[float], waves: int, time: float) -> Vector:
+    """max(0, sum beta Y_lm(d) cos(2 pi n (t - mu_t)) + 1/2), degree 3 (3DGS; 4DGS eq. 12); x has means, times, sh.
+
+    Y_lm by the general formula, with associated Legendre functions of cos(theta): real harmonics in 3DGS' signs. Where
+    d is undefined only the constant one is not zero, by definition.
+    """
+    raw = _unpack(x, layout)
+    dx, dy, dz = unit([m - mpf(c) for m, c in zip(raw["means"], center, strict=True)])
+    defined = any((dx, dy, dz))
+    basis = [_harmonic(degree, order, dx, dy, dz) if defined or degree == 0 else mpf(0)
+             for degree in range(4) for order in range(-degree, degree + 1)]  # fmt: skip
+    cosines = [mp.cos(2 * mp.pi * n * (mpf(time) - raw["times"][0])) for n in range(waves)]
+    Y = [c * y for c in cosines for y in basis]
+    return [max(mpf(0), mp.fdot(Y, raw["sh"][channel::3]) + mpf(1) / 2) for channel in range(3)]
+
+
+LEGENDRE = ((1,), (0, 1), (-0.5, 0, 1.5), (0, -1.5, 0, 2.5))  # coefficients of P_l by powers
+
+
+def _harmonic(degree: int, order: int, x: Any, y: Any, z: Any) -> Any:
+    """N_lm d^m P_l/dz^m Re or Im (x + i y)^m, with (-1)^m as 3DGS has it."""
+    m = abs(order)
+    scale = mp.sqrt((2 * degree + 1) / (4 * mp.pi) * mp.factorial(degree - m) / mp.factorial(degree + m))
+    legendre = [mpf(c) for c in LEGENDRE[degree]]
+    for _ in range(m):
+        legendre = [i * c for i, c in enumerate(legendre)][1:]
+    power = mp.mpc(x, y) ** m
+    part = power.imag if order < 0 else power.real
+    value = scale * mp.fsum(c * z**i for i, c in enumerate(legendre)) * part
+    return value if order == 0 else (-1) ** m * mp.sqrt(2) * value
+
+
+# ---- small parts
+
+
+def unit(v: Vector) -> Vector:
+    """v at length 1; a vector too short to have a direction becomes zero."""
+    square = mp.fdot(v, v)
+    return [x / mp.sqrt(square) for x in v] if square > UNDEFINED else [mpf(0)] * 3
+
+
+def _size(log: Any) -> Any:
+    return mp.exp(min(max(log, mpf(-LOG_SIZE_MAX)), mpf(LOG_SIZE_MAX)))
+
+
+def _sigmoid(x: Any) -> Any:
+    return 1 / (1 + mp.exp(-x))
+
+
+def _normalised(q: Vector) -> Vector:
+    length = max(mp.sqrt(mp.fdot(q, q)), mpf("1e-12"))  # as torch's normalize
+    return [x / length for x in q]
+
+
+def _unpack(x: Vector, layout: dict[str, int]) -> dict[str, Vector]:
+    parts, first = {}, 0
+    for name, count in layout.items():
+        parts[name] = x[first : first + count]
+        first += count
+    return parts
+
+
+def _block(S: Matrix, rows: list[int], columns: list[int]) -> Matrix:
+    return [[S[i][j] for j in columns] for i in rows]
+
+
+def _mahalanobis(S: Matrix, delta: Vector) -> Any:
+    return mp.fdot(delta, _solve(S, delta))
+
+
+def _solve(A: Matrix, b: Vector) -> Vector:
+    """A^-1 b by Gauss' elimination; the digits make up for the pivots not being chosen (A is positive definite)."""
+    n = len(b)
+    rows = [[*row, value] for row, value in zip(A, b, strict=True)]
+    for i in range(n):
+        for k in range(i + 1, n):
+            factor = rows[k][i] / rows[i][i]
+            rows[k] = [x - factor * y for x, y in zip(rows[k], rows[i], strict=True)]
+    x: Vector = [mpf(0)] * n
+    for i in reversed(range(n)):
+        x[i] = (rows[i][n] - mp.fdot(rows[i][i + 1 : n], x[i + 1 :])) / rows[i][i]
+    return x

@@ -1,0 +1,213 @@
+"""Hard pictures: single Gaussians that projection can lose its digits on, and crowds that blending can."""
+
+import math
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+from gsbench.stability.cases import case
+
+Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`, float32
+WIDTH, HEIGHT = 16, 12
+FOCAL = 24.0
+DEPTH = 4.0  # of what is not said to be elsewhere; a power of two, so that a camera without rotation gives it exactly
+CROWD = 100_000
+NO_GRADIENT = math.nan  # bound of a gradient that is not judged
+
+
+def single(mean: Tensor, factor: Tensor, opacity: float = 0.9) -> Arguments:
+    """One Gaussian before one camera at the origin that looks along z."""
+    return {
+        "means": mean.float()[None], "factors": factor.float()[None], "opacities": torch.tensor([opacity]),
+        "colors": torch.ones(1, 1), "viewmats": torch.eye(4)[None], "Ks": intrinsics(),
+        "width": WIDTH, "height": HEIGHT,
+    }  # fmt: skip
+
+
+def intrinsics(fx: float = FOCAL, fy: float = FOCAL, cx: float = WIDTH / 2, cy: float = HEIGHT / 2) -> Tensor:
+    """[1, 3, 3], pixels."""
+    return torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]])
+
+
+def ordinary(g: Generator, size: float = 0.2) -> Arguments:
+    """A Gaussian in view, a few pixels large."""
+    mean = torch.tensor([0.2, -0.1, DEPTH]) + 0.1 * torch.randn(3, generator=g)
+    return single(mean, size * torch.randn(3, 3, generator=g))
+
+
+def turned(g: Generator, sizes: Tensor) -> Tensor:
+    """A factor with these sizes along axes in random directions."""
+    return torch.linalg.qr(torch.randn(3, 3, generator=g))[0] * sizes
+
+
+# ---- projection
+
+
+@case("projection")
+def ordinary_splats(g: Generator, severity: float) -> list[Arguments]:  # noqa: ARG001
+    """Nothing: the floor that the other rows are read against."""
+    return [ordinary(g) for _ in range(3)]
+
+
+@case("projection")
+def at_the_near_plane(g: Generator, severity: float) -> list[Arguments]:
+    """Means on the near plane, an ulp before and behind it, and behind the camera: 1/z explodes, z < 0 mirrors."""
+    near = 0.25
+    just_before, just_behind = near * (1 + 2**-22), near * (1 - 2**-22)
+    depths = [near, just_before, just_behind, 0.0, -1.0, -near]
+    made = []
+    for depth in depths:
+        z = depth * severity + DEPTH * (1 - severity)
+        made.append(single(torch.tensor([0.02, -0.01, z]), 0.02 * torch.randn(3, 3, generator=g)) | {"near": near})
+    return made
+
+
+@case("projection")
+def far_off_axis(g: Generator, severity: float) -> list[Arguments]:
+    """Means up to x/z = 100 that reach into the picture: EWA's Jacobian blows up (diff-gaussian-rasterization #75)."""
+    made = []
+    for tangent in (1.0, 10.0, 100.0):
+        x = DEPTH * tangent**severity
+        mean = torch.tensor([x, 0.3 * x, DEPTH])
+        made.append(single(mean, 0.4 * x * torch.randn(3, 3, generator=g)))
+    return made
+
+
+@case("projection")
+def needle(g: Generator, severity: float) -> list[Arguments]:
+    """Axes 10^5 : 1 : 1 and 10^5 : 10^5 : 1, which training makes of edges; det = ab - c^2 cancels (UnityGS #14)."""
+    thin = 10 ** (-5 * severity)
+    return [
+        ordinary(g) | {"factors": turned(g, torch.tensor(sizes))[None]}
+        for sizes in ([2.0, 2 * thin, 2 * thin], [2.0, 2.0, 2 * thin], [200.0, 200 * thin, 200 * thin])
+    ]
+
+
+@case("projection")
+def pointlike(g: Generator, severity: float) -> list[Arguments]:
+    """Sizes of 10^-8, and zero: all that is seen is eps2d, and nothing may divide by the size."""
+    sizes = (10 ** (-8 * severity), 0.0 if severity == 1 else 0.1)
+    return [ordinary(g) | {"factors": size * torch.randn(1, 3, 3, generator=g)} for size in sizes]
+
+
+@case("projection")
+def larger_than_the_scene(g: Generator, severity: float) -> list[Arguments]:
+    """Sizes of 10^3 to 10^7, the largest a log size is let to: det of the 2D covariance overflows (UnityGS #196)."""
+    made = []
+    for power in (3, 5, 7):
+        made.append(ordinary(g) | {"factors": 10 ** (power * severity) * torch.randn(1, 3, 3, generator=g)})
+    return made
+
+
+@case("projection")
+def extreme_focal_lengths(g: Generator, severity: float) -> list[Arguments]:
+    """Focal lengths of 10 and 10^5 pixels: a fisheye's crop, and a telescope's."""
+    wide, tele = 24 ** (1 - severity) * 10**severity, 24 ** (1 - severity) * 1e5**severity
+    shrink = FOCAL / tele
+    far = ordinary(g, 0.2 * shrink)
+    far["means"] = far["means"] * torch.tensor([shrink, shrink, 1.0])
+    return [ordinary(g) | {"Ks": intrinsics(wide, wide)}, far | {"Ks": intrinsics(tele, tele)}]
+
+
+@case("projection")
+def oblong_pixels(g: Generator, severity: float) -> list[Arguments]:
+    """fx / fy = 100 and 1/100: anamorphic lenses; a renderer with one focal length draws something else."""
+    stretch = 10**severity
+    return [ordinary(g, 0.1) | {"Ks": intrinsics(FOCAL * s, FOCAL / s)} for s in (stretch, 1 / stretch)]
+
+
+@case("projection")
+def principal_point_outside(g: Generator, severity: float) -> list[Arguments]:
+    """The principal point ten widths outside, as in crops; clamps that take it as centred fail (gsplat #305)."""
+    away = 10 * WIDTH * severity
+    made = ordinary(g)
+    shift = away / FOCAL * DEPTH
+    made["means"] = made["means"] - torch.tensor([shift, -shift, 0.0])
+    return [made | {"Ks": intrinsics(cx=WIDTH / 2 + away, cy=HEIGHT / 2 - away)}]
+
+
+# ---- blending
+
+
+def crowd(g: Generator, N: int, size: float) -> Arguments:
+    """N Gaussians of about `size` in view, at different depths."""
+    spread = torch.tensor([1.0, 0.7, 1.0])
+    means = (torch.rand(N, 3, generator=g) * 2 - 1) * spread + torch.tensor([0.0, 0.0, DEPTH])
+    return {
+        "means": means, "factors": size * torch.randn(N, 3, 3, generator=g),
+        "opacities": 0.05 + 0.9 * torch.rand(N, generator=g), "colors": torch.rand(N, 3, generator=g),
+        "viewmats": torch.eye(4)[None], "Ks": intrinsics(), "width": WIDTH, "height": HEIGHT,
+        "background": torch.tensor([0.2, 0.5, 0.8]),
+    }  # fmt: skip
+
+
+@case("blending")
+def ordinary_crowd(g: Generator, severity: float) -> list[Arguments]:  # noqa: ARG001
+    """Nothing: the floor that the other rows are read against."""
+    return [crowd(g, 200, 0.15)]
+
+
+@case("blending")
+def faint_crowd(g: Generator, severity: float) -> list[Arguments]:
+    """10^5 Gaussians of opacity 1/100 over each other, all over the picture: products and sums of many small terms."""
+    made = crowd(g, max(10, int(CROWD**severity)), 5.0)
+    few = {"width": 8, "height": 6, "Ks": intrinsics(cx=4.0, cy=3.0)}  # brute force takes seconds for these
+    return [made | few | {"opacities": torch.full((len(made["means"]),), 0.01)}]
+
+
+@case("blending")
+def opaque_stack(g: Generator, severity: float) -> list[Arguments]:
+    """A thousand opaque ones behind each other: 1 - alpha and what is behind must not become 0/0 in backward."""
+    made = crowd(g, 1000, 1.0)
+    return [made | {"opacities": 1 - 0.4 * (1 - severity) * torch.rand(1000, generator=g)}]
+
+
+@case("blending")
+def equal_depths(g: Generator, severity: float) -> list[Arguments]:
+    """All at one depth, as points of a plane that faces the camera: the lower index is in front, in every backend."""
+    made = crowd(g, 200, 0.3)
+    made["means"][:, 2] = DEPTH + (1 - severity) * (made["means"][:, 2] - DEPTH)
+    return [made]
+
+
+@case("blending", forward=1.01 / 255, gradient=NO_GRADIENT)
+def alpha_at_its_limits(g: Generator, severity: float) -> list[Arguments]:
+    """Alpha within an ulp of 1/255 and of 0.999: one may be drawn or not, which is worth 1/255 and no more."""
+    made = crowd(g, 3, 1.0)
+    made["factors"] = 1e4 * torch.eye(3).repeat(3, 1, 1)  # flat over the picture
+    faint = torch.tensor([1 / 255]) * torch.tensor([1 - 2**-23, 1.0, 1 + 2**-22]) ** severity
+    full = torch.tensor([0.999]) * torch.tensor([1 - 2**-23, 1.0, 1 + 2**-23]) ** severity
+    return [made | {"opacities": opacity[None]} | _only(made, i) for i, opacity in enumerate(faint)] + [
+        made | {"opacities": opacity[None]} | _only(made, i) for i, opacity in enumerate(full)
+    ]
+
+
+@case("blending", forward=1e-3, gradient=NO_GRADIENT)
+def transmittance_at_the_stop(g: Generator, severity: float) -> list[Arguments]:
+    """Four of alpha 0.9 leave 1e-4, the stop itself: the fourth may be drawn or not, which is worth 9e-4."""
+    made = crowd(g, 6, 1.0)
+    made["factors"] = 1e4 * torch.eye(3).repeat(6, 1, 1)
+    return [made | {"opacities": torch.full((6,), 0.9 * severity + 0.5 * (1 - severity))}]
+
+
+@case("blending")
+def brilliant_colors(g: Generator, severity: float) -> list[Arguments]:
+    """Colours of 10^4, unbounded above in 3DGS: sums of large terms; errors are relative to the brightest."""
+    made = crowd(g, 200, 0.15)
+    return [made | {"colors": made["colors"] * 10 ** (4 * severity)}]
+
+
+@case("blending")
+def no_gaussians(g: Generator, severity: float) -> list[Arguments]:
+    """No Gaussian at all, and all culled: pruning can take the last one; the background remains."""
+    made = crowd(g, 20, 0.1)
+    away = made["means"] - torch.tensor([0.0, 0.0, 50.0 * severity])
+    return [made | _only(made, slice(0)), made | {"means": away}]
+
+
+def _only(made: Arguments, which: int | slice) -> Arguments:
+    rows = slice(which, which + 1) if isinstance(which, int) else which
+    return {name: made[name][rows] for name in ("means", "factors", "colors")} | (
+        {} if isinstance(which, int) else {"opacities": made["opacities"][rows]}
+    )

@@ -1,0 +1,123 @@
+"""Judges pictures: single Gaussians beside mpmath, crowds beside brute force in float64."""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.raster import rasterize
+from gsbench.stability import brute, oracle
+from gsbench.stability.cases import Case, Cell, device_of
+from gsbench.stability.slices import ALPHA_MIN, fastest, worst
+
+UNDECIDED = 1e-3  # what is relatively nearer to a threshold may fall to either side of it in float32
+EPS2D = 0.3
+NEAR = 0.01  # of `rasterize`
+Arguments = dict[str, Any]
+Truth = tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]  # image and alpha [1, H, W, .], decided [1, H, W], gradients
+
+
+def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
+    """One cell a backend: the worst of the case's pictures."""
+    pictures = case()
+    truths = [(alone if case.area == "projection" else together)(arguments) for arguments in pictures]
+    if case.bound.gradient != case.bound.gradient:  # every pixel is at a threshold: what may flip is what is judged
+        truths = [(image, alpha, torch.ones_like(decided), {}) for image, alpha, decided, _ in truths]
+    for backend in backends:
+        found = [compare(a, known, backend) for a, known in zip(pictures, truths, strict=True)]
+        forward, gradient, bad = (torch.tensor(x, dtype=torch.float64) for x in zip(*found, strict=True))
+        drawn = sum(int((known[1] > 0).any()) for known in truths)
+        yield Cell(
+            case.area, case.name, "-", "-", backend, worst(forward),
+            worst(gradient) if truths[0][3] else float("nan"), float(bad.mean()),
+            fastest(partial(_all, pictures, backend)), case.bound,
+            f"{drawn} of {len(pictures)} pictures not empty",
+        )  # fmt: skip
+
+
+def _all(pictures: list[Arguments], backend: str) -> None:
+    for arguments in pictures:
+        differentiate(arguments, backend, *weights(arguments))
+
+
+def weights(arguments: Arguments) -> tuple[Tensor, Tensor]:
+    """What the loss weighs image and alpha by, float64."""
+    shape = (1, arguments["height"], arguments["width"])
+    g = torch.Generator().manual_seed(1)
+    D = arguments["colors"].shape[-1]
+    return (torch.randn(*shape, D, generator=g, dtype=torch.float64),
+            torch.randn(*shape, 1, generator=g, dtype=torch.float64))  # fmt: skip
+
+
+def together(arguments: Arguments) -> Truth:
+    """By brute force."""
+    exact: Arguments = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+    with torch.no_grad():
+        picture = brute.paint(**exact)
+    decided = picture.slack > UNDECIDED
+    weight, weight_alpha = (w * decided[..., None] for w in weights(arguments))
+    gradients = brute.differentiate(exact, weight, weight_alpha)
+    return picture.image, picture.alpha, decided, gradients
+
+
+def alone(arguments: Arguments) -> Truth:
+    """By mpmath: one Gaussian of one channel of 1, so that image and alpha are the same."""
+    size = (arguments["width"], arguments["height"])
+    pixels = [(i + 0.5, j + 0.5) for j in range(size[1]) for i in range(size[0])]
+    parts = [arguments[name].flatten() for name in ("means", "factors", "opacities")]
+    x, shape = torch.cat(parts).tolist(), (1, size[1], size[0], 1)
+    if not x[2] > torch.tensor(arguments.get("near", NEAR)).item():  # the camera is the world: z is the depth
+        none = torch.zeros(shape, dtype=torch.float64)
+        return none, none, none[..., 0] == 0, {k: torch.zeros_like(arguments[k]).double() for k in brute.DIFFERENTIABLE}
+    function = partial(
+        oracle.alphas, viewmat=arguments["viewmats"][0].tolist(), K=arguments["Ks"][0].tolist(), size=size,
+        pixels=pixels, eps2d=float(torch.tensor(EPS2D)),
+    )  # fmt: skip
+    free = torch.tensor([float(v) for v in oracle.evaluate(function, x)], dtype=torch.float64).view(shape)
+    decided = ((free / ALPHA_MIN - 1).abs() > UNDECIDED)[..., 0]
+    shown = torch.where(free >= ALPHA_MIN, free, 0.0)
+    weight = sum(weights(arguments)) * decided[..., None] * (shown > 0)
+    gradient = torch.tensor([float(v) for v in oracle.gradient(function, x, weight.flatten().tolist())])
+    gradients = {name: part.view_as(arguments[name]).double() for name, part in
+                 zip(("means", "factors", "opacities"), gradient.split([3, 9, 1]), strict=True)}  # fmt: skip
+    image_weight = weights(arguments)[0] * decided[..., None]
+    return shown, shown, decided, gradients | {"colors": (image_weight * shown).sum().view(1, 1)}
+
+
+def differentiate(
+    arguments: Arguments, backend: str, weight: Tensor, weight_alpha: Tensor
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """Image and alpha, and the gradients of the loss, by a rasterizer in float32."""
+    inputs = {name: arguments[name].detach().clone().requires_grad_() for name in brute.DIFFERENTIABLE}
+    device = device_of(backend)
+    there: Arguments = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in (arguments | inputs).items()}
+    out = rasterize(**there, backend=backend)
+    image, alpha = out.image.cpu().double(), out.alpha.cpu().double()
+    loss = (image * weight).sum() + (alpha * weight_alpha).sum()
+    gradients = torch.autograd.grad(loss, list(inputs.values()), materialize_grads=True)
+    return image.detach(), alpha.detach(), dict(zip(inputs, gradients, strict=True))
+
+
+def compare(arguments: Arguments, known: Truth, backend: str) -> tuple[float, float, float]:
+    """Largest error of a decided pixel, relative to the brightest colour or 1; of a gradient; share not finite."""
+    image, alpha, decided, exact = known
+    weight, weight_alpha = (w * decided[..., None] for w in weights(arguments))
+    try:
+        got, covered, gradients = differentiate(arguments, backend, weight, weight_alpha)
+    except InputError:  # refused at the door is not drawn wrong, but every case here is one that must be drawn
+        return float("nan"), float("nan"), 1.0
+    finite = got.isfinite().all() & covered.isfinite().all() & all(g.isfinite().all() for g in gradients.values())
+    brightest = max(1.0, float(arguments["colors"].abs().max())) if arguments["colors"].numel() else 1.0
+    errors = torch.cat([(got - image).abs().amax(-1) / brightest, (covered - alpha).abs().amax(-1)])
+    forward = worst(torch.where(torch.cat([decided, decided]), errors, 0.0))
+    slopes = [_relative(gradients[name].double(), truth) for name, truth in exact.items()]
+    return forward, max(slopes, default=0.0), float(not finite)
+
+
+def _relative(found: Tensor, exact: Tensor) -> float:
+    """|found - exact| / |exact|; where nothing is exact, |found|."""
+    size = float(exact.norm())
+    return float((found - exact).norm()) / (size if size > 0 else 1.0)

@@ -1,0 +1,242 @@
+"""A million random hard slices: what a scheme makes of them, beside Gram and Schmidt's answer in double precision.
+
+mpmath would need weeks for a million Gaussians. The reference here is modified Gram-Schmidt, done twice ("twice is
+enough": Giraud et al. 2005), in float64; `verify` holds it to mpmath's answer on a sample, in every audit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from gsbench.models import GaussianModel, build
+from gsbench.models.slicing import subtract
+from gsbench.models.triangular import FACTOR_ORDERS, TriangularModel
+from gsbench.stability import oracle
+from gsbench.stability.cases import device_of
+
+Floats = NDArray[np.float64]
+CHUNK = 50_000  # Gaussians at a time: bounds memory
+BELOW = np.tril_indices(7, -1)
+NEVER = -110.0  # log lambda; exp of it is zero in float32, so that every Gaussian is seen whatever its query
+
+
+@dataclass(frozen=True)
+class Hard:
+    """Raw parameters of 7D Gaussians with mu_p = 0, seen from there at t = 0: the query (d, t) is 0 and exact."""
+
+    log_diagonal: Tensor  # [N, 7] float32
+    off_diagonal: Tensor  # [N, 21]
+    offset: Tensor  # [N, 4] mu_d, mu_t
+
+    def __len__(self) -> int:
+        return len(self.offset)
+
+    def rows(self, which: slice) -> "Hard":
+        """Some of them."""
+        return Hard(self.log_diagonal[which], self.off_diagonal[which], self.offset[which])
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Of each Gaussian: mean [N, 3], covariance [N, 3, 3], and the gradient of `loss` by the raw parameters."""
+
+    mean: Floats
+    cov: Floats
+    gradient: Floats  # [N, 28]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Of each Gaussian, relative; NaN and inf are kept."""
+
+    cov: Floats
+    gradient: Floats
+    bad: NDArray[np.bool_]  # not finite, or not semi-definite where the scheme forms a covariance
+
+
+def draw(generator: torch.Generator, N: int, order: str, decades: Tensor | float = 5.0) -> Hard:
+    """Factors with diagonals 10^-u, u uniform in [0, decades], and normal entries below; queries one sigma away."""
+    u = torch.rand(N, 7, generator=generator, dtype=torch.float64)
+    log_diagonal = -(decades * u) * np.log(10.0)
+    off_diagonal = torch.randn(N, 21, generator=generator, dtype=torch.float64)
+    L = np.tril(factor(Hard(log_diagonal, off_diagonal, u)))
+    q = conditioned(order)
+    offset = np.einsum("nij,nj->ni", L[:, q], torch.randn(N, 7, generator=generator, dtype=torch.float64).numpy())
+    return Hard(log_diagonal.float(), off_diagonal.float(), torch.from_numpy(offset).float())
+
+
+def factor(hard: Hard) -> Floats:
+    """The triangular factor in float64, [N, 7, 7]."""
+    L = np.zeros((len(hard), 7, 7))
+    L[:, *BELOW] = hard.off_diagonal.double().numpy()
+    L[:, range(7), range(7)] = np.exp(hard.log_diagonal.double().numpy())
+    return L
+
+
+def conditioned(order: str) -> list[int]:
+    """Rows of d and then t in the triangular factor of an order."""
+    return [4, 5, 6, 3] if order == "paper" else [0, 1, 2, 3]
+
+
+def weights(N: int) -> tuple[Floats, Floats]:
+    """What the loss weighs means [N, 3] and (symmetric) covariances [N, 3, 3] by."""
+    random = np.random.default_rng(1)
+    W = random.standard_normal((N, 3, 3))
+    return random.standard_normal((N, 3)), W + W.transpose(0, 2, 1)
+
+
+def truth(hard: Hard, order: str) -> Truth:
+    """Means, covariances and the gradient of the loss w . mean / |mean| + <W, cov> / |cov|, in float64."""
+    w, W = weights(len(hard))
+    chunks = [slice(i, i + CHUNK) for i in range(0, len(hard), CHUNK)]
+    parts = [_truth(hard.rows(rows), order, w[rows].T, W[rows].transpose(1, 2, 0)) for rows in chunks]
+    return Truth(*(np.ascontiguousarray(np.moveaxis(np.concatenate(x, -1), -1, 0)) for x in zip(*parts, strict=True)))
+
+
+def _truth(hard: Hard, order: str, w: Floats, W: Floats) -> tuple[Floats, Floats, Floats]:
+    """The same, with the Gaussians along the last axis of every array."""
+    L, q = np.ascontiguousarray(factor(hard).transpose(1, 2, 0)), conditioned(order)
+    p = [i for i in range(7) if i not in q]
+    Q, R = gram_schmidt(L[q + p])  # L = R^T Q^T
+    T_qq, T_pq, T_pp = (_transposed(x) for x in (R[:4, :4], R[:4, 4:], R[4:, 4:]))
+    white = _solve_lower(T_qq, -hard.offset.double().numpy().T[:, None])
+    mean, cov = _product(T_pq, white)[:, 0], _product(T_pp, R[4:, 4:])
+    g, G = w / np.linalg.norm(mean, axis=0), W / np.sqrt((cov * cov).sum((0, 1)))
+    # dcov = 2 sym(dF_p - K dF_q) (F_p - K F_q)^T and dmean by dK, with F_p - K F_q = T_pp Q_p^T and y = S_qq^-1 delta.
+    K = _transposed(_solve_upper(R[:4, :4], R[:4, 4:]))
+    y = _solve_upper(R[:4, :4], white)
+    residual, along = _product(T_pp, _transposed(Q[:, 4:])), _product(Q[:, :4], white)
+    g_F = np.zeros_like(L)
+    g_F[p] = 2 * _product(G, residual) + g[:, None] * _transposed(along)
+    g_F[q] = y * _product(g[None], residual) - _product(_transposed(K), g_F[p])
+    return mean, cov, np.concatenate([g_F[range(7), range(7)] * L[range(7), range(7)], g_F[BELOW]])
+
+
+def gram_schmidt(rows: Floats) -> tuple[Floats, Floats]:
+    """Q, R with rows^T = Q R for rows [n, n, N], each direction taken out twice."""
+    Q, R = np.zeros_like(rows), np.zeros_like(rows)
+    for i in range(len(rows)):
+        v = rows[i].copy()
+        for _ in range(2):
+            for j in range(i):
+                along = (Q[:, j] * v).sum(0)
+                v -= along * Q[:, j]
+                R[j, i] += along
+        R[i, i] = np.sqrt((v * v).sum(0))
+        Q[:, i] = v / R[i, i]
+    return Q, R
+
+
+def _transposed(A: Floats) -> Floats:
+    return A.transpose(1, 0, 2)
+
+
+def _product(A: Floats, B: Floats) -> Floats:
+    return np.asarray(sum(A[:, j, None] * B[None, j] for j in range(len(B))))
+
+
+def _solve_lower(T: Floats, B: Floats) -> Floats:
+    X = np.zeros_like(B)
+    for i in range(len(B)):
+        X[i] = (B[i] - (T[i, :i, None] * X[:i]).sum(0)) / T[i, i]
+    return X
+
+
+def _solve_upper(T: Floats, B: Floats) -> Floats:
+    X = np.zeros_like(B)
+    for i in reversed(range(len(B))):
+        X[i] = (B[i] - (T[i, i + 1 :, None] * X[i + 1 :]).sum(0)) / T[i, i]
+    return X
+
+
+def verify(hard: Hard, order: str, count: int = 8) -> float:
+    """The largest relative error of `truth` on the first Gaussians, against mpmath: covariance and gradient."""
+    some = hard.rows(slice(count))
+    found = truth(some, order)
+    w, W = weights(count)
+    layout = {"log_diagonal": 7, "off_diagonal": 21, "means": 3, "directions": 3, "times": 1, "opacities": 1}
+    worst = 0.0
+    for i in range(count):
+        raw = [some.log_diagonal[i], some.off_diagonal[i], torch.zeros(3), some.offset[i], torch.zeros(1)]
+        x = torch.cat(raw).tolist()
+        exact = _slice(layout, order)
+        values = np.array(oracle.evaluate(exact, x), float)
+        mean, cov = values[:3], values[3:12]
+        weight = np.concatenate([w[i] / np.linalg.norm(mean), W[i].ravel() / np.linalg.norm(cov), [0]])
+        gradient = np.array(oracle.gradient(exact, x, weight.tolist(), first=28), float)
+        worst = max(worst, _relative(found.cov[i].ravel(), cov), _relative(found.gradient[i], gradient))
+    return worst
+
+
+def _slice(layout: dict[str, int], order: str) -> oracle.Function:
+    names = "".join(x * (1 if x == "t" else 3) for x in FACTOR_ORDERS[order])
+    log_lambda = {"direction": NEVER, "time": NEVER}
+    return lambda x: oracle.slice_triangular(x, layout, names, 0.5, log_lambda, [0.0] * 3, 0.0)
+
+
+def _relative(found: Floats, exact: Floats) -> float:
+    return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
+
+
+def judge(hard: Hard, known: Truth, order: str, scheme: str, backend: str) -> Errors:
+    """What 7DGS in float32 makes of hard slices."""
+    model = all_seen(order, scheme, backend)
+    w, W = weights(len(hard))
+    parts = [_judge(model, hard, known, w, W, slice(i, i + CHUNK)) for i in range(0, len(hard), CHUNK)]
+    cov, gradient, bad = (np.concatenate(x) for x in zip(*parts, strict=True))
+    return Errors(cov, gradient, bad)
+
+
+def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
+    """A 7DGS that gates nothing away."""
+    model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme)
+    assert isinstance(model, TriangularModel)
+    model.backend = backend
+    for name in ("direction", "time"):
+        model.log_modulation[name] = nn.Parameter(torch.tensor(NEVER))
+    return model.to(device_of(backend))
+
+
+def _judge(
+    model: TriangularModel, hard: Hard, known: Truth, w: Floats, W: Floats, rows: slice
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    raw = raw_parameters(hard.rows(rows))
+    shape = raw["log_diagonal"].requires_grad_(), raw["off_diagonal"].requires_grad_()
+    device = device_of(model.backend)
+    there = {name: value.to(device) for name, value in raw.items()}
+    out = model.observe(there, torch.zeros(3, device=device), torch.zeros((), device=device))
+    mean, F = out[0].cpu(), out[1].cpu()
+    exact_mean, exact_cov = torch.from_numpy(known.mean[rows]), torch.from_numpy(known.cov[rows])
+    cov = F.double() @ F.double().mT
+    loss = (torch.from_numpy(w[rows]) * mean / exact_mean.norm(dim=1, keepdim=True)).sum()
+    loss = loss + (torch.from_numpy(W[rows]) * cov / exact_cov.norm(dim=(1, 2), keepdim=True)).sum()
+    gradient = torch.cat(torch.autograd.grad(loss, shape), 1).double()
+    exact_gradient = torch.from_numpy(known.gradient[rows])
+    bad = ~(mean.isfinite().all(1) & F.isfinite().all((1, 2)) & gradient.isfinite().all(1))
+    bad |= indefinite(model, raw)
+    cov_error = (cov - exact_cov).norm(dim=(1, 2)) / exact_cov.norm(dim=(1, 2))
+    gradient_error = (gradient - exact_gradient).norm(dim=1) / exact_gradient.norm(dim=1)
+    return cov_error.detach().numpy(), gradient_error.numpy(), bad.numpy()
+
+
+@torch.no_grad()
+def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
+    """Whether the covariance a scheme subtracts to has a negative eigenvalue, [N]; F F^T never has one."""
+    scheme: str = model.scheme  # type: ignore[assignment]  # of every model that slices
+    if scheme == "square_root":
+        return torch.zeros(len(raw["means"]), dtype=torch.bool)
+    cov = subtract(model.factors(raw), scheme)[1].double()  # type: ignore[operator]
+    finite = cov.isfinite().all((1, 2))
+    least = torch.linalg.eigvalsh(torch.where(finite[:, None, None], cov, 0.0))[:, 0]
+    return ~finite | (least < 0)
+
+
+def raw_parameters(hard: Hard) -> dict[str, Tensor]:
+    """The raw parameters of 7DGS."""
+    N = len(hard)
+    return {"means": torch.zeros(N, 3), "directions": hard.offset[:, :3], "times": hard.offset[:, 3:],
+            "log_diagonal": hard.log_diagonal.clone(), "off_diagonal": hard.off_diagonal.clone(),
+            "opacities": torch.zeros(N)}  # fmt: skip

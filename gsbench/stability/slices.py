@@ -1,0 +1,152 @@
+"""Judges slices and colours: what a model in float32 makes of a case, beside the truth in a hundred digits."""
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from gsbench.models import GaussianModel, build
+from gsbench.models.slicing import SCHEMES
+from gsbench.stability import oracle
+from gsbench.stability.cases import Case, Cell, device_of
+from gsbench.stability.population import indefinite
+from gsbench.stability.slicing_cases import COUNT, Observed, variables
+
+OPTIONS = {
+    "4dgs": {},
+    "6dgs": {"lambda_d": 0.35, "directional_half": False},
+    "7dgs": {"lambda_d": 0.35, "lambda_t": 0.35},
+}
+ALPHA_MIN = 1 / 255  # what is fainter is not drawn: its place and shape have no picture
+SLOW_MS = 500.0
+COPIES = 1024  # of a case's Gaussians, where it is timed
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Of the Gaussians of a case: mean, covariance by rows and opacity, and the gradient of the loss."""
+
+    outputs: Tensor  # [COUNT, 13] float64
+    weights: Tensor  # [COUNT, 13]: the loss is their product with the outputs, summed
+    scale: Tensor  # [COUNT] what errors of the mean are relative to
+    gradient: Tensor  # [COUNT, parameters], in the order of `Observed.raw`
+
+
+def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
+    """Every model, scheme and backend. Only the square-root scheme has kernels; the others run in torch."""
+    for model in case.subjects:
+        observed = case(model=model)
+        known = truth(observed)
+        for scheme in SCHEMES:
+            for backend in backends if scheme == "square_root" else ["reference"]:
+                yield _cell(case, observed, known, scheme, backend)
+
+
+def truth(observed: Observed) -> Truth:
+    """What mpmath says, and the loss: sums of mean, covariance and opacity, each relative to its own size.
+
+    What is too faint to be drawn counts by its opacity alone, so that its gradient is zero or next to it.
+    """
+    outputs, scales, gradients = [], [], []
+    weights = torch.randn(COUNT, 13, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    function = exact(observed)
+    for i in range(COUNT):
+        x = torch.cat([value[i].flatten() for value in observed.raw.values()]).tolist()
+        values = torch.tensor([float(v) for v in oracle.evaluate(function, x)], dtype=torch.float64)
+        mean = observed.raw["means"][i].double()
+        scale = mean.norm() + (values[:3] - mean).norm() + values[[3, 7, 11]].sum().sqrt()
+        weights[i, :3] /= scale
+        weights[i, 3:12] /= values[3:12].norm()
+        if values[12] < ALPHA_MIN:
+            weights[i, :12] = 0
+        outputs.append(values)
+        scales.append(scale)
+        gradients.append([float(v) for v in oracle.gradient(function, x, weights[i].tolist())])
+    return Truth(torch.stack(outputs), weights, torch.stack(scales), torch.tensor(gradients, dtype=torch.float64))
+
+
+def exact(observed: Observed) -> oracle.Function:
+    """The oracle's function of one Gaussian's raw parameters, with every constant as float32 holds it."""
+    layout = {name: value[0].numel() for name, value in observed.raw.items()}
+    log_lambda = {name: _single(value) for name, value in observed.log_lambda.items()}
+    if observed.model == "4dgs":
+        return functools.partial(
+            oracle.slice_rotated, layout=layout, log_lambda=log_lambda, time=_single(observed.time)
+        )
+    return functools.partial(
+        oracle.slice_triangular, layout=layout, order=variables(observed.model),
+        half=0.5 if observed.model == "7dgs" else 1.0, log_lambda=log_lambda, center=observed.center.tolist(),
+        time=_single(observed.time) if observed.model == "7dgs" else None,
+    )  # fmt: skip
+
+
+def load(observed: Observed, scheme: str, backend: str, copies: int = 1) -> tuple[GaussianModel, dict[str, Tensor]]:
+    """A model that holds the case's Gaussians, `copies` times."""
+    model = build(observed.model, scheme=scheme, **OPTIONS[observed.model])
+    model.backend = backend
+    for name, value in observed.log_lambda.items():
+        model.log_modulation[name] = nn.Parameter(torch.tensor(value))
+    model.to(device_of(backend))
+    rows = torch.arange(COUNT).repeat(copies)
+    return model, {name: value[rows].requires_grad_() for name, value in observed.raw.items()}
+
+
+def differentiate(
+    model: GaussianModel, raw: dict[str, Tensor], observed: Observed, weights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Outputs [N, 13] and gradients [N, parameters] in float64, computed in float32 where the model's backend is."""
+    device = device_of(model.backend)
+    moment = torch.tensor(observed.time, device=device) if "time" in model.observes else None
+    there = {name: value.to(device) for name, value in raw.items()}
+    mean, F, opacity = (x.cpu().double() for x in model.observe(there, observed.center.to(device), moment))
+    outputs = torch.cat([mean, (F @ F.mT).flatten(1), opacity[:, None]], 1)
+    inputs = list(raw.values())
+    gradients = torch.autograd.grad(outputs, inputs, weights, materialize_grads=True)
+    return outputs.detach(), torch.cat([g.reshape(len(g), -1).double() for g in gradients], 1)
+
+
+def _cell(case: Case, observed: Observed, known: Truth, scheme: str, backend: str) -> Cell:
+    model, raw = load(observed, scheme, backend)
+    outputs, gradient = differentiate(model, raw, observed, known.weights)
+    bad = ~(outputs.isfinite().all(1) & gradient.isfinite().all(1))
+    bad |= indefinite(model, raw)
+    wrong = outputs - known.outputs
+    drawn = known.outputs[:, 12] >= ALPHA_MIN
+    shape = wrong[:, 3:12].norm(dim=1) / known.outputs[:, 3:12].norm(dim=1)
+    place = wrong[:, :3].norm(dim=1) / known.scale
+    geometry = torch.where(drawn, torch.maximum(shape, place), 0.0)
+    size = known.gradient.norm(dim=1)
+    slope = (gradient - known.gradient).norm(dim=1) / torch.where(size > 0, size, 1.0)
+    return Cell(
+        case.area, case.name, observed.model, scheme, backend, worst(torch.maximum(geometry, wrong[:, 12].abs())),
+        worst(slope), bad.double().mean().item(), _milliseconds(observed, known, scheme, backend), case.bound,
+        note=f"{int(drawn.sum())} of {COUNT} drawn",
+    )  # fmt: skip
+
+
+def worst(errors: Tensor) -> float:
+    """The largest; NaN if any is."""
+    return float(errors.max()) if bool(errors.isfinite().all()) else float("nan")
+
+
+def _milliseconds(observed: Observed, known: Truth, scheme: str, backend: str) -> float:
+    model, raw = load(observed, scheme, backend, COPIES)
+    weights = known.weights.repeat(COPIES, 1)
+    return fastest(lambda: differentiate(model, raw, observed, weights))
+
+
+def fastest(call: Callable[[], object], repeats: int = 3) -> float:
+    """Milliseconds of the fastest of a few calls, the machine may be shared; of one, if that takes half a second."""
+    times: list[float] = []
+    while len(times) < repeats and (not times or times[0] < SLOW_MS):
+        start = time.perf_counter()
+        call()
+        times.append(1e3 * (time.perf_counter() - start))
+    return min(times)
+
+
+def _single(x: float) -> float:
+    return float(torch.tensor(x, dtype=torch.float32))

@@ -1,0 +1,233 @@
+"""Hard slices: raw parameters of a few Gaussians, as training can leave them, and where they are observed from."""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Generator, Tensor
+
+from gsbench.kernels.thresholds import LOG_SIZE_MAX
+from gsbench.stability.cases import case
+
+COUNT = 4  # Gaussians a case: their truth takes a hundred evaluations each in a hundred digits
+LN_10 = math.log(10)
+TIME_LIKE = ("4dgs", "7dgs")
+TRIANGULAR = ("6dgs", "7dgs")
+ALL = ("4dgs", "6dgs", "7dgs")
+
+
+@dataclass
+class Observed:
+    """Gaussians of one model, seen from a place at a time."""
+
+    model: str
+    raw: dict[str, Tensor]  # float32, by the model's own names
+    center: Tensor
+    time: float
+    log_lambda: dict[str, float] = field(default_factory=dict)
+
+
+def variables(model: str) -> str:
+    """The variable of each row of the default triangular factor, conditioned ones first."""
+    return "dddtppp" if model == "7dgs" else "dddppp"
+
+
+def ordinary(g: Generator, model: str) -> Observed:
+    """Gaussians as a training starts with them, moved a little: nothing is hard yet, and all can be seen."""
+    means = torch.rand(COUNT, 3, generator=g) * 2 - 1
+    center, time = torch.tensor([0.3, -0.2, -4.0]), 0.4
+    raw = {"means": means, "opacities": torch.randn(COUNT, generator=g)}
+    if model == "4dgs":
+        raw["times"] = time + 0.1 * torch.randn(COUNT, 1, generator=g)
+        raw["scales"] = torch.randn(COUNT, 4, generator=g) * 0.3 - 1
+        raw["left_quats"], raw["right_quats"] = (torch.randn(COUNT, 4, generator=g) for _ in range(2))
+        return Observed(model, raw, center, time, {"time": 0.0})
+    n = len(variables(model))
+    towards = torch.nn.functional.normalize(means - center, dim=-1)
+    raw["directions"] = towards + 0.2 * torch.randn(COUNT, 3, generator=g)
+    raw["log_diagonal"] = 0.3 * torch.randn(COUNT, n, generator=g) - 0.5
+    raw["off_diagonal"] = 0.3 * torch.randn(COUNT, n * (n - 1) // 2, generator=g)
+    log_lambda = {"direction": math.log(0.35)}
+    if model == "7dgs":
+        raw["times"] = time + 0.1 * torch.randn(COUNT, 1, generator=g)
+        log_lambda["time"] = math.log(0.35)
+    return Observed(model, raw, center, time, log_lambda)
+
+
+def sizes(observed: Observed, variable: str) -> Tensor:
+    """A view on the log sizes of one variable, [COUNT, width], to be written to."""
+    if observed.model == "4dgs":
+        return observed.raw["scales"][:, 3:] if variable == "t" else observed.raw["scales"][:, :3]
+    rows = [i for i, name in enumerate(variables(observed.model)) if name == variable]
+    return observed.raw["log_diagonal"][:, rows[0] : rows[-1] + 1]
+
+
+def upright(observed: Observed) -> None:
+    """Turn a 4D Gaussian so that its last axis is time itself."""
+    for name in ("left_quats", "right_quats"):
+        observed.raw[name][:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+
+
+def entries(observed: Observed, variable: str) -> list[tuple[int, int]]:
+    """Places (row, number among the off-diagonals) left of the diagonal in the rows of one variable."""
+    names = variables(observed.model)
+    rows = [i for i, name in enumerate(names) if name == variable]
+    return [(i, i * (i - 1) // 2 + j) for i in rows for j in range(i)]
+
+
+@case("slicing", *ALL)
+def ordinary_gaussians(g: Generator, severity: float, model: str) -> Observed:  # noqa: ARG001
+    """Nothing: what every scheme must get right, the floor that the other rows are read against."""
+    return ordinary(g, model)
+
+
+@case("slicing", *ALL)
+def diagonals_over_eight_decades(g: Generator, severity: float, model: str) -> Observed:
+    """Factor diagonals from 1 to 1e-8 under correlations of 1: the condition number is squared wherever S is formed.
+
+    The camera is on the means, so that d = 0 has no rounding: what is tested is the factor and not the query.
+    """
+    observed = ordinary(g, model)
+    name = "scales" if model == "4dgs" else "log_diagonal"
+    observed.raw[name] = -8 * LN_10 * severity * torch.rand(observed.raw[name].shape, generator=g)
+    if model == "4dgs":
+        return observed
+    observed.raw["off_diagonal"] = torch.randn(observed.raw["off_diagonal"].shape, generator=g)
+    observed.center, observed.raw["means"][:] = torch.ones(3), 1.0
+    narrowest = sizes(observed, "d").amin(1, keepdim=True).clamp(min=-LOG_SIZE_MAX).exp()
+    observed.raw["directions"] = 0.3 * narrowest * torch.randn(COUNT, 3, generator=g)
+    if "times" in observed.raw:
+        observed.time = 0.0
+        observed.raw["times"] = 0.3 * torch.randn(COUNT, 1, generator=g)
+    return observed
+
+
+@case("slicing", *TRIANGULAR)
+def narrow_in_direction(g: Generator, severity: float, model: str) -> Observed:
+    """A highlight 10^-3 wide: d has an ulp of 6e-8, so float32 cannot place it to better than 6e-5 of its width."""
+    observed = ordinary(g, model)
+    sizes(observed, "d")[:] = -3 * LN_10 * severity
+    for _, at in entries(observed, "d"):
+        observed.raw["off_diagonal"][:, at] *= 10 ** (-3 * severity)
+    offset = observed.raw["means"] - observed.center
+    spread = 10 ** (-3 * severity) * torch.randn(COUNT, 3, generator=g)
+    observed.raw["directions"] = torch.nn.functional.normalize(offset, dim=-1) + spread
+    return observed
+
+
+@case("slicing", *ALL)
+def nearly_certain(g: Generator, severity: float, model: str) -> Observed:
+    """Position and the conditioned variable correlated to 1 - 1e-12: S_pp - K S_qp is the difference of equals."""
+    observed = ordinary(g, model)
+    thin = -severity * 0.5 * math.log(5e11)  # sqrt(1 - rho^2) = sqrt(2e-12)
+    if model == "4dgs":
+        half = math.pi / 8  # left and right rotations of 22.5 degrees turn z into t by 45
+        for name in ("left_quats", "right_quats"):
+            observed.raw[name][:] = torch.tensor([math.cos(half), math.sin(half), 0.0, 0.0])
+        observed.raw["scales"][:, 2] = observed.raw["scales"][:, 3] + thin
+        return observed
+    for row, at in entries(observed, "p"):
+        observed.raw["off_diagonal"][:, at] = 1.0 if row != at else 0.0
+    sizes(observed, "p")[:] = thin
+    return observed
+
+
+@case("slicing", *TIME_LIKE)
+def instant(g: Generator, severity: float, model: str) -> Observed:
+    """S_t -> 0, log sigma_t to -80: Gaussians of one frame, as 4DGS grows on video; half are seen at their instant."""
+    observed = ordinary(g, model)
+    if model == "4dgs":
+        upright(observed)
+    else:
+        for _, at in entries(observed, "t"):
+            observed.raw["off_diagonal"][:, at] = 0.0
+    sizes(observed, "t")[:] = -80 * severity
+    observed.raw["times"][::2] = float(torch.tensor(observed.time))
+    return observed
+
+
+@case("slicing", *TIME_LIKE)
+def static(g: Generator, severity: float, model: str) -> Observed:
+    """S_t -> inf, log sigma_t to 80: what does not move has no gradient that ends the growth of its duration."""
+    observed = ordinary(g, model)
+    if model == "4dgs":
+        upright(observed)
+    sizes(observed, "t")[:] = 80 * severity
+    return observed
+
+
+@case("slicing", *ALL)
+def far_from_the_query(g: Generator, severity: float, model: str) -> Observed:
+    """t and d 10^3 sigma away: f underflows and must be 0 with gradient 0, where 0 x inf is NaN (4DGaussians #35)."""
+    observed = ordinary(g, model)
+    if model == "4dgs":
+        upright(observed)
+    for variable in "td" if model == "7dgs" else "t" if model == "4dgs" else "d":
+        sizes(observed, variable)[:] = -severity * 3 * LN_10
+    if "times" in observed.raw:
+        observed.raw["times"] += 1.0
+    if "directions" in observed.raw:
+        observed.raw["directions"] += 1.0
+    return observed
+
+
+@case("slicing", *ALL)
+def insensitive(g: Generator, severity: float, model: str) -> Observed:
+    """lambda -> 0: f is 1 for every query, and only the mean still moves with it."""
+    observed = ordinary(g, model)
+    observed.log_lambda = dict.fromkeys(observed.log_lambda, -110.0 * severity)  # exp(-110) is 0 in float32
+    return observed
+
+
+@case("slicing", *ALL)
+def oversensitive(g: Generator, severity: float, model: str) -> Observed:
+    """lambda = 10^4: training switched lambda on and ran away; f is 0 or 1."""
+    observed = ordinary(g, model)
+    observed.log_lambda = dict.fromkeys(observed.log_lambda, 4 * LN_10 * severity)
+    near = 10 ** (-2 * severity)
+    if "directions" in observed.raw:
+        towards = torch.nn.functional.normalize(observed.raw["means"] - observed.center, dim=-1)
+        observed.raw["directions"] = towards + near * 0.3 * torch.randn(COUNT, 3, generator=g)
+    if "times" in observed.raw:
+        observed.raw["times"] = observed.time + near * 0.3 * torch.randn(COUNT, 1, generator=g)
+    return observed
+
+
+@case("slicing", *ALL)
+def camera_on_a_mean(g: Generator, severity: float, model: str) -> Observed:
+    """The camera sits on a mean, or 1e-12, 1e-6 and 1e-3 beside it: d is 0/0, by definition 0 (walk-throughs, SLAM)."""
+    observed = ordinary(g, model)
+    aside = torch.tensor([0.0, 1e-12, 1e-6, 1e-3])[:, None] + 1 - severity
+    observed.center = torch.zeros(3)
+    observed.raw["means"] = aside * torch.tensor([[1.0, -2.0, 0.5]])
+    if "directions" in observed.raw:
+        observed.raw["directions"] = 0.5 * torch.randn(COUNT, 3, generator=g)
+    return observed
+
+
+@case("slicing", *TRIANGULAR)
+def direction_off_the_sphere(g: Generator, severity: float, model: str) -> Observed:
+    """mu_d 10^4 away from the unit sphere where every d lies: its rate of 2.5e-2 a step has nothing to stop it."""
+    observed = ordinary(g, model)
+    observed.raw["directions"] *= 10 ** (4 * severity)
+    sizes(observed, "d")[:] += 4 * LN_10 * severity
+    return observed
+
+
+@case("slicing", *ALL)
+def refinement_pushes_sizes(g: Generator, severity: float, model: str) -> Observed:
+    """AGR residuals that push log sizes to +-80: exp overflows float32 at 89, and its square at 45."""
+    observed = ordinary(g, model)
+    name = "scales" if model == "4dgs" else "log_diagonal"
+    sign = torch.where(torch.rand(observed.raw[name].shape, generator=g) < 0.5, -1.0, 1.0)
+    observed.raw[name] += 80 * severity * sign
+    return observed
+
+
+@case("slicing", "4dgs")
+def vanishing_quaternion(g: Generator, severity: float, model: str) -> Observed:
+    """Quaternions of length 1e-6: normalised in the loss but never in the parameters, weight decay shrinks them."""
+    observed = ordinary(g, model)
+    for name in ("left_quats", "right_quats"):
+        observed.raw[name] *= 10 ** (-6 * severity)
+    return observed

@@ -1,0 +1,90 @@
+"""Condition numbers of the factors in a trained model: how hard the slices are that training really makes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.models.factors import rotation4d, sizes, triangular
+from gsbench.models.slicing import reduce, subtract
+from gsbench.stability.plots import save
+from gsbench.stability.population import Floats
+from gsbench.train import checkpoint
+
+FILE_NAME = "spectrum.png"
+PERCENTILES = (50, 90, 99, 99.9, 100)
+
+
+def measure(path: Path) -> dict[str, Floats]:
+    """Condition numbers of the joint factor and of the sliced one, of each Gaussian of a checkpoint, before AGR.
+
+    Raises:
+        InputError: it is no checkpoint, or of a model that slices nothing.
+    """
+    joint, k = joint_factors(_splats(path), path)
+    sliced = reduce(joint).T_pp
+    return {f"joint factor, {3 + k} x {3 + k}": _condition(joint), "sliced factor, 3 x 3": _condition(sliced)}
+
+
+def failures(path: Path) -> dict[str, tuple[float, float]]:
+    """Of each scheme that subtracts, in float32: share of the checkpoint's covariances it makes indefinite, and the
+    99th percentile of their relative error.
+    """  # fmt: skip
+    joint, _ = joint_factors(_splats(path), path)
+    exact = reduce(joint).T_pp
+    exact = exact @ exact.mT
+    found = {}
+    for scheme in ("schur", "cholesky"):
+        cov = subtract(joint.float(), scheme)[1].double()
+        error = (cov - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))
+        found[scheme] = (float((torch.linalg.eigvalsh(cov)[:, 0] < 0).double().mean()), float(error.quantile(0.99)))
+    return found
+
+
+def _splats(path: Path) -> dict[str, Tensor]:
+    state: dict[str, Any] = checkpoint.read(path)[1].get("model", {})
+    return {name.removeprefix("splats."): value.double() for name, value in state.items() if name[:7] == "splats."}
+
+
+def joint_factors(splats: dict[str, Tensor], path: Path) -> tuple[Tensor, int]:
+    """Factors [N, 3+k, 3+k] with rows (p, q), and k. Triangular ones are taken in the order (q, p), the default."""
+    if "log_diagonal" in splats:
+        L = triangular(splats["log_diagonal"], splats["off_diagonal"])
+        k = L.shape[1] - 3
+        return torch.cat([L[:, k:], L[:, :k]], 1), k
+    if "left_quats" in splats:
+        R = rotation4d(splats["left_quats"], splats["right_quats"])
+        return R * sizes(splats["scales"])[:, None, :], 1
+    raise InputError(f"{path}: expected a checkpoint of 4dgs, 6dgs or 7dgs, got parameters {sorted(splats)}")
+
+
+def report(found: dict[str, Floats]) -> str:
+    """Percentiles as a table."""
+    lines = [f"| condition number of | {' | '.join(f'{p:g} %' for p in PERCENTILES)} |",
+             "| --- |" + " ---: |" * len(PERCENTILES)]  # fmt: skip
+    for name, values in found.items():
+        lines.append(f"| {name} | {' | '.join(f'{x:.1e}' for x in np.percentile(values, PERCENTILES))} |")
+    return "\n".join(lines)
+
+
+def draw(found: dict[str, Floats], folder: Path, title: str) -> Path:
+    """Write a histogram to `folder`; return where."""
+
+    def histogram(axes: Axes) -> None:
+        most = max(float(values.max()) for values in found.values())
+        bins = np.logspace(0, np.log10(most) + 0.1, 60)
+        for name, values in found.items():
+            axes.hist(values, bins=bins.tolist(), alpha=0.6, label=name)
+        axes.set(xscale="log", xlabel="condition number", ylabel="Gaussians", title=title)
+        axes.legend()
+
+    save(folder / FILE_NAME, histogram)
+    return folder / FILE_NAME
+
+
+def _condition(factors: Tensor) -> Floats:
+    return np.asarray(np.linalg.cond(factors.numpy()), np.float64)

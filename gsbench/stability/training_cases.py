@@ -1,0 +1,146 @@
+"""Hard trainings: tiny scenes under recipes that drive a model where it should not go."""
+
+import math
+from dataclasses import dataclass, replace
+
+import hydra
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+from torch import Generator, Tensor
+
+from gsbench.__main__ import CONF
+from gsbench.config import Config, register_schema
+from gsbench.scenes.scene import Camera, Points, Scene, View
+from gsbench.stability.cases import case
+
+MODELS = ("3dgs", "4dgs", "6dgs", "7dgs")
+SIZE = 16  # pixels a side
+VIEWS = 12
+POINTS = 80
+STEPS = 150
+LONG_STEPS = 2_000
+
+
+@dataclass
+class Training:
+    """A run to be made: the recipe and the photographs."""
+
+    model: str
+    config: Config
+    scene: Scene
+    refused: bool = False  # it must be refused at the door, rather than end well
+
+
+def compose(model: str, steps: int, *overrides: str) -> Config:
+    """The config of `+exp=mini` with few steps; its scene is not loaded."""
+    register_schema()
+    names = ["+exp=mini", "scene=moving-matte", f"model={model}", f"train.iterations={steps}", *overrides]
+    if GlobalHydra.instance().is_initialized():
+        composed = hydra.compose("config", names)
+    else:
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            composed = hydra.compose("config", names)
+    config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
+    return config
+
+
+def moving_square(views: int = VIEWS, dtype: torch.dtype = torch.float32) -> Scene:
+    """A white square on black that moves with time, seen from cameras on a circle around it."""
+    made = []
+    for i in range(views):
+        moment, angle = i / max(1, views - 1), 2 * math.pi * i / views
+        image = torch.zeros(SIZE, SIZE, 3, dtype=dtype)
+        left = 3 + round(5 * moment)
+        image[5:11, left : left + 5] = torch.tensor([1.0, 0.9, 0.7], dtype=dtype)
+        made.append(View(f"train/{i}", camera_on_circle(angle, dtype), moment, image))
+    g = torch.Generator().manual_seed(0)
+    points = Points(torch.rand(POINTS, 3, generator=g) * 1.6 - 0.8, torch.rand(POINTS, 3, generator=g))
+    return Scene("moving-square", made, [], made, (0.0, 0.0, 0.0), 4.4, points, "made here")
+
+
+def camera_on_circle(angle: float, dtype: torch.dtype) -> Camera:
+    """Four units from the origin, looking at it."""
+    c, s = math.cos(angle), math.sin(angle)
+    viewmat = torch.eye(4, dtype=dtype)
+    viewmat[:3, :3] = torch.tensor([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
+    viewmat[2, 3] = 4.0
+    focal = SIZE * 1.4
+    K = torch.tensor([[focal, 0.0, SIZE / 2], [0.0, focal, SIZE / 2], [0.0, 0.0, 1.0]], dtype=dtype)
+    return Camera(viewmat, K, SIZE, SIZE)
+
+
+def faster(config: Config, factor: float) -> Config:
+    """The same recipe with every learning rate `factor` times as high."""
+    for rate in config.model.lr.values():
+        rate.start *= factor
+        rate.end = rate.end if rate.end is None else rate.end * factor
+    return config
+
+
+@case("training", *MODELS, forward=0.0, gradient=math.nan)
+def learning_rates_times_30(g: Generator, severity: float, model: str, steps: int = STEPS) -> Training:  # noqa: ARG001
+    """Every learning rate times 30: parameters run to the ends of their ranges; 2,000 steps of it in the long audit."""
+    return Training(model, faster(compose(model, steps), 30**severity), moving_square())
+
+
+@case("training", *MODELS, forward=0.0, gradient=math.nan)
+def one_frame(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
+    """A data set of one photograph: depth, time and direction are all free, and the cameras' extent is zero."""
+    scene = moving_square()
+    views = scene.train[: max(1, round(VIEWS * (1 - severity)))]
+    return Training(model, compose(model, STEPS), replace(scene, train=views, extent=4.4 * (1 - severity)))
+
+
+@case("training", *MODELS, forward=0.0, gradient=math.nan)
+def all_images_equal(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
+    """Every photograph is black: nothing to show, so opacities sink and all Gaussians may be pruned."""
+    scene = moving_square()
+    views = [replace(view, image=view.image * (1 - severity)) for view in scene.train]
+    return Training(model, compose(model, STEPS), replace(scene, train=views))
+
+
+@case("training", *MODELS, forward=0.0, gradient=math.nan)
+def seen_by_no_view(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
+    """Half of the Gaussians lie where no camera looks: their gradient is 0, and Adam divides it by sqrt(0) + eps."""
+    scene = moving_square()
+    assert scene.points is not None
+    means: Tensor = scene.points.means.clone()
+    means[::2, 1] += 100 * severity
+    return Training(model, compose(model, STEPS), replace(scene, points=Points(means, scene.points.colors)))
+
+
+@case("training", "7dgs", forward=0.0, gradient=math.nan)
+def reset_into_refinement(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
+    """Opacities are reset in the step before AGR starts to act, with its learning rate times 100."""
+    config = compose(model, 2 * STEPS, "train.recipe_iterations=300", "train.densify.start=20",
+                     "train.densify.reset_every=100", "train.densify.stop=500",
+                     "train.refine_from=100", "train.batch_size=1")  # fmt: skip
+    config.model.lr["refinement"].start *= 100**severity
+    return Training(model, config, moving_square())
+
+
+@case("training", "6dgs", "7dgs", forward=0.0, gradient=math.nan)
+def modulation_switched_on(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
+    """lambda starts to learn in the middle, at 1000 times the usual rate: it runs to 0 or away."""
+    config = compose(model, STEPS, "train.modulation_from=15000")
+    config.model.lr["modulation"].start = 1e-3 * 1000**severity
+    return Training(model, config, moving_square())
+
+
+@case("training", "3dgs", forward=0.0, gradient=math.nan)
+def poisoned_photograph(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
+    """One pixel of one photograph is NaN: it must be refused at the door, not found in every parameter later."""
+    scene = moving_square()
+    scene.train[3].image[2, 5, 1] = math.nan
+    return Training(model, compose(model, STEPS), scene, refused=True)
+
+
+@case("drift", "7dgs", forward=1.0, gradient=math.nan)
+def single_against_double(g: Generator, severity: float, model: str, run_seed: int = 0) -> Training:  # noqa: ARG001
+    """500 steps of one seed in float32 and in float64, whose rounding decides who is split; the error is in dB."""
+    scene = moving_square()
+    assert scene.points is not None
+    half = Points(scene.points.means[::2], scene.points.colors[::2])
+    config = compose(model, 500, "train.batch_size=1", f"seed={run_seed}")
+    return Training(model, config, replace(scene, points=half))

@@ -1,0 +1,104 @@
+"""Judges trainings: whether they end well, with finite numbers everywhere, and how far float32 drifts from float64."""
+
+import contextlib
+import io
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from gsbench import models
+from gsbench.errors import InputError
+from gsbench.models import GaussianModel
+from gsbench.scenes.scene import Camera, Points, Scene, View
+from gsbench.stability.cases import Case, Cell, device_of
+from gsbench.stability.training_cases import Training
+from gsbench.train.diagnosis import explain
+from gsbench.train.loop import Trainer
+from gsbench.train.schedule import generator
+from gsbench.train.watch import DivergedError
+
+
+def judge(case: Case, backend: str, **more: Any) -> Iterator[Cell]:
+    """One cell a model: error 0 for a run that ends as it should, else 1."""
+    for name in case.subjects:
+        training: Training = case(model=name, **more)
+        start, end, bad, note = time.perf_counter(), 1.0, 1.0, ""
+        steps = training.config.train.iterations
+        try:
+            trainer = fit(training, backend)
+            bad = share_not_finite(trainer.model)
+            end = float(training.refused)
+            note = f"{steps} steps, {psnr(trainer):.2f} dB, {len(trainer.model)} Gaussians"
+        except DivergedError as error:
+            note = f"diverged: {error}"
+        except InputError as error:
+            end, bad = float(not training.refused), 0.0 if training.refused else 1.0
+            note = f"refused: {error}"
+        ms = 1e3 * (time.perf_counter() - start)
+        yield Cell(case.area, case.name, name, "-", backend, end, float("nan"), bad, ms, case.bound, note)
+
+
+def drift(case: Case, backend: str) -> Iterator[Cell]:
+    """PSNR of a float32 training less that of the same one in float64, which only the reference has."""
+    for name in case.subjects:
+        training: Training = case(model=name)
+        exact = psnr(fit(replace(training, scene=double(training.scene)), "reference"))
+        other = psnr(fit(case(model=name, run_seed=1), backend))
+        start = time.perf_counter()
+        trainer = fit(training, backend)
+        single, ms = psnr(trainer), 1e3 * (time.perf_counter() - start)
+        note = f"float32 {single:.3f} dB, float64 {exact:.3f} dB; seed 1 in float32 {other:.3f} dB"
+        yield Cell(case.area, case.name, name, "-", backend, abs(single - exact), float("nan"),
+                   share_not_finite(trainer.model), ms, case.bound, note)  # fmt: skip
+
+
+def fit(training: Training, backend: str) -> Trainer:
+    """Train to the end, in the precision of the scene's images.
+
+    Raises:
+        DivergedError: a number was not finite; it says where.
+        InputError: the data was refused.
+    """
+    config, scene = training.config, training.scene
+    config.raster.backend = backend
+    config.train.curve_points = 1
+    model = models.build(config.model.name, agr=config.agr, sh_degree=config.model.sh_degree, **config.model.options)
+    model.backend = backend
+    assert scene.points is not None
+    model.initialise(scene.points, scene.extent, generator(config.seed))
+    dtype, config.device = scene.train[0].image.dtype, device_of(backend)
+    model.to(config.device, dtype)
+    scene = scene.to(config.device)
+    trainer = Trainer(model, scene, scene.train, config)
+    trainer.background = trainer.background.to(dtype)
+    with contextlib.redirect_stderr(io.StringIO()):  # one progress bar is enough
+        try:
+            trainer.run(lambda _: None, training.model)
+        except DivergedError as error:
+            raise DivergedError(f"{error}; {explain(model)}") from None
+    return trainer
+
+
+def psnr(trainer: Trainer) -> float:
+    """Mean over the training views, dB."""
+    return trainer.psnr(trainer.scene.train)
+
+
+def share_not_finite(model: GaussianModel) -> float:
+    """Of all parameters, networks and lambdas included."""
+    values = torch.cat([p.detach().flatten() for p in model.parameters()])
+    return float((~values.isfinite()).double().mean()) if values.numel() else 0.0
+
+
+def double(scene: Scene) -> Scene:
+    """The scene in float64; its points stay, so that both trainings start from the same numbers."""
+
+    def view(seen: View) -> View:
+        camera = Camera(seen.camera.viewmat.double(), seen.camera.K.double(), seen.camera.width, seen.camera.height)
+        return replace(seen, camera=camera, image=seen.image.double())
+
+    points = scene.points and Points(scene.points.means, scene.points.colors)
+    return replace(scene, train=[view(v) for v in scene.train], test=[view(v) for v in scene.test], points=points)

@@ -1,0 +1,61 @@
+"""Why a training diverged: the first Gaussian whose gradient is not finite, and the hard case it resembles."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from gsbench.kernels.thresholds import LOG_SIZE_MAX
+from gsbench.models import GaussianModel
+
+THIN = -10.0  # log of a size in time: e^-10 of the clip is less than a frame of any
+NEEDLE = math.log(1e5)
+FAR = 1e3  # times the scene's extent
+LOUD = 1e3  # coefficients of a colour
+
+
+def explain(model: GaussianModel) -> str:
+    """One line about the gradients that `backward` left on a model, to follow the report that one is not finite."""
+    for name, parameter in model.splats.items():
+        if parameter.grad is None:
+            continue
+        bad = ~parameter.grad.reshape(len(parameter), -1).isfinite().all(1)
+        if bad.any():
+            index = int(bad.nonzero()[0])
+            case = resembles(model, index)
+            like = f"it resembles the stability case '{case}'" if case else "it resembles no stability case"
+            return f"the first is Gaussian {index} of {len(parameter)} in '{name}' ({int(bad.sum())} in all): {like}"
+    return "no Gaussian's gradient is: look at the refinement's networks or at lambda"
+
+
+@torch.no_grad()
+def resembles(model: GaussianModel, index: int) -> str | None:
+    """The case of `gsbench.stability` that a Gaussian's raw parameters come nearest to, None if they look ordinary."""
+    raw = {name: parameter[index].flatten() for name, parameter in model.splats.items()}
+    if not all(value.isfinite().all() for value in raw.values()):
+        return "learning_rates_times_30"  # the step before went too far
+    sizes = raw["log_diagonal"] if "log_diagonal" in raw else raw["scales"]
+    in_time = _log_size_in_time(model, sizes)
+    lambdas = [float(value) for value in model.log_modulation.parameters()]
+    checks = {
+        "refinement_pushes_sizes": float(sizes.abs().amax()) > LOG_SIZE_MAX,
+        "instant": in_time is not None and in_time < THIN,
+        "static": in_time is not None and in_time > -THIN,
+        "needle": float(sizes.amax() - sizes.amin()) > NEEDLE,
+        "vanishing_quaternion": any(float(raw[q].norm()) < 1e-5 for q in raw if q.endswith("quats")),
+        "direction_off_the_sphere": "directions" in raw and float(raw["directions"].norm()) > 10,
+        "larger_than_the_scene": float(sizes.amax()) > math.log(FAR * max(model.extent, 1e-3)),
+        "far_off_axis": float(raw["means"].norm()) > FAR * max(model.extent, 1e-3),
+        "loud_harmonics": max(float(raw["sh0"].abs().amax()), float(raw["shN"].abs().max())) > LOUD,
+        "oversensitive": any(value > math.log(1e3) for value in lambdas),
+        "insensitive": any(value < math.log(1e-6) for value in lambdas),
+    }
+    return next((name for name, found in checks.items() if found), None)
+
+
+def _log_size_in_time(model: GaussianModel, sizes: Tensor) -> float | None:
+    """The log size that belongs to time, None for a model that does not observe it."""
+    if "time" not in model.observes:
+        return None
+    rows = getattr(model, "rows", None)  # of the triangular models
+    return float(sizes[rows["t"][0]] if rows else sizes[3])

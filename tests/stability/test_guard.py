@@ -1,0 +1,135 @@
+"""What a user learns when a training diverges, and what a trained model's factors are like."""
+
+import contextlib
+import io
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsbench import models
+from gsbench.errors import InputError
+from gsbench.stability import (
+    __main__ as command,
+)
+from gsbench.stability import (
+    colors,  # noqa: F401  # its cases enter the list
+    picture_cases,  # noqa: F401
+    slicing_cases,  # noqa: F401
+    spectrum,
+    training_cases,
+)
+from gsbench.stability.cases import CASES
+from gsbench.train import checkpoint, diagnosis
+from gsbench.train.loop import Trainer
+from gsbench.train.schedule import generator
+from gsbench.train.watch import DivergedError
+
+POISONED = 7
+
+
+def trainer(name: str, steps: int = 12) -> Trainer:
+    config, scene = training_cases.compose(name, steps, "train.densify.stop=1"), training_cases.moving_square()
+    config.train.curve_points = 1
+    model = models.build(name, agr=config.agr, sh_degree=3, **config.model.options)
+    assert scene.points is not None
+    model.initialise(scene.points, scene.extent, generator(0))
+    return Trainer(model, scene, scene.train, config)
+
+
+def poison(model: models.GaussianModel, parameter: str, after: int) -> None:
+    """From so many backward passes on, one Gaussian's gradient is NaN."""
+    passes = [0]
+
+    def hook(gradient: Tensor) -> Tensor:
+        passes[0] += 1
+        if passes[0] > after:
+            gradient = gradient.clone()
+            gradient[POISONED] = math.nan
+        return gradient
+
+    model.splats[parameter].register_hook(hook)
+
+
+def test_the_step_the_parameter_the_gaussian_and_the_case(tmp_path: Path) -> None:
+    """Catches a NaN that is noticed steps later, is blamed on something else, or reaches a parameter or checkpoint."""
+    run = trainer("7dgs")
+    batch = run.config.train.batch_size
+    run.model.splats["log_diagonal"].data[POISONED, 3] = -14.0  # e^-14 of the clip: an instant
+    run.config.train.checkpoint_minutes = 0  # after every step
+    poison(run.model, "log_diagonal", after=5 * batch)
+    path = tmp_path / "checkpoint.pt"
+    with contextlib.redirect_stderr(io.StringIO()), pytest.raises(DivergedError, match=r"step 5.*'log_diagonal'"):
+        run.run(lambda state: checkpoint.save(path, "config", "data", state), "poisoned")
+    assert diagnosis.explain(run.model) == (
+        "the first is Gaussian 7 of 80 in 'log_diagonal' (1 in all): it resembles the stability case 'instant'"
+    )
+    assert all(p.isfinite().all() for p in run.model.parameters())
+    state = checkpoint.load(path, "config", "data", "cpu")
+    assert state is not None
+    assert state["step"] == 5
+    assert all(value.isfinite().all() for value in state["model"].values())
+
+
+CHANGES = {
+    "refinement_pushes_sizes": ("log_diagonal", 4, 40.0),
+    "instant": ("log_diagonal", 3, -12.0),
+    "static": ("log_diagonal", 3, 12.0),
+    "needle": ("log_diagonal", 5, -15.0),
+    "direction_off_the_sphere": ("directions", 0, 1e3),
+    "larger_than_the_scene": ("log_diagonal", slice(4, 7), 9.0),
+    "far_off_axis": ("means", 0, 1e5),
+    "loud_harmonics": ("sh0", 0, 1e4),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_resemblance(name: str) -> None:
+    """Catches a diagnosis that names a case there is none of, or another one than the Gaussian was made like."""
+    model = trainer("7dgs").model
+    parameter, at, value = CHANGES[name]
+    model.splats[parameter].data[POISONED, at] = value
+    assert name in CASES
+    assert diagnosis.resembles(model, POISONED) == name
+    assert diagnosis.resembles(model, POISONED + 1) is None
+
+
+def test_resemblance_of_the_whole_model() -> None:
+    """Catches lambdas and quaternions that are not looked at, and a diagnosis without any Gaussian to blame."""
+    model = trainer("7dgs").model
+    assert "networks" in diagnosis.explain(model)
+    for value, name in ((9.0, "oversensitive"), (-50.0, "insensitive")):
+        model.log_modulation["time"].data.fill_(value)
+        assert diagnosis.resembles(model, 0) == name
+    rotated = trainer("4dgs").model
+    rotated.splats["left_quats"].data[0] *= 1e-6
+    assert diagnosis.resembles(rotated, 0) == "vanishing_quaternion"
+
+
+def test_spectrum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches condition numbers of something else than the factor: a diagonal one has max / min, in space too."""
+    model = trainer("7dgs").model
+    model.splats["off_diagonal"].data.zero_()
+    logs = torch.tensor([0.0, 0.0, 0.0, 3.0, -1.0, -2.0, -3.0])
+    model.splats["log_diagonal"].data[:] = logs
+    path = tmp_path / "checkpoint.pt"
+    checkpoint.save(path, "config", "data", {"model": model.state_dict()})
+    joint, sliced = spectrum.measure(path).values()
+    torch.testing.assert_close(torch.from_numpy(joint), torch.full((80,), math.exp(6)).double(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(torch.from_numpy(sliced), torch.full((80,), math.exp(2)).double(), rtol=1e-6, atol=0)
+    assert command.main(["--checkpoint", str(path), "--out", str(tmp_path)]) == 0
+    assert "schur in float32: 0.00 % indefinite" in capsys.readouterr().out
+    assert (tmp_path / spectrum.FILE_NAME).exists()
+
+
+def test_spectrum_of_what_is_no_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a stack trace for a file that is none, or a model that slices nothing."""
+    path = tmp_path / "checkpoint.pt"
+    path.write_text("no")
+    assert command.main(["--checkpoint", str(path), "--out", str(tmp_path)]) == 2
+    assert "expected a checkpoint" in capsys.readouterr().err
+    checkpoint.save(path, "config", "data", {"model": trainer("3dgs").model.state_dict()})
+    with pytest.raises(InputError, match="4dgs, 6dgs or 7dgs"):
+        spectrum.measure(path)
