@@ -10,7 +10,7 @@ import torch
 from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 
-VERSION = 1
+VERSION = 2
 FILE_NAME = "checkpoint.pt"
 
 

@@ -1,4 +1,4 @@
-"""Adaptive density control: clone where small, split where large, prune what is faint (3DGS, section 5.2)."""
+"""Adaptive density control: clone where small, split where large, prune what is faint or unseen (3DGS, section 5.2)."""
 
 import torch
 from torch import Tensor
@@ -13,12 +13,16 @@ from gsbench.train.optim import Optimizer
 class DensityControl:
     """Collects the gradients of 2D means and, when asked, edits the model and the optimizer's moments alike."""
 
-    def __init__(self, model: GaussianModel, optimizer: Optimizer, config: DensifyConfig, min_opacity: float) -> None:
-        """Control the density of `model`, pruning below `min_opacity`."""
+    def __init__(
+        self, model: GaussianModel, optimizer: Optimizer, config: DensifyConfig, min_opacity: float, views: int
+    ) -> None:
+        """Control the density of `model` over epochs of `views`, pruning below `min_opacity`."""
         self.model = model
         self.optimizer = optimizer
         self.config = config
         self.min_opacity = min_opacity
+        self.patience = 2 * views - 1  # so many views in a row hold a whole epoch, wherever they begin
+        self.unseen = torch.zeros(len(model), dtype=torch.int32, device=model.splats["means"].device)
         self.forget()
 
     def forget(self) -> None:
@@ -33,7 +37,10 @@ class DensityControl:
         assert info.means2d.grad is not None, "call info.means2d.retain_grad() before backward()"
         x, y = info.means2d.grad.unbind(-1)  # scaled apart: a tensor of both sizes would be waited for on a GPU
         self.gradient += (torch.stack([x * (width / 2), y * (height / 2)], -1) * views).norm(dim=-1).sum(0)
-        self.seen += (info.radii > 0).sum(0)
+        drawn = (info.radii > 0).sum(0)
+        self.seen += drawn
+        # [N] views since the last that drew the Gaussian
+        self.unseen = torch.where(drawn > 0, 0, self.unseen + len(info.radii))
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator, prune_large: bool) -> None:
@@ -51,7 +58,8 @@ class DensityControl:
         children = torch.arange(len(model) - len(parents), len(model), device=parents.device)
         model.split(children, generator)
 
-        keep = torch.sigmoid(model.splats["opacities"]) >= self.min_opacity
+        # What no view draws has no gradient: nothing could bring it back, and it costs as much as any other.
+        keep = (torch.sigmoid(model.splats["opacities"]) >= self.min_opacity) & (self.unseen < self.patience)
         if prune_large:
             keep &= model.scales() <= config.prune_above * model.extent
         self._select(keep.nonzero()[:, 0], fresh=0)
@@ -63,14 +71,15 @@ class DensityControl:
         self.optimizer.forget(self.model.splats["opacities"])
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What was collected since the last densification."""
-        return {"gradient": self.gradient, "seen": self.seen}
+        """What was collected."""
+        return {"gradient": self.gradient, "seen": self.seen, "unseen": self.unseen}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Go on from `state_dict`."""
-        self.gradient, self.seen = state["gradient"], state["seen"]
+        self.gradient, self.seen, self.unseen = state["gradient"], state["seen"], state["unseen"]
 
     def _select(self, rows: Tensor, fresh: int) -> None:
         is_fresh = torch.arange(len(rows), device=rows.device) >= len(rows) - fresh
         self.model.select(rows)
+        self.unseen = self.unseen[rows]
         self.optimizer.follow(self.model, rows, is_fresh)

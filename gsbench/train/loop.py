@@ -55,7 +55,7 @@ class Trainer:
         self.background = torch.tensor(scene.background, device=config.device)
         self.schedule = Schedule(train, config.model.sh_degree, config.agr)
         self.optimizer = Optimizer(model, config.model, scene.extent, train.iterations, config.optim)
-        self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity)
+        self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity, len(scene.train))
         self.stages = Stages(config.device)
         self.watch = Watch(config.device)
         if config.device.startswith("cuda"):  # there a bad step is found later, and must not be applied meanwhile

@@ -14,11 +14,11 @@ from gsbench.kernels.cuda.loss import l1_ssim
 from gsbench.kernels.cuda.raster import View
 from gsbench.raster import RasterOutput, rasterize
 from gsbench.raster.cuda import splat
+from gsbench.stability.brute import paint
 from gsbench.train.losses import photometric
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "raster"))
 from cases import camera, case, gaussians, names
-from oracle import paint
 
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background")
 
@@ -36,8 +36,8 @@ def draw(arguments: dict[str, Any], device: str) -> RasterOutput:
 
 def decided(arguments: dict[str, Any]) -> Tensor:
     """Pixels where no rounding can flip a decision of the picture's rules, [C, H, W]."""
-    arrays = {k: v.double().numpy() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-    return torch.from_numpy(paint(**arrays).slack > 1e-3)
+    exact = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+    return paint(**exact).slack > 1e-3
 
 
 @pytest.mark.parametrize("name", names())

@@ -70,10 +70,10 @@ def test_rates_and_parameters_must_match() -> None:
         fitted(rates={**RATES, "sacles": LearningRate(1.0)})
 
 
-def info_with_gradient(gradients: torch.Tensor) -> RasterInfo:  # [N, 2]
+def info_with_gradient(gradients: torch.Tensor, drawn: torch.Tensor | None = None) -> RasterInfo:  # [N, 2]
     means2d = torch.zeros(1, *gradients.shape)
     means2d.grad = gradients[None]
-    radii = torch.ones(1, len(gradients), dtype=torch.int32)
+    radii = torch.ones(1, len(gradients), dtype=torch.int32) if drawn is None else drawn[None].int()
     return RasterInfo(radii, means2d, torch.ones(1, len(gradients)), 0)
 
 
@@ -81,7 +81,7 @@ def test_density_control_clones_small_splits_large_prunes_faint() -> None:
     """Catches a wrong criterion or count of any of the three, and a gradient in pixels instead of half pictures."""
     model, optimizer = fitted(6)
     descend(model, optimizer, 0)
-    control = DensityControl(model, optimizer, DensifyConfig(grad_threshold=1.0), min_opacity=0.01)
+    control = DensityControl(model, optimizer, DensifyConfig(grad_threshold=1.0), min_opacity=0.01, views=3)
     with torch.no_grad():
         model.splats["scales"].fill_(math.log(0.001))  # small: below 0.01 x extent 2
         model.splats["scales"][3:5] = math.log(0.1)  # large
@@ -102,13 +102,33 @@ def test_density_control_clones_small_splits_large_prunes_faint() -> None:
     descend(model, optimizer, 1)
 
 
+def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
+    """Catches dead weight that stays, Gaussians dropped before every view has looked, and miscounted rows."""
+    model, optimizer = fitted(4)
+    with torch.no_grad():
+        model.splats["means"].copy_(torch.arange(4.0)[:, None].expand(4, 3))
+    control = DensityControl(model, optimizer, DensifyConfig(grad_threshold=1.0), min_opacity=0.01, views=3)
+    now_and_then, never = torch.tensor([True, False, True, True]), torch.tensor([True, False, False, True])
+
+    def look(drawn: torch.Tensor, times: int) -> list[float]:
+        for _ in range(times):
+            control.observe(info_with_gradient(torch.zeros(4, 2)[: len(model)], drawn), 10, 10, views=1)
+        control.densify(torch.Generator(), prune_large=False)
+        return model.splats["means"].detach()[:, 0].tolist()
+
+    assert look(never, 4) == [0, 1, 2, 3]  # four views in a row may miss one of three
+    assert look(now_and_then, 1) == [0, 2, 3]  # the fifth
+    assert look(now_and_then[[0, 1, 3]], 4) == [0, 2, 3]
+    assert look(now_and_then[[0, 1, 3]], 1) == [0, 3]
+
+
 def test_large_gaussians_are_pruned_only_when_asked() -> None:
     """Catches pruning by size before the first opacity reset."""
     model, optimizer = fitted(4)
     with torch.no_grad():
         model.splats["scales"].fill_(math.log(0.1))
         model.splats["scales"][0] = math.log(0.3)  # above 0.1 x extent 2
-    control = DensityControl(model, optimizer, DensifyConfig(), min_opacity=0.01)
+    control = DensityControl(model, optimizer, DensifyConfig(), min_opacity=0.01, views=3)
     control.densify(torch.Generator(), prune_large=False)
     assert len(model) == 4
     control.densify(torch.Generator(), prune_large=True)
@@ -119,7 +139,7 @@ def test_opacity_reset_forgets_momentum() -> None:
     """Catches momentum that undoes the reset in the next steps, and a reset to below what is pruned."""
     model, optimizer = fitted(4)
     descend(model, optimizer, 0)
-    control = DensityControl(model, optimizer, DensifyConfig(), min_opacity=0.01)
+    control = DensityControl(model, optimizer, DensifyConfig(), min_opacity=0.01, views=3)
     control.reset_opacities()
     assert torch.sigmoid(model.splats["opacities"]).max().item() == pytest.approx(0.02)
     assert not optimizer.adam.state[model.splats["opacities"]]["exp_avg"].any()
