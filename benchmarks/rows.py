@@ -88,15 +88,16 @@ def refining() -> Iterator[Row]:
     """AGR's four perceptrons on 100k 7D Gaussians."""
     refinement = model("7dgs", 100_000, agr=True).refinement
     assert refinement is not None
-    features = torch.randn(100_000, 7).requires_grad_()
+    widths = [3, 1, 3, 7, 21]
+    values = [torch.randn(100_000, width).requires_grad_() for width in widths]
     multiplications = 100_000 * 64 * (4 * 7 + 35)
     for native in (True, False):
-        out = refinement(features, torch.tensor(0.3), native=native)
+        out = refinement(values, torch.tensor(0.3), native=native)
         upstream = [torch.ones_like(x) for x in out]
-        inputs = [features, *refinement.parameters()]
+        inputs = [*values, *refinement.parameters()]
         backend = "cpu" if native else "reference"
         yield Row("agr", f"AGR 100k forward, {backend}",
-                  lambda n=native: refinement(features, torch.tensor(0.3), native=n), 20.0 if native else None,
+                  lambda n=native: refinement(values, torch.tensor(0.3), native=n), 20.0 if native else None,
                   ("flops", 2 * multiplications))  # fmt: skip
         yield Row("agr", f"AGR 100k backward, {backend}",
                   lambda o=out, u=upstream, i=inputs: torch.autograd.grad(o, i, u, retain_graph=True),

@@ -15,70 +15,82 @@ HIDDEN = 64
 
 
 def refine(
-    features: Tensor,  # [N, F]
+    values: list[Tensor],  # of [N, c]; those of the first P - 1 are the features, F numbers in all
     weight_in: Tensor,  # [P * 64, F]
     bias_in: Tensor,  # [P * 64]
     weights_out: list[Tensor],  # P of [c, 64]
     biases_out: list[Tensor],  # P of [c]
-) -> list[Tensor]:  # P of [N, c]
-    """P perceptrons F x 64 x c with ReLU on the same features (7DGS eq. 14).
+) -> list[Tensor]:  # of [N, c], as `values`
+    """Values moved by P perceptrons F x 64 x c with ReLU, x + phi(features) (7DGS eq. 14 and 15).
 
-    What does not change from Gaussian to Gaussian, as gamma(t), belongs into `bias_in`.
+    Perceptron i moves values i; the last one all that are left, in their order. What does not change from Gaussian to
+    Gaussian, as gamma(t), belongs into `bias_in`.
 
     Raises:
         InputError: not float32 on one device, or shapes that do not fit.
     """
     widths = [len(w) for w in weights_out]
-    rows, F = HIDDEN * len(widths), features.shape[-1]
-    shapes = [(features, (len(features), F)), (weight_in, (rows, F)), (bias_in, (rows,))]
+    last, rows = len(widths) - 1, HIDDEN * len(widths)
+    moved = [x.shape[-1] for x in values]
+    if last < 1 or [*moved[:last], sum(moved[last:])] != widths:
+        raise InputError(f"refine: expected a perceptron for each feature and one for all other values, got outputs "
+                         f"of {widths} numbers for values of {moved}")  # fmt: skip
+    N, F = len(values[0]), sum(widths[:last])
+    shapes = [(x, (N, c)) for x, c in zip(values, moved, strict=True)]
+    shapes += [(weight_in, (rows, F)), (bias_in, (rows,))]
     shapes += [(w, (c, HIDDEN)) for w, c in zip(weights_out, widths, strict=True)]
     shapes += [(b, (c,)) for b, c in zip(biases_out, widths, strict=True)]
     for tensor, shape in shapes:
-        here = tensor.device == features.device and tensor.device.type in ("cpu", "cuda")
+        here = tensor.device == values[0].device and tensor.device.type in ("cpu", "cuda")
         if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or not here:
             raise InputError(f"refine: expected {list(shape)} float32 on the CPU or a GPU, all on one, got "
                              f"{list(tensor.shape)} {tensor.dtype} on {tensor.device}")  # fmt: skip
-    out = _refine(features, weight_in, bias_in, torch.cat(weights_out), torch.cat(biases_out), widths)
-    return list(out.split(widths, -1))
+    out: list[Tensor] = _refine(values, weight_in, bias_in, torch.cat(weights_out), torch.cat(biases_out), widths)
+    return out
 
 
 @custom_op("gsbench::refine", mutates_args=())
 def _refine(
-    features: Tensor, weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int]
-) -> Tensor:
-    out = features.new_empty(len(features), len(weight_out))
-    native().refine(*plain(features, weight_in, bias_in, weight_out, bias_out), widths, threads(), out)
+    values: list[Tensor], weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int]
+) -> list[Tensor]:
+    out = [rows_like(x) for x in values]
+    native().refine(list(plain(*values)), *plain(weight_in, bias_in, weight_out, bias_out), widths, threads(), out)
     return out
 
 
 @_refine.register_fake
-def _(features: Tensor, _in: Tensor, _bias: Tensor, weight_out: Tensor, *_: Any) -> Tensor:
-    return features.new_empty(len(features), len(weight_out))
+def _(values: list[Tensor], *_: Any) -> list[Tensor]:
+    return [rows_like(x) for x in values]
 
 
 @custom_op("gsbench::refine_backward", mutates_args=())
 def _refine_backward(
-    features: Tensor, weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int],
-    g_out: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    arrays = plain(features, weight_in, bias_in, weight_out, bias_out)
-    out = tuple(rows_like(x) for x in arrays)
-    native().refine_backward(*arrays, widths, threads(), *plain(g_out), *out)
-    return out[0], out[1], out[2], out[3], out[4]
+    values: list[Tensor], weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int],
+    g_out: list[Tensor],
+) -> list[Tensor]:  # fmt: skip
+    """Gradients of the features, then of the weights; that of any other value is its `g_out`."""
+    weights = plain(weight_in, bias_in, weight_out, bias_out)
+    features, out = [rows_like(x) for x in values[: len(widths) - 1]], [rows_like(x) for x in weights]
+    native().refine_backward(list(plain(*values)), *weights, widths, threads(), list(plain(*g_out)), features, *out)
+    return features + out
 
 
 @_refine_backward.register_fake
-def _(*arrays: Any) -> tuple[Tensor, ...]:
-    return tuple(rows_like(x) for x in arrays[:5])
+def _(values: list[Tensor], *arrays: Any) -> list[Tensor]:
+    return [rows_like(x) for x in (*values[: len(arrays[4]) - 1], *arrays[:4])]
 
 
-def _context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # noqa: ARG001
-    ctx.save_for_backward(*inputs[:5])
-    ctx.widths = inputs[5]
+def _context(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:  # noqa: ARG001
+    values, *weights, widths = inputs
+    ctx.save_for_backward(*values, *weights)
+    ctx.widths = widths
 
 
-def _gradient(ctx: Any, g_out: Tensor) -> tuple[Tensor | None, ...]:
-    return *_refine_backward(*ctx.saved_tensors, ctx.widths, g_out), None
+def _gradient(ctx: Any, g_out: list[Tensor]) -> tuple[Any, ...]:
+    *values, weight_in, bias_in, weight_out, bias_out = ctx.saved_tensors
+    features = len(ctx.widths) - 1
+    got = _refine_backward(values, weight_in, bias_in, weight_out, bias_out, ctx.widths, g_out)
+    return [*got[:features], *g_out[features:]], *got[features:], None
 
 
 _refine.register_kernel("cuda")(on_cuda.refine)

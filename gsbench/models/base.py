@@ -129,10 +129,8 @@ class GaussianModel(nn.Module, ABC):
         raw |= self.initial_colors((points.colors - 0.5) / SH_C0)
         self.splats = nn.ParameterDict({name: nn.Parameter(value.clone()) for name, value in raw.items()})
         if self.agr:
-            features = sum(raw[name].shape[-1] for name in self.centers)
             shape = sum(raw[name].shape[-1] for name in self.shape)
-            outputs = [*(raw[name].shape[-1] for name in self.centers), shape]
-            self.refinement = Refinement(features, outputs, generator)
+            self.refinement = Refinement([*(raw[name].shape[-1] for name in self.centers), shape], generator)
         self.set_stage(self.stage)
 
     def slice(self, camera_center: Tensor, time: float | None) -> Gaussians3D:
@@ -168,14 +166,9 @@ class GaussianModel(nn.Module, ABC):
         raw: Raw = dict(self.splats.items())
         if self.refinement is None or not self.stage.refine or time is None:
             return raw
-        features = torch.cat([raw[name] for name in self.centers], -1)
-        *centers, shape = self.refinement(features, time, native=self.uses_kernels(features))
-        for name, residual in zip(self.centers, centers, strict=True):
-            raw[name] = raw[name] + residual
-        parts = shape.split([raw[name].shape[-1] for name in self.shape], -1)
-        for name, residual in zip(self.shape, parts, strict=True):
-            raw[name] = raw[name] + residual
-        return raw
+        names = (*self.centers, *self.shape)
+        moved = self.refinement([raw[name] for name in names], time, native=self.uses_kernels(raw["means"]))
+        return raw | dict(zip(names, moved, strict=True))
 
     def modulate(self, name: str, value: float) -> None:
         """Give the model lambda_t (`time`) or lambda_d (`direction`), at `value` to begin with.

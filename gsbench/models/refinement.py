@@ -19,16 +19,17 @@ def encode_time(time: Tensor) -> Tensor:
 
 
 class Refinement(nn.Module):
-    """One two-layer perceptron f x 64 x c for each group of raw parameters, f = means + gamma(t) (7DGS eq. 14, 15).
+    """Perceptrons f x 64 x c that read the means and gamma(t) = f, one to move each mean and one to move the rest.
 
-    The output layers start at zero, so that switching the refinement on changes nothing. f does not depend on the view.
+    7DGS eq. 14 and 15. The output layers start at zero, so that switching the refinement on changes nothing. f does not
+    depend on the view.
     """
 
-    def __init__(self, features: int, outputs: list[int], generator: torch.Generator) -> None:
-        """Make one network for each entry of `outputs`, its width, on `features` numbers and the time encoding."""
+    def __init__(self, outputs: list[int], generator: torch.Generator) -> None:
+        """Make one network for each entry of `outputs`, its width; the last is of what is no mean."""
         super().__init__()
-        self.features = features
-        width = features + 2 * OCTAVES
+        self.features = sum(outputs[:-1])
+        width = self.features + 2 * OCTAVES
         # The first layers of all networks read the same f: they are one matrix, 64 rows for each.
         self.weight_in = nn.Parameter(torch.empty(HIDDEN * len(outputs), width))
         self.bias_in = nn.Parameter(torch.empty(HIDDEN * len(outputs)))
@@ -38,16 +39,19 @@ class Refinement(nn.Module):
         self.weights_out = nn.ParameterList([nn.Parameter(torch.zeros(width, HIDDEN)) for width in outputs])
         self.biases_out = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in outputs])
 
-    def forward(self, features: Tensor, time: Tensor, *, native: bool = False) -> list[Tensor]:
-        """Residuals, one [N, c] for each output, of N feature rows [N, features] at one time [].
+    def forward(self, values: list[Tensor], time: Tensor, *, native: bool = False) -> list[Tensor]:
+        """Raw parameters [N, c] at one time [], moved: those that are read, then the others.
 
-        With `native`, by the CPU kernel (float32), which never writes a hidden layer to memory.
+        With `native`, by the kernel (float32), which never writes a hidden layer to memory.
         """
         weight_in, bias_in = self.weight_in[:, : self.features], self.at_time(time)
         if native:
-            return refine(features, weight_in, bias_in, list(self.weights_out), list(self.biases_out))
+            return refine(values, weight_in, bias_in, list(self.weights_out), list(self.biases_out))
+        features = torch.cat(values[: len(self.weights_out) - 1], -1)
         parts = torch.relu(F.linear(features, weight_in, bias_in)).split(HIDDEN, -1)
-        return [F.linear(h, w, b) for h, w, b in zip(parts, self.weights_out, self.biases_out, strict=True)]
+        layers = zip(parts, self.weights_out, self.biases_out, strict=True)
+        residuals = torch.cat([F.linear(h, w, b) for h, w, b in layers], -1).split([x.shape[-1] for x in values], -1)
+        return [x + residual for x, residual in zip(values, residuals, strict=True)]
 
     def at_time(self, time: Tensor) -> Tensor:
         """What gamma(t), the same for all Gaussians, adds to every hidden unit: one vector, not 20 more columns."""

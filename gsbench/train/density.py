@@ -36,7 +36,7 @@ class DensityControl:
         """Add one view's gradients, of a loss that is a mean over `views`, in units of half the picture (NDC)."""
         assert info.means2d.grad is not None, "call info.means2d.retain_grad() before backward()"
         x, y = info.means2d.grad.unbind(-1)  # scaled apart: a tensor of both sizes would be waited for on a GPU
-        self.gradient += (torch.stack([x * (width / 2), y * (height / 2)], -1) * views).norm(dim=-1).sum(0)
+        self.gradient += torch.hypot(x * (views * width / 2), y * (views * height / 2)).sum(0)
         drawn = (info.radii > 0).sum(0)
         self.seen += drawn
         # [N] views since the last that drew the Gaussian

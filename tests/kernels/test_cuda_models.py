@@ -111,26 +111,27 @@ def test_colors(degree: int, waves: int, move: Move) -> None:
 def test_refinement(N: int, widths: list[int], move: Move) -> None:
     """Catches a batch's edge that is lost, a network that reads another's weights, and any wrong gradient."""
     g = torch.Generator().manual_seed(N)
-    exact = Refinement(sum(widths[:-1]), widths, g).double()
+    exact = Refinement(widths, g).double()
     with torch.no_grad():
         for parameter in exact.parameters():
             parameter.add_(0.2 * torch.randn(parameter.shape, generator=g))
-    features = torch.randn(N, sum(widths[:-1]), generator=g, dtype=torch.float64).requires_grad_()
-    expected = exact(features, torch.tensor(0.37, dtype=torch.float64))
+    parts = [*widths[:-1], 2, widths[-1] - 2]  # the last network moves two arrays
+    values = [torch.randn(N, c, generator=g, dtype=torch.float64).requires_grad_() for c in parts]
+    expected = exact(values, torch.tensor(0.37, dtype=torch.float64))
     weights = [torch.randn(x.shape, generator=g) for x in expected]
 
     single = {name: move(p) for name, p in exact.named_parameters()}
-    inputs, at_time = move(features), move(exact.at_time(torch.tensor(0.37, dtype=torch.float64)))
+    inputs, at_time = [move(x) for x in values], move(exact.at_time(torch.tensor(0.37, dtype=torch.float64)))
     outs = [[single[f"{kind}_out.{i}"] for i in range(len(widths))] for kind in ("weights", "biases")]
     actual = refine.refine(inputs, single["weight_in"][:, : exact.features], at_time, *outs)
     assert_same(back(actual), expected)
-    wanted = torch.autograd.grad(expected, [features, *exact.parameters()], [w.double() for w in weights])
-    got = torch.autograd.grad(actual, [inputs, at_time, single["weight_in"], *outs[0], *outs[1]],
+    wanted = torch.autograd.grad(expected, [*values, *exact.parameters()], [w.double() for w in weights])
+    got = torch.autograd.grad(actual, [*inputs, at_time, single["weight_in"], *outs[0], *outs[1]],
                               [move(w) for w in weights])  # fmt: skip
-    by_name = dict(zip(["features", *(name for name, _ in exact.named_parameters())], wanted, strict=True))
-    used = slice(None, exact.features)
-    assert_same(back([got[0], got[1], got[2][:, used], *got[3:]]),
-                [by_name["features"], by_name["bias_in"], by_name["weight_in"][:, used],
+    n, used = len(values), slice(None, exact.features)
+    by_name = dict(zip((name for name, _ in exact.named_parameters()), wanted[n:], strict=True))
+    assert_same(back([*got[:n], got[n], got[n + 1][:, used], *got[n + 2 :]]),
+                [*wanted[:n], by_name["bias_in"], by_name["weight_in"][:, used],
                  *(by_name[f"weights_out.{i}"] for i in range(len(widths))),
                  *(by_name[f"biases_out.{i}"] for i in range(len(widths)))])  # fmt: skip
 
@@ -139,5 +140,5 @@ def test_networks_too_large_are_refused(move: Move) -> None:
     """Catches a network that would not fit the kernel's arrays, and would be read past their end."""
     one = move(torch.ones(1))
     with pytest.raises(InputError, match="at most 28 outputs"):
-        refine.refine(move(torch.ones(4, 3)), move(torch.ones(64, 3)), one.expand(64), [move(torch.ones(29, 64))],
-                      [one.expand(29)])  # fmt: skip
+        refine.refine([move(torch.ones(4, 3)), move(torch.ones(4, 29))], move(torch.ones(128, 3)), one.expand(128),
+                      [move(torch.ones(3, 64)), move(torch.ones(29, 64))], [one.expand(3), one.expand(29)])  # fmt: skip

@@ -159,29 +159,30 @@ def test_what_cannot_be_drawn_has_no_color() -> None:
 def test_refinement(N: int, widths: list[int]) -> None:
     """Catches a block's edge that is lost, a network that reads another's weights, and any wrong gradient."""
     g = torch.Generator().manual_seed(N)
-    exact = Refinement(sum(widths[:-1]), widths, g).double()
+    exact = Refinement(widths, g).double()
     with torch.no_grad():
         for parameter in exact.parameters():
             parameter.add_(0.2 * torch.randn(parameter.shape, generator=g))
-    features = torch.randn(N, sum(widths[:-1]), generator=g, dtype=torch.float64).requires_grad_()
-    expected = exact(features, torch.tensor(0.37, dtype=torch.float64))
+    parts = [*widths[:-1], 2, widths[-1] - 2]  # the last network moves two arrays
+    values = [torch.randn(N, c, generator=g, dtype=torch.float64).requires_grad_() for c in parts]
+    expected = exact(values, torch.tensor(0.37, dtype=torch.float64))
 
-    single = Refinement(sum(widths[:-1]), widths, g)
+    single = Refinement(widths, g)
     single.load_state_dict(exact.state_dict())
-    inputs = features.detach().float().requires_grad_()
+    inputs = [x.detach().float().requires_grad_() for x in values]
     at_time = single.at_time(torch.tensor(0.37))
     weight = single.weight_in[:, : single.features]
     actual = refine(inputs, weight, at_time, list(single.weights_out), list(single.biases_out))
     for a, b in zip(actual, expected, strict=True):
         torch.testing.assert_close(a.double(), b, rtol=1e-5, atol=1e-5)
-    assert_same(gradients(actual, [inputs, *single.parameters()]),
-                gradients(expected, [features, *exact.parameters()]))  # fmt: skip
+    assert_same(gradients(actual, [*inputs, *single.parameters()]),
+                gradients(expected, [*values, *exact.parameters()]))  # fmt: skip
 
 
 def test_no_gaussians() -> None:
     """Catches a loop that runs once over nothing."""
-    out = refine(torch.empty(0, 3), torch.ones(128, 3), torch.ones(128), [torch.ones(3, 64), torch.ones(7, 64)],
-                 [torch.ones(3), torch.ones(7)])  # fmt: skip
+    out = refine([torch.empty(0, 3), torch.empty(0, 7)], torch.ones(128, 3), torch.ones(128),
+                 [torch.ones(3, 64), torch.ones(7, 64)], [torch.ones(3), torch.ones(7)])  # fmt: skip
     assert [x.shape for x in out] == [(0, 3), (0, 7)]
     assert show_colors(torch.empty(0, 1, 3), torch.empty(0, 15, 3), torch.empty(0, 3), torch.empty(0),
                        torch.zeros(3), 3).shape == (0, 3)  # fmt: skip
@@ -197,4 +198,9 @@ def test_errors() -> None:
     with pytest.raises(InputError, match="no gradient by center"):
         show_colors(sh0, shN, means, torch.ones(21), torch.zeros(3).requires_grad_(), 3)
     with pytest.raises(InputError, match="refine: expected"):
-        refine(torch.ones(4, 3), torch.ones(64, 3), torch.ones(64), [torch.ones(3, 32)], [torch.ones(3)])
+        refine([torch.ones(4, 3)], torch.ones(64, 3), torch.ones(64), [torch.ones(3, 64)], [torch.ones(3)])
+    values, out = [torch.ones(4, 3), torch.ones(4, 7)], [torch.ones(3, 64), torch.ones(7, 64)]
+    with pytest.raises(InputError, match="refine: expected"):
+        refine(values, torch.ones(128, 2), torch.ones(128), out, [torch.ones(3), torch.ones(7)])
+    with pytest.raises(InputError, match="values of"):
+        refine(values[::-1], torch.ones(128, 3), torch.ones(128), out, [torch.ones(3), torch.ones(7)])

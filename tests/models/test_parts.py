@@ -160,29 +160,29 @@ def test_time_encoding() -> None:
 
 def test_refinement_starts_at_zero_but_learns() -> None:
     """Catches residuals before any training, and an output layer of zeros that gets no gradient."""
-    refinement = Refinement(7, [3, 1, 3, 28], torch.Generator().manual_seed(0))
-    residuals = refinement(normal(0, 5, 7).float(), torch.tensor(0.3))
-    assert [r.shape for r in residuals] == [(5, 3), (5, 1), (5, 3), (5, 28)]
-    assert not any(r.any() for r in residuals)
-    sum(r.sum() for r in residuals).backward()
+    refinement = Refinement([3, 1, 3, 28], torch.Generator().manual_seed(0))
+    values = list(normal(0, 5, 35).float().split([3, 1, 3, 7, 21], -1))
+    moved = refinement(values, torch.tensor(0.3))
+    assert all(torch.equal(x, y) for x, y in zip(moved, values, strict=True))
+    sum(x.sum() for x in moved).backward()
     assert all(w.grad.any() for w in refinement.weights_out)
 
 
 def test_refinement_is_four_perceptrons_on_27_numbers() -> None:
     """Catches a shortcut of the shared first layer that is not 27 x 64 x c on the concatenated features."""
-    refinement = Refinement(7, [3, 1, 3, 28], torch.Generator().manual_seed(0)).double()
+    refinement = Refinement([3, 1, 3, 28], torch.Generator().manual_seed(0)).double()
     for i, p in enumerate([*refinement.weights_out, *refinement.biases_out]):
         p.data = normal(i, *p.shape)
-    features, time = normal(9, 6, 7), torch.tensor(0.3, dtype=torch.float64)
-    f = torch.cat([features, encode_time(time).expand(6, -1)], -1)
+    values, time = list(normal(9, 6, 35).split([3, 1, 3, 28], -1)), torch.tensor(0.3, dtype=torch.float64)
+    f = torch.cat([*values[:3], encode_time(time).expand(6, -1)], -1)
     assert f.shape[-1] == 27
-    for i, (width, residual) in enumerate(zip([3, 1, 3, 28], refinement(features, time), strict=True)):
+    for i, (value, moved) in enumerate(zip(values, refinement(values, time), strict=True)):
         rows = slice(64 * i, 64 * (i + 1))
-        perceptron = nn.Sequential(nn.Linear(27, 64), nn.ReLU(), nn.Linear(64, width)).double()
+        perceptron = nn.Sequential(nn.Linear(27, 64), nn.ReLU(), nn.Linear(64, value.shape[1])).double()
         first, last = perceptron[0], perceptron[2]
         first.weight.data, first.bias.data = refinement.weight_in.data[rows], refinement.bias_in.data[rows]
         last.weight.data, last.bias.data = refinement.weights_out[i].data, refinement.biases_out[i].data
-        torch.testing.assert_close(residual, perceptron(f))
+        torch.testing.assert_close(moved, value + perceptron(f))
 
 
 # ---- directions

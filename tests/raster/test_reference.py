@@ -95,11 +95,18 @@ GRADIENT_CASES = ("random", "off_screen", "larger_than_picture", "near_plane", "
 def test_gradients_of_every_input(name: str) -> None:
     """Catches a wrong or missing derivative of any input, cameras and background included (central differences)."""
     arguments = smooth(name)
-    inputs = tuple(arguments.pop(k).requires_grad_() for k in DIFFERENTIABLE)
+    # Of Ks the four numbers: the others are fixed, and refused when central differences move them.
+    Ks = arguments.pop("Ks")
+    intrinsics = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], -1)
+    names = [k for k in DIFFERENTIABLE if k != "Ks"]
+    inputs = tuple(x.requires_grad_() for x in (*map(arguments.pop, names), intrinsics))
     weight = torch.randn(2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
     def loss(*tensors: Tensor) -> Tensor:
-        output = draw(arguments | dict(zip(DIFFERENTIABLE, tensors, strict=True)))
+        fx, fy, cx, cy = tensors[-1].unbind(-1)
+        o, i = torch.zeros_like(fx), torch.ones_like(fx)
+        Ks = torch.stack([fx, o, cx, o, fy, cy, o, o, i], -1).unflatten(-1, (3, 3))
+        output = draw(arguments | dict(zip(names, tensors[:-1], strict=True)) | {"Ks": Ks})
         waves = torch.arange(output.image.numel(), dtype=torch.float64).mul(0.05).sin().view_as(output.image)
         return weight[0] * (waves * output.image.square()).sum() + weight[1] * output.alpha.square().sum()
 

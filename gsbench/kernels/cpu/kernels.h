@@ -113,19 +113,21 @@ struct ColorGrads {
     float *sh0, *shN, *means, *times;
 };
 
-// Perceptrons features x 64 x width, one for each of `networks`, on every Gaussian (AGR).
+// Perceptrons features x 64 x width, one for each of `networks`, on every Gaussian (AGR). They read the values of the
+// first `networks - 1` arrays, each of which one of them moves; the last moves all the others.
 struct RefineArgs {
     int64_t N;
-    int features_width, networks, outputs;  // outputs: the sum of widths
-    const int* widths;
-    const float* features;               // [N, features_width]
+    int features_width, networks, arrays, outputs;  // outputs: the sum of widths, and of value_widths
+    const int *widths, *value_widths;               // [networks] [arrays]
+    const float* const* values;                     // [arrays] of [N, value_widths]
     const float *weight_in, *bias_in;    // [networks * 64, features_width] [networks * 64]
     const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
     int threads;
 };
 
 struct RefineGrads {
-    float *features, *weight_in, *bias_in, *weight_out, *bias_out;
+    float* const* features;  // [networks - 1] of [N, value_widths]
+    float *weight_in, *bias_in, *weight_out, *bias_out;
 };
 
 // Adam on the rows [N, width] of a parameter that are `drawn`.
@@ -153,8 +155,8 @@ struct Kernels {
     void (*observe_rotated_backward)(const RotatedArgs&, const Observation& grads, RotatedGrads&);
     void (*show_colors)(const ColorArgs&, float* colors);
     void (*show_colors_backward)(const ColorArgs&, const ColorGrads&);
-    void (*refine)(const RefineArgs&, float* out);
-    void (*refine_backward)(const RefineArgs&, const float* grads, const RefineGrads&);
+    void (*refine)(const RefineArgs&, float* const* out);
+    void (*refine_backward)(const RefineArgs&, const float* const* grads, const RefineGrads&);
     void (*adam)(const AdamArgs&);
     float (*roofline_flops)(int64_t rounds);
     void (*roofline_triad)(float* a, const float* b, const float* c, int64_t n);

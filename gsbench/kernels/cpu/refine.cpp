@@ -1,4 +1,4 @@
-// AGR (7DGS, section 4.3): four perceptrons of two layers on every Gaussian, a block of Gaussians at a time.
+// AGR (7DGS, section 4.3): four perceptrons of two layers move every Gaussian, a block of Gaussians at a time.
 //
 // Gaussians lie along the vectors, so each layer is a product of a small matrix with a tall one that stays in cache:
 // hidden layers are never written to memory, and backward computes them again.
@@ -118,12 +118,24 @@ void load_block(const float* rows, int64_t first, int64_t N, int width, float* o
     }
 }
 
-void store_block(const float* block, int64_t first, int64_t N, int width, float* rows) {
+// The block's `width` rows, added to those of `base` [N, width] unless that is null.
+void store_block(const float* block, const float* base, int64_t first, int64_t N, int width, float* rows) {
     for (int v = 0; v < BLOCK && first + v < N; v += LANES) {
         const int64_t i = first + v;
+        const int n = lanes_from(i, N);
         for (int k = 0; k < width; ++k) {
-            scatter(Vec::load(block + k * BLOCK + v), rows + i * width + k, width, lanes_from(i, N));
+            const Vec x = Vec::load(block + k * BLOCK + v);
+            const int64_t at = i * width + k;
+            scatter(base ? x + gather(base + at, width, n) : x, rows + at, width, n);
         }
+    }
+}
+
+// The first `arrays` of several as rows of the block, one array below the other.
+void load_blocks(const RefineArgs& a, const float* const* arrays, int count, int64_t first, float* out) {
+    for (int i = 0; i < count; ++i) {
+        load_block(arrays[i], first, a.N, a.value_widths[i], out);
+        out += a.value_widths[i] * BLOCK;
     }
 }
 
@@ -164,10 +176,10 @@ struct Scratch {
 };
 
 void backward_block(const RefineArgs& a, const WeightLayout& layout, const float* weight_in_T,
-                    const float* weight_out_T, int64_t first, const float* grads, float* g_features, float* g_weights,
-                    const Scratch& s) {
-    load_block(a.features, first, a.N, a.features_width, s.X);
-    load_block(grads, first, a.N, a.outputs, s.G);
+                    const float* weight_out_T, int64_t first, const float* const* grads, float* const* g_features,
+                    float* g_weights, const Scratch& s) {
+    load_blocks(a, a.values, a.networks - 1, first, s.X);
+    load_blocks(a, grads, a.arrays, first, s.G);
     int output = 0;
     for (int network = 0; network < a.networks; ++network) {
         const int width = a.widths[network];
@@ -188,18 +200,22 @@ void backward_block(const RefineArgs& a, const WeightLayout& layout, const float
         output += width;
     }
     add_row_sums(s.G, a.outputs, g_weights + layout.bias_out);
-    store_block(s.g_X, first, a.N, a.features_width, g_features);
+    const float* g_X = s.g_X;
+    for (int i = 0; i < a.networks - 1; ++i) {
+        store_block(g_X, grads[i], first, a.N, a.value_widths[i], g_features[i]);
+        g_X += a.value_widths[i] * BLOCK;
+    }
 }
 
 }  // namespace
 
-void refine(const RefineArgs& a, float* out) {
+void refine(const RefineArgs& a, float* const* out) {
     const size_t scratch_size = Scratch::size(a);
     Buffer<float> scratch(scratch_size * static_cast<size_t>(a.threads));
 #pragma omp parallel for num_threads(a.threads) schedule(dynamic, 8) if (a.N > CHUNK)
     for (int64_t first = 0; first < a.N; first += BLOCK) {
         const Scratch s(a, scratch.data() + scratch_size * static_cast<size_t>(thread_index()));
-        load_block(a.features, first, a.N, a.features_width, s.X);
+        load_blocks(a, a.values, a.networks - 1, first, s.X);
         int output = 0;
         for (int network = 0; network < a.networks; ++network) {
             hidden_layer(a, network, s.X, s.H);
@@ -207,11 +223,15 @@ void refine(const RefineArgs& a, float* out) {
                     s.G + output * BLOCK);
             output += a.widths[network];
         }
-        store_block(s.G, first, a.N, a.outputs, out);
+        const float* G = s.G;
+        for (int i = 0; i < a.arrays; ++i) {
+            store_block(G, a.values[i], first, a.N, a.value_widths[i], out[i]);
+            G += a.value_widths[i] * BLOCK;
+        }
     }
 }
 
-void refine_backward(const RefineArgs& a, const float* grads, const RefineGrads& out) {
+void refine_backward(const RefineArgs& a, const float* const* grads, const RefineGrads& out) {
     const WeightLayout layout(a);
     const size_t rows = static_cast<size_t>(a.networks) * HIDDEN, width = static_cast<size_t>(a.features_width);
     Buffer<float> weight_in_T(rows * width), weight_out_T(static_cast<size_t>(a.outputs) * HIDDEN);

@@ -57,7 +57,7 @@ def on_device(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:
-        first: Any = args[0]
+        first: Any = args[0][0] if isinstance(args[0], list) else args[0]
         with torch.cuda.device_of(first):
             return function(*args, **kwargs)
 

@@ -93,10 +93,11 @@ def show_backward(
 
 @on_device
 def refine(
-    features: Tensor, weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int]
-) -> Tensor:
-    """Outputs [N, sum of widths] of the perceptrons."""
+    values: list[Tensor], weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int]
+) -> list[Tensor]:
+    """Values moved by the perceptrons."""
     limits = cuda()
+    features = torch.cat(values[: len(widths) - 1], -1)
     if features.shape[1] > limits.MAX_FEATURES or len(widths) > limits.MAX_NETWORKS or max(widths) > limits.MAX_WIDTH:
         raise InputError(f"refine: expected on a GPU at most {limits.MAX_NETWORKS} networks of at most "
                          f"{limits.MAX_FEATURES} features and at most {limits.MAX_WIDTH} outputs, got {len(widths)}, "
@@ -104,21 +105,25 @@ def refine(
     arrays = plain(features, weight_in, bias_in, weight_out, bias_out)
     out = allocate("refinements", features, len(features), len(weight_out))
     cuda().refine(*features.shape, widths, *pointers(*arrays, out), stream(features))
-    return out
+    residuals = out.split([x.shape[-1] for x in values], -1)
+    return [x + residual for x, residual in zip(values, residuals, strict=True)]
 
 
 @on_device
 def refine_backward(
-    features: Tensor, weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int],
-    g_out: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Gradients of the first five."""
-    arrays = plain(features, weight_in, bias_in, weight_out, bias_out, g_out)
+    values: list[Tensor], weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int],
+    g_out: list[Tensor],
+) -> list[Tensor]:  # fmt: skip
+    """Gradients of the features, then of the weights."""
+    read = values[: len(widths) - 1]
+    features = torch.cat(read, -1)
+    arrays = plain(features, weight_in, bias_in, weight_out, bias_out, torch.cat(g_out, -1))
     by_network = allocate("gradients of AGR's features", features, len(widths), *features.shape)
     out = tuple(x.new_zeros(x.shape) for x in (weight_in, bias_in, weight_out, bias_out))
     cuda().refine_backward(*features.shape, widths, *pointers(*arrays, by_network, *out),
                            stream(features))  # fmt: skip
-    return by_network.sum(0), out[0], out[1], out[2], out[3]
+    through = by_network.sum(0).split([x.shape[-1] for x in read], -1)
+    return [*(g + more for g, more in zip(g_out, through, strict=False)), *out]
 
 
 def _observation(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:
