@@ -36,7 +36,7 @@ def refine(
         raise InputError(f"refine: expected a perceptron for each feature and one for all other values, got outputs "
                          f"of {widths} numbers for values of {moved}")  # fmt: skip
     N, F = len(values[0]), sum(widths[:last])
-    shapes = [(x, (N, c)) for x, c in zip(values, moved, strict=True)]
+    shapes: list[tuple[Tensor, tuple[int, ...]]] = [(x, (N, c)) for x, c in zip(values, moved, strict=True)]
     shapes += [(weight_in, (rows, F)), (bias_in, (rows,))]
     shapes += [(w, (c, HIDDEN)) for w, c in zip(weights_out, widths, strict=True)]
     shapes += [(b, (c,)) for b, c in zip(biases_out, widths, strict=True)]

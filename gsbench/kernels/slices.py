@@ -25,12 +25,13 @@ def observe_triangular(
     conditioned_first: bool,
     row_scaled: bool = False,
     directional_half: bool = True,
+    subtracts: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Slice 6D or 7D Gaussians as seen from `center` at `time`: means [N, 3], factors [N, 3, 3], opacities [N].
 
     The square-root scheme of `gsbench.models.slicing` for the parameters of `gsbench.models.triangular`, with
     f_temp and f_dir (7DGS eq. 9 to 12) in the opacities. `conditioned_first` is the order of the factor's rows,
-    (d, t, p), else (p, t, d).
+    (d, t, p), else (p, t, d). With `subtracts` by the scheme `cholesky` instead, which is there on the CPU only.
 
     Raises:
         InputError: not float32 on one device, shapes that do not fit, or a gradient by `center` is asked for.
@@ -47,7 +48,7 @@ def observe_triangular(
     return _observe(
         means, directions, empty if times is None else times[:, 0], log_diagonal, off_diagonal, opacities, center,
         empty if time is None or times is None else time, lambda_d, empty if lambda_t is None else lambda_t,
-        0.5 if directional_half else 1.0, conditioned_first, row_scaled,
+        0.5 if directional_half else 1.0, conditioned_first, row_scaled, subtracts,
     )  # fmt: skip
 
 
@@ -55,12 +56,12 @@ def observe_triangular(
 def _observe(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
     center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
-    row_scaled: bool,
+    row_scaled: bool, subtracts: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     out = means.new_empty(len(means), 3), means.new_empty(len(means), 3, 3), means.new_empty(len(means))
     arrays = plain(means, directions, times, log_diagonal, off_diagonal, opacities, center)
     native().observe_triangular(*arrays, *map(number, (time, lambda_d, lambda_t)), half, conditioned_first, row_scaled,
-                                threads(), *out)  # fmt: skip
+                                subtracts, threads(), *out)  # fmt: skip
     return out
 
 
@@ -74,14 +75,14 @@ def _(means: Tensor, *_: Any) -> tuple[Tensor, Tensor, Tensor]:
 def _observe_backward(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
     center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
-    row_scaled: bool, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
+    row_scaled: bool, subtracts: bool, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     arrays = plain(means, directions, times, log_diagonal, off_diagonal, opacities)
     out = tuple(rows_like(x) for x in arrays)
     lambdas = means.new_empty(2)
     native().observe_triangular_backward(
         *arrays, *plain(center), *map(number, (time, lambda_d, lambda_t)), half, conditioned_first, row_scaled,
-        threads(), *plain(g_means, g_factors, g_opacities), *out, lambdas,
+        subtracts, threads(), *plain(g_means, g_factors, g_opacities), *out, lambdas,
     )  # fmt: skip
     return out[0], out[1], out[2], out[3], out[4], out[5], lambdas
 
@@ -98,7 +99,7 @@ def _observe_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  #
 
 def _observe_gradient(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
     *g, lambdas = _observe_backward(*ctx.saved_tensors, *ctx.rest, *grads)
-    return *g, None, None, lambdas[0], lambdas[1] if ctx.needs_input_grad[9] else None, None, None, None
+    return *g, None, None, lambdas[0], lambdas[1] if ctx.needs_input_grad[9] else None, None, None, None, None
 
 
 _observe.register_kernel("cuda")(on_cuda.observe)

@@ -59,6 +59,7 @@ class TriangularModel(GaussianModel):
             raise InputError(f"factor_order '{factor_order}' is not known. {did_you_mean(factor_order, FACTOR_ORDERS)}")
         check_scheme(scheme)
         self.modulate("direction", lambda_d)
+        self.factor_order = factor_order
         self.scheme = scheme
         self.row_scaled = row_scaled
         self.directional_half = directional_half
@@ -104,8 +105,9 @@ class TriangularModel(GaussianModel):
         return Conditioned(means, factors, gate)
 
     def observe(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """The square-root scheme by the native kernel, where it serves."""
-        if self.scheme != "square_root" or not self.uses_kernels(raw["means"]):
+        """By the native kernel where there is one: for the square-root scheme, and on the CPU for `cholesky`."""
+        has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
+        if not has_kernel or not self.uses_kernels(raw["means"]):
             return super().observe(raw, camera_center, time)
         return observe_triangular(
             raw["means"],
@@ -118,9 +120,10 @@ class TriangularModel(GaussianModel):
             time,
             self.modulation("direction"),
             self.modulation("time") if "time" in self.observes else None,
-            conditioned_first=self.is_reduced,
+            conditioned_first=self.factor_order == "conditioned_first",
             row_scaled=self.row_scaled,
             directional_half=self.directional_half,
+            subtracts=self.scheme == "cholesky",
         )
 
     def scales(self) -> Tensor:

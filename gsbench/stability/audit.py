@@ -15,7 +15,7 @@ from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS
 from gsbench.raster import choose_backend
 from gsbench.stability import colors, curves, pictures, population, slices, trainings
-from gsbench.stability.cases import Bound, Cell, of_area
+from gsbench.stability.cases import Bound, Cell, backends_with, of_area
 from gsbench.stability.training_cases import LONG_STEPS
 
 BACKENDS = ("cpu", "cuda", "reference")
@@ -103,7 +103,7 @@ def hard_slices(audit: Audit, order: str, N: int) -> None:
     audit.verified[order] = population.verify(hard, order)
     for scheme in SCHEMES:
         count = N if scheme == "square_root" else min(N, SUBTRACTING)
-        for backend in audit.backends if scheme == "square_root" else ["reference"]:
+        for backend in backends_with(scheme, "7dgs", audit.backends):
             start = time.perf_counter()
             errors = population.judge(hard.rows(slice(count)), known, order, scheme, backend)
             ms = 1e3 * (time.perf_counter() - start)

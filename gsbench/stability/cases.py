@@ -73,6 +73,15 @@ def device_of(backend: str) -> str:
     return "cuda" if backend == "cuda" else "cpu"
 
 
+def backends_with(scheme: str, model: str, backends: list[str]) -> list[str]:
+    """Where a scheme has code of its own: square_root everywhere, cholesky for 6D and 7D on the CPU, schur in torch."""
+    if scheme == "square_root":
+        return backends
+    if scheme == "cholesky" and model != "4dgs":
+        return [backend for backend in backends if backend != "cuda"]
+    return ["reference"]
+
+
 CASES: dict[str, Case] = {}
 
 

@@ -15,7 +15,7 @@ from gsbench.models import build
 from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS
 from gsbench.stability import picture_cases, pictures, population, slices
-from gsbench.stability.cases import device_of
+from gsbench.stability.cases import backends_with, device_of
 from gsbench.stability.picture_cases import Arguments
 
 SPREAD = 40_000  # Gaussians of the curve by condition number
@@ -69,9 +69,10 @@ def accuracy_for_time(backends: list[str]) -> Iterator[Point]:
     for scheme in SCHEMES:
         for dtype in (torch.float32, torch.float64):
             yield _sliced(hard, known, scheme, "reference", dtype)
-    for backend in backends:
-        if backend != "reference":
-            yield _sliced(hard, known, "square_root", backend, torch.float32)
+    for scheme in SCHEMES:
+        for backend in backends_with(scheme, "7dgs", backends):
+            if backend != "reference":
+                yield _sliced(hard, known, scheme, backend, torch.float32)
     arguments = picture_cases.crowd(torch.Generator().manual_seed(5), DRAWN, 0.05)
     scale = picture_cases.intrinsics(6 * picture_cases.FOCAL, 6 * picture_cases.FOCAL, PICTURE / 2, PICTURE / 2)
     arguments |= {"width": PICTURE, "height": PICTURE, "Ks": scale}
@@ -144,11 +145,11 @@ def by_condition() -> Iterator[ConditionCurve]:
 
 
 def safety(backends: list[str]) -> Iterator[Cost]:
-    """Every scheme on every backend; schur and cholesky have no kernels and run in torch on all of them."""
+    """Every scheme on every backend that has it."""
     for order in FACTOR_ORDERS:
         hard = population.draw(torch.Generator().manual_seed(3), TIMED, order, 1.0)
         for scheme in SCHEMES:
-            for backend in backends if scheme == "square_root" else ["reference"]:
+            for backend in backends_with(scheme, "7dgs", backends):
                 model = build("7dgs", lambda_d=0.35, lambda_t=0.35, factor_order=order, scheme=scheme)
                 device, forward, backward = device_of(backend), [], []
                 wait = synchroniser(device)

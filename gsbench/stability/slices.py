@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from gsbench.models import GaussianModel, build
 from gsbench.models.slicing import SCHEMES
 from gsbench.stability import oracle
-from gsbench.stability.cases import Case, Cell, device_of
+from gsbench.stability.cases import Case, Cell, backends_with, device_of
 from gsbench.stability.population import indefinite
 from gsbench.stability.slicing_cases import COUNT, Observed, variables
 
@@ -36,12 +36,12 @@ class Truth:
 
 
 def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
-    """Every model, scheme and backend. Only the square-root scheme has kernels; the others run in torch."""
+    """Every model, scheme and backend."""
     for model in case.subjects:
         observed = case(model=model)
         known = truth(observed)
         for scheme in SCHEMES:
-            for backend in backends if scheme == "square_root" else ["reference"]:
+            for backend in backends_with(scheme, model, backends):
                 yield _cell(case, observed, known, scheme, backend)
 
 

@@ -25,6 +25,12 @@ VARIANTS: list[tuple[bool, dict[str, Any]]] = [
     (False, {}),
     (False, {"factor_order": "paper", "row_scaled": True, "directional_half": False}),
 ]
+# The scheme that is there for comparison, where it keeps its digits.
+SUBTRACTING: list[tuple[bool, dict[str, Any]]] = [
+    (True, {"scheme": "cholesky"}),
+    (True, {"scheme": "cholesky", "factor_order": "paper"}),
+    (False, {"scheme": "cholesky", "row_scaled": True}),
+]
 
 
 def model_and_raw(
@@ -36,8 +42,9 @@ def model_and_raw(
            "log_diagonal": 0.3 * torch.randn(N, n, generator=g) - 0.5,
            "off_diagonal": 0.5 * torch.randn(N, n * (n - 1) // 2, generator=g),
            "opacities": 2 * torch.randn(N, generator=g)}  # fmt: skip
-    raw["log_diagonal"][3:6] = -4.0  # so narrow that next to nothing is left of them
-    raw["log_diagonal"][7:9, 0] = torch.tensor([17.0, -17.0])  # beyond where the diagonal stops
+    if options.get("scheme") != "cholesky":
+        raw["log_diagonal"][3:6] = -4.0  # so narrow that next to nothing is left of them
+        raw["log_diagonal"][7:9, 0] = torch.tensor([17.0, -17.0])  # beyond where the diagonal stops
     if timed:
         raw["times"] = torch.rand(N, 1, generator=g)
     model = (
@@ -62,7 +69,7 @@ def assert_same(actual: list[Tensor], expected: list[Tensor]) -> None:
 
 
 @pytest.mark.usefixtures("instruction_set")
-@pytest.mark.parametrize(("timed", "options"), VARIANTS)
+@pytest.mark.parametrize(("timed", "options"), VARIANTS + SUBTRACTING)
 def test_slice(timed: bool, options: dict[str, Any]) -> None:
     """Catches a wrong row order, reflection, gate or derivative of any parameter, in every instruction set."""
     center = torch.tensor([0.3, -0.2, -3.0])
@@ -76,7 +83,7 @@ def test_slice(timed: bool, options: dict[str, Any]) -> None:
         single["opacities"], center, torch.tensor(0.4), model.modulation("direction"),
         model.modulation("time") if timed else None,
         conditioned_first=options.get("factor_order") != "paper", row_scaled=model.row_scaled,
-        directional_half=model.directional_half,
+        directional_half=model.directional_half, subtracts=model.scheme == "cholesky",
     ))  # fmt: skip
     assert_same(actual, expected)
     assert_same(gradients(actual, [*single.values(), *lambdas]),

@@ -67,6 +67,7 @@ struct SimilarityArgs {
 struct TriangularArgs {
     int64_t N;
     bool conditioned_first, row_scaled;
+    bool subtracts;  // by the scheme that forms S, for comparison
     float half, lambda_d, lambda_t, time, center[3];
     const float *means, *directions, *times;  // [N, 3] [N, 3] [N], null: time is not observed
     const float *log_diagonal, *off_diagonal;  // [N, n] [N, n (n - 1) / 2]

@@ -32,7 +32,7 @@ GSB_HD inline void load(const Observation& o, int64_t i, int n, Observed<Vec>& o
     out.opacity = load_first(o.opacities + i, n);
 }
 
-template <bool TIME>
+template <bool TIME, template <class, int> class Reduction>
 void observe(const TriangularArgs& a, const Observation& out) {
     const TriangularModel model = model_of(a);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
@@ -40,7 +40,7 @@ void observe(const TriangularArgs& a, const Observation& out) {
         const int n = lanes_from(i, a.N);
         TriangularParameters<Vec, TIME> raw;
         load<TIME>(a, i, n, raw);
-        TriangularGaussian<Vec, TIME> gaussian(model, raw);
+        TriangularGaussian<Vec, TIME, Reduction> gaussian(model, raw);
         const Observed<Vec> seen = gaussian.observe();
         scatter_row(seen.mean, out.means, i, n);
         scatter_matrix(seen.factor, out.factors, i, n);
@@ -48,7 +48,7 @@ void observe(const TriangularArgs& a, const Observation& out) {
     }
 }
 
-template <bool TIME>
+template <bool TIME, template <class, int> class Reduction>
 void observe_backward(const TriangularArgs& a, const Observation& grads, TriangularGrads& out) {
     const TriangularModel model = model_of(a);
     const int64_t chunks = (a.N + CHUNK - 1) / CHUNK;
@@ -63,7 +63,7 @@ void observe_backward(const TriangularArgs& a, const Observation& grads, Triangu
             Observed<Vec> given;
             load<TIME>(a, i, n, raw);
             load(grads, i, n, given);
-            TriangularGaussian<Vec, TIME> gaussian(model, raw);
+            TriangularGaussian<Vec, TIME, Reduction> gaussian(model, raw);
             gaussian.observe();
             gaussian.vjp(given, g);
             scatter_row(g.mean, out.means, i, n);
@@ -87,11 +87,19 @@ void observe_backward(const TriangularArgs& a, const Observation& grads, Triangu
 }  // namespace
 
 void observe_triangular(const TriangularArgs& a, const Observation& out) {
-    a.times ? observe<true>(a, out) : observe<false>(a, out);
+    if (a.subtracts) {
+        a.times ? observe<true, Subtraction>(a, out) : observe<false, Subtraction>(a, out);
+    } else {
+        a.times ? observe<true, Reflections>(a, out) : observe<false, Reflections>(a, out);
+    }
 }
 
 void observe_triangular_backward(const TriangularArgs& a, const Observation& grads, TriangularGrads& out) {
-    a.times ? observe_backward<true>(a, grads, out) : observe_backward<false>(a, grads, out);
+    if (a.subtracts) {
+        a.times ? observe_backward<true, Subtraction>(a, grads, out) : observe_backward<false, Subtraction>(a, grads, out);
+    } else {
+        a.times ? observe_backward<true, Reflections>(a, grads, out) : observe_backward<false, Reflections>(a, grads, out);
+    }
 }
 
 }  // namespace GSB_ISA

@@ -15,9 +15,11 @@ from gsbench.kernels.cuda import allocate, cuda, on_device, plain, pointers, str
 def observe(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
     center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
-    row_scaled: bool,
+    row_scaled: bool, subtracts: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Means [N, 3], factors [N, 3, 3] and opacities [N] of a slice; empty `times`: time is not observed."""
+    if subtracts:
+        raise InputError("observe_triangular: expected the square-root scheme on a GPU, got one that subtracts")
     out = _observation(means)
     arrays = plain(time, lambda_d, lambda_t, center, means, directions, times, log_diagonal, off_diagonal, opacities)
     cuda().observe_triangular(len(means), conditioned_first, row_scaled, half, *pointers(*arrays), *pointers(*out),
@@ -29,9 +31,10 @@ def observe(
 def observe_backward(
     means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
     center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
-    row_scaled: bool, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
+    row_scaled: bool, subtracts: bool, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of the first six, and of (lambda_d, lambda_t) [2]."""
+    assert not subtracts, "`observe` has refused it"
     arrays = plain(time, lambda_d, lambda_t, center, means, directions, times, log_diagonal, off_diagonal, opacities)
     out = _like(means, directions, times, log_diagonal, off_diagonal, opacities)
     lambdas = means.new_zeros(2)

@@ -77,6 +77,7 @@ GSB_HD inline void moved_mean_vjp(const Reduced<T, K>& t, const T (&white)[K], c
 // (Householder, with the sign that avoids cancellation: Golub and Van Loan, section 5.1).
 template <class T, int K>
 struct Reflections {
+    static constexpr bool KEEPS_REDUCED = true;  // what is in that form already may be left as it is
     static constexpr int N = K + 3;
     T before[K][N][N];  // what each reflection was given: its row first, then those below; from its column on
     T v[K][N];

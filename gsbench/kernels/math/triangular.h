@@ -3,7 +3,7 @@
 
 #include "harmonics.h"
 #include "thresholds.h"
-#include "slicing.h"
+#include "subtraction.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
@@ -41,7 +41,7 @@ struct TriangularParameters {
     T lambda_d, lambda_t;                                                        // in gradients only
 };
 
-template <class T, bool TIME>
+template <class T, bool TIME, template <class, int> class Reduction = Reflections>
 struct TriangularGaussian {
     using Parameters = TriangularParameters<T, TIME>;
     static constexpr int K = Parameters::K, N = Parameters::N;
@@ -49,7 +49,7 @@ struct TriangularGaussian {
     const TriangularModel& model;
     const Parameters& raw;
     T L[N][N];  // the factor, lower triangle
-    Reflections<T, K> reflections;
+    Reduction<T, K> reduction;
     Reduced<T, K> t;
     Vec3<T> offset;  // camera to mean
     T white[K], delta_t, spread_t, gate, opacity;
@@ -62,7 +62,7 @@ struct TriangularGaussian {
     GSB_HD Observed<T> observe() {
         const T zero(0.0f);
         make_factor();
-        if (model.conditioned_first) {
+        if (is_reduced()) {
             GSB_UNROLL for (int i = 0; i < K; ++i) {
                 GSB_UNROLL for (int j = 0; j < K; ++j) t.qq[i][j] = j <= i ? L[i][j] : zero;
             }
@@ -75,7 +75,7 @@ struct TriangularGaussian {
             for (int i = 0; i < N; ++i) {
                 for (int j = 0; j < N; ++j) rows[i][j] = j <= row(i) ? L[row(i)][j] : zero;
             }
-            reflections.reduce(rows, t);
+            reduction.reduce(rows, t);
         }
         T delta[K];
         offset = {raw.mean[0] - model.center[0], raw.mean[1] - model.center[1], raw.mean[2] - model.center[2]};
@@ -149,6 +149,9 @@ struct TriangularGaussian {
     }
 
 private:
+    // Nothing is left to do for a square root of that order; a scheme that subtracts never knows.
+    GSB_HD bool is_reduced() const { return model.conditioned_first && Reduction<T, K>::KEEPS_REDUCED; }
+
     GSB_HD void make_factor() {
         int at = 0;
         GSB_UNROLL for (int i = 0; i < N; ++i) {
@@ -162,7 +165,7 @@ private:
 
     GSB_HD void factor_vjp(const Reduced<T, K>& g_t, Parameters& out) const {
         T g_L[N][N];
-        if (model.conditioned_first) {
+        if (is_reduced()) {
             GSB_UNROLL for (int i = 0; i < N; ++i) {
                 GSB_UNROLL for (int j = 0; j <= i; ++j) {
                     g_L[i][j] = i < K ? g_t.qq[i][j] : j < K ? g_t.pq[i - K][j] : g_t.pp[i - K][j - K];
@@ -170,7 +173,7 @@ private:
             }
         } else {
             T g_rows[N][N];
-            reflections.vjp(g_t, g_rows);
+            reduction.vjp(g_t, g_rows);
             for (int i = 0; i < N; ++i) {
                 for (int j = 0; j <= row(i); ++j) g_L[row(i)][j] = g_rows[i][j];
             }
