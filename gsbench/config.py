@@ -58,11 +58,11 @@ class ModelConfig:
 
 @dataclass
 class DensifyConfig:
-    """Adaptive density control (3DGS, section 5.2). Steps are those of a run of `recipe_iterations`."""
+    """Adaptive density control (3DGS, section 5.2). Steps but `every` are those of a run of `recipe_iterations`."""
 
     start: int = 500
     stop: int = 15_000
-    every: int = 100
+    every: int = 100  # steps of any run: what was cloned needs them to part before it is judged again
     reset_every: int = 3_000  # opacity reset
     grad_threshold: float = 2e-4  # mean gradient of a 2D mean, in units of half the picture
     clone_below: float = 0.01  # clone where the largest scale is below this part of the extent, split above
@@ -71,7 +71,7 @@ class DensifyConfig:
 
 @dataclass
 class TrainConfig:
-    """The recipe. Every step is stated for a run of `recipe_iterations` and scales with the run's length."""
+    """The recipe. Steps are stated for a run of `recipe_iterations` and scale with the run's length."""
 
     iterations: int = 30_000
     recipe_iterations: int = 30_000

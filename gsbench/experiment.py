@@ -89,9 +89,12 @@ def identify(composed: DictConfig) -> Run:
                          f"{did_you_mean(config.scene.eval_split, SPLITS)}")  # fmt: skip
     if config.optim not in OPTIMIZERS:
         raise InputError(f"optim '{config.optim}' is not known. {did_you_mean(config.optim, OPTIMIZERS)}")
-    for key in ("iterations", "recipe_iterations", "batch_size"):
-        if getattr(config.train, key) < 1:
-            raise InputError(f"train.{key}: expected at least 1, got {getattr(config.train, key)}")
+    train = config.train
+    counts = {"iterations": train.iterations, "recipe_iterations": train.recipe_iterations,
+              "batch_size": train.batch_size, "densify.every": train.densify.every}  # fmt: skip
+    for key, count in counts.items():
+        if count < 1:
+            raise InputError(f"train.{key}: expected at least 1, got {count}")
     choose_device(config.device)
     if config.optim == "sparse_adam" and not config.device.startswith("cpu"):
         raise InputError(f"optim=sparse_adam has no kernel for device '{config.device}' yet: use optim=adam")

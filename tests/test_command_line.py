@@ -35,6 +35,7 @@ def test_help_lists_what_there_is_without_torch() -> None:
         (["+exp=mini", "trian.iterations=5"], ["trian", "Did you mean 'train'"]),
         (["+exp=mini", "train.iterations=many"], ["train.iterations", "many"]),
         (["+exp=mini", "train.iterations=0"], ["train.iterations", "at least 1"]),
+        (["+exp=mini", "train.densify.every=0"], ["train.densify.every", "at least 1"]),
         (["+exp=mini", "device=gpu"], ["device 'gpu'", "Valid: cpu, cuda"]),
         (["+exp=mini", "device=cuda:99"], ["device 'cuda:99'", "device=cpu"]),
         (["+exp=mini", "raster.backend=refrence"], ["backend 'refrence'", "Did you mean 'reference'"]),

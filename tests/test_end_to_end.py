@@ -8,7 +8,7 @@ from tiny_run import gsbench
 from gsbench.measure import record
 from gsbench.report import layout, tables
 
-SHORT = ("train.iterations=250", "train.curve_points=2", "data.initial_points=800")
+SHORT = ("train.iterations=250", "train.densify.every=25", "train.curve_points=2", "data.initial_points=800")
 
 
 def scores(results: Path) -> dict[tuple[str, str], float]:

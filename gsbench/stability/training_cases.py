@@ -35,7 +35,8 @@ class Training:
 def compose(model: str, steps: int, *overrides: str) -> Config:
     """The config of `+exp=mini` with few steps; its scene is not loaded."""
     register_schema()
-    names = ["+exp=mini", "scene=moving-matte", f"model={model}", f"train.iterations={steps}", *overrides]
+    names = ["+exp=mini", "scene=moving-matte", f"model={model}", f"train.iterations={steps}",
+             "train.densify.every=25", *overrides]  # fmt: skip
     if GlobalHydra.instance().is_initialized():
         composed = hydra.compose("config", names)
     else:

@@ -5,9 +5,9 @@ import torch
 from gsbench.config import TrainConfig
 from gsbench.models import Stage
 
-# Intervals wait for something that takes a number of steps, not a part of the run, and never get shorter than that.
-VIEWS_BETWEEN_DENSIFY = 50  # for the mean gradient of a Gaussian
-STEPS_BETWEEN_RESETS = 300  # for Adam, at its rate of 0.05, to raise opacities again
+# What an interval waits for takes a number of steps, not a part of the run. So `densify.every` does not scale, and
+# resets are never closer than Adam, at its rate of 0.05, needs to raise opacities again.
+STEPS_BETWEEN_RESETS = 300
 
 
 class Schedule:
@@ -21,7 +21,7 @@ class Schedule:
         densify = config.densify
         self.densify_start = self.scaled(densify.start)
         self.densify_stop = self.scaled(densify.stop)
-        self.densify_every = max(self.scaled(densify.every), -(-VIEWS_BETWEEN_DENSIFY // config.batch_size))
+        self.densify_every = densify.every
         self.reset_every = max(self.scaled(densify.reset_every), STEPS_BETWEEN_RESETS)
 
     def scaled(self, step: int) -> int:

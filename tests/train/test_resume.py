@@ -16,7 +16,13 @@ from gsbench.errors import InputError
 from gsbench.measure import record
 from gsbench.train import checkpoint
 
-RUN = ("model=7dgs", "train.iterations=60", "train.checkpoint_minutes=0", "data.initial_points=60")
+RUN = (
+    "model=7dgs",
+    "train.iterations=60",
+    "train.densify.every=10",
+    "train.checkpoint_minutes=0",
+    "data.initial_points=60",
+)
 
 
 @pytest.fixture(scope="module")

@@ -35,9 +35,9 @@ def test_short_run_keeps_the_proportions(iterations: int) -> None:
 
 
 def test_intervals_never_fall_below_what_they_wait_for() -> None:
-    """Catches densification from a handful of gradients, and opacity resets faster than Adam can recover from."""
+    """Catches clones judged again before they part, and opacity resets faster than Adam can recover from."""
     s = schedule(600, batch_size=2)
-    assert s.densify_every * 2 >= 50
+    assert [step + 1 for step in range(600) if s.densifies(step)] == [100, 200, 300]
     assert s.reset_every == STEPS_BETWEEN_RESETS
     resets = [step for step in range(600) if s.resets(step)]
     assert all(step + 1 + s.reset_every // 2 <= s.densify_stop for step in resets)
