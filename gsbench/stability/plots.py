@@ -86,8 +86,10 @@ def by_time(axes: Axes, audit: Audit, thing: str) -> None:
     points.sort(key=lambda point: point.ms)
     for i, (point, height) in enumerate(zip(points, shown([point.error for point in points]), strict=True)):
         color = next((color for scheme, color in COLORS.items() if scheme in point.way), "tab:blue")
-        axes.scatter(point.ms, height, color=color, marker="s" if "float64" in point.way else "o")
-        aside = (6, (5, -12)[i % 2])  # labels of neighbours would cover each other
+        double = "float64" in point.way
+        axes.scatter(point.ms, height, color=color, marker="s" if double else "o")
+        # Labels of neighbours would cover each other.
+        aside = (6, ((5, 16) if double else (-12, -23))[i % 2])
         axes.annotate(point.way, (point.ms, height), textcoords="offset points", xytext=aside, fontsize=8, color=color)
     axes.set(xscale="log", yscale="log", xlabel="ms, forward and backward (square: float64)", ylabel="error")
     left, right = axes.get_xlim()
