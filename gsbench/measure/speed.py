@@ -3,12 +3,13 @@
 torch is imported only where a GPU is asked for, so that the record, and a table of records, need none.
 """
 
+import ctypes
 import statistics
 import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -168,6 +169,8 @@ def reset_peak_memory(device: str = "cpu") -> None:
 
         torch.cuda.reset_peak_memory_stats(device)
     elif (clear := Path("/proc/self/clear_refs")).exists():
+        with suppress(AttributeError):  # another libc than glibc
+            ctypes.CDLL(None).malloc_trim(0)  # what the native kernels keep for the next step is not the next run's
         clear.write_text("5")  # proc(5): resets VmHWM, which ru_maxrss reports
 
 
