@@ -20,8 +20,8 @@ from gsbench.stability.training_cases import LONG_STEPS
 
 BACKENDS = ("cpu", "cuda", "reference")
 MILLION = 1_000_000
-NOT_DEFAULT = 200_000  # of them for the factor order that is not the default, in the short audit
-SUBTRACTING = 100_000  # Gaussians for the schemes that subtract: their failures are no rare event
+NOT_DEFAULT = 100_000  # of them for the factor order that is not the default, in the short audit
+SUBTRACTING = 50_000  # Gaussians for the schemes that subtract: their failures are no rare event
 DEFAULT_ORDER = "conditioned_first"
 SEED = 0
 T = TypeVar("T")

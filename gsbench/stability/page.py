@@ -109,7 +109,7 @@ def costs(audit: Audit) -> list[str]:
     """What square_root costs beside the schemes that subtract."""
     lines = [
         "## what safety costs", "",
-        "Milliseconds of slicing 100,000 7D Gaussians, medians of three (torch: one). The kernel of `cholesky` does",
+        "Milliseconds of slicing 100,000 7D Gaussians, medians of nine (torch: one). The kernel of `cholesky` does",
         "what one of `schur` would have to, solving where that inverts; `schur` runs in torch, as published code does.",
         "The last column is forward and backward as multiples of `cholesky` in the same order on the same backend.", "",
         "| factor order | scheme | backend | forward | backward | multiples |",
