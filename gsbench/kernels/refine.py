@@ -8,7 +8,7 @@ from torch.library import custom_op
 
 from gsbench.errors import InputError
 from gsbench.kernels import native, threads
-from gsbench.kernels.arrays import plain, rows_like
+from gsbench.kernels.arrays import check, plain, rows_like
 from gsbench.kernels.cuda import observe as on_cuda
 
 HIDDEN = 64
@@ -36,15 +36,13 @@ def refine(
         raise InputError(f"refine: expected a perceptron for each feature and one for all other values, got outputs "
                          f"of {widths} numbers for values of {moved}")  # fmt: skip
     N, F = len(values[0]), sum(widths[:last])
-    shapes: list[tuple[Tensor, tuple[int, ...]]] = [(x, (N, c)) for x, c in zip(values, moved, strict=True)]
-    shapes += [(weight_in, (rows, F)), (bias_in, (rows,))]
-    shapes += [(w, (c, HIDDEN)) for w, c in zip(weights_out, widths, strict=True)]
-    shapes += [(b, (c,)) for b, c in zip(biases_out, widths, strict=True)]
-    for tensor, shape in shapes:
-        here = tensor.device == values[0].device and tensor.device.type in ("cpu", "cuda")
-        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or not here:
-            raise InputError(f"refine: expected {list(shape)} float32 on the CPU or a GPU, all on one, got "
-                             f"{list(tensor.shape)} {tensor.dtype} on {tensor.device}")  # fmt: skip
+    arrays: dict[str, tuple[Tensor, tuple[int, ...]]] = {
+        f"values[{i}]": (x, (N, c)) for i, (x, c) in enumerate(zip(values, moved, strict=True))
+    }
+    arrays |= {"weight_in": (weight_in, (rows, F)), "bias_in": (bias_in, (rows,))}
+    for i, (w, b, c) in enumerate(zip(weights_out, biases_out, widths, strict=True)):
+        arrays |= {f"weights_out[{i}]": (w, (c, HIDDEN)), f"biases_out[{i}]": (b, (c,))}
+    check("refine", arrays)
     out: list[Tensor] = _refine(values, weight_in, bias_in, torch.cat(weights_out), torch.cat(biases_out), widths)
     return out
 

@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.cuda import available, cuda, plain, pointers, stream
+from gsbench.kernels.arrays import plain
+from gsbench.kernels.cuda import available, cuda, pointers, stream
 from gsbench.kernels.cuda.raster import MAX_ITEMS, View, bin_tiles, blend, project
 from gsbench.raster import RasterInfo, RasterOutput, check_values
 

@@ -98,7 +98,6 @@ class Trainer:
         self.model.set_stage(self.schedule.stage(step))
         views = [self.scene.train[i] for i in batch(step, len(self.scene.train), train.batch_size, self.config.seed)]
         losses = []
-        drawn = torch.zeros(len(self.model), dtype=torch.bool, device=self.config.device)
         for view in views:
             with stages("slice"):
                 gaussians = self.model.slice(view.camera.center, view.time)
@@ -117,10 +116,9 @@ class Trainer:
                 loss.backward()
             with stages("density"):
                 self.density.observe(output.info, view.camera.width, view.camera.height, len(views))
-                drawn |= (output.info.radii > 0).any(0)
         self.watch.see(step, torch.stack(losses).sum(), self.model.groups())
         with stages("optimizer"):
-            self.optimizer.step(step, drawn)
+            self.optimizer.step(step, drawn=self.density.unseen < len(views))
         with stages("density"):
             if self.schedule.densifies(step):
                 self.density.densify(generator(self.config.seed, step), self.schedule.has_reset(step))

@@ -70,11 +70,6 @@ def stream(tensor: Tensor) -> int:
     return torch.cuda.current_stream(tensor.device).cuda_stream if tensor.is_cuda else 0
 
 
-def plain(*tensors: Tensor) -> tuple[Tensor, ...]:
-    """The same values in rows, without their graph."""
-    return tuple(t.detach().contiguous() for t in tensors)
-
-
 def pointers(*tensors: Tensor | None) -> tuple[int, ...]:
     """Addresses of tensors in rows; 0 for None. The tensors must live until the call they are passed to returns."""
     return tuple(0 if t is None else t.data_ptr() for t in tensors)

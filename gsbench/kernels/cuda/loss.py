@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsbench.kernels.cuda import allocate, cuda, on_device, plain, pointers, stream
+from gsbench.kernels.arrays import plain
+from gsbench.kernels.cuda import allocate, cuda, on_device, pointers, stream
 
 
 @on_device

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.cuda import allocate, cuda, on_device, plain, pointers, stream
+from gsbench.kernels.arrays import plain
+from gsbench.kernels.cuda import allocate, cuda, on_device, pointers, stream
 
 
 @on_device

@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsbench.errors import InputError
-from gsbench.kernels.cuda import allocate, cuda, plain, pointers, stream
+from gsbench.kernels.arrays import plain
+from gsbench.kernels.cuda import allocate, cuda, pointers, stream
 
 TILE = 16  # as launch.h has it
 MAX_ITEMS = (1 << 31) - 1  # splats, and pairs of a tile and a splat, are numbered by int32
