@@ -1,4 +1,7 @@
 // Colours of Gaussians, sixteen at a time; the mathematics is math/harmonics.h. What cannot be drawn costs nothing.
+//
+// A 4D Gaussian has 144 coefficients and is drawn for part of the time, so memory is what counts here: those with
+// something to do are packed first, and the rows of all others are neither read nor worked on.
 #include "../math/projection.h"
 #include "../math/harmonics.h"
 
@@ -9,118 +12,194 @@ namespace gsb {
 inline namespace GSB_ISA {
 namespace {
 
-constexpr int64_t CHUNK = 512;
+constexpr int64_t CHUNK = 512;  // Gaussians a task
 constexpr float TURN = 6.28318531f;
 
-// What the colours of sixteen Gaussians are made of: everything but the coefficients.
-struct Weights {
+// The numbers, within a chunk, of those of its Gaussians that have something to do.
+struct Picked {
+    int count = 0;
+    uint32_t which[CHUNK + LANES];  // append_bits writes up to a vector past the end
+
+    template <class Wanted>
+    GSB_HD Picked(int size, Wanted wanted) {
+        for (int i = 0; i < size; i += LANES) {
+            count += append_bits(bits(wanted(i, lanes_from(i, size))), static_cast<uint32_t>(i), which + count);
+        }
+    }
+
+    // Calls f(first, end) for each run of Gaussians that were not picked.
+    template <class F>
+    GSB_HD void each_gap(int size, F f) const {
+        int next = 0;
+        for (int k = 0; k < count; ++k) {
+            const int row = static_cast<int>(which[k]);
+            if (row > next) f(next, row);
+            next = row + 1;
+        }
+        if (size > next) f(next, size);
+    }
+};
+
+// Sixteen picked rows, or what is left of them; lanes without one read zero.
+struct Rows {
+    uint32_t lanes;
+    alignas(64) int32_t ones[LANES] = {}, threes[LANES] = {}, all[LANES] = {};
+
+    GSB_HD Rows(const Picked& picked, int first, int stride) {
+        const int n = lanes_from(first, picked.count);
+        lanes = ALL_LANES >> (LANES - n);
+        for (int k = 0; k < n; ++k) {
+            ones[k] = static_cast<int32_t>(picked.which[first + k]);
+            threes[k] = ones[k] * 3;
+            all[k] = ones[k] * stride;
+        }
+    }
+    GSB_HD Vec load(const float* p, const int32_t (&offsets)[LANES]) const {
+        return gather_at(p, Places(offsets), lanes);
+    }
+    GSB_HD void store(Vec x, float* p, const int32_t (&offsets)[LANES]) const {
+        scatter_at(x, p, Places(offsets), lanes);
+    }
+    GSB_HD void load3(const float* p, Vec (&out)[3]) const {
+        for (int k = 0; k < 3; ++k) out[k] = load(p + k, threes);
+    }
+    GSB_HD void store3(const Vec (&x)[3], float* p) const {
+        for (int k = 0; k < 3; ++k) store(x[k], p + k, threes);
+    }
+};
+
+// What the colours of sixteen Gaussians are made of.
+struct Shades {
     Unit<Vec> unit;
     int used;  // harmonics
     Vec Y[MAX_BASIS], cosines[MAX_WAVES], sines[MAX_WAVES];
 
-    GSB_HD Weights(const ColorArgs& a, int64_t i, int n) : unit(offset(a, i, n)) {
+    GSB_HD Shades(const ColorArgs& a, const Rows& rows) : unit(offset(a, rows)) {
         used = harmonics(unit.direction, a.degree, Y);
-        waves_of(a.times ? Vec(a.time) - load_first(a.times + i, n) : Vec(0.0f), a.waves, cosines, sines);
+        waves_of(a.times ? Vec(a.time) - rows.load(a.times, rows.ones) : Vec(0.0f), a.waves, cosines, sines);
     }
 
-    GSB_HD static Vec3<Vec> offset(const ColorArgs& a, int64_t i, int n) {
+    // The constant's are kept in an array of their own.
+    GSB_HD static Vec coefficient(const ColorArgs& a, const Rows& rows, int k, int channel) {
+        return k ? rows.load(a.shN + (k - 1) * 3 + channel, rows.all) : rows.load(a.sh0 + channel, rows.threes);
+    }
+
+    // Before they are clamped.
+    GSB_HD void sum(const ColorArgs& a, const Rows& rows, Vec (&color)[3]) const {
+        for (auto& channel : color) channel = Vec(0.5f);
+        for (int wave = 0; wave < a.waves; ++wave) {
+            for (int basis = 0; basis < used; ++basis) {
+                const int k = wave * a.bases + basis;
+                const Vec weight = Y[basis] * cosines[wave];
+                for (int channel = 0; channel < 3; ++channel) {
+                    color[channel] += coefficient(a, rows, k, channel) * weight;
+                }
+            }
+        }
+    }
+
+    GSB_HD static Vec3<Vec> offset(const ColorArgs& a, const Rows& rows) {
         Vec mean[3];
-        gather_row(a.means, i, n, mean);
+        rows.load3(a.means, mean);
         return {mean[0] - a.center[0], mean[1] - a.center[1], mean[2] - a.center[2]};
     }
 };
 
-GSB_HD inline Mask drawn(const ColorArgs& a, int64_t i, int n) {
-    return load_first(a.opacities + i, n) >= Vec(ALPHA_MIN);
+GSB_HD inline int stride_of(const ColorArgs& a) { return (a.waves * a.bases - 1) * 3; }
+
+// The same Gaussians' arguments, from the one at `first` on, as many as a task has.
+GSB_HD inline ColorArgs chunk_of(ColorArgs a, int64_t first) {
+    a.N = a.N - first < CHUNK ? a.N - first : CHUNK;
+    a.sh0 += first * 3;
+    a.shN += first * stride_of(a);
+    a.means += first * 3;
+    a.opacities += first;
+    if (a.times) a.times += first;
+    return a;
+}
+GSB_HD inline ColorGrads chunk_of(ColorGrads g, const ColorArgs& a, int64_t first) {
+    g.colors += first * 3;
+    g.sh0 += first * 3;
+    g.shN += first * stride_of(a);
+    g.means += first * 3;
+    if (a.times) g.times += first;
+    return g;
 }
 
-// The arrays hold the coefficient of the constant apart from the others, three channels each.
-struct Coefficients {
-    int64_t stride;  // of shN, floats a Gaussian
+GSB_HD inline Mask drawn(const ColorArgs& a, int i, int n) { return load_first(a.opacities + i, n) >= Vec(ALPHA_MIN); }
 
-    explicit Coefficients(const ColorArgs& a) : stride(static_cast<int64_t>(a.waves * a.bases - 1) * 3) {}
-
-    template <class F>
-    GSB_HD auto* at(F* sh0, F* shN, int64_t i, int k) const { return k ? shN + i * stride + (k - 1) * 3 : sh0 + i * 3; }
-    GSB_HD int step(int k) const { return k ? static_cast<int>(stride) : 3; }
-};
-
-GSB_HD inline void sum_colors(const ColorArgs& a, const Coefficients& c, const Weights& w, int64_t i, int n,
-                              Vec (&color)[3]) {
-    for (auto& channel : color) channel = Vec(0.5f);
-    for (int wave = 0; wave < a.waves; ++wave) {
-        for (int basis = 0; basis < w.used; ++basis) {
-            const int k = wave * a.bases + basis;
-            const float* p = c.at(a.sh0, a.shN, i, k);
-            const Vec weight = w.Y[basis] * w.cosines[wave];
-            for (int channel = 0; channel < 3; ++channel) color[channel] += gather(p + channel, c.step(k), n) * weight;
-        }
-    }
+GSB_HD inline void fill_zero(float* rows, int width, int first, int end) {
+    __builtin_memset(rows + static_cast<int64_t>(first) * width, 0,
+                     sizeof(float) * static_cast<size_t>(end - first) * static_cast<size_t>(width));
 }
 
-GSB_HD inline void backward_block(const ColorArgs& a, const ColorGrads& out, int64_t i, int n, Mask shown) {
-    const Coefficients c(a);
-    const Weights w(a, i, n);
+GSB_HD inline void backward_rows(const ColorArgs& a, const ColorGrads& out, const Rows& rows) {
     const Vec zero(0.0f);
-    Vec color[3], g[3], g_Y[MAX_BASIS];
-    sum_colors(a, c, w, i, n, color);
-    gather_row(out.colors, i, n, g);
-    for (int k = 0; k < 3; ++k) g[k] = select(shown & (color[k] >= zero), g[k], zero);
+    Vec color[3], g[3], g_Y[MAX_BASIS], g_time(0.0f);
+    const Shades s(a, rows);
+    s.sum(a, rows, color);
+    rows.load3(out.colors, g);
+    for (int k = 0; k < 3; ++k) g[k] = select(color[k] >= zero, g[k], zero);
     for (auto& y : g_Y) y = zero;
-    Vec g_time(0.0f);
     for (int wave = 0; wave < a.waves; ++wave) {
-        for (int basis = 0; basis < w.used; ++basis) {
+        for (int basis = 0; basis < s.used; ++basis) {
             const int k = wave * a.bases + basis;
-            const float* p = c.at(a.sh0, a.shN, i, k);
-            float* g_p = c.at(out.sh0, out.shN, i, k);
-            const Vec weight = w.Y[basis] * w.cosines[wave];
+            const Vec weight = s.Y[basis] * s.cosines[wave];
             Vec along(0.0f);
             for (int channel = 0; channel < 3; ++channel) {
-                along += gather(p + channel, c.step(k), n) * g[channel];
-                scatter(g[channel] * weight, g_p + channel, c.step(k), n);
+                along += Shades::coefficient(a, rows, k, channel) * g[channel];
+                k ? rows.store(g[channel] * weight, out.shN + (k - 1) * 3 + channel, rows.all)
+                  : rows.store(g[channel] * weight, out.sh0 + channel, rows.threes);
             }
-            g_Y[basis] += along * w.cosines[wave];
-            g_time += along * w.Y[basis] * w.sines[wave] * (TURN * static_cast<float>(wave));  // by mu_t
+            g_Y[basis] += along * s.cosines[wave];
+            g_time += along * s.Y[basis] * s.sines[wave] * (TURN * static_cast<float>(wave));  // by mu_t
         }
     }
-    const Vec3<Vec> g_mean = w.unit.vjp(harmonics_vjp(w.unit.direction, a.degree, g_Y));
-    const Vec rows[3] = {g_mean.x, g_mean.y, g_mean.z};
-    scatter_row(rows, out.means, i, n);
-    if (a.times) store_first(g_time, out.times + i, n);
+    const Vec3<Vec> g_mean = s.unit.vjp(harmonics_vjp(s.unit.direction, a.degree, g_Y));
+    rows.store3({g_mean.x, g_mean.y, g_mean.z}, out.means);
+    if (a.times) rows.store(g_time, out.times, rows.ones);
 }
 
 }  // namespace
 
-void show_colors(const ColorArgs& a, float* colors) {
-    const Coefficients c(a);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
-    for (int64_t i = 0; i < a.N; i += LANES) {
-        const int n = lanes_from(i, a.N);
-        const Mask shown = drawn(a, i, n);
-        Vec color[3] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)};
-        if (any(shown)) sum_colors(a, c, Weights(a, i, n), i, n, color);
-        for (auto& channel : color) channel = select(shown, max(channel, Vec(0.0f)), Vec(0.0f));
-        scatter_row(color, colors, i, n);
+void show_colors(const ColorArgs& all, float* colors) {
+#pragma omp parallel for num_threads(all.threads) schedule(static) if (all.N > CHUNK)
+    for (int64_t first = 0; first < all.N; first += CHUNK) {
+        const ColorArgs a = chunk_of(all, first);
+        const int size = static_cast<int>(a.N);
+        float* out = colors + first * 3;
+        const Picked picked(size, [&](int i, int n) { return drawn(a, i, n); });
+        picked.each_gap(size, [&](int from, int end) { fill_zero(out, 3, from, end); });
+        for (int k = 0; k < picked.count; k += LANES) {
+            const Rows rows(picked, k, stride_of(a));
+            Vec color[3];
+            Shades(a, rows).sum(a, rows, color);
+            for (auto& channel : color) channel = max(channel, Vec(0.0f));
+            rows.store3(color, out);
+        }
     }
 }
 
-void show_colors_backward(const ColorArgs& a, const ColorGrads& out) {
-    const Coefficients c(a);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
-    for (int64_t i = 0; i < a.N; i += LANES) {
-        const int n = lanes_from(i, a.N);
-        const Mask shown = drawn(a, i, n);
-        const bool some = any(shown);
-        if (!some || (a.degree + 1) * (a.degree + 1) < a.bases) {  // coefficients that the block leaves untouched
-            __builtin_memset(out.shN + i * c.stride, 0, sizeof(float) * static_cast<size_t>(n * c.stride));
-        }
-        if (some) {
-            backward_block(a, out, i, n, shown);
-            continue;
-        }
-        __builtin_memset(out.sh0 + i * 3, 0, sizeof(float) * static_cast<size_t>(n) * 3);
-        __builtin_memset(out.means + i * 3, 0, sizeof(float) * static_cast<size_t>(n) * 3);
-        if (a.times) __builtin_memset(out.times + i, 0, sizeof(float) * static_cast<size_t>(n));
+void show_colors_backward(const ColorArgs& all, const ColorGrads& grads) {
+#pragma omp parallel for num_threads(all.threads) schedule(static) if (all.N > CHUNK)
+    for (int64_t first = 0; first < all.N; first += CHUNK) {
+        const ColorArgs a = chunk_of(all, first);
+        const ColorGrads out = chunk_of(grads, all, first);
+        const int size = static_cast<int>(a.N);
+        const Picked picked(size, [&](int i, int n) {
+            Vec g[3];
+            gather_row(out.colors, i, n, g);
+            return drawn(a, i, n) & !((g[0] == Vec(0.0f)) & (g[1] == Vec(0.0f)) & (g[2] == Vec(0.0f)));
+        });
+        const bool partly = (a.degree + 1) * (a.degree + 1) < a.bases;  // coefficients that nothing below writes
+        if (partly) fill_zero(out.shN, stride_of(a), 0, size);
+        picked.each_gap(size, [&](int from, int end) {
+            if (!partly) fill_zero(out.shN, stride_of(a), from, end);
+            fill_zero(out.sh0, 3, from, end);
+            fill_zero(out.means, 3, from, end);
+            if (a.times) fill_zero(out.times, 1, from, end);
+        });
+        for (int k = 0; k < picked.count; k += LANES) backward_rows(a, out, Rows(picked, k, stride_of(a)));
     }
 }
 
