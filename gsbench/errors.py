@@ -8,6 +8,10 @@ class InputError(ValueError):
     """A fault in what was given (config, data set, tensor), told in one line and shown without a stack trace."""
 
 
+class TooLargeError(InputError, MemoryError):
+    """A request that memory would not suffice for, refused before it was made."""
+
+
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
     """Return ``Did you mean 'x'? Valid: a, b, x.`` for a name that is not among `valid`."""
     choices = sorted(valid)

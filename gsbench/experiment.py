@@ -96,8 +96,6 @@ def identify(composed: DictConfig) -> Run:
         if count < 1:
             raise InputError(f"train.{key}: expected at least 1, got {count}")
     choose_device(config.device)
-    if config.optim == "sparse_adam" and not config.device.startswith("cpu"):
-        raise InputError(f"optim=sparse_adam has no kernel for device '{config.device}' yet: use optim=adam")
     choose_backend(config.raster.backend, torch.device(config.device).type)
     as_published = config.agr == config.model.published_with_agr
     label = config.model.name + ("" if as_published else "_agr" if config.agr else "_noagr")

@@ -147,16 +147,23 @@ def test_divergence_ends_as_a_record_and_the_rest_goes_on(square: Path, tmp_path
     assert done.stderr.count("gsbench: error: square: diverged: step 0: ") == 2
 
 
-def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(square: Path, tmp_path: Path) -> None:
-    """Catches a run out of a GPU's memory that ends the process, or a record that does not say what to lower."""
+@pytest.mark.parametrize(
+    "error",
+    ['torch.OutOfMemoryError("pictures need 9.0 MiB: lower the picture\'s size")',
+     'errors.TooLargeError("pictures need 9.0 MiB: lower the picture\'s size")'],
+)  # fmt: skip
+def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(error: str, square: Path, tmp_path: Path) -> None:
+    """Catches a run out of a GPU's memory, or refused by the CPU's, that ends the process, counts as diverged, or has
+    a record that does not say what to lower."""
     sweep = ["-m", *overrides(square, tmp_path), "model=3dgs", "seed=0,1"]
     code = (
         "import sys, torch\n"
+        "from gsbench import errors\n"
         "from gsbench.train import loop\n"
         "draw = loop.draw\n"
         "def full(*arguments):\n"
         "    loop.draw = draw\n"  # the next run has memory again
-        '    raise torch.OutOfMemoryError("pictures need 9.0 MiB on cuda:0: lower the picture\'s size")\n'
+        f"    raise {error}\n"
         "loop.draw = full\n"
         f"sys.argv = {['gsbench', *sweep]}\n"
         "from gsbench.__main__ import main\n"
@@ -165,5 +172,5 @@ def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(square: Path, tmp_p
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 1
     statuses = {one.seed: (one.status, one.reason) for one in map(record.read, record.find(tmp_path))}
-    reason = "out of memory: pictures need 9.0 MiB on cuda:0: lower the picture's size"
+    reason = "out of memory: pictures need 9.0 MiB: lower the picture's size"
     assert statuses == {0: ("failed", reason), 1: ("ok", None)}

@@ -7,9 +7,9 @@ from torch.library import custom_op
 from gsbench.errors import InputError
 from gsbench.kernels import native, threads
 from gsbench.kernels.arrays import check
+from gsbench.kernels.cuda import adam as on_cuda
 
 
-@custom_op("gsbench::adam", mutates_args=("parameter", "mean", "square"))
 def adam(
     parameter: Tensor,  # [N, ...]
     gradient: Tensor,  # [N, ...]
@@ -19,32 +19,41 @@ def adam(
     rate: float,
     betas: list[float],
     eps: float,
-    step: int,
+    step: Tensor,  # []
 ) -> None:
     """One update, the `step`-th from 1, of the rows `drawn` (Kingma & Ba 2015, algorithm 1).
 
     `mean` and `square` are the running means of the gradient and of its square.
 
     Raises:
-        InputError: not contiguous float32 on the CPU, or shapes that do not fit.
+        InputError: not contiguous float32 on one device, or shapes that do not fit.
     """
     shape = tuple(parameter.shape)
     named = {"parameter": parameter, "gradient": gradient, "mean": mean, "square": square}
-    check("adam", {name: (tensor, shape) for name, tensor in named.items()})
-    if parameter.device.type != "cpu" or drawn.device.type != "cpu":
-        raise InputError(f"adam: expected tensors on the CPU, got {parameter.device} and {drawn.device}")
-    if drawn.shape != shape[:1] or drawn.dtype != torch.bool:
-        raise InputError(f"adam: expected drawn as bool of shape {list(shape[:1])}, got {drawn.dtype} of shape "
-                         f"{list(drawn.shape)}")  # fmt: skip
+    check("adam", {name: (tensor, shape) for name, tensor in named.items()} | {"step": (step, ())})
+    if drawn.shape != shape[:1] or drawn.dtype != torch.bool or drawn.device != parameter.device:
+        raise InputError(f"adam: expected drawn as bool of shape {list(shape[:1])} on {parameter.device}, got "
+                         f"{drawn.dtype} of shape {list(drawn.shape)} on {drawn.device}")  # fmt: skip
     if not all(tensor.is_contiguous() for tensor in (parameter, mean, square)):
         raise InputError("adam: expected parameter, mean and square row by row in memory: call .contiguous()")
-    if not len(parameter):
-        return
+    if len(parameter):
+        _adam(parameter, gradient, mean, square, drawn, rate, betas, eps, step)
+
+
+@custom_op("gsbench::adam", mutates_args=("parameter", "mean", "square"))
+def _adam(
+    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, drawn: Tensor, rate: float, betas: list[float],
+    eps: float, step: Tensor,
+) -> None:  # fmt: skip
     rows = [t.detach().view(len(t), -1) for t in (parameter, gradient.contiguous(), mean, square)]
-    unbias = [1 / (1 - betas[0] ** step), (1 - betas[1] ** step) ** -0.5]
+    count = step.item()
+    unbias = [1 / (1 - betas[0] ** count), (1 - betas[1] ** count) ** -0.5]
     native().adam(*rows, drawn.contiguous(), rate, *betas, eps, *unbias, threads())
 
 
-@adam.register_fake
+@_adam.register_fake
 def _(*_: object) -> None:
     return None
+
+
+_adam.register_kernel("cuda")(on_cuda.adam)

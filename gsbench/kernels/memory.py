@@ -2,19 +2,19 @@
 
 from pathlib import Path
 
-from gsbench.errors import InputError
+from gsbench.errors import TooLargeError
 
 SMALL = 1 << 26  # bytes not worth asking the system about
 
 
 def require(size: int, what: str) -> None:
-    """Raise InputError if `size` bytes for `what` are more than this process can still get."""
+    """Raise TooLargeError if `size` bytes for `what` are more than this process can still get."""
     if size < SMALL:
         return
     free = available()
     if free is not None and size > free:
-        raise InputError(f"{what} need {size / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are available: "
-                         "use a smaller picture, fewer cameras at once or fewer Gaussians")  # fmt: skip
+        raise TooLargeError(f"{what} need {size / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are available: "
+                            "use a smaller picture, fewer cameras at once or fewer Gaussians")  # fmt: skip
 
 
 def available() -> int | None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gsbench.config import Config
-from gsbench.errors import InputError
+from gsbench.errors import InputError, TooLargeError
 from gsbench.measure.curve import Curve
 from gsbench.measure.quality import psnr
 from gsbench.measure.speed import Stages
@@ -104,6 +104,8 @@ class Trainer:
             with stages("raster"):
                 try:
                     output = draw(gaussians, view.camera, self.background, self.config.raster)
+                except TooLargeError:
+                    raise
                 except InputError as error:  # the rasterizer's door is the first to see a slice that is not finite
                     raise DivergedError(f"step {step}: {error}") from None
                 output.info.means2d.retain_grad()

@@ -51,7 +51,8 @@ class Optimizer:
     ) -> None:
         """Update what has a gradient, at the rates of this step, and drop the gradients.
 
-        `drawn`: which Gaussians some view of the batch drew; the others have no gradient.
+        `drawn`: which Gaussians some view of the batch drew; the others have no gradient. Where `adam.found_inf` [] is
+        set to 1, nothing is updated.
         """
         for group in self.adam.param_groups:
             group["lr"] = rate_at(self.rates[group["name"]], step / self.iterations, self.extent)
@@ -68,12 +69,15 @@ class Optimizer:
         if not state:  # in the layout of torch.optim.Adam
             state["step"] = torch.zeros((), device=parameter.device)
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        state["step"] += 1
+        skip: Tensor | None = getattr(self.adam, "found_inf", None)
+        if skip is not None:  # as a mask: to look at it would be to wait for the GPU
+            drawn = drawn & (skip == 0)
+        state["step"] += 1 if skip is None else 1 - skip
         update = adam if self.model.uses_kernels(parameter) else adam_reference
         moments = state["exp_avg"], state["exp_avg_sq"]
         with torch.no_grad():
             update(parameter, parameter.grad, *moments, drawn, group["lr"], list(group["betas"]), group["eps"],
-                   int(state["step"]))  # fmt: skip
+                   state["step"])  # fmt: skip
         parameter.grad = None
 
     def follow(self, model: GaussianModel, rows: Tensor, fresh: Tensor) -> None:
@@ -103,13 +107,14 @@ def rate_at(rate: LearningRate, progress: float, extent: float) -> float:
 
 def adam_reference(
     parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, drawn: Tensor, rate: float, betas: list[float],
-    eps: float, step: int,
+    eps: float, step: Tensor,
 ) -> None:  # fmt: skip
     """`gsbench.kernels.adam.adam` in torch."""
     rows = drawn.nonzero()[:, 0]
     g = gradient[rows]
     m = mean[rows].lerp(g, 1 - betas[0])
     v = square[rows].lerp(g.square(), 1 - betas[1])
-    denominator = v.sqrt() * (1 - betas[1] ** step) ** -0.5 + eps
-    parameter[rows] -= m * (rate / (1 - betas[0] ** step)) / denominator
+    count = step.double()
+    denominator = v.sqrt() * (1 - betas[1] ** count) ** -0.5 + eps
+    parameter[rows] -= m * (rate / (1 - betas[0] ** count)) / denominator
     mean[rows], square[rows] = m, v

@@ -166,6 +166,21 @@ def test_sparse_adam_is_adam_where_all_is_drawn_and_rests_elsewhere() -> None:
         torch.testing.assert_close(new["exp_avg"][~drawn], old["exp_avg"][~drawn], rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("kind", ["adam", "sparse_adam"])
+def test_a_bad_step_that_is_found_later_changes_nothing(kind: str) -> None:
+    """Catches an update, or a count of it, where the watch of a GPU has said that a gradient was not finite."""
+    model, optimizer = fitted(kind=kind)
+    descend(model, optimizer, 0)
+    before, moments = copy.deepcopy(model.state_dict()), copy.deepcopy(optimizer.adam.state_dict()["state"])
+    optimizer.adam.found_inf = torch.ones(())  # type: ignore[attr-defined]
+    descend(model, optimizer, 1)
+    for name, value in model.state_dict().items():
+        torch.testing.assert_close(value, before[name], rtol=0, atol=0, msg=lambda text, name=name: f"{name}: {text}")
+    for index, state in optimizer.adam.state_dict()["state"].items():
+        for name, value in state.items():
+            torch.testing.assert_close(value, moments[index][name], rtol=0, atol=0)
+
+
 @pytest.mark.skipif(not kernels.available(), reason="the native kernels are not built here")
 @pytest.mark.parametrize("shape", [(0, 3), (1,), (700, 1, 3), (1000, 28)])
 def test_kernel_and_torch_make_the_same_update(shape: tuple[int, ...]) -> None:
@@ -173,7 +188,7 @@ def test_kernel_and_torch_make_the_same_update(shape: tuple[int, ...]) -> None:
     random = torch.Generator().manual_seed(0)
     g, p, m = (torch.randn(shape, generator=random) for _ in range(3))
     v, drawn = torch.rand(shape, generator=random), torch.rand(shape[0], generator=random) < 0.7
-    rule = drawn, 0.01, [0.9, 0.999], 1e-15, 5
+    rule = drawn, 0.01, [0.9, 0.999], 1e-15, torch.tensor(5.0)
     expected = p.clone(), m.clone(), v.clone()
     adam_reference(expected[0], g, expected[1], expected[2], *rule)
     out = []
@@ -193,7 +208,7 @@ def test_kernel_and_torch_make_the_same_update(shape: tuple[int, ...]) -> None:
 def test_adam_refuses_what_does_not_fit() -> None:
     """Catches a mask or an array of another size or type that reaches the kernel."""
     x = torch.zeros(4, 2)
-    rule = 0.01, [0.9, 0.999], 1e-15, 1
+    rule = 0.01, [0.9, 0.999], 1e-15, torch.tensor(1.0)
     with pytest.raises(InputError, match=r"expected drawn as bool of shape \[4\]"):
         adam(x.clone(), x, x.clone(), x.clone(), torch.ones(3, dtype=torch.bool), *rule)
     with pytest.raises(InputError, match=r"expected gradient of shape \[4, 2\], got \[4, 3\]"):

@@ -190,6 +190,13 @@ void l1_ssim(int height, int width, Address image, Address target, float ssim_we
     gsb::cuda::l1_ssim({height, width, image, target, ssim_weight, loss, derivatives, grad}, stream);
 }
 
+void adam(int64_t N, int64_t width, Address drawn, Address gradients, Address parameters, Address means,
+          Address squares, float rate, float beta1, float beta2, float log_beta1, float log_beta2, float eps,
+          Address step, Address stream) {
+    gsb::cuda::adam({N, width, drawn, gradients, parameters, means, squares, rate, beta1, beta2, log_beta1, log_beta2,
+                     eps, step}, stream);
+}
+
 }  // namespace
 
 NB_MODULE(GSB_MODULE, m) {
@@ -214,4 +221,5 @@ NB_MODULE(GSB_MODULE, m) {
     m.attr("MAX_NETWORKS") = gsb::cuda::MAX_NETWORKS;
     m.attr("MAX_WIDTH") = gsb::cuda::MAX_WIDTH;
     m.def("l1_ssim", &l1_ssim);
+    m.def("adam", &adam);
 }

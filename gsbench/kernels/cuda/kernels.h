@@ -145,6 +145,17 @@ struct RefineGrads {
     float *weight_in, *bias_in, *weight_out, *bias_out;  // zero on entry
 };
 
+// Adam on the rows [N, width] of a parameter that are `drawn`.
+struct AdamArgs {
+    int64_t N, width;
+    const bool* drawn;                    // [N]
+    const float* gradients;               // [N, width], as are ..
+    float *parameters, *means, *squares;  // .. the values, and Adam's moments
+    float rate, beta1, beta2, log_beta1, log_beta2, eps;
+    const float* step;  // [1], from 1
+};
+void adam(const AdamArgs&, Stream);
+
 // Bit k of `flags` is set where the k-th array has a value that is not finite, or out of range: means, factors,
 // opacities, colors, viewmats, Ks, background.
 struct Values {
