@@ -116,9 +116,8 @@ def test_rotated_slice() -> None:
                 gradients(expected, [*raw.values(), *exact.log_modulation.parameters()]))  # fmt: skip
 
 
-def color_inputs(waves: int, dtype: torch.dtype) -> list[Tensor]:
+def color_inputs(waves: int, dtype: torch.dtype, N: int = 21) -> list[Tensor]:
     g = torch.Generator().manual_seed(3)
-    N = 21
     shapes = [(N, 1, 3), (N, 16 * waves - 1, 3), (N, 3), (N, 1)]
     return [torch.randn(shape, generator=g).to(dtype).requires_grad_() for shape in shapes]
 
@@ -145,19 +144,29 @@ def test_colors(degree: int, waves: int) -> None:
     assert_same(list(torch.autograd.grad(actual, single[:inputs], torch.ones_like(actual))), list(g_exact))
 
 
-def test_what_cannot_be_drawn_has_no_color() -> None:
-    """Catches culling that is not exact: colours are left out only below 1/255, and then get no gradient."""
-    sh0, shN, means, _ = color_inputs(1, torch.float32)
-    opacities = torch.full((21,), 0.99 / 255)
-    opacities[::5] = 1.01 / 255
-    colors = show_colors(sh0, shN, means, opacities, torch.zeros(3), 3)
-    everything = show_colors(sh0, shN, means, torch.ones(21), torch.zeros(3), 3)
-    assert torch.equal(colors[::5], everything[::5])
-    (gradient,) = torch.autograd.grad(colors, shN, torch.ones_like(colors))
-    hidden = opacities < 1 / 255
-    assert not colors[hidden].any()
-    assert not gradient[hidden].any()
-    assert gradient[~hidden].any()
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("degree", [1, 3])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_what_cannot_be_drawn_has_no_color(share: float, degree: int) -> None:
+    """Catches culling that is not exact (colours are left out below 1/255 only, and then get no gradient), and
+    gradients that are not written, or in the wrong row, as the drawn are packed: chunks end within runs of either."""
+    N, center, time = 1100, torch.tensor([0.1, 0.2, -2.0]), torch.tensor(0.7)
+    inputs = color_inputs(3, torch.float32, N)
+    random = torch.Generator().manual_seed(1)
+    drawn = torch.rand(N, generator=random) < share
+    colors, everything = (
+        show_colors(*inputs[:3], opacities, center, degree, inputs[3], time, 3)
+        for opacities in (torch.where(drawn, 1.01 / 255, 0.99 / 255), torch.ones(N))
+    )
+    assert torch.equal(colors, everything * drawn[:, None])
+    weights = torch.randn(N, 3, generator=random)
+    weights[::7] = 0
+    got = torch.autograd.grad(colors, inputs, weights)
+    want = torch.autograd.grad(everything, inputs, weights * drawn[:, None])
+    for one, other in zip(got, want, strict=True):
+        assert torch.equal(one, other)
+        assert not one[~drawn | (weights == 0).all(1)].any()
+        assert (share > 0) == bool(one.any())
 
 
 @pytest.mark.usefixtures("instruction_set")
