@@ -12,11 +12,19 @@ namespace {
 
 constexpr int DIGIT_BITS = 11;
 constexpr uint32_t DIGITS = 1u << DIGIT_BITS;
+constexpr int64_t AHEAD = 16;  // entries that are fetched before they are needed
 
 struct Key {
     uint32_t depth;  // the bits of a positive float sort as the float does
-    int32_t id;
+    int32_t entry;
 };
+
+// A splat that has tiles. They are visited in order of depth, which is no order in memory, so they lie close together.
+struct Entry {
+    int32_t id;
+    uint16_t x0, y0, x1, y1;  // its TileRect: no picture is more than FARTHEST / TILE tiles wide
+};
+static_assert(FARTHEST / TILE < 65536);
 
 // Stable radix sort by depth, least digit first; a digit that all keys share is skipped. Returns where the result is.
 Key* radix_sort(Key* keys, Key* spare, int64_t n) {
@@ -87,15 +95,17 @@ void fill_tiles(const BinArgs& a, const int64_t* offsets, int32_t* ids) {
     const int across = tiles_along(a.width), down = tiles_along(a.height);
     const int64_t tiles = static_cast<int64_t>(across) * down;
     Buffer<Key> keys(static_cast<size_t>(a.N)), spare(static_cast<size_t>(a.N));
+    Buffer<Entry> entries(static_cast<size_t>(a.N));
     Buffer<int64_t> cursors(static_cast<size_t>(tiles));
-    Buffer<TileRect> rects(static_cast<size_t>(a.N));
     for (int64_t c = 0; c < a.C; ++c) {
         const int64_t* begin = offsets + c * tiles;
         int64_t n = 0;
         each_rect(a, c, [&](int64_t i, const TileRect& r) {
-            rects[static_cast<size_t>(i)] = r;
+            const auto tile = [](int x) { return static_cast<uint16_t>(x); };
+            entries[static_cast<size_t>(n)] = {static_cast<int32_t>(i), tile(r.x0), tile(r.y0), tile(r.x1), tile(r.y1)};
             std::memcpy(&keys[static_cast<size_t>(n)].depth, a.depths + c * a.N + i, sizeof(float));
-            keys[static_cast<size_t>(n++)].id = static_cast<int32_t>(i);
+            keys[static_cast<size_t>(n)].entry = static_cast<int32_t>(n);
+            ++n;
         });
         const Key* sorted = radix_sort(keys.data(), spare.data(), n);
         std::memcpy(cursors.data(), begin, sizeof(int64_t) * static_cast<size_t>(tiles));
@@ -111,11 +121,12 @@ void fill_tiles(const BinArgs& a, const int64_t* offsets, int32_t* ids) {
             };
             const int low = first_row(task), high = first_row(task + 1);
             for (int64_t k = 0; k < n; ++k) {
-                const TileRect r = rects[static_cast<size_t>(sorted[k].id)];
-                const int y0 = r.y0 > low ? r.y0 : low, y1 = r.y1 < high ? r.y1 : high;
+                __builtin_prefetch(&entries[static_cast<size_t>(sorted[k + AHEAD < n ? k + AHEAD : k].entry)]);
+                const Entry e = entries[static_cast<size_t>(sorted[k].entry)];
+                const int y0 = e.y0 > low ? e.y0 : low, y1 = e.y1 < high ? e.y1 : high;
                 for (int y = y0; y < y1; ++y) {
                     int64_t* row = &cursors[static_cast<size_t>(y) * across];
-                    for (int x = r.x0; x < r.x1; ++x) ids[row[x]++] = sorted[k].id;
+                    for (int x = e.x0; x < e.x1; ++x) ids[row[x]++] = e.id;
                 }
             }
         }

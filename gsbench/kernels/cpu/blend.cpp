@@ -129,7 +129,7 @@ void blend(const BlendArgs& a, const Picture& out) {
     const size_t scratch_size = Blocks::size(a.D);
     Buffer<float> scratch(scratch_size * static_cast<size_t>(a.threads));
     for (int64_t c = 0; c < a.C; ++c) {
-        make_records(a, c, records.data());
+        make_records(a, c, records.data(), nullptr);
         const float* colors = a.colors + (a.color_per_camera ? c * a.N * a.D : 0);
 #pragma omp parallel for num_threads(a.threads) schedule(dynamic, 4)
         for (int tile = 0; tile < tiles; ++tile) {

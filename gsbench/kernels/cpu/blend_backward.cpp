@@ -156,13 +156,13 @@ void backward_tile(const TileJob& job) {
     }
 }
 
-// One splat's gradient from its pairs.
-void reduce_splat(const BlendArgs& a, const BlendGrads& out, int64_t camera, int64_t i, const Record& s, int64_t end,
-                  const float* pair_sums, const uint8_t* pair_seen, float* color) {
+// One splat's gradient from its pairs [begin, end); without any it has no record.
+void reduce_splat(const BlendArgs& a, const BlendGrads& out, int64_t camera, int64_t i, const Record& s, int64_t begin,
+                  int64_t end, const float* pair_sums, const uint8_t* pair_seen, float* color) {
     const int width = GEOMETRY + a.D;
     FalloffMoments<float> m{};
     for (int k = 0; k < a.D; ++k) color[k] = 0.0f;
-    for (int64_t pair = s.first_pair; pair < end; ++pair) {
+    for (int64_t pair = begin; pair < end; ++pair) {
         if (!pair_seen[pair]) continue;
         const float* sums = pair_sums + pair * width;
         m.v += sums[0];
@@ -174,7 +174,7 @@ void reduce_splat(const BlendArgs& a, const BlendGrads& out, int64_t camera, int
         for (int k = 0; k < a.D; ++k) color[k] += sums[GEOMETRY + k];
     }
     float g[GEOMETRY] = {};
-    if (s.opacity > 0.0f) splat_gradient(m, s.p, s.q, s.r, s.opacity, g);
+    if (begin < end && s.opacity > 0.0f) splat_gradient(m, s.p, s.q, s.r, s.opacity, g);
     const int64_t at = camera * a.N + i;
     out.means2d[at * 2] = g[0];
     out.means2d[at * 2 + 1] = g[1];
@@ -195,6 +195,7 @@ void blend_backward(const BlendArgs& a, const Picture& picture, const BlendGrads
         most_pairs = pairs > most_pairs ? pairs : most_pairs;
     }
     Buffer<Record> records(static_cast<size_t>(a.N));
+    Buffer<int32_t> first_pairs(static_cast<size_t>(a.N) + 1);
     const size_t scratch_size = Blocks::size(a.D) + D * LANES;
     Buffer<float> scratch(scratch_size * threads), pair_sums(static_cast<size_t>(most_pairs) * (GEOMETRY + D));
     Buffer<uint8_t> pair_seen(static_cast<size_t>(most_pairs));
@@ -202,8 +203,8 @@ void blend_backward(const BlendArgs& a, const Picture& picture, const BlendGrads
     for (size_t k = 0; k < D; ++k) out.background[k] = 0.0f;
 
     for (int64_t c = 0; c < a.C; ++c) {
-        make_records(a, c, records.data());
-        const int64_t pairs = number_pairs(a, records.data());
+        make_records(a, c, records.data(), first_pairs.data());
+        number_pairs(a, records.data(), first_pairs.data());
         pair_seen.zero();
         const float* colors = a.colors + (a.color_per_camera ? c * a.N * a.D : 0);
 #pragma omp parallel for num_threads(a.threads) schedule(dynamic, 4)
@@ -216,9 +217,10 @@ void blend_backward(const BlendArgs& a, const Picture& picture, const BlendGrads
         }
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > SPLATS_PER_TASK)
         for (int64_t i = 0; i < a.N; ++i) {
-            const int64_t end = i + 1 < a.N ? records[static_cast<size_t>(i) + 1].first_pair : pairs;
+            const size_t splat = static_cast<size_t>(i);
             float* color = scratch.data() + scratch_size * static_cast<size_t>(thread_index());
-            reduce_splat(a, out, c, i, records[static_cast<size_t>(i)], end, pair_sums.data(), pair_seen.data(), color);
+            reduce_splat(a, out, c, i, records[splat], first_pairs[splat], first_pairs[splat + 1], pair_sums.data(),
+                         pair_seen.data(), color);
         }
         for (size_t k = 0; k < D; ++k) {
             double total = 0.0;

@@ -43,7 +43,6 @@ inline Record make_record(const BlendArgs& a, int64_t camera, int64_t i, const T
     s.reach = reach * reach;
     s.foot_y = -s.q / s.r;
     s.foot_x = -s.q * s.r / (s.p * s.p + s.q * s.q);
-    s.first_pair = static_cast<int32_t>(rect.count());
     s.tile_x = rect.x0;
     s.tile_y = rect.y0;
     s.columns = rect.x1 - rect.x0;
@@ -54,27 +53,33 @@ inline Record make_record(const BlendArgs& a, int64_t camera, int64_t i, const T
     return s;
 }
 
-// The records of one camera's splats; first_pair is left to `number_pairs`.
-inline void make_records(const BlendArgs& a, int64_t camera, Record* records) {
+// The records of those of a camera's splats that have tiles; first_pair is left to `number_pairs`. `pairs` [N]: how many
+// each has; null: not wanted.
+inline void make_records(const BlendArgs& a, int64_t camera, Record* records, int32_t* pairs) {
     const int64_t base = camera * a.N;
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > 1024)
     for (int64_t first = 0; first < a.N; first += LANES) {
         const int n = lanes_from(first, a.N);
         TileRect rects[LANES];
         tile_rects(a.means2d + base * 2, a.half_sizes + base * 2, first, n, a.width, a.height, rects);
-        for (int k = 0; k < n; ++k) records[first + k] = make_record(a, camera, first + k, rects[k]);
+        for (int k = 0; k < n; ++k) {
+            if (pairs) pairs[first + k] = static_cast<int32_t>(rects[k].count());
+            if (rects[k].count() > 0) records[first + k] = make_record(a, camera, first + k, rects[k]);
+        }
     }
 }
 
-// Gives each splat the places of its pairs, all splats' in a row; returns their number.
-inline int64_t number_pairs(const BlendArgs& a, Record* records) {
-    int64_t pairs = 0;
+// Gives each splat the places of its pairs, all splats' in a row. `pairs` [N + 1]: as make_records left them, and after
+// where those of each splat begin.
+inline void number_pairs(const BlendArgs& a, Record* records, int32_t* pairs) {
+    int32_t total = 0;
     for (int64_t i = 0; i < a.N; ++i) {
-        const int32_t count = records[i].first_pair;  // as make_records left it
-        records[i].first_pair = static_cast<int32_t>(pairs);
-        pairs += count;
+        const int32_t count = pairs[i];
+        if (count) records[i].first_pair = total;
+        pairs[i] = total;
+        total += count;
     }
-    return pairs;
+    pairs[a.N] = total;
 }
 
 // Where the pixels and blocks of one tile are.
