@@ -2,6 +2,7 @@
 // raises TypeError here, sizes that contradict each other ValueError; gsbench/kernels/__init__.py says it in words.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -9,6 +10,7 @@
 #include <malloc.h>
 #endif
 
+#include <optional>
 #include <stdexcept>
 #include <vector>
 
@@ -285,14 +287,23 @@ void show_colors(In<-1, -1, 3> sh0, In<-1, -1, 3> shN, In<-1, 3> means, In<-1> o
 
 void show_colors_backward(In<-1, -1, 3> sh0, In<-1, -1, 3> shN, In<-1, 3> means, In<-1> opacities, In<-1> times,
                           In<3> center, double time, int degree, int waves, int threads, In<-1, 3> g_colors,
-                          Out<-1, -1, 3> out_sh0, Out<-1, -1, 3> out_shN, Out<-1, 3> out_means, Out<-1> out_times) {
+                          Out<-1, -1, 3> out_sh0, Out<-1, -1, 3> out_shN, Out<-1, 3> out_means, Out<-1> out_times,
+                          std::optional<Array<const int64_t, -1>> rows) {
     const auto args = color_args(sh0, shN, means, opacities, times, center, time, degree, waves, threads);
     expect_all(args.N, "N", g_colors.shape(0), out_sh0.shape(0), out_means.shape(0));
-    expect_all(size(shN.size()), "the coefficients", out_shN.size());
+    const int64_t count = rows ? size(rows->shape(0)) : args.N;
+    expect_all(count, "the rows of the coefficients", out_shN.shape(0));
+    expect_all(size(shN.shape(1)), "the coefficients", out_shN.shape(1));
     expect_all(args.times ? args.N : 0, "times", out_times.shape(0));
+    for (int64_t k = 0; rows && k < count; ++k) {
+        if ((*rows)(k) < (k ? (*rows)(k - 1) + 1 : 0) || (*rows)(k) >= args.N) {
+            throw std::invalid_argument("expected rows in ascending order, each of a Gaussian");
+        }
+    }
     nb::gil_scoped_release release;
-    active->show_colors_backward(args,
-                                 {g_colors.data(), out_sh0.data(), out_shN.data(), out_means.data(), out_times.data()});
+    active->show_colors_backward(
+        args, {g_colors.data(), out_sh0.data(), out_shN.data(), out_means.data(), out_times.data(), rows.has_value(),
+               rows ? rows->data() : nullptr, rows ? count : 0});
 }
 
 template <class T>

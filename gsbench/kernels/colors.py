@@ -5,6 +5,7 @@ What cannot be drawn (an opacity below 1/255 after f_temp and f_dir) is left out
 
 from typing import Any
 
+import torch
 from torch import Tensor
 from torch.library import custom_op
 
@@ -71,17 +72,25 @@ def _(_sh0: Tensor, _shN: Tensor, means: Tensor, *_: Any) -> Tensor:
 @custom_op("gsbench::show_colors_backward", mutates_args=())
 def _show_backward(
     sh0: Tensor, shN: Tensor, means: Tensor, opacities: Tensor, times: Tensor, center: Tensor,
-    time: Tensor, degree: int, waves: int, g_colors: Tensor,
+    time: Tensor, degree: int, waves: int, g_colors: Tensor, rows: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    out = tuple(rows_like(x) for x in (sh0, shN, means, times))
+    """Gradients of sh0, shN, means and times; with `rows` that of shN has those rows only, and no other has any."""
+    out = _gradients(sh0, shN, means, times, rows)
     native().show_colors_backward(*plain(sh0, shN, means, opacities, times, center), number(time), degree, waves,
-                                  threads(), *plain(g_colors), *out)  # fmt: skip
-    return out[0], out[1], out[2], out[3]
+                                  threads(), *plain(g_colors), *out, rows)  # fmt: skip
+    return out
 
 
 @_show_backward.register_fake
-def _(sh0: Tensor, shN: Tensor, means: Tensor, _opacities: Tensor, times: Tensor, *_: Any) -> tuple[Tensor, ...]:
-    return tuple(rows_like(x) for x in (sh0, shN, means, times))
+def _(sh0: Tensor, shN: Tensor, means: Tensor, _opacities: Tensor, times: Tensor, *rest: Any) -> tuple[Tensor, ...]:
+    return _gradients(sh0, shN, means, times, rest[-1])
+
+
+def _gradients(
+    sh0: Tensor, shN: Tensor, means: Tensor, times: Tensor, rows: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    written = len(shN) if rows is None else len(rows)
+    return rows_like(sh0), shN.new_empty(written, *shN.shape[1:]), rows_like(means), rows_like(times)
 
 
 def _show_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # noqa: ARG001
@@ -90,8 +99,16 @@ def _show_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  #
 
 
 def _show_gradient(ctx: Any, g_colors: Tensor) -> tuple[Tensor | None, ...]:
-    g = _show_backward(*ctx.saved_tensors, *ctx.rest, g_colors)
-    return g[0], g[1], g[2], None, g[3], None, None, None, None
+    shN, opacities = ctx.saved_tensors[1], ctx.saved_tensors[3]
+    rows = None
+    # Most of a model's numbers are in shN, most Gaussians of a clip are not there at any one time, and memory is what a
+    # step waits for: where autograd will add this view's gradient to that of others, it gets the rows that have one.
+    if shN.is_leaf and shN.grad is not None and not shN.is_cuda:
+        rows = ((opacities >= 1 / 255) & (g_colors != 0).any(1)).nonzero()[:, 0]
+    g_sh0, g_shN, g_means, g_times = _show_backward(*ctx.saved_tensors, *ctx.rest, g_colors, rows)
+    if rows is not None:
+        g_shN = torch.sparse_coo_tensor(rows[None], g_shN, shN.shape, is_coalesced=True, check_invariants=False)
+    return g_sh0, g_shN, g_means, None, g_times, None, None, None, None
 
 
 _show.register_kernel("cuda")(on_cuda.show)

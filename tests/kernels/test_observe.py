@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels import native
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.refine import refine
 from gsbench.kernels.slices import observe_rotated, observe_triangular
@@ -167,6 +168,40 @@ def test_what_cannot_be_drawn_has_no_color(share: float, degree: int) -> None:
         assert torch.equal(one, other)
         assert not one[~drawn | (weights == 0).all(1)].any()
         assert (share > 0) == bool(one.any())
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("degree", [1, 3])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_gradients_of_views_add_up(share: float, degree: int) -> None:
+    """Catches a view whose gradient, of the rows that have one, lands in other rows of what views before it left."""
+    N, random = 1100, torch.Generator().manual_seed(1)
+    inputs = color_inputs(3, torch.float32, N)
+    views = [
+        show_colors(*inputs[:3], (torch.rand(N, generator=random) < share).float(), torch.tensor([0.1, 0.2, -z]),
+                    degree, inputs[3], torch.tensor(0.7), 3)
+        for z in (2.0, 3.0, 4.0)
+    ]  # fmt: skip
+    weights = [torch.randn(N, 3, generator=random) for _ in views]
+    apart = [torch.autograd.grad(v, inputs, w, retain_graph=True) for v, w in zip(views, weights, strict=True)]
+    for view, weight in zip(views, weights, strict=True):
+        view.backward(weight)
+    for x, *gradients in zip(inputs, *apart, strict=True):
+        assert x.grad is not None
+        assert x.grad.layout == torch.strided
+        assert torch.equal(x.grad, sum(gradients[1:], gradients[0]))
+
+
+@pytest.mark.parametrize("rows", [[0, 0], [1, 0], [-1], [21]])
+def test_rows_that_are_no_rows_are_refused(rows: list[int]) -> None:
+    """Catches a list of rows by which the kernel would write past an array."""
+    sh0, shN, means, _ = (x.detach() for x in color_inputs(1, torch.float32))
+    written = torch.empty(len(rows), *shN.shape[1:])
+    with pytest.raises(ValueError, match="ascending"):
+        native().show_colors_backward(
+            sh0, shN, means, torch.ones(21), torch.empty(0), torch.zeros(3), 0.0, 3, 1, 1, torch.ones(21, 3),
+            torch.empty_like(sh0), written, torch.empty_like(means), torch.empty(0), torch.tensor(rows),
+        )  # fmt: skip
 
 
 @pytest.mark.usefixtures("instruction_set")

@@ -5,6 +5,8 @@
 #include "../math/projection.h"
 #include "../math/harmonics.h"
 
+#include <algorithm>
+
 #include "isa.h"
 #include "rows.h"
 
@@ -27,6 +29,11 @@ struct Picked {
         }
     }
 
+    // Those of a chunk that begins at `first` from a list of all, of which [begin, begin + number) are the chunk's.
+    GSB_HD Picked(const int64_t* rows, int64_t begin, int number, int64_t first) : count(number) {
+        for (int k = 0; k < number; ++k) which[k] = static_cast<uint32_t>(rows[begin + k] - first);
+    }
+
     // Calls f(first, end) for each run of Gaussians that were not picked.
     template <class F>
     GSB_HD void each_gap(int size, F f) const {
@@ -43,7 +50,7 @@ struct Picked {
 // Sixteen picked rows, or what is left of them; lanes without one read zero.
 struct Rows {
     uint32_t lanes;
-    alignas(64) int32_t ones[LANES] = {}, threes[LANES] = {}, all[LANES] = {};
+    alignas(64) int32_t ones[LANES] = {}, threes[LANES] = {}, all[LANES] = {}, packed[LANES] = {};
 
     GSB_HD Rows(const Picked& picked, int first, int stride) {
         const int n = lanes_from(first, picked.count);
@@ -52,6 +59,7 @@ struct Rows {
             ones[k] = static_cast<int32_t>(picked.which[first + k]);
             threes[k] = ones[k] * 3;
             all[k] = ones[k] * stride;
+            packed[k] = (first + k) * stride;
         }
     }
     GSB_HD Vec load(const float* p, const int32_t (&offsets)[LANES]) const {
@@ -117,16 +125,22 @@ GSB_HD inline ColorArgs chunk_of(ColorArgs a, int64_t first) {
     if (a.times) a.times += first;
     return a;
 }
-GSB_HD inline ColorGrads chunk_of(ColorGrads g, const ColorArgs& a, int64_t first) {
+GSB_HD inline ColorGrads chunk_of(ColorGrads g, const ColorArgs& a, int64_t first, int64_t first_of_shN) {
     g.colors += first * 3;
     g.sh0 += first * 3;
-    g.shN += first * stride_of(a);
+    g.shN += first_of_shN * stride_of(a);
     g.means += first * 3;
     if (a.times) g.times += first;
     return g;
 }
 
 GSB_HD inline Mask drawn(const ColorArgs& a, int i, int n) { return load_first(a.opacities + i, n) >= Vec(ALPHA_MIN); }
+
+GSB_HD inline Mask learns(const ColorArgs& a, const ColorGrads& g, int i, int n) {
+    Vec color[3];
+    gather_row(g.colors, i, n, color);
+    return drawn(a, i, n) & !((color[0] == Vec(0.0f)) & (color[1] == Vec(0.0f)) & (color[2] == Vec(0.0f)));
+}
 
 GSB_HD inline void fill_zero(float* rows, int width, int first, int end) {
     __builtin_memset(rows + static_cast<int64_t>(first) * width, 0,
@@ -148,7 +162,7 @@ GSB_HD inline void backward_rows(const ColorArgs& a, const ColorGrads& out, cons
             Vec along(0.0f);
             for (int channel = 0; channel < 3; ++channel) {
                 along += Shades::coefficient(a, rows, k, channel) * g[channel];
-                k ? rows.store(g[channel] * weight, out.shN + (k - 1) * 3 + channel, rows.all)
+                k ? rows.store(g[channel] * weight, out.shN + (k - 1) * 3 + channel, out.by_rows ? rows.packed : rows.all)
                   : rows.store(g[channel] * weight, out.sh0 + channel, rows.threes);
             }
             g_Y[basis] += along * s.cosines[wave];
@@ -184,17 +198,17 @@ void show_colors_backward(const ColorArgs& all, const ColorGrads& grads) {
 #pragma omp parallel for num_threads(all.threads) schedule(static) if (all.N > CHUNK)
     for (int64_t first = 0; first < all.N; first += CHUNK) {
         const ColorArgs a = chunk_of(all, first);
-        const ColorGrads out = chunk_of(grads, all, first);
         const int size = static_cast<int>(a.N);
-        const Picked picked(size, [&](int i, int n) {
-            Vec g[3];
-            gather_row(out.colors, i, n, g);
-            return drawn(a, i, n) & !((g[0] == Vec(0.0f)) & (g[1] == Vec(0.0f)) & (g[2] == Vec(0.0f)));
-        });
+        const int64_t *from = std::lower_bound(grads.rows, grads.rows + grads.count, first),
+                      *end = std::lower_bound(from, grads.rows + grads.count, first + size);
+        const int64_t begin = from - grads.rows;
+        const ColorGrads out = chunk_of(grads, all, first, grads.by_rows ? begin : first);
+        const Picked picked = grads.by_rows ? Picked(grads.rows, begin, static_cast<int>(end - from), first)
+                                            : Picked(size, [&](int i, int n) { return learns(a, out, i, n); });
         const bool partly = (a.degree + 1) * (a.degree + 1) < a.bases;  // coefficients that nothing below writes
-        if (partly) fill_zero(out.shN, stride_of(a), 0, size);
+        if (partly) fill_zero(out.shN, stride_of(a), 0, grads.by_rows ? picked.count : size);
         picked.each_gap(size, [&](int from, int end) {
-            if (!partly) fill_zero(out.shN, stride_of(a), from, end);
+            if (!partly && !grads.by_rows) fill_zero(out.shN, stride_of(a), from, end);
             fill_zero(out.sh0, 3, from, end);
             fill_zero(out.means, 3, from, end);
             if (a.times) fill_zero(out.times, 1, from, end);

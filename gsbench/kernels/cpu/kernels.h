@@ -112,6 +112,9 @@ struct ColorArgs {
 struct ColorGrads {
     const float* colors;
     float *sh0, *shN, *means, *times;
+    bool by_rows;         // only these Gaussians have a gradient, and shN has a row for each of them:
+    const int64_t* rows;  // [count] ascending
+    int64_t count;
 };
 
 // Perceptrons features x 64 x width, one for each of `networks`, on every Gaussian (AGR). They read the values of the

@@ -85,9 +85,10 @@ def show(
 @on_device
 def show_backward(
     sh0: Tensor, shN: Tensor, means: Tensor, opacities: Tensor, times: Tensor, center: Tensor,
-    time: Tensor, degree: int, waves: int, g_colors: Tensor,
+    time: Tensor, degree: int, waves: int, g_colors: Tensor, rows: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of sh0, shN, means and times."""
+    assert rows is None, "`rows` are of the CPU's kernel"
     arrays = plain(sh0, shN, means, opacities, times, center, time, g_colors)
     out = [x.zero_() for x in _like(sh0, shN, means, times)]
     cuda().show_colors_backward(len(means), degree, _bases(shN, waves), waves, *pointers(*arrays, *out),
