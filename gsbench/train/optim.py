@@ -54,14 +54,19 @@ class Optimizer:
         `drawn`: which Gaussians some view of the batch drew; the others have no gradient. Where `adam.found_inf` [] is
         set to 1, nothing is updated.
         """
+        skip: Tensor | None = getattr(self.adam, "found_inf", None)
+        if skip is not None:  # as a mask: to look at it would be to wait for the GPU
+            drawn = drawn & (skip == 0)
+        counts = 1 if skip is None else 1 - skip
         for group in self.adam.param_groups:
             group["lr"] = rate_at(self.rates[group["name"]], step / self.iterations, self.extent)
             if self.is_sparse and group["name"] in self.model.splats:
-                self._step_rows(group, drawn)
+                self._step_rows(group, drawn, counts)
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
 
-    def _step_rows(self, group: dict[str, Any], drawn: Tensor) -> None:
+    def _step_rows(self, group: dict[str, Any], drawn: Tensor, counts: int | Tensor) -> None:
+        """Update the rows `drawn`; `counts` is 0 where this is no step."""
         (parameter,) = group["params"]
         if parameter.grad is None:
             return
@@ -69,10 +74,7 @@ class Optimizer:
         if not state:  # in the layout of torch.optim.Adam
             state["step"] = torch.zeros((), device=parameter.device)
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        skip: Tensor | None = getattr(self.adam, "found_inf", None)
-        if skip is not None:  # as a mask: to look at it would be to wait for the GPU
-            drawn = drawn & (skip == 0)
-        state["step"] += 1 if skip is None else 1 - skip
+        state["step"] += counts
         update = adam if self.model.uses_kernels(parameter) else adam_reference
         moments = state["exp_avg"], state["exp_avg_sq"]
         with torch.no_grad():

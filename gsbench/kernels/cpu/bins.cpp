@@ -12,7 +12,6 @@ namespace {
 
 constexpr int DIGIT_BITS = 11;
 constexpr uint32_t DIGITS = 1u << DIGIT_BITS;
-constexpr int64_t AHEAD = 16;  // entries that are fetched before they are needed
 
 struct Key {
     uint32_t depth;  // the bits of a positive float sort as the float does

@@ -9,6 +9,8 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
+constexpr int AHEAD = 16;  // splats that are fetched before they are needed
+
 struct TileRect {
     int x0, y0, x1, y1;  // half open; empty where x1 <= x0
 

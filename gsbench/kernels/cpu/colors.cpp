@@ -5,8 +5,6 @@
 #include "../math/projection.h"
 #include "../math/harmonics.h"
 
-#include <algorithm>
-
 #include "isa.h"
 #include "rows.h"
 
@@ -29,9 +27,9 @@ struct Picked {
         }
     }
 
-    // Those of a chunk that begins at `first` from a list of all, of which [begin, begin + number) are the chunk's.
-    GSB_HD Picked(const int64_t* rows, int64_t begin, int number, int64_t first) : count(number) {
-        for (int k = 0; k < number; ++k) which[k] = static_cast<uint32_t>(rows[begin + k] - first);
+    // The given rows of a chunk that begins at `first`.
+    GSB_HD Picked(const int64_t* rows, int64_t number, int64_t first) : count(static_cast<int>(number)) {
+        for (int k = 0; k < count; ++k) which[k] = static_cast<uint32_t>(rows[k] - first);
     }
 
     // Calls f(first, end) for each run of Gaussians that were not picked.
@@ -142,6 +140,16 @@ GSB_HD inline Mask learns(const ColorArgs& a, const ColorGrads& g, int i, int n)
     return drawn(a, i, n) & !((color[0] == Vec(0.0f)) & (color[1] == Vec(0.0f)) & (color[2] == Vec(0.0f)));
 }
 
+// How many of the ascending rows are below `limit`. (std::lower_bound would be shared between the instruction sets.)
+GSB_HD inline int64_t count_below(const ColorGrads& g, int64_t limit) {
+    int64_t low = 0, high = g.count;
+    while (low < high) {
+        const int64_t middle = (low + high) / 2;
+        g.rows[middle] < limit ? low = middle + 1 : high = middle;
+    }
+    return low;
+}
+
 GSB_HD inline void fill_zero(float* rows, int width, int first, int end) {
     __builtin_memset(rows + static_cast<int64_t>(first) * width, 0,
                      sizeof(float) * static_cast<size_t>(end - first) * static_cast<size_t>(width));
@@ -199,11 +207,9 @@ void show_colors_backward(const ColorArgs& all, const ColorGrads& grads) {
     for (int64_t first = 0; first < all.N; first += CHUNK) {
         const ColorArgs a = chunk_of(all, first);
         const int size = static_cast<int>(a.N);
-        const int64_t *from = std::lower_bound(grads.rows, grads.rows + grads.count, first),
-                      *end = std::lower_bound(from, grads.rows + grads.count, first + size);
-        const int64_t begin = from - grads.rows;
+        const int64_t begin = count_below(grads, first), end = count_below(grads, first + size);  // of its rows
         const ColorGrads out = chunk_of(grads, all, first, grads.by_rows ? begin : first);
-        const Picked picked = grads.by_rows ? Picked(grads.rows, begin, static_cast<int>(end - from), first)
+        const Picked picked = grads.by_rows ? Picked(grads.rows + begin, end - begin, first)
                                             : Picked(size, [&](int i, int n) { return learns(a, out, i, n); });
         const bool partly = (a.degree + 1) * (a.degree + 1) < a.bases;  // coefficients that nothing below writes
         if (partly) fill_zero(out.shN, stride_of(a), 0, grads.by_rows ? picked.count : size);

@@ -11,7 +11,6 @@ inline namespace GSB_ISA {
 constexpr int BLOCKS = 16, BLOCK = 4;
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int BATCH = 64;     // splats whose blocks are found at once
-constexpr int AHEAD = 16;     // splats whose records are fetched before they are needed
 
 // Of a lane in its block, and of a block in its tile.
 alignas(64) constexpr float COLUMN[LANES] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
