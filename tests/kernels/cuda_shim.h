@@ -71,6 +71,12 @@ T __shfl_xor_sync(unsigned, T x, int offset) {
     return value<T>(exchange(bits(x))[static_cast<int>(thread->number % 32) ^ offset]);
 }
 
+template <class T>
+T __shfl_sync(unsigned, T x, int lane) {
+    using namespace gsb::cuda::shim;
+    return value<T>(exchange(bits(x))[lane % 32]);
+}
+
 inline unsigned __ballot_sync(unsigned, bool predicate) {
     const uint32_t* lanes = gsb::cuda::shim::exchange(predicate);
     unsigned all = 0;
@@ -79,6 +85,7 @@ inline unsigned __ballot_sync(unsigned, bool predicate) {
 }
 inline bool __any_sync(unsigned mask, bool predicate) { return __ballot_sync(mask, predicate) != 0; }
 
+inline float __fdividef(float x, float y) { return x / y; }
 inline int __popc(unsigned x) { return __builtin_popcount(x); }
 inline uint32_t __float_as_uint(float x) { return gsb::cuda::shim::bits(x); }
 

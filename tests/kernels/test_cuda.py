@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.cuda import raster
 from gsbench.kernels.cuda.adam import adam
 from gsbench.kernels.cuda.loss import l1_ssim
 from gsbench.kernels.cuda.raster import View
@@ -79,6 +80,13 @@ def assert_gradients_close(got: dict[str, Tensor], want: dict[str, Tensor]) -> N
             assert torch.cosine_similarity(got[name].flatten(), expected.flatten(), dim=0) > 0.9999, name
 
 
+@pytest.fixture(params=[False, True], ids=["by_pixel", "by_splat"])
+def by_splat(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs the test with each of backward's kernels."""
+    monkeypatch.setattr(raster, "BACKWARD_BY_SPLAT", request.param)
+
+
+@pytest.mark.usefixtures("by_splat")
 @pytest.mark.parametrize("name", names())
 def test_gradients_are_those_of_the_reference(name: str, cuda_device: str) -> None:
     """Catches a wrong or missing derivative of any input, and sums that miss a patch, a lane or a camera."""
@@ -89,6 +97,7 @@ def test_gradients_are_those_of_the_reference(name: str, cuda_device: str) -> No
     assert_gradients_close(got, want)
 
 
+@pytest.mark.usefixtures("by_splat")
 def test_many_tiles_and_rounds(cuda_device: str) -> None:
     """Catches what shows only with more than 32 splats a tile and several tiles: staging rounds, offsets, sort keys."""
     g = torch.Generator().manual_seed(3)
@@ -107,6 +116,7 @@ def test_many_tiles_and_rounds(cuda_device: str) -> None:
                            gradients(exact, lambda a: rasterize(**a, backend="reference"), weight))  # fmt: skip
 
 
+@pytest.mark.usefixtures("by_splat")
 @pytest.mark.parametrize("name", ["random", "opaque_stack", "three_cameras", "five_channels"])
 def test_order_of_threads_does_not_matter(name: str, cuda_device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a missing barrier: by the shim, a thread would read what another has not written yet, or has over."""

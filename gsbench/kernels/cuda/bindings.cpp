@@ -91,10 +91,11 @@ void blend(int64_t N, int64_t C, int D, bool color_per_camera, Address means2d, 
 void blend_backward(int64_t N, int64_t C, int D, bool color_per_camera, Address means2d, Address roots, Address colors,
                     Address background, Address offsets, Address ids, int width, int height, Address transmittance,
                     Address stop, Address g_image, Address g_alpha, Address sums, Address out_means2d,
-                    Address out_roots, Address out_colors, Address stream) {
+                    Address out_roots, Address out_colors, bool by_splat, Address stream) {
     gsb::cuda::blend_backward(
         {N, C, D, color_per_camera, means2d, roots, colors, background, offsets, ids, width, height},
-        {nullptr, nullptr, transmittance, stop}, {g_image, g_alpha, sums, out_means2d, out_roots, out_colors}, stream);
+        {nullptr, nullptr, transmittance, stop}, {g_image, g_alpha, sums, out_means2d, out_roots, out_colors}, by_splat,
+        stream);
 }
 
 gsb::cuda::TriangularArgs triangular_args(int64_t N, bool conditioned_first, bool row_scaled, float half, Address time,

@@ -8,8 +8,8 @@ __global__ void __launch_bounds__(PATCHES * WARP) blend_kernel(BlendArgs a, Pict
     __shared__ StagedSplat shared[PATCHES][WARP];
     StagedSplat* staged = shared[threadIdx.x / WARP];
     const Patch patch(a, first_channel);
-    const float x = static_cast<float>(patch.x()) + 0.5f, y = static_cast<float>(patch.y()) + 0.5f;
-    bool open = patch.inside();
+    const float x = static_cast<float>(patch.x(patch.lane)) + 0.5f, y = static_cast<float>(patch.y(patch.lane)) + 0.5f;
+    bool open = patch.inside(patch.lane);
     float T = 1.0f, color[CHANNELS] = {};
     int stop = 0;
     for (int first = 0; first < patch.size; first += WARP) {
@@ -30,8 +30,8 @@ __global__ void __launch_bounds__(PATCHES * WARP) blend_kernel(BlendArgs a, Pict
         }
         __syncwarp();
     }
-    if (!patch.inside()) return;
-    const int64_t pixel = patch.pixel();
+    if (!patch.inside(patch.lane)) return;
+    const int64_t pixel = patch.pixel(patch.lane);
     for (int k = 0; k < patch.count; ++k) {
         const int channel = first_channel + k;
         out.image[pixel * a.D + channel] = color[k] + T * a.background[channel];

@@ -177,7 +177,8 @@ void fill_tiles(const BinArgs&, const uint32_t* order, const int64_t* ends, int6
                 size_t scratch_bytes, Stream);
 
 void blend(const BlendArgs&, const Picture&, Stream);
-void blend_backward(const BlendArgs&, const Picture&, const BlendGrads&, Stream);
+// `by_splat`: with a splat a lane, else with a pixel a lane; the same gradients.
+void blend_backward(const BlendArgs&, const Picture&, const BlendGrads&, bool by_splat, Stream);
 
 void observe_triangular(const TriangularArgs&, const Observation&, Stream);
 void observe_triangular_backward(const TriangularArgs&, const Observation& grads, const TriangularGrads&, Stream);

@@ -39,12 +39,25 @@ struct Patch {
         size = a.offsets[tile + 1] - begin;
     }
 
-    __device__ int x() const { return left + lane % PATCH_X; }
-    __device__ int y() const { return top + lane / PATCH_X; }
-    __device__ bool inside() const { return x() < args.width && y() < args.height; }
-    __device__ int64_t pixel() const { return (camera * args.height + y()) * args.width + x(); }
+    // Of pixel number k: where, whether in the picture, its place in the pictures' arrays.
+    __device__ int x(int k) const { return left + k % PATCH_X; }
+    __device__ int y(int k) const { return top + k / PATCH_X; }
+    __device__ bool inside(int k) const { return x(k) < args.width && y(k) < args.height; }
+    __device__ int64_t pixel(int k) const { return (camera * args.height + y(k)) * args.width + x(k); }
 
-    __device__ int64_t color_row(int32_t id) const { return args.color_per_camera ? id : id - camera * args.N; }
+    __device__ int32_t id_at(int position) const { return args.ids[begin + position]; }
+
+    __device__ bool reached_at(int position) const {
+        const int32_t id = id_at(position);
+        return Reach(reinterpret_cast<const float2*>(args.means2d)[id], reinterpret_cast<const float4*>(args.roots)[id])
+            .touches(left, top, PATCH_X, PATCH_Y);
+    }
+
+    __device__ void load_color(int32_t id, float (&out)[CHANNELS]) const {
+        const int64_t row = args.color_per_camera ? id : id - camera * args.N;
+        const float* color = args.colors + row * args.D + first_channel;
+        for (int k = 0; k < CHANNELS; ++k) out[k] = k < count ? color[k] : 0.0f;
+    }
 
     // The splats at positions [first, first + 32) of the list that reach the patch, in order. Returns how many.
     __device__ int stage(int first, StagedSplat* staged) const {
@@ -52,7 +65,7 @@ struct Patch {
         bool reached = false;
         StagedSplat s;
         if (position < size) {
-            s.id = args.ids[begin + position];
+            s.id = id_at(position);
             const float2 mean = reinterpret_cast<const float2*>(args.means2d)[s.id];
             const float4 root = reinterpret_cast<const float4*>(args.roots)[s.id];
             s.x = mean.x, s.y = mean.y;
@@ -62,8 +75,7 @@ struct Patch {
         }
         const unsigned all = __ballot_sync(ALL_LANES, reached);
         if (reached) {
-            const float* color = args.colors + color_row(s.id) * args.D + first_channel;
-            for (int k = 0; k < CHANNELS; ++k) s.color[k] = k < count ? color[k] : 0.0f;
+            load_color(s.id, s.color);
             staged[__popc(all & ((1u << lane) - 1))] = s;
         }
         __syncwarp();

@@ -18,6 +18,8 @@ TILE = 16  # as launch.h has it
 MAX_ITEMS = (1 << 31) - 1  # splats, and pairs of a tile and a splat, are numbered by int32
 GEOMETRY = 6  # of a splat: x, y, p, q, r, opacity
 PAIRS = "lists of each tile's Gaussians"
+# Backward with a splat a lane, or with a pixel a lane: the same gradients; docs/gpu.md says why it is the latter.
+BACKWARD_BY_SPLAT = False
 
 
 class View(NamedTuple):
@@ -153,7 +155,7 @@ class _Blend(torch.autograd.Function):
         out = [allocate("gradients of projected Gaussians", x, *x.shape) for x in (means2d, roots, colors)]
         cuda().blend_backward(*ctx.sizes, *pointers(means2d, roots, colors, background, *bins), ctx.view.width,
                               ctx.view.height, *pointers(transmittance, stop, g_image, g_alpha, sums, *out),
-                              stream(means2d))  # fmt: skip
+                              BACKWARD_BY_SPLAT, stream(means2d))  # fmt: skip
         g_background = None
         if ctx.needs_input_grad[3] and g_image is not None:
             g_background = (g_image * transmittance[..., None]).sum((0, 1, 2))

@@ -1,0 +1,65 @@
+// The derivative of blending with a pixel a lane: a splat's sums over the patch are reduced across the lanes and added to
+// its row with one atomic instruction of nine lanes.
+#include "blend_backward.h"
+
+namespace gsb::cuda {
+namespace {
+
+// The sum over the warp of nine values, lane l holding that of value `value_of(l)`. Eight of them are summed at once, each
+// step of the butterfly halving how many a lane is responsible for: 9 shuffles instead of 40, and 5 for the ninth.
+struct NineSums {
+    static __device__ int value_of(int lane) { return lane % 4 == 0 ? lane / 4 : lane == 1 ? SUMS - 1 : -1; }
+
+    static __device__ float reduce(float (&v)[SUMS], int lane) {
+        halve<4>(v, lane, 16);
+        halve<2>(v, lane, 8);
+        halve<1>(v, lane, 4);
+        v[0] += __shfl_xor_sync(ALL_LANES, v[0], 2);
+        v[0] += __shfl_xor_sync(ALL_LANES, v[0], 1);
+        const float last = warp_sum(v[SUMS - 1]);
+        return lane == 1 ? last : v[0];
+    }
+
+  private:
+    template <int N>
+    static __device__ void halve(float (&v)[SUMS], int lane, int offset) {
+        const bool upper = (lane & offset) != 0;
+        for (int i = 0; i < N; ++i) {
+            const float mine = upper ? v[i + N] : v[i], other = upper ? v[i] : v[i + N];
+            v[i] = mine + __shfl_xor_sync(ALL_LANES, other, offset);
+        }
+    }
+};
+static_assert(SUMS == 9);
+
+__global__ void __launch_bounds__(PATCHES * WARP)
+    by_pixel_kernel(BlendArgs a, Picture picture, BlendGrads grads, int first_channel) {
+    __shared__ StagedSplat shared[PATCHES][WARP];
+    StagedSplat* staged = shared[threadIdx.x / WARP];
+    const Patch patch(a, first_channel);
+    auto [place, grad, behind] = BackwardPixel(patch, patch.lane, picture, grads);
+    const int my_value = NineSums::value_of(patch.lane);
+    const bool writes = my_value >= 0 && my_value < GEOMETRY + patch.count;
+    for (int first = (last_stop(place.stop) + WARP - 1) / WARP * WARP - WARP; first >= 0; first -= WARP) {
+        for (int i = patch.stage(first, staged) - 1; i >= 0; --i) {
+            const StagedSplat& s = staged[i];
+            const Falloff<float> f(place.x - s.x, place.y - s.y, s.p, s.q, s.r, s.opacity);
+            const bool blended = s.position < place.stop && f.alpha >= ALPHA_MIN;
+            if (!__any_sync(ALL_LANES, blended)) continue;
+            float sums[SUMS] = {};
+            if (blended) unblend(f, s.color, place, grad, behind, sums);
+            const float sum = NineSums::reduce(sums, patch.lane);
+            if (writes) atomicAdd(sum_of(grads, patch, s.id, my_value), sum);
+        }
+        __syncwarp();
+    }
+}
+
+}  // namespace
+
+void blend_backward_by_pixel(const BlendArgs& a, const Picture& picture, const BlendGrads& grads, int first_channel,
+                             Stream stream) {
+    launch(by_pixel_kernel, tiles_of(a), PATCHES * WARP, stream, a, picture, grads, first_channel);
+}
+
+}  // namespace gsb::cuda

@@ -1,0 +1,107 @@
+// The derivative of blending with a splat a lane, which keeps its sums in registers: nothing is reduced across lanes.
+//
+// The 32 pixels of a patch travel along the warp, back to front: pixel p meets splat i in step p + i, in lane i % 32. So
+// every lane works in every step, once the first have come by; lane i takes its next splat as the last pixel leaves it.
+#include "blend_backward.h"
+
+namespace gsb::cuda {
+namespace {
+
+struct Waiting {
+    int32_t id, position;
+};
+
+// Of a warp, in shared memory.
+struct Traffic {
+    Place places[WARP];
+    ColorGrad colors[WARP];
+    Waiting waiting[2 * WARP];  // splats that reach the patch, back to front: a ring
+    alignas(16) float sums[WARP][12];  // of splats that all pixels have passed; nine of twelve, to be aligned
+    int32_t ids[WARP];                 // theirs; -1: none
+};
+
+// A splat in its lane. Without one its alpha is zero.
+struct Host {
+    float x, y, p, q, r, opacity, color[CHANNELS];
+    int32_t id, position;
+
+    __device__ Host() : x(0), y(0), p(0), q(0), r(0), opacity(0), color{}, id(-1), position(0) {}
+
+    __device__ Host(const Patch& patch, Waiting w) : id(w.id), position(w.position) {
+        const float2 mean = reinterpret_cast<const float2*>(patch.args.means2d)[id];
+        const float4 root = reinterpret_cast<const float4*>(patch.args.roots)[id];
+        x = mean.x, y = mean.y, p = root.x, q = root.y, r = root.z, opacity = root.w;
+        patch.load_color(id, color);
+    }
+};
+
+// Lets splats of the list wait until there is one for every lane or no more; `end` is where the list is not yet read.
+__device__ void let_wait(const Patch& patch, Waiting* waiting, int first, int& count, int& end) {
+    while (count < WARP && end > 0) {
+        const int position = end - 1 - patch.lane;
+        const bool reached = position >= 0 && patch.reached_at(position);
+        const unsigned all = __ballot_sync(ALL_LANES, reached);
+        if (reached) {
+            const int place = first + count + __popc(all & ((1u << patch.lane) - 1));
+            waiting[place % (2 * WARP)] = {patch.id_at(position), position};
+        }
+        count += __popc(all);
+        end -= WARP;
+    }
+    __syncwarp();
+}
+
+__global__ void __launch_bounds__(PATCHES * WARP)
+    by_splat_kernel(BlendArgs a, Picture picture, BlendGrads grads, int first_channel) {
+    __shared__ Traffic shared[PATCHES];
+    Traffic& traffic = shared[threadIdx.x / WARP];
+    const Patch patch(a, first_channel);
+    // The pixel that lane l begins with is the one that is to be in lane 0 after 32 - l steps.
+    const int mine = (WARP - patch.lane) % WARP;
+    const BackwardPixel start(patch, mine, picture, grads);
+    traffic.places[mine] = start.place;
+    traffic.colors[mine] = start.color;
+    Behind behind = start.behind;
+    int first = 0, count = 0, end = last_stop(start.place.stop);  // of the ring; of the list
+    if (end == 0) return;
+    Host host;
+    float sums[SUMS] = {};
+    const int source = (patch.lane + WARP - 1) % WARP;
+    for (int before = 0, n = WARP; n > 0;) {
+        let_wait(patch, traffic.waiting, first, count, end);
+        before = n, n = count < WARP ? count : WARP;
+        const Host next = patch.lane < n ? Host(patch, traffic.waiting[(first + patch.lane) % (2 * WARP)]) : Host();
+        first += n, count -= n;
+        const int steps = n > 0 ? WARP : before;  // at last, until the pixels have passed the splats before
+        for (int step = 0; step < steps; ++step) {
+            if (patch.lane == step) {
+                for (int k = 0; k < SUMS; ++k) traffic.sums[step][k] = sums[k], sums[k] = 0.0f;
+                traffic.ids[step] = host.id;
+                host = next;
+            }
+            const int pixel = (step - patch.lane) & (WARP - 1);
+            const Place place = traffic.places[pixel];
+            const Falloff<float> f(place.x - host.x, place.y - host.y, host.p, host.q, host.r, host.opacity);
+            if (host.position < place.stop && f.alpha >= ALPHA_MIN) {
+                unblend(f, host.color, place, traffic.colors[pixel], behind, sums);
+            }
+            behind = {__shfl_sync(ALL_LANES, behind.T, source), __shfl_sync(ALL_LANES, behind.seen, source)};
+        }
+        __syncwarp();
+        for (int k = patch.lane; k < steps * SUMS; k += WARP) {
+            const int row = k / SUMS, column = k % SUMS;
+            if (traffic.ids[row] < 0 || column >= GEOMETRY + patch.count) continue;
+            atomicAdd(sum_of(grads, patch, traffic.ids[row], column), traffic.sums[row][column]);
+        }
+        __syncwarp();
+    }
+}
+
+}  // namespace
+
+void blend_backward_by_splat(const BlendArgs& a, const Picture& picture, const BlendGrads& grads, int first_channel,
+                             Stream stream) {
+    launch(by_splat_kernel, tiles_of(a), PATCHES * WARP, stream, a, picture, grads, first_channel);
+}
+
+}  // namespace gsb::cuda
