@@ -133,15 +133,17 @@ class GaussianModel(nn.Module, ABC):
             self.refinement = Refinement([*(raw[name].shape[-1] for name in self.centers), shape], generator)
         self.set_stage(self.stage)
 
-    def slice(self, camera_center: Tensor, time: float | None) -> Gaussians3D:
+    def slice(self, camera_center: Tensor, time: float | Tensor | None) -> Gaussians3D:
         """Observe the model from a place [3] at a time in [0, 1]: 3D Gaussians for the rasterizer.
+
+        A time [] on the device is read there, so that what is recorded once can be replayed for another.
 
         Raises:
             InputError: the model needs a time and got none.
         """
         if time is None and ("time" in self.observes or self.agr):
             raise InputError(f"{type(self).__name__}: expected a time in [0, 1], got none: this model observes time")
-        t = None if time is None else camera_center.new_full((), time)  # no copy from the host, which would wait for it
+        t = camera_center.new_full((), time) if isinstance(time, float | int) else time  # no copy, which would wait
         raw = self.refined(t)
         means, factors, opacities = self.observe(raw, camera_center, t)
         return Gaussians3D(means, factors, opacities, self.paint(raw, means, opacities, camera_center, t))

@@ -14,6 +14,9 @@ from gsbench import kernels
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels import cuda as cuda_kernels  # `cuda` is this package's own module
 
+NEAR, FAR = 0.01, 1e10  # depths between which a mean is drawn, unless told
+EPS2D = 0.3  # added to the diagonal of projected covariances, unless told, pixels^2
+
 # A backend is a module with a function `draw` of this door's (checked) arguments.
 _MODULES = {"reference": "gsbench.raster.reference", "cpu": "gsbench.raster.native", "cuda": "gsbench.raster.cuda"}
 
@@ -48,9 +51,9 @@ def rasterize(
     height: int,
     *,
     background: Tensor | None = None,  # [D]
-    near: float = 0.01,
-    far: float = 1e10,
-    eps2d: float = 0.3,
+    near: float = NEAR,
+    far: float = FAR,
+    eps2d: float = EPS2D,
     backend: str = "auto",
     antialias: bool = False,
 ) -> RasterOutput:

@@ -6,7 +6,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.arrays import plain
 from gsbench.kernels.cuda import available, cuda, pointers, stream
-from gsbench.kernels.cuda.raster import MAX_ITEMS, View, bin_tiles, blend, project
+from gsbench.kernels.cuda.raster import MAX_ITEMS, View, bin_tiles, bin_within, blend, project
 from gsbench.raster import RasterInfo, RasterOutput, check_values
 
 
@@ -38,19 +38,48 @@ def splat(
     """`draw` where the kernels can run."""
     if Ks.requires_grad:
         raise InputError("raster backend 'cuda' has no gradient by Ks: detach them, or use backend 'reference'")
-    C, N, D = colors.shape
+    C, N, _ = colors.shape
     if C * N > MAX_ITEMS:
         raise InputError(f"raster backend 'cuda': expected at most {MAX_ITEMS} Gaussians times cameras, got {C * N}")
-    if C == 1 or colors.stride(0) == 0:  # one set of colours, seen by every camera
-        colors = colors[:1]
-    flags = torch.zeros(1, dtype=torch.int64, device=means.device)
-    values = plain(means, factors, opacities, colors, viewmats, Ks, background)
-    cuda().flag_values(N, C, colors.numel(), D, *pointers(*values, flags), stream(means))
-
-    means2d, roots, depths, half_sizes = project(means, factors, opacities, viewmats, Ks, view)
-    bins, flagged = bin_tiles(means2d, roots, depths, half_sizes, view.width, view.height, flags)
+    colors = _one_set(colors)
+    flags = _flags(means, factors, opacities, colors, viewmats, Ks, background)
+    splats = project(means, factors, opacities, viewmats, Ks, view)
+    bins, flagged = bin_tiles(splats, view, flags)
     if flagged:  # looked at on the device, so that only a bad picture waits for the words
         check_values(means, factors, opacities, colors, viewmats, Ks, background)
-    image, alpha = blend(means2d, roots, colors, background, bins, view)
-    radii = half_sizes.amax(-1).ceil_().int()
-    return RasterOutput(image, alpha, RasterInfo(radii, means2d, depths, len(bins.ids)))
+    image, alpha = blend(splats, colors, background, bins, view)
+    radii = splats.half_sizes.amax(-1).ceil_().int()
+    return RasterOutput(image, alpha, RasterInfo(radii, splats.means2d, splats.depths, len(bins.ids)))
+
+
+def splat_within(
+    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+    background: Tensor, view: View, room: int,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """The image [C, H, W, D] without waiting for the device, where `room` pairs of a tile and a Gaussian are enough.
+
+    Whether they were is for the caller to see: the second tensor, [2] int64, is how many there were, and not zero where
+    a value was out of range.
+    """
+    colors = _one_set(colors)
+    flags = _flags(means, factors, opacities, colors, viewmats, Ks, background)
+    splats = project(means, factors, opacities, viewmats, Ks, view)
+    bins, needed = bin_within(splats, view, flags, room)
+    return blend(splats, colors, background, bins, view)[0], needed
+
+
+def _one_set(colors: Tensor) -> Tensor:
+    """Colours [C, N, D], or [1, N, D] where every camera sees the same."""
+    return colors[:1] if len(colors) == 1 or colors.stride(0) == 0 else colors
+
+
+def _flags(*values: Tensor) -> Tensor:
+    """Not zero where a value is not finite or out of range, [1] int64: found out by the device, and not waited for.
+
+    `values` are means, factors, opacities, colors, viewmats, Ks, background.
+    """
+    means, _, _, colors, viewmats, *_ = values
+    flags = torch.zeros(1, dtype=torch.int64, device=means.device)
+    cuda().flag_values(len(means), len(viewmats), colors.numel(), colors.shape[-1], *pointers(*plain(*values), flags),
+                       stream(means))  # fmt: skip
+    return flags

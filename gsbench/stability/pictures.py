@@ -8,14 +8,12 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.raster import rasterize
+from gsbench.raster import EPS2D, NEAR, rasterize
 from gsbench.stability import brute, oracle
 from gsbench.stability.cases import Case, Cell, device_of
 from gsbench.stability.slices import ALPHA_MIN, fastest, worst
 
 UNDECIDED = 1e-3  # what is relatively nearer to a threshold may fall to either side of it in float32
-EPS2D = 0.3
-NEAR = 0.01  # of `rasterize`
 Arguments = dict[str, Any]
 Truth = tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]  # image and alpha [1, H, W, .], decided [1, H, W], gradients
 

@@ -54,12 +54,13 @@ __global__ void count_kernel(BinArgs a, const uint32_t* order, int64_t* counts) 
     if (threadIdx.x % WARP == 0) counts[k] = count;
 }
 
-__global__ void fill_kernel(BinArgs a, const uint32_t* order, const int64_t* ends, int64_t no_tile, uint32_t* tiles,
-                            uint32_t* splats) {
+// Pairs beyond the number there is room for are left out.
+__global__ void fill_kernel(BinArgs a, const uint32_t* order, const int64_t* ends, int64_t room, int64_t no_tile,
+                            uint32_t* tiles, uint32_t* splats) {
     const int64_t k = global_thread() / WARP;
     if (k >= a.N * a.C) return;
     const unsigned lane = threadIdx.x % WARP;
-    const int64_t end = ends[k], s = order[k];
+    const int64_t end = ends[k] < room ? ends[k] : room, s = order[k];
     int64_t at = k > 0 ? ends[k - 1] : 0;
     const int64_t first_tile = s / a.N * tiles_along(a.width) * tiles_along(a.height);
     each_tile(a, s, [&](bool reached, int tile, unsigned others) {
@@ -107,7 +108,7 @@ void fill_tiles(const BinArgs& a, const uint32_t* order, const int64_t* ends, in
                 Stream stream) {
     const int64_t count = a.C * tiles_along(a.width) * tiles_along(a.height);
     if (pairs > 0) {
-        launch(fill_kernel, blocks_for(a.N * a.C * WARP), THREADS, stream, a, order, ends, count, tiles, splats);
+        launch(fill_kernel, blocks_for(a.N * a.C * WARP), THREADS, stream, a, order, ends, pairs, count, tiles, splats);
         sort_pairs(scratch, bytes, tiles, sorted_tiles, splats, ids, pairs, bit_width(count), stream);
     }
     launch(offset_kernel, blocks_for(pairs + 1), THREADS, stream, sorted_tiles, pairs, count, offsets);

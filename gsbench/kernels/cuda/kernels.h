@@ -171,7 +171,8 @@ void project_backward(const Gaussians&, const Cameras&, const SplatGrads&, const
 // keys, indices, sorted_keys, order: [splats]; ends: [splats]
 void count_tiles(const BinArgs&, uint32_t* keys, uint32_t* indices, uint32_t* sorted_keys, uint32_t* order,
                  int64_t* ends, void* scratch, size_t scratch_bytes, Stream);
-// tiles, splats, sorted_tiles, ids: [pairs]; offsets: [C * tiles + 1]
+// tiles, splats, sorted_tiles, ids: [pairs]; offsets: [C * tiles + 1]. Where `pairs` is not the last of `ends`, but the
+// room there is, `tiles` are 0xffffffff on entry, and pairs beyond it are left out.
 void fill_tiles(const BinArgs&, const uint32_t* order, const int64_t* ends, int64_t pairs, uint32_t* tiles,
                 uint32_t* splats, uint32_t* sorted_tiles, uint32_t* ids, int32_t* offsets, void* scratch,
                 size_t scratch_bytes, Stream);

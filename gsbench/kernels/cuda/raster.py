@@ -33,16 +33,20 @@ class View(NamedTuple):
     antialias: bool
 
 
+class Splats(NamedTuple):
+    """Gaussians as C cameras see them."""
+
+    means2d: Tensor  # [C, N, 2] pixels
+    roots: Tensor  # [C, N, 4]: p, q, r of the inverse 2D covariance's triangular root (math/projection.h); the opacity
+    depths: Tensor  # [C, N]
+    half_sizes: Tensor  # [C, N, 2] pixels, beyond which alpha < 1/255; without a gradient
+
+
 def project(
     means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, view: View
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Project Gaussians: means2d [C, N, 2], roots [C, N, 4], depths [C, N], half_sizes [C, N, 2].
-
-    `roots` are p, q, r of the inverse 2D covariance's triangular root (math/projection.h), and the opacity;
-    `half_sizes`, beyond which alpha < 1/255, have no gradient.
-    """
-    out: tuple[Tensor, Tensor, Tensor, Tensor] = _Project.apply(means, factors, opacities, viewmats, Ks, view)
-    return out
+) -> Splats:  # fmt: skip
+    """Project Gaussians."""
+    return Splats(*_Project.apply(means, factors, opacities, viewmats, Ks, view))
 
 
 class _Project(torch.autograd.Function):
@@ -80,9 +84,7 @@ class Bins(NamedTuple):
     ids: Tensor  # [pairs] int32, of the C * N splats
 
 
-def bin_tiles(
-    means2d: Tensor, roots: Tensor, depths: Tensor, half_sizes: Tensor, width: int, height: int, flags: Tensor
-) -> tuple[Bins, int]:
+def bin_tiles(splats: Splats, view: View, flags: Tensor) -> tuple[Bins, int]:
     """Sort splats by depth and list each tile's; ties keep their order. Returns `flags` [1] int64 as an int, too.
 
     This waits for the device, once, for the number of pairs; `flags` comes along.
@@ -90,29 +92,56 @@ def bin_tiles(
     Raises:
         InputError: more pairs than int32 counts.
     """
-    C, N = depths.shape
-    splats = plain(means2d, roots, depths, half_sizes)
-    arguments = (N, C, *pointers(*splats), width, height)
-    keys, indices, sorted_keys, order = allocate("depths to sort", depths, 4, C * N, dtype=torch.int32).unbind()
-    ends = allocate("numbers of tiles", depths, C * N + 1, dtype=torch.int64)
-    scratch = _scratch(C * N, depths)
-    cuda().count_tiles(*arguments, *pointers(keys, indices, sorted_keys, order, ends, scratch), len(scratch),
-                       stream(depths))  # fmt: skip
-    ends[-1:].copy_(flags)
+    splats = Splats(*plain(*splats))
+    order, ends = _count(splats, view, flags)
     *total, flagged = ends[-2:].tolist()
     pairs = total[0] if total else 0
     if pairs > MAX_ITEMS:
         raise InputError(f"{pairs} pairs of a tile and a Gaussian are more than {MAX_ITEMS}: "
                          "draw fewer cameras at once, a smaller picture, or fewer large Gaussians")  # fmt: skip
-    # Three are let go when this returns; the fourth, of its own, lives until backward.
-    tiles, unsorted, sorted_tiles = allocate(PAIRS, depths, 3, pairs, dtype=torch.int32).unbind()
-    ids = allocate(PAIRS, depths, pairs, dtype=torch.int32)
-    offsets = allocate("lists of tiles", depths, C * -(-width // TILE) * -(-height // TILE) + 1, dtype=torch.int32)
-    scratch = _scratch(pairs, depths)
-    cuda().fill_tiles(*arguments, *pointers(order, ends), pairs,
-                      *pointers(tiles, unsorted, sorted_tiles, ids, offsets, scratch), len(scratch),
-                      stream(depths))  # fmt: skip
-    return Bins(offsets, ids), flagged
+    return _fill(splats, view, order, ends, _room(splats, pairs)), flagged
+
+
+def bin_within(splats: Splats, view: View, flags: Tensor, room: int) -> tuple[Bins, Tensor]:
+    """`bin_tiles` that waits for nothing, where there is room for a number of pairs; others are left out.
+
+    Returns how many there were, if there are Gaussians, and `flags`: [2] int64.
+    """
+    splats = Splats(*plain(*splats))
+    order, ends = _count(splats, view, flags)
+    lists = _room(splats, room)
+    lists[0].fill_(-1)  # no tile: what is not filled sorts behind all others
+    return _fill(splats, view, order, ends, lists), ends[-2:]
+
+
+def _count(splats: Splats, view: View, flags: Tensor) -> tuple[Tensor, Tensor]:
+    """Splats by depth [C * N] int32; the running sum of the tiles they reach, then `flags`, [C * N + 1] int64."""
+    (C, N), like = splats.depths.shape, splats.depths
+    keys, indices, sorted_keys, order = allocate("depths to sort", like, 4, C * N, dtype=torch.int32).unbind()
+    ends = allocate("numbers of tiles", like, C * N + 1, dtype=torch.int64)
+    scratch = _scratch(C * N, like)
+    cuda().count_tiles(N, C, *pointers(*splats), view.width, view.height,
+                       *pointers(keys, indices, sorted_keys, order, ends, scratch), len(scratch),
+                       stream(like))  # fmt: skip
+    ends[-1:].copy_(flags)
+    return order, ends
+
+
+def _room(splats: Splats, pairs: int) -> tuple[Tensor, ...]:
+    """For tiles, splats, sorted tiles, sorted splats: [pairs] int32. The last, of its own, lives until backward."""
+    rows = allocate(PAIRS, splats.depths, 3, pairs, dtype=torch.int32)
+    return *rows.unbind(), allocate(PAIRS, splats.depths, pairs, dtype=torch.int32)
+
+
+def _fill(splats: Splats, view: View, order: Tensor, ends: Tensor, lists: tuple[Tensor, ...]) -> Bins:
+    """List and sort the pairs that `lists` have room for."""
+    (C, N), like, ids = splats.depths.shape, splats.depths, lists[-1]
+    tiles = C * -(-view.width // TILE) * -(-view.height // TILE)
+    offsets = allocate("lists of tiles", like, tiles + 1, dtype=torch.int32)
+    scratch = _scratch(len(ids), like)
+    cuda().fill_tiles(N, C, *pointers(*splats), view.width, view.height, *pointers(order, ends), len(ids),
+                      *pointers(*lists, offsets, scratch), len(scratch), stream(like))  # fmt: skip
+    return Bins(offsets, ids)
 
 
 def _scratch(items: int, like: Tensor) -> Tensor:
@@ -120,11 +149,9 @@ def _scratch(items: int, like: Tensor) -> Tensor:
     return allocate("scratch space to sort", like, cuda().scratch_bytes(items), dtype=torch.uint8)
 
 
-def blend(
-    means2d: Tensor, roots: Tensor, colors: Tensor, background: Tensor, bins: Bins, view: View
-) -> tuple[Tensor, Tensor]:
+def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, view: View) -> tuple[Tensor, Tensor]:
     """Blend each tile's splats: image [C, H, W, D], alpha [C, H, W, 1]; colours are [1, N, D] for all or [C, N, D]."""
-    out: tuple[Tensor, Tensor] = _Blend.apply(means2d, roots, colors, background, bins, view)
+    out: tuple[Tensor, Tensor] = _Blend.apply(splats.means2d, splats.roots, colors, background, bins, view)
     return out
 
 

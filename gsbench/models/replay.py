@@ -1,0 +1,106 @@
+"""Renders of a model as a CUDA graph: what a picture launches is recorded once, and replayed for cameras and times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.kernels.cuda.raster import View
+from gsbench.models.base import GaussianModel
+from gsbench.models.render import draw
+from gsbench.raster import EPS2D, FAR, NEAR, choose_backend
+from gsbench.raster.cuda import splat_within
+from gsbench.scenes.scene import Camera
+
+if TYPE_CHECKING:  # the configuration needs hydra, which building and drawing a model does not
+    from gsbench.config import RasterConfig
+
+MARGIN = 1.25  # room for pairs, over what the picture at hand needs
+T = TypeVar("T")
+
+
+class _Recording(NamedTuple):
+    """A picture of one size. What it reads is written before each replay."""
+
+    camera: Camera
+    time: Tensor | None  # []
+    play: Callable[[], None]
+    image: Tensor  # [H, W, 3]
+    needed: Tensor  # [2] int64: pairs of a tile and a Gaussian, and whether a value was out of range
+    room: int  # for pairs
+
+
+class Replay:
+    """`render` of a model on a GPU, without launching and, but at a picture's end, without waiting.
+
+    The numbers of Gaussians and of pixels are fixed when a picture is recorded, at the first call for its size; that of
+    pairs to sort, which `render` waits for in the middle of a picture, is held below a bound that was enough for the
+    picture at hand and is looked at when a picture is done. One beyond it is recorded again with more room.
+    """
+
+    def __init__(self, model: GaussianModel, background: Tensor, config: RasterConfig) -> None:
+        """Render `model`, whose parameters may change in value but not in number, before a background colour [3].
+
+        Raises:
+            InputError: pictures of this model are not drawn by the CUDA backend.
+        """
+        place = model.splats["means"]
+        backend = choose_backend(config.backend, place.device.type, place.dtype)
+        if backend != "cuda":
+            raise InputError(f"replay: expected raster.backend=cuda, got '{backend}': only a GPU records what it does")
+        self.model = model
+        self.background = background
+        self.config = config
+        self._recordings: dict[tuple[int, int, bool], _Recording] = {}
+
+    @torch.no_grad()
+    def __call__(self, camera: Camera, time: float | None) -> Tensor:  # [H, W, 3]
+        """The picture of a model from a camera at a time; the next call overwrites it.
+
+        Raises:
+            InputError: the model needs a time and got none, or a value is out of range.
+            RuntimeError: CUDA cannot record what this model does.
+        """
+        size = camera.width, camera.height, time is None
+        if size not in self._recordings:
+            self._recordings[size] = self._record(camera, time)
+        recording = self._recordings[size]
+        recording.camera.viewmat.copy_(camera.viewmat)
+        recording.camera.K.copy_(camera.K)
+        if recording.time is not None and time is not None:
+            recording.time.fill_(time)
+        recording.play()
+        *pairs, flags = recording.needed.tolist()  # waits for the picture
+        if flags or any(n > recording.room for n in pairs):
+            del self._recordings[size]
+            return self(camera, time)
+        return recording.image
+
+    def _record(self, camera: Camera, time: float | None) -> _Recording:
+        seen = self.model.slice(camera.center, time)
+        room = 1 + int(MARGIN * draw(seen, camera, self.background, self.config).info.pairs)
+        own = Camera(camera.viewmat.clone(), camera.K.clone(), camera.width, camera.height)
+        own_time = None if time is None else own.K.new_full((), time)
+        view = View(camera.width, camera.height, NEAR, FAR, EPS2D, self.config.antialias)
+
+        def frame() -> tuple[Tensor, Tensor]:
+            means, factors, opacities, colors = self.model.slice(own.center, own_time)
+            return splat_within(means, factors, opacities, colors[None], own.viewmat[None], own.K[None],
+                                self.background, view, room)  # fmt: skip
+
+        with torch.cuda.device_of(own.K):
+            play, (image, needed) = capture(frame)
+        return _Recording(own, own_time, play, image[0], needed, room)
+
+
+def capture(call: Callable[[], T]) -> tuple[Callable[[], None], T]:
+    """Record what a call enqueues on the current GPU: what replays it, and its results, which a replay overwrites."""
+    call()  # loads what is loaded once a process, which cannot be recorded
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        results = call()
+    return graph.replay, results

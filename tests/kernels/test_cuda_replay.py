@@ -1,0 +1,139 @@
+"""Replayed renders against launched ones: on a GPU as a CUDA graph, by the shim as a call that is made again."""
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchmarks.scene import camera as benchmark_camera
+from benchmarks.scene import model
+from gsbench import experiment
+from gsbench.config import RasterConfig
+from gsbench.errors import InputError
+from gsbench.models import replay
+from gsbench.models.render import render
+from gsbench.models.replay import Replay
+from gsbench.raster.cuda import splat_within
+from gsbench.scenes.scene import Camera, View
+
+BACKGROUND = (0.1, 0.5, 0.9)
+
+
+def camera(device: str, distance: float = 4.0, size: int = 40) -> Camera:
+    viewmats, Ks = benchmark_camera(size)
+    viewmats[0, 2, 3] = distance
+    return Camera(viewmats[0], Ks[0], size, size - 3).to(device)
+
+
+def called_again(call: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
+    """`replay.capture` where there is no GPU: its results are overwritten, as a graph's are."""
+    results = call()
+
+    def play() -> None:
+        for old, new in zip(results, call(), strict=True):
+            old.copy_(new)
+
+    return play, results
+
+
+@pytest.fixture
+def device(cuda_device: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Where replays run."""
+    if cuda_device == "cpu":
+        monkeypatch.setattr(replay, "capture", called_again)
+        monkeypatch.setattr(replay, "choose_backend", lambda *_: "cuda")
+    return cuda_device
+
+
+def both(device: str, name: str, agr: bool = False) -> tuple[Any, Replay, Callable[[Camera, float], Tensor]]:
+    """A model, its replay, and its launched render."""
+    fitted = model(name, 300, agr=agr).to(device)
+    background, config = torch.tensor(BACKGROUND, device=device), RasterConfig()
+
+    def launched(camera: Camera, time: float) -> Tensor:
+        with torch.no_grad():
+            return render(fitted, camera, time, background, config)
+
+    return fitted, Replay(fitted, background, config), launched
+
+
+@pytest.mark.parametrize(("name", "agr"), [("3dgs", False), ("4dgs", False), ("6dgs", True), ("7dgs", True)])
+def test_replays_are_what_is_launched(name: str, agr: bool, device: str) -> None:
+    """Catches a camera, a time or a parameter that is read when a picture is recorded, and not when it is replayed."""
+    fitted, replayed, launched = both(device, name, agr)
+    for distance, time in ((4.0, 0.4), (4.5, 0.1), (3.9, 0.9)):
+        seen = camera(device, distance)
+        torch.testing.assert_close(replayed(seen, time), launched(seen, time), rtol=0, atol=1e-4)
+    with torch.no_grad():
+        fitted.splats["means"].mul_(0.8)
+        fitted.splats["opacities"].add_(0.5)
+    torch.testing.assert_close(replayed(seen, 0.9), launched(seen, 0.9), rtol=0, atol=1e-4)
+
+
+def test_more_pairs_than_there_is_room_for(device: str) -> None:
+    """Catches Gaussians that are left out because a picture recorded from afar had few pairs of tiles and Gaussians."""
+    _, replayed, launched = both(device, "7dgs")
+    for distance in (30.0, 2.5, 1.5):
+        near = camera(device, distance, size=90)
+        torch.testing.assert_close(replayed(near, 0.4), launched(near, 0.4), rtol=0, atol=1e-4)
+    assert len(replayed._recordings) == 1
+    small = camera(device)
+    torch.testing.assert_close(replayed(small, 0.4), launched(small, 0.4), rtol=0, atol=1e-4)
+
+
+def test_a_bad_value_is_named(device: str) -> None:
+    """Catches a picture of NaN: replays do not go through the rasterizer's door."""
+    fitted, replayed, _ = both(device, "4dgs")
+    replayed(camera(device), 0.4)
+    with torch.no_grad():
+        fitted.splats["means"][7] = torch.nan
+    with pytest.raises(InputError, match="means: expected finite"):
+        replayed(camera(device), 0.4)
+
+
+@pytest.mark.parametrize("room", [0, 1, 40])
+@pytest.mark.parametrize("N", [0, 300])
+def test_too_little_room_is_told(N: int, room: int, device: str) -> None:
+    """Catches a pair written past the end of the lists; with too few of them the count alone is right."""
+    seen, fitted = camera(device), model("4dgs", 300).to(device)
+    with torch.no_grad():
+        means, factors, opacities, colors = fitted.slice(seen.center, 0.4)
+        image, needed = splat_within(
+            means[:N], factors[:N], opacities[:N], colors[None, :N], seen.viewmat[None], seen.K[None],
+            torch.tensor(BACKGROUND, device=device), replay.View(seen.width, seen.height, 0.01, 1e10, 0.3, False), room,
+        )  # fmt: skip
+    assert needed.tolist()[-1] == 0
+    assert image.isfinite().all()
+    if N:
+        assert needed.tolist()[0] > 40
+
+
+def test_only_the_cuda_backend_is_replayed() -> None:
+    """Catches a graph asked for where nothing records one."""
+    with pytest.raises(InputError, match=r"expected raster\.backend=cuda, got 'reference'"):
+        Replay(model("3dgs", 5), torch.zeros(3), RasterConfig(backend="reference"))
+
+
+def test_what_cannot_be_recorded_is_launched(
+    device: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a finished training that is lost because its model waits for the device, and an FPS that hides which."""
+    fitted = model("4dgs", 300).to(device)
+    config = SimpleNamespace(device=device, raster=RasterConfig())
+    trainer: Any = SimpleNamespace(model=fitted, background=torch.zeros(3, device=device), config=config, render=id)
+    monkeypatch.setattr(experiment, "choose_backend", lambda *_: "cuda")
+    seen = camera(device)
+    view = View("test/r_0", seen, 0.4, torch.zeros(seen.height, seen.width, 3, device=device))
+    frame, made = experiment.frames(trainer, view)
+    assert made == {"frames": "replayed"}
+    assert frame(view).shape == view.image.shape
+
+    def refuse(_: Callable[[], Any]) -> None:
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+    monkeypatch.setattr(replay, "capture", refuse)
+    assert experiment.frames(trainer, view) == (id, {"frames": "launched"})
+    assert "CUDA cannot record this model: operation not permitted" in capsys.readouterr().err
