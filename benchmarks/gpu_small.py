@@ -3,9 +3,13 @@
 import torch
 
 from benchmarks.scene import camera, gaussians, model
+from gsbench.kernels.cuda import raster
+from gsbench.kernels.cuda.adam import adam
 from gsbench.kernels.loss import l1_ssim
-from gsbench.raster import rasterize
+from gsbench.raster import EPS2D, FAR, NEAR, rasterize
+from gsbench.raster.cuda import splat_within
 
+VIEW = raster.View(70, 50, NEAR, FAR, EPS2D, antialias=False)
 MODELS = (("4dgs", {}), ("6dgs", {}), ("7dgs", {}), ("7dgs", {"factor_order": "paper"}))
 
 
@@ -14,14 +18,21 @@ def main() -> None:
     for D in (3, 5):  # channels: blended at once, and in two turns
         means, factors, opacities, _ = (x.cuda().requires_grad_() for x in gaussians(1_000))
         colors = torch.rand(1_000, D, device="cuda").requires_grad_()
-        output = rasterize(means, factors * 4, opacities, colors, viewmats.requires_grad_(), Ks, 70, 50, backend="cuda")
-        (output.image.square().sum() + output.alpha.sum()).backward()
+        arguments = means, factors * 4, opacities, colors, viewmats.requires_grad_(), Ks
+        for raster.BACKWARD_BY_SPLAT in (True, False):
+            output = rasterize(*arguments, 70, 50, backend="cuda")
+            (output.image.square().sum() + output.alpha.sum()).backward(retain_graph=True)
+        for room in (100, 100_000):  # too few pairs, too many
+            with torch.no_grad():
+                splat_within(*arguments[:3], colors[None], *arguments[4:], colors.new_zeros(D), VIEW, room)
     center = torch.tensor([0.0, 0.0, -4.0], device="cuda")
     for name, options in MODELS:
         seen = model(name, 500, agr=True, **options).cuda().slice(center, 0.4)
         sum(x.square().sum() for x in seen).backward()
     image = torch.rand(37, 50, 3, device="cuda").requires_grad_()
     l1_ssim(image, torch.rand(37, 50, 3, device="cuda"), 0.2).backward()
+    rows = torch.rand(4, 300, 7, device="cuda").unbind()
+    adam(*rows, torch.rand(300, device="cuda") < 0.5, 0.1, [0.9, 0.999], 1e-15, torch.ones((), device="cuda"))
     torch.cuda.synchronize()
     print("every kernel ran")
 

@@ -1,0 +1,128 @@
+"""Two ways to the same thing, timed side by side on one device: what a call costs, and the rows a comparison gives."""
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+Call = Callable[[], Any]
+Row = dict[str, Any]
+
+
+class Cost(NamedTuple):
+    """Milliseconds of a call, and the MiB it holds at most beside what was there before (0 on the CPU)."""
+
+    ms: float  # median
+    p10: float
+    p90: float
+    mib: float
+
+    @classmethod
+    def of(cls, times: list[float], peak: int) -> "Cost":
+        deciles = statistics.quantiles(times, n=10, method="inclusive")
+        return cls(statistics.median(times), deciles[0], deciles[-1], peak / 2**20)
+
+
+@dataclass
+class Place:
+    """Where is measured, and against what. Not torch's default device: that would cost a microsecond an operation."""
+
+    device: str
+    gsplat: bool = False
+
+    @property
+    def on_gpu(self) -> bool:
+        return self.device == "cuda"
+
+    def put(self, tensors: tuple[Tensor, ...]) -> list[Tensor]:
+        return [x.to(self.device) for x in tensors]
+
+    def cost(self, call: Call, repeats: int = 30) -> Cost:
+        """Time a call after a few to warm up; on a GPU by events, the device waited for between calls."""
+        for _ in range(5 if self.on_gpu else 1):
+            call()
+        if not self.on_gpu:
+            return Cost.of([1e3 * timed(call) for _ in range(3)], 0)
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        held, times = torch.cuda.memory_allocated(), []
+        for _ in range(repeats):
+            start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+            torch.cuda.synchronize()
+            start.record()
+            call()
+            end.record()
+            torch.cuda.synchronize()
+            times.append(start.elapsed_time(end))
+        return Cost.of(times, torch.cuda.max_memory_allocated() - held)
+
+
+def timed(call: Call) -> float:
+    began = time.perf_counter()
+    call()
+    return time.perf_counter() - began
+
+
+@dataclass
+class Case:
+    """What is compared: two ways to the same picture, each with what it has gradients by."""
+
+    section: str
+    name: str
+    ours: Call
+    theirs: Call
+    leaves: list[Tensor]
+    their_leaves: list[Tensor]
+    least_bytes: float | None = None  # that forward cannot do without
+    least_alphas: float | None = None  # of at least 1/255
+
+    def rows(self, place: Place) -> Iterator[Row]:
+        """Forward without a graph, backward on a graph that is kept, and both."""
+        passes = {"forward": 1, "backward": 2, "both": 3}  # a backward moves and blends everything about twice
+        ours = self.costs(place, self.ours, self.leaves)
+        theirs = self.costs(place, self.theirs, self.their_leaves) if place.gsplat else [None] * len(passes)
+        with torch.no_grad():
+            difference = (self.ours() - self.theirs()).abs().mean().item() if place.gsplat else None
+        for (way, times), mine, other in zip(passes.items(), ours, theirs, strict=True):
+            yield compared(self.section, self.name, way, mine, other) | {
+                "ours_gb_s": self.least_bytes and times * self.least_bytes / mine.ms / 1e6,
+                "ours_galpha_s": self.least_alphas and times * self.least_alphas / mine.ms / 1e6,
+                "difference": difference,
+            }
+
+    @staticmethod
+    def costs(place: Place, call: Call, leaves: list[Tensor]) -> list[Cost]:
+        image = call()
+        upstream = torch.ones_like(image)
+
+        def both() -> None:
+            torch.autograd.grad(call(), leaves, upstream, allow_unused=True)
+
+        backward = place.cost(
+            lambda: torch.autograd.grad(image, leaves, upstream, retain_graph=True, allow_unused=True)
+        )
+        return [place.cost(torch.no_grad()(call)), backward, place.cost(both)]
+
+
+def attempted(case: Callable[[], Case], name: str, section: str, place: Place) -> Iterator[Row]:
+    """The rows of a case, or one that says how it failed: the others are still measured."""
+    try:
+        yield from case().rows(place)
+    except Exception as error:
+        yield failure(section, name, error)
+
+
+def failure(section: str, case: str, error: Exception) -> Row:
+    return {"section": section, "case": case, "failed": f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"}
+
+
+def compared(section: str, case: str, way: str, ours: Cost, theirs: Cost | None) -> Row:
+    row: Row = {"section": section, "case": case, "pass": way}
+    for who, found in (("ours", ours), ("theirs", theirs)):
+        if found is not None:
+            row |= {f"{who}_{name}": value for name, value in found._asdict().items()}
+    return row | ({"ratio": theirs.ms / ours.ms} if theirs else {})

@@ -1,0 +1,171 @@
+"""What is compared on a GPU: the raster, its backward, frames of models, replays, steps of training, the loss."""
+
+import itertools
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.compare import Call, Case, Cost, Place, Row, attempted, compared, failure
+from benchmarks.gsplat_way import gsplat_image
+from benchmarks.rows import useful_alphas
+from benchmarks.scene import camera, gaussians, model
+from gsbench.kernels.cuda import raster as cuda_raster
+from gsbench.kernels.loss import l1_ssim
+from gsbench.models import GaussianModel
+from gsbench.models.factors import rotation
+from gsbench.models.render import render
+from gsbench.models.replay import Replay
+from gsbench.raster import rasterize
+from gsbench.scenes.scene import Camera
+from gsbench.train.losses import photometric
+
+TIME = 0.4  # at which models are seen
+
+
+def every(place: Place) -> Iterator[Row]:
+    """All rows, those that matter most first."""
+    for rows in (raster_rows, backward_rows, frame_rows, replay_rows, step_rows, loss_rows):
+        yield from rows(place)
+
+
+def raster_rows(place: Place) -> Iterator[Row]:
+    """The rasterizer alone: ours by factors, gsplat by quaternions and scales, its faster way."""
+    sizes = [(1_000, 64)] if not place.on_gpu else itertools.product((10_000, 100_000, 1_000_000), (400, 800, 1600))
+    for N, size in sizes:
+        case = f"{N} / {size}x{size}"
+        yield from attempted(lambda a=(place, case, N, size): raster_case(*a), case, "raster", place)
+
+
+def raster_case(place: Place, case: str, N: int, size: int) -> Case:
+    means, factors, opacities, colors = place.put(gaussians(N))
+    quats = torch.randn(N, 4, generator=torch.Generator().manual_seed(0)).to(means)
+    viewmats, Ks = place.put(camera(size))
+    scales = factors.norm(dim=1)
+    shared = [x.requires_grad_() for x in (means, opacities, colors)]
+    equal = (rotation(quats) * scales[:, None]).requires_grad_()
+    quats.requires_grad_()
+    scales.requires_grad_()
+
+    def ours() -> Tensor:
+        return rasterize(means, equal, opacities, colors, viewmats, Ks, size, size).image
+
+    def theirs() -> Tensor:
+        return gsplat_image(means, quats, scales, opacities, colors, viewmats=viewmats, Ks=Ks, size=size)
+
+    # 16 floats a Gaussian and four a pixel.
+    return Case("raster", case, ours, theirs, [*shared, equal], [*shared, quats, scales],
+                4.0 * (16 * N + 4 * size * size), useful_alphas(N, size))  # fmt: skip
+
+
+def backward_rows(place: Place) -> Iterator[Row]:
+    """The raster's backward with a pixel a lane against a splat a lane (docs/gpu.md)."""
+    sizes = itertools.product((10_000, 100_000, 1_000_000), (400, 800, 1600)) if place.on_gpu else ()
+    for N, size in sizes:
+        name = f"{N} / {size}x{size}, theirs is a splat a lane"
+        try:
+            yield compared("backward", name, "backward", *(backward_cost(place, N, size, x) for x in (False, True)))
+        except Exception as error:
+            yield failure("backward", name, error)
+
+
+def backward_cost(place: Place, N: int, size: int, by_splat: bool) -> Cost:
+    inputs = [x.requires_grad_() for x in place.put(gaussians(N))]
+    image = rasterize(*inputs, *place.put(camera(size)), size, size).image
+    upstream = torch.ones_like(image)
+    before, cuda_raster.BACKWARD_BY_SPLAT = cuda_raster.BACKWARD_BY_SPLAT, by_splat
+    try:
+        return place.cost(lambda: torch.autograd.grad(image, inputs, upstream, retain_graph=True))
+    finally:
+        cuda_raster.BACKWARD_BY_SPLAT = before
+
+
+def frame_rows(place: Place) -> Iterator[Row]:
+    """Whole frames from a model's parameters to a picture, and the gradients of all parameters."""
+    N, sizes = (500, (48,)) if not place.on_gpu else (100_000, (400, 800))
+    for name, agr, size in itertools.product(("4dgs", "6dgs", "7dgs"), (False, True), sizes):
+        case = f"{name} {'with' if agr else 'without'} AGR, {N} / {size}x{size}"
+        yield from attempted(lambda a=(place, case, name, agr, N, size): frame_case(*a), case, "frame", place)
+
+
+def frame_case(place: Place, case: str, name: str, agr: bool, N: int, size: int) -> Case:
+    fitted = model(name, N, agr=agr).to(place.device)
+    parameters = [p for p in fitted.parameters() if p.requires_grad]
+    return Case("frame", case, *two_ways(place, fitted, size), parameters, parameters)
+
+
+def two_ways(place: Place, fitted: GaussianModel, size: int) -> tuple[Call, Call]:
+    """A model's picture by our kernels, and by slicing in torch and drawing by gsplat."""
+    viewmats, Ks = place.put(camera(size))
+    center = -(viewmats[0, :3, :3].T @ viewmats[0, :3, 3])
+
+    def ours() -> Tensor:
+        fitted.backend = "auto"
+        return rasterize(*fitted.slice(center, TIME), viewmats, Ks, size, size).image
+
+    def theirs() -> Tensor:
+        fitted.backend = "reference"
+        seen = fitted.slice(center, TIME)
+        covars = seen.factors @ seen.factors.mT
+        return gsplat_image(seen.means, None, None, seen.opacities, seen.colors, covars=covars, viewmats=viewmats,
+                            Ks=Ks, size=size)  # fmt: skip
+
+    return ours, theirs
+
+
+def replay_rows(place: Place) -> Iterator[Row]:
+    """Frames replayed as a CUDA graph, as FPS is measured, against the same frames launched."""
+    N, sizes = 100_000, (400, 800) if place.on_gpu else ()
+    for name, agr, size in itertools.product(("3dgs", "4dgs", "6dgs", "7dgs"), (False, True), sizes):
+        case = f"{name} {'with' if agr else 'without'} AGR, {N} / {size}x{size}, theirs is launched"
+        try:
+            fitted, background = model(name, N, agr=agr).to(place.device), torch.zeros(3, device=place.device)
+            viewmats, Ks = place.put(camera(size))
+            seen, config = Camera(viewmats[0], Ks[0], size, size), SimpleNamespace(backend="auto", antialias=False)
+            replay = Replay(fitted, background, config)
+            with torch.no_grad():
+                launched = place.cost(lambda a=(fitted, seen, TIME, background, config): render(*a))
+            yield compared("replay", case, "forward", place.cost(lambda a=replay, b=seen: a(b, TIME)), launched)
+        except Exception as error:
+            yield failure("replay", case, error)
+
+
+def step_rows(place: Place) -> Iterator[Row]:
+    """A step of training on one view: frame, L1 + SSIM (ours fused, theirs torch), gradients, Adam (fused in both)."""
+    N, sizes = (500, (48,)) if not place.on_gpu else (100_000, (400, 800))
+    for agr, size in itertools.product((False, True), sizes):
+        case = f"7dgs {'with' if agr else 'without'} AGR, {N} / {size}x{size}"
+        try:
+            ours, theirs = steps(place, agr, N, size)
+            yield compared("step", case, "all", place.cost(ours), place.cost(theirs) if place.gsplat else None)
+        except Exception as error:
+            yield failure("step", case, error)
+
+
+def steps(place: Place, agr: bool, N: int, size: int) -> list[Call]:
+    found: list[Call] = []
+    target = torch.rand(1, size, size, 3, device=place.device)
+    for k, loss in enumerate((l1_ssim, lambda a, b, w: photometric(a, b, w, "reference"))):
+        fitted = model("7dgs", N, agr=agr).to(place.device)
+        picture = two_ways(place, fitted, size)[k]
+        adam = torch.optim.Adam(fitted.parameters(), lr=1e-5, eps=1e-15, fused=True)
+
+        def step(picture: Call = picture, loss: Any = loss, adam: torch.optim.Adam = adam) -> None:
+            loss(picture()[0], target[0], 0.2).backward()
+            adam.step()
+            adam.zero_grad(set_to_none=True)
+
+        found.append(step)
+    return found
+
+
+def loss_rows(place: Place) -> Iterator[Row]:
+    """L1 + SSIM forward and backward, against torch's own operations."""
+    for size in (32,) if not place.on_gpu else (400, 800, 1600):
+        image, target = (torch.rand(size, size, 3, device=place.device) for _ in range(2))
+        image.requires_grad_()
+        ours = place.cost(lambda a=image, b=target: torch.autograd.grad(l1_ssim(a, b, 0.2), a))
+        theirs = place.cost(lambda a=image, b=target: torch.autograd.grad(photometric(a, b, 0.2, "reference"), a))
+        yield compared("loss", f"{size}x{size}, theirs is torch", "both", ours, theirs)

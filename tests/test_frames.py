@@ -1,0 +1,53 @@
+"""What FPS is measured on: replayed frames where a GPU can record them."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from gsbench import experiment
+from gsbench.config import RasterConfig
+from gsbench.scenes.scene import Camera, View
+
+VIEW = View("test/r_0", Camera(torch.eye(4), torch.eye(3), 5, 4), 0.4, torch.zeros(4, 5, 3))
+
+
+def trainer() -> Any:
+    config = SimpleNamespace(device="cpu", raster=RasterConfig())
+    return SimpleNamespace(model=None, background=None, config=config, render=lambda _: "launched")
+
+
+class Recorded:
+    """Stands for `Replay`, which needs a GPU."""
+
+    def __init__(self, *_: Any) -> None: ...
+
+    def __call__(self, *_: Any) -> str:
+        return "replayed"
+
+
+class Refused(Recorded):
+    def __call__(self, *_: Any) -> str:
+        raise RuntimeError("operation not permitted when stream is capturing\nmore")
+
+
+def test_on_a_cpu_frames_are_launched() -> None:
+    """Catches a protocol that speaks of replays where there are none."""
+    frame, made = experiment.frames(trainer(), VIEW)
+    assert (frame(VIEW), made) == ("launched", {})
+
+
+@pytest.mark.parametrize(("replay", "made"), [(Recorded, "replayed"), (Refused, "launched")])
+def test_on_a_gpu_the_record_says_which(
+    replay: type[Recorded], made: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a finished training lost to a model that waits for the device, and an FPS that hides how it was made."""
+    monkeypatch.setattr(experiment, "choose_backend", lambda *_: "cuda")
+    monkeypatch.setattr(experiment, "Replay", replay)
+    frame, told = experiment.frames(trainer(), VIEW)
+    assert (frame(VIEW), told) == (made, {"frames": made})
+    said = capsys.readouterr().err
+    assert ("cannot record this model: operation not permitted when stream is capturing\n" in said) == (
+        made == "launched"
+    )
