@@ -1,5 +1,6 @@
 """AGR, the adaptive Gaussian refinement: small networks that move a Gaussian's raw parameters with time (7DGS, 4.3)."""
 
+import functools
 import math
 
 import torch
@@ -14,8 +15,14 @@ HIDDEN = 64
 
 def encode_time(time: Tensor) -> Tensor:
     """gamma(t) = (sin 2^0 pi t, cos 2^0 pi t, .., sin 2^9 pi t, cos 2^9 pi t), [] -> [20]."""
-    angles = time * math.pi * 2.0 ** torch.arange(OCTAVES, device=time.device, dtype=time.dtype)
+    angles = time * _frequencies(time.device, time.dtype)
     return torch.stack([angles.sin(), angles.cos()], -1).flatten()
+
+
+@functools.cache
+def _frequencies(device: torch.device, dtype: torch.dtype) -> Tensor:
+    """2^k pi, [10]: made once, as on a GPU every operation of a few numbers costs as much as one of thousands."""
+    return math.pi * 2.0 ** torch.arange(OCTAVES, device=device, dtype=dtype)
 
 
 class Refinement(nn.Module):

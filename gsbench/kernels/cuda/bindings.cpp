@@ -158,32 +158,62 @@ void show_colors_backward(int64_t N, int degree, int bases, int waves, Address s
                                     {g_colors, out_sh0, out_shN, out_means, out_times}, stream);
 }
 
-gsb::cuda::RefineArgs refine_args(int64_t N, int features_width, const std::vector<int>& widths, Address features,
-                                  Address weight_in, Address bias_in, Address weight_out, Address bias_out) {
+// `from` and `to` are arrays [N, widths]: those that the networks move, in order; the first ones are the features.
+struct RefineValues {
+    std::vector<uintptr_t> from, to;
+    std::vector<int> widths;
+
+    gsb::cuda::Column column(size_t array, int c) const {
+        return {reinterpret_cast<const float*>(from[array]) + c, to[array] ? reinterpret_cast<float*>(to[array]) + c : nullptr,
+                widths[array]};
+    }
+};
+
+gsb::cuda::RefineArgs refine_args(int64_t N, const std::vector<int>& widths, const RefineValues& features,
+                                  const RefineValues& moved, Address weight_in, Address bias_in, Address weight_out,
+                                  Address bias_out) {
     using namespace gsb::cuda;
-    if (features_width >= MAX_FEATURES || widths.size() > MAX_NETWORKS) throw nb::value_error("networks too large");
-    RefineArgs args{N, features_width, static_cast<int>(widths.size()), 0, {}, features, weight_in, bias_in, weight_out,
-                    bias_out};
-    for (size_t k = 0; k < widths.size(); ++k) {
-        if (widths[k] > MAX_WIDTH) throw nb::value_error("networks too large");
-        args.outputs += args.widths[k] = widths[k];
+    RefineArgs args{N, 0, static_cast<int>(widths.size()), 0, {}, {}, {}, weight_in, bias_in, weight_out, bias_out};
+    const auto fits = [](bool good) { if (!good) throw nb::value_error("networks too large, or not of these values"); };
+    fits(widths.size() <= MAX_NETWORKS && features.widths.size() + 1 == widths.size() && !moved.widths.empty());
+    for (size_t array = 0; array < features.widths.size(); ++array) {
+        for (int c = 0; c < features.widths[array]; ++c) {
+            fits(args.features_width < MAX_FEATURES - 1);
+            args.features[args.features_width++] = features.column(array, c);
+        }
+    }
+    size_t array = 0;
+    for (size_t network = 0, c = 0; network < widths.size(); ++network) {
+        fits(widths[network] <= MAX_WIDTH);
+        args.outputs += args.widths[network] = widths[network];
+        for (int k = 0; k < widths[network]; ++k, ++c) {
+            if (c == static_cast<size_t>(moved.widths[array])) ++array, c = 0;
+            fits(array < moved.widths.size());
+            args.moved[network][k] = moved.column(array, static_cast<int>(c));
+        }
     }
     return args;
 }
 
-void refine(int64_t N, int features_width, const std::vector<int>& widths, Address features, Address weight_in,
-            Address bias_in, Address weight_out, Address bias_out, Address out, Address stream) {
-    gsb::cuda::refine(refine_args(N, features_width, widths, features, weight_in, bias_in, weight_out, bias_out), out,
-                      stream);
+void refine(int64_t N, const std::vector<int>& widths, const std::vector<int>& value_widths,
+            const std::vector<uintptr_t>& values, Address weight_in, Address bias_in, Address weight_out,
+            Address bias_out, const std::vector<uintptr_t>& out, Address stream) {
+    const auto features = static_cast<std::ptrdiff_t>(widths.size()) - 1;
+    const RefineValues moved{values, out, value_widths};
+    const RefineValues read{values, out, {value_widths.begin(), value_widths.begin() + features}};
+    gsb::cuda::refine(refine_args(N, widths, read, moved, weight_in, bias_in, weight_out, bias_out), stream);
 }
 
-void refine_backward(int64_t N, int features_width, const std::vector<int>& widths, Address features, Address weight_in,
-                     Address bias_in, Address weight_out, Address bias_out, Address g_out, Address out_features,
-                     Address out_weight_in, Address out_bias_in, Address out_weight_out, Address out_bias_out,
-                     Address stream) {
-    gsb::cuda::refine_backward(
-        refine_args(N, features_width, widths, features, weight_in, bias_in, weight_out, bias_out), g_out,
-        {out_features, out_weight_in, out_bias_in, out_weight_out, out_bias_out}, stream);
+void refine_backward(int64_t N, const std::vector<int>& widths, const std::vector<int>& value_widths,
+                     const std::vector<uintptr_t>& values, Address weight_in, Address bias_in, Address weight_out,
+                     Address bias_out, const std::vector<uintptr_t>& g_out, const std::vector<uintptr_t>& out_features,
+                     Address by_network, Address out_weight_in, Address out_bias_in, Address out_weight_out,
+                     Address out_bias_out, Address stream) {
+    const auto features = static_cast<std::ptrdiff_t>(widths.size()) - 1;
+    const RefineValues moved{g_out, std::vector<uintptr_t>(g_out.size()), value_widths};
+    const RefineValues read{values, out_features, {value_widths.begin(), value_widths.begin() + features}};
+    gsb::cuda::refine_backward(refine_args(N, widths, read, moved, weight_in, bias_in, weight_out, bias_out),
+                               {by_network, out_weight_in, out_bias_in, out_weight_out, out_bias_out}, stream);
 }
 
 void l1_ssim(int height, int width, Address image, Address target, float ssim_weight, Address loss, Address derivatives,

@@ -131,17 +131,25 @@ struct ColorGrads {
 // Perceptrons features x 64 x width, one for each of `networks`, on every Gaussian (AGR).
 constexpr int MAX_NETWORKS = 4, MAX_FEATURES = 8, MAX_WIDTH = 28;
 
+// A column of a value [N, stride]: what is read, and where what comes of it goes.
+struct Column {
+    const float* from;
+    float* to;
+    int64_t stride;
+};
+
 struct RefineArgs {
     int64_t N;
     int features_width, networks, outputs;  // outputs: the sum of widths
     int widths[MAX_NETWORKS];
-    const float* features;               // [N, features_width]
-    const float *weight_in, *bias_in;    // [networks * 64, features_width] [networks * 64]
-    const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
+    Column features[MAX_FEATURES];              // what the networks read; `to` its gradient, which is added to
+    Column moved[MAX_NETWORKS][MAX_WIDTH];      // what each network moves; backward: `from` the outputs' gradient
+    const float *weight_in, *bias_in;           // [networks * 64, features_width] [networks * 64]
+    const float *weight_out, *bias_out;         // [outputs, 64] [outputs]
 };
 
 struct RefineGrads {
-    float* features;                                     // [networks, N, features_width], to be added up
+    float* features;                                     // [networks, N, features_width] scratch
     float *weight_in, *bias_in, *weight_out, *bias_out;  // zero on entry
 };
 
@@ -190,8 +198,8 @@ void observe_rotated_backward(const RotatedArgs&, const Observation& grads, cons
 void show_colors(const ColorArgs&, float* colors, Stream);
 void show_colors_backward(const ColorArgs&, const ColorGrads&, Stream);
 
-void refine(const RefineArgs&, float* out, Stream);
-void refine_backward(const RefineArgs&, const float* grads, const RefineGrads&, Stream);
+void refine(const RefineArgs&, Stream);
+void refine_backward(const RefineArgs&, const RefineGrads&, Stream);
 
 int similarity_blocks(int height, int width);
 void l1_ssim(const SimilarityArgs&, Stream);

@@ -101,17 +101,16 @@ def refine(
     values: list[Tensor], weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int]
 ) -> list[Tensor]:
     """Values moved by the perceptrons."""
-    limits = cuda()
-    features = torch.cat(values[: len(widths) - 1], -1)
-    if features.shape[1] > limits.MAX_FEATURES or len(widths) > limits.MAX_NETWORKS or max(widths) > limits.MAX_WIDTH:
+    limits, features = cuda(), sum(widths[:-1])
+    if features > limits.MAX_FEATURES or len(widths) > limits.MAX_NETWORKS or max(widths) > limits.MAX_WIDTH:
         raise InputError(f"refine: expected on a GPU at most {limits.MAX_NETWORKS} networks of at most "
                          f"{limits.MAX_FEATURES} features and at most {limits.MAX_WIDTH} outputs, got {len(widths)}, "
-                         f"{features.shape[1]} and {max(widths)}")  # fmt: skip
-    arrays = plain(features, weight_in, bias_in, weight_out, bias_out)
-    out = allocate("refinements", features, len(features), len(weight_out))
-    cuda().refine(*features.shape, widths, *pointers(*arrays, out), stream(features))
-    residuals = out.split([x.shape[-1] for x in values], -1)
-    return [x + residual for x, residual in zip(values, residuals, strict=True)]
+                         f"{features} and {max(widths)}")  # fmt: skip
+    given, weights = plain(*values), plain(weight_in, bias_in, weight_out, bias_out)
+    out = [allocate("refinements", x, *x.shape) for x in given]
+    cuda().refine(len(given[0]), widths, _widths(given), pointers(*given), *pointers(*weights), pointers(*out),
+                  stream(weight_in))  # fmt: skip
+    return out
 
 
 @on_device
@@ -120,15 +119,18 @@ def refine_backward(
     g_out: list[Tensor],
 ) -> list[Tensor]:  # fmt: skip
     """Gradients of the features, then of the weights."""
-    read = values[: len(widths) - 1]
-    features = torch.cat(read, -1)
-    arrays = plain(features, weight_in, bias_in, weight_out, bias_out, torch.cat(g_out, -1))
-    by_network = allocate("gradients of AGR's features", features, len(widths), *features.shape)
-    out = tuple(x.new_zeros(x.shape) for x in (weight_in, bias_in, weight_out, bias_out))
-    cuda().refine_backward(*features.shape, widths, *pointers(*arrays, by_network, *out),
-                           stream(features))  # fmt: skip
-    through = by_network.sum(0).split([x.shape[-1] for x in read], -1)
-    return [*(g + more for g, more in zip(g_out, through, strict=False)), *out]
+    given, grads, weights = plain(*values), plain(*g_out), plain(weight_in, bias_in, weight_out, bias_out)
+    features = [g.clone() for g in grads[: len(widths) - 1]]
+    by_network = allocate("gradients of AGR's features", weight_in, len(widths), len(given[0]), sum(widths[:-1]))
+    out = [torch.zeros_like(x) for x in weights]
+    cuda().refine_backward(len(given[0]), widths, _widths(given), pointers(*given), *pointers(*weights),
+                           pointers(*grads), pointers(*features), *pointers(by_network, *out),
+                           stream(weight_in))  # fmt: skip
+    return [*features, *out]
+
+
+def _widths(values: tuple[Tensor, ...]) -> list[int]:
+    return [x.shape[-1] for x in values]
 
 
 def _observation(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,5 +1,5 @@
-// AGR (7DGS, section 4.3): a few perceptrons of two layers on every Gaussian. Weights lie in shared memory and hidden
-// units in registers, so that nothing but features and outputs is read or written; backward computes the hidden units
+// AGR (7DGS, section 4.3): a few perceptrons of two layers move every Gaussian. Weights lie in shared memory and hidden
+// units in registers, so that nothing but the Gaussians' values is read or written; backward computes the hidden units
 // again, 32 Gaussians at a time.
 #include "launch.h"
 
@@ -38,7 +38,7 @@ struct Network {
 // A Gaussian's features, and a one for the bias.
 __device__ void load_features(const RefineArgs& a, int64_t i, float (&x)[MAX_FEATURES]) {
     GSB_UNROLL for (int f = 0; f < MAX_FEATURES - 1; ++f) {
-        x[f] = i < a.N && f < a.features_width ? a.features[i * a.features_width + f] : 0.0f;
+        x[f] = i < a.N && f < a.features_width ? a.features[f].from[i * a.features[f].stride] : 0.0f;
     }
     x[MAX_FEATURES - 1] = 1.0f;
 }
@@ -49,25 +49,37 @@ __device__ int first_output_of(const RefineArgs& a, int network) {
     return first;
 }
 
-// A thread a Gaussian, a row of blocks a network.
-__global__ void __launch_bounds__(THREADS) refine_kernel(const __grid_constant__ RefineArgs a, float* out) {
+constexpr int AT_ONCE = 4;  // Gaussians of a thread: a weight that is read from shared memory serves all of them
+constexpr int MOVERS = 128;  // threads of a block
+
+// A row of blocks a network, the last and widest first.
+__global__ void __launch_bounds__(MOVERS) refine_kernel(const __grid_constant__ RefineArgs a) {
     __shared__ Network net;
-    const int network = static_cast<int>(blockIdx.y), first = first_output_of(a, network), width = a.widths[network];
+    const int network = a.networks - 1 - static_cast<int>(blockIdx.y);
+    const int first = first_output_of(a, network), width = a.widths[network];
     net.load(a, network, first);
     __syncthreads();
-    const int64_t i = global_thread();
-    if (i >= a.N) return;
-    float x[MAX_FEATURES], sums[MAX_WIDTH];
-    load_features(a, i, x);
-    GSB_UNROLL for (int c = 0; c < MAX_WIDTH; ++c) sums[c] = c < width ? a.bias_out[first + c] : 0.0f;
+    const int64_t begin = static_cast<int64_t>(blockIdx.x) * MOVERS * AT_ONCE + threadIdx.x;
+    float x[AT_ONCE][MAX_FEATURES], sums[AT_ONCE][MAX_WIDTH];
+    GSB_UNROLL for (int n = 0; n < AT_ONCE; ++n) {
+        load_features(a, begin + n * MOVERS, x[n]);
+        GSB_UNROLL for (int c = 0; c < MAX_WIDTH; ++c) sums[n][c] = c < width ? a.bias_out[first + c] : 0.0f;
+    }
     for (int unit = 0; unit < HIDDEN; ++unit) {
-        const float h = net.hidden(unit, x);
+        float h[AT_ONCE];
+        GSB_UNROLL for (int n = 0; n < AT_ONCE; ++n) h[n] = net.hidden(unit, x[n]);
         GSB_UNROLL for (int c = 0; c < MAX_WIDTH; ++c) {
-            if (c / 4 * 4 < width) sums[c] += h * net.out[unit][c];
+            if (c / 4 * 4 >= width) continue;
+            GSB_UNROLL for (int n = 0; n < AT_ONCE; ++n) sums[n][c] += h[n] * net.out[unit][c];
         }
     }
     GSB_UNROLL for (int c = 0; c < MAX_WIDTH; ++c) {
-        if (c < width) out[i * a.outputs + first + c] = sums[c];
+        if (c >= width) continue;
+        const Column column = a.moved[network][c];
+        GSB_UNROLL for (int n = 0; n < AT_ONCE; ++n) {
+            const int64_t i = begin + n * MOVERS, at = i * column.stride;
+            if (i < a.N) column.to[at] = column.from[at] + sums[n][c];
+        }
     }
 }
 
@@ -86,7 +98,7 @@ struct BackwardBatch {
 
 // A row of blocks a network; each block sums the weights' gradients over the batches it takes, and adds them at the end.
 __global__ void __launch_bounds__(BATCH * PARTS)
-    refine_backward_kernel(const __grid_constant__ RefineArgs a, const float* grads, RefineGrads out) {
+    refine_backward_kernel(const __grid_constant__ RefineArgs a, RefineGrads out) {
     __shared__ Network net;
     __shared__ BackwardBatch batch;
     const int network = static_cast<int>(blockIdx.y), first = first_output_of(a, network), width = a.widths[network];
@@ -100,7 +112,8 @@ __global__ void __launch_bounds__(BATCH * PARTS)
         float x[MAX_FEATURES], g[MAX_WIDTH], g_x[MAX_FEATURES] = {};
         load_features(a, i, x);
         GSB_UNROLL for (int c = 0; c < MAX_WIDTH; ++c) {
-            g[c] = i < a.N && c < width ? grads[i * a.outputs + first + c] : 0.0f;
+            const Column& column = a.moved[network][c];
+            g[c] = i < a.N && c < width ? column.from[i * column.stride] : 0.0f;
         }
         if (part == 0) {
             GSB_UNROLL for (int f = 0; f < MAX_FEATURES; ++f) batch.x[lane][f] = x[f];
@@ -147,20 +160,36 @@ __global__ void __launch_bounds__(BATCH * PARTS)
     if (thread < width) atomicAdd(out.bias_out + first + thread, g_bias);
 }
 
-}  // namespace
-
-void refine(const RefineArgs& a, float* out, Stream stream) {
-    if (a.N == 0) return;
-    launch(refine_kernel, dim3(blocks_for(a.N), static_cast<unsigned>(a.networks)), THREADS, stream, a, out);
+// A feature moves through every network, and itself: the gradient of what it was moved to is there already.
+__global__ void feature_kernel(const __grid_constant__ RefineArgs a, const float* by_network) {
+    const int64_t i = global_thread(), step = a.N * a.features_width;
+    if (i >= a.N) return;
+    GSB_UNROLL for (int f = 0; f < MAX_FEATURES - 1; ++f) {
+        if (f >= a.features_width) continue;
+        float sum = 0.0f;
+        GSB_UNROLL for (int network = 0; network < MAX_NETWORKS; ++network) {
+            if (network < a.networks) sum += by_network[network * step + i * a.features_width + f];
+        }
+        a.features[f].to[i * a.features[f].stride] += sum;
+    }
 }
 
-void refine_backward(const RefineArgs& a, const float* grads, const RefineGrads& out, Stream stream) {
+}  // namespace
+
+void refine(const RefineArgs& a, Stream stream) {
+    if (a.N == 0) return;
+    const auto blocks = static_cast<unsigned>((a.N + MOVERS * AT_ONCE - 1) / (MOVERS * AT_ONCE));
+    launch(refine_kernel, dim3(blocks, static_cast<unsigned>(a.networks)), MOVERS, stream, a);
+}
+
+void refine_backward(const RefineArgs& a, const RefineGrads& out, Stream stream) {
     if (a.N == 0) return;
     // Each block adds its sums by atomics once: few blocks, but enough to fill the largest GPUs.
     constexpr unsigned MOST_BLOCKS = 512;
     const auto batches = static_cast<unsigned>((a.N + BATCH - 1) / BATCH);
     const dim3 grid(batches < MOST_BLOCKS ? batches : MOST_BLOCKS, static_cast<unsigned>(a.networks));
-    launch(refine_backward_kernel, grid, BATCH * PARTS, stream, a, grads, out);
+    launch(refine_backward_kernel, grid, BATCH * PARTS, stream, a, out);
+    launch(feature_kernel, blocks_for(a.N), THREADS, stream, a, out.features);
 }
 
 }  // namespace gsb::cuda
