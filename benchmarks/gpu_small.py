@@ -10,7 +10,7 @@ from gsbench.raster import EPS2D, FAR, NEAR, rasterize
 from gsbench.raster.cuda import splat_within
 
 VIEW = raster.View(70, 50, NEAR, FAR, EPS2D, antialias=False)
-MODELS = (("4dgs", {}), ("6dgs", {}), ("7dgs", {}), ("7dgs", {"factor_order": "paper"}))
+MODELS = (("3dgs", {}), ("4dgs", {}), ("6dgs", {}), ("7dgs", {}), ("7dgs", {"factor_order": "paper"}))
 
 
 def main() -> None:

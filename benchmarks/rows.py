@@ -66,11 +66,11 @@ def useful_alphas(N: int, size: int) -> float:
 def observing() -> Iterator[Row]:
     """Slices, colours and projection of 100k Gaussians, one after the other, and AGR."""
     center = torch.tensor([0.0, 0.0, -4.0])
-    for name, agr in (("4dgs", False), ("6dgs", False), ("7dgs", False), ("7dgs", True)):
+    for name, agr in (("3dgs", False), ("4dgs", False), ("6dgs", False), ("7dgs", False), ("7dgs", True)):
         for backend in ("cpu", "reference"):
             observed = model(name, 100_000, agr=agr)
             observed.backend = backend
-            time = None if name == "6dgs" else 0.4
+            time = 0.4 if "time" in observed.observes else None
             parameters = [p for p in observed.parameters() if p.requires_grad]
             out = observed.slice(center, time)
             upstream = [torch.ones_like(x) for x in out]

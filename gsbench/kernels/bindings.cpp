@@ -261,6 +261,31 @@ double observe_rotated_backward(In<-1, 3> means, In<-1> times, In<-1, 4> scales,
     return grads.lambda_t;
 }
 
+gsb::StillArgs still_args(const In<-1, 3>& scales, const In<-1, 4>& quats, const In<-1>& opacities, int threads) {
+    const int64_t N = size(scales.shape(0));
+    expect_all(N, "N", quats.shape(0), opacities.shape(0));
+    const Frame frame(1, 1, threads);
+    return {N, scales.data(), quats.data(), opacities.data(), threads};
+}
+
+void observe_still(In<-1, 3> scales, In<-1, 4> quats, In<-1> opacities, int threads, Out<-1, 3, 3> out_factors,
+                   Out<-1> out_opacities) {
+    const auto args = still_args(scales, quats, opacities, threads);
+    expect_all(args.N, "N", out_factors.shape(0), out_opacities.shape(0));
+    nb::gil_scoped_release release;
+    active->observe_still(args, {out_factors.data(), out_opacities.data()});
+}
+
+void observe_still_backward(In<-1, 3> scales, In<-1, 4> quats, In<-1> opacities, int threads, Out<-1, 3, 3> g_factors,
+                            Out<-1> g_opacities, Out<-1, 3> out_scales, Out<-1, 4> out_quats, Out<-1> out_opacities) {
+    const auto args = still_args(scales, quats, opacities, threads);
+    expect_all(args.N, "N", g_factors.shape(0), g_opacities.shape(0), out_scales.shape(0), out_quats.shape(0),
+               out_opacities.shape(0));
+    nb::gil_scoped_release release;
+    active->observe_still_backward(args, {g_factors.data(), g_opacities.data()},
+                                   {out_scales.data(), out_quats.data(), out_opacities.data()});
+}
+
 gsb::ColorArgs color_args(const In<-1, -1, 3>& sh0, const In<-1, -1, 3>& shN, const In<-1, 3>& means,
                           const In<-1>& opacities, const In<-1>& times, const In<3>& center, double time, int degree,
                           int waves, int threads) {
@@ -430,6 +455,8 @@ NB_MODULE(_native, m) {
     define(m, "observe_triangular_backward", observe_triangular_backward);
     define(m, "observe_rotated", observe_rotated);
     define(m, "observe_rotated_backward", observe_rotated_backward);
+    define(m, "observe_still", observe_still);
+    define(m, "observe_still_backward", observe_still_backward);
     define(m, "show_colors", show_colors);
     define(m, "show_colors_backward", show_colors_backward);
     define(m, "refine", refine);

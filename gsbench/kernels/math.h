@@ -7,9 +7,11 @@
 
 #include "math/blending.h"
 #include "math/harmonics.h"
+#include "math/parameters.h"
 #include "math/projection.h"
 #include "math/rotated.h"
 #include "math/scalar.h"
 #include "math/similarity.h"
 #include "math/slicing.h"
+#include "math/still.h"
 #include "math/triangular.h"

@@ -1,4 +1,4 @@
-"""Torch operations that observe the geometry of a model: slices of Gaussians with triangular and rotated factors."""
+"""Torch operations that observe the geometry of a model: slices with triangular and rotated factors, or none."""
 
 from typing import Any
 
@@ -179,3 +179,59 @@ def _rotated_gradient(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
 _rotated.register_kernel("cuda")(on_cuda.rotated)
 _rotated_backward.register_kernel("cuda")(on_cuda.rotated_backward)
 _rotated.register_autograd(_rotated_gradient, setup_context=_rotated_context)
+
+
+def observe_still(
+    scales: Tensor,  # [N, 3] log scales
+    quats: Tensor,  # [N, 4] wxyz
+    opacities: Tensor,  # [N] logits
+) -> tuple[Tensor, Tensor]:
+    """Factors F = R diag(exp scales) [N, 3, 3] (3DGS eq. 6) and opacities [N] of Gaussians that are their own slice.
+
+    Raises:
+        InputError: not float32 on one device, or shapes that do not fit.
+    """
+    N = len(scales)
+    check("observe_still", {"scales": (scales, (N, 3)), "quats": (quats, (N, 4)), "opacities": (opacities, (N,))})
+    factors, out = _still(scales, quats, opacities)
+    return factors, out
+
+
+@custom_op("gsbench::observe_still", mutates_args=())
+def _still(scales: Tensor, quats: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
+    out = scales.new_empty(len(scales), 3, 3), rows_like(opacities)
+    native().observe_still(*plain(scales, quats, opacities), threads(), *out)
+    return out
+
+
+@_still.register_fake
+def _(scales: Tensor, _quats: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
+    return scales.new_empty(len(scales), 3, 3), rows_like(opacities)
+
+
+@custom_op("gsbench::observe_still_backward", mutates_args=())
+def _still_backward(
+    scales: Tensor, quats: Tensor, opacities: Tensor, g_factors: Tensor, g_opacities: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    arrays = plain(scales, quats, opacities)
+    out = tuple(rows_like(x) for x in arrays)
+    native().observe_still_backward(*arrays, threads(), *plain(g_factors, g_opacities), *out)
+    return out[0], out[1], out[2]
+
+
+@_still_backward.register_fake
+def _(*arrays: Tensor) -> tuple[Tensor, ...]:
+    return tuple(rows_like(x) for x in arrays[:3])
+
+
+def _still_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # noqa: ARG001
+    ctx.save_for_backward(*inputs)
+
+
+def _still_gradient(ctx: Any, *grads: Tensor) -> tuple[Tensor, ...]:
+    return tuple(_still_backward(*ctx.saved_tensors, *grads))
+
+
+_still.register_kernel("cuda")(on_cuda.still)
+_still_backward.register_kernel("cuda")(on_cuda.still_backward)
+_still.register_autograd(_still_gradient, setup_context=_still_context)

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsbench.kernels.slices import observe_still
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register
 from gsbench.models.factors import rotation, sizes
 from gsbench.scenes.scene import Points
@@ -30,6 +31,12 @@ class Gaussians3DModel(GaussianModel):
     def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
         """The Gaussian as it is."""
         return Conditioned(raw["means"], self.factors(raw), torch.ones_like(raw["opacities"]))
+
+    def observe(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """By the native kernel, where it serves."""
+        if not self.uses_kernels(raw["means"]):
+            return super().observe(raw, camera_center, time)
+        return raw["means"], *observe_still(raw["scales"], raw["quats"], raw["opacities"])
 
     def scales(self) -> Tensor:
         """Largest of the three scales."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_observe import VARIANTS, assert_same, color_inputs, gradients, model_and_raw, rotated
+from test_observe import VARIANTS, assert_same, color_inputs, gradients, model_and_raw, rotated, still
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -14,6 +14,7 @@ from gsbench.kernels import colors, refine, slices
 from gsbench.kernels.cuda import observe as on_cuda
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
+from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.refinement import Refinement
 
 OPERATIONS = {
@@ -21,6 +22,8 @@ OPERATIONS = {
     slices._observe_backward: on_cuda.observe_backward,
     slices._rotated: on_cuda.rotated,
     slices._rotated_backward: on_cuda.rotated_backward,
+    slices._still: on_cuda.still,
+    slices._still_backward: on_cuda.still_backward,
     colors._show: on_cuda.show,
     colors._show_backward: on_cuda.show_backward,
     refine._refine: on_cuda.refine,
@@ -80,6 +83,18 @@ def test_rotated_slice(move: Move) -> None:
     given = [move(torch.randn(x.shape, generator=g)) for x in actual]
     assert_same(back(list(torch.autograd.grad(actual, [*single, log_lambda], given))),
                 gradients(expected, [*raw.values(), exact.log_modulation["time"]]))  # fmt: skip
+
+
+def test_still_slice(move: Move) -> None:
+    """Catches a wrong sign of a rotation's entry, a size that does not stop, or a derivative."""
+    raw = still(torch.float64)
+    expected = [Gaussians3DModel.factors(raw), torch.sigmoid(raw["opacities"])]
+    single = [move(x) for x in raw.values()]
+    actual = list(slices.observe_still(*single))
+    assert_same(back(actual), expected)
+    g = torch.Generator().manual_seed(2)
+    given = [move(torch.randn(x.shape, generator=g)) for x in actual]
+    assert_same(back(list(torch.autograd.grad(actual, single, given))), gradients(expected, list(raw.values())))
 
 
 @pytest.mark.parametrize("waves", [1, 3])

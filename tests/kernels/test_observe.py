@@ -10,9 +10,10 @@ from gsbench.errors import InputError
 from gsbench.kernels import native
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.refine import refine
-from gsbench.kernels.slices import observe_rotated, observe_triangular
+from gsbench.kernels.slices import observe_rotated, observe_still, observe_triangular
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
+from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.gaussians6d import Gaussians6DModel
 from gsbench.models.gaussians7d import Gaussians7DModel
@@ -115,6 +116,24 @@ def test_rotated_slice() -> None:
     assert_same(actual, expected)
     assert_same(gradients(actual, [*single.values(), *model.log_modulation.parameters()]),
                 gradients(expected, [*raw.values(), *exact.log_modulation.parameters()]))  # fmt: skip
+
+
+def still(dtype: torch.dtype) -> dict[str, Tensor]:
+    g = torch.Generator().manual_seed(5)
+    raw = {"scales": 0.5 * torch.randn(45, 3, generator=g) - 1, "quats": torch.randn(45, 4, generator=g),
+           "opacities": 2 * torch.randn(45, generator=g)}  # fmt: skip
+    raw["scales"][3:5, 0] = torch.tensor([17.0, -17.0])  # beyond where sizes stop
+    return {k: v.to(dtype).requires_grad_() for k, v in raw.items()}
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_still_slice() -> None:
+    """Catches a wrong sign of a rotation's entry, a size that does not stop, or a derivative, at a vector's end too."""
+    raw, single = still(torch.float64), still(torch.float32)
+    expected = [Gaussians3DModel.factors(raw), torch.sigmoid(raw["opacities"])]
+    actual = list(observe_still(*single.values()))
+    assert_same(actual, expected)
+    assert_same(gradients(actual, list(single.values())), gradients(expected, list(raw.values())))
 
 
 def color_inputs(waves: int, dtype: torch.dtype, N: int = 21) -> list[Tensor]:

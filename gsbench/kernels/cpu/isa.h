@@ -18,6 +18,8 @@ void observe_triangular(const TriangularArgs&, const Observation&);
 void observe_triangular_backward(const TriangularArgs&, const Observation& grads, TriangularGrads&);
 void observe_rotated(const RotatedArgs&, const Observation&);
 void observe_rotated_backward(const RotatedArgs&, const Observation& grads, RotatedGrads&);
+void observe_still(const StillArgs&, const StillSlice&);
+void observe_still_backward(const StillArgs&, const StillSlice& grads, const StillGrads&);
 void show_colors(const ColorArgs&, float* colors);
 void show_colors_backward(const ColorArgs&, const ColorGrads&);
 void refine(const RefineArgs&, float* const* out);

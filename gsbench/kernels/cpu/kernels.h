@@ -93,6 +93,21 @@ struct RotatedGrads {
     float lambda_t;
 };
 
+// 3D Gaussians with the factor R diag(exp scales), which are their own slice (3DGS).
+struct StillArgs {
+    int64_t N;
+    const float *scales, *quats, *opacities;  // [N, 3] [N, 4] [N] logits
+    int threads;
+};
+
+struct StillSlice {  // or its gradients
+    float *factors, *opacities;  // [N, 3, 3] [N]
+};
+
+struct StillGrads {
+    float *scales, *quats, *opacities;
+};
+
 // The 3D Gaussians that an observation leaves, or their gradients.
 struct Observation {
     float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
@@ -157,6 +172,8 @@ struct Kernels {
     void (*observe_triangular_backward)(const TriangularArgs&, const Observation& grads, TriangularGrads&);
     void (*observe_rotated)(const RotatedArgs&, const Observation&);
     void (*observe_rotated_backward)(const RotatedArgs&, const Observation& grads, RotatedGrads&);
+    void (*observe_still)(const StillArgs&, const StillSlice&);
+    void (*observe_still_backward)(const StillArgs&, const StillSlice& grads, const StillGrads&);
     void (*show_colors)(const ColorArgs&, float* colors);
     void (*show_colors_backward)(const ColorArgs&, const ColorGrads&);
     void (*refine)(const RefineArgs&, float* const* out);

@@ -146,6 +146,18 @@ void observe_rotated_backward(int64_t N, Address time, Address lambda_t, Address
         {out_means, out_times, out_scales, out_left, out_right, out_opacities, out_lambda_t}, stream);
 }
 
+void observe_still(int64_t N, Address scales, Address quats, Address opacities, Address out_factors,
+                   Address out_opacities, Address stream) {
+    gsb::cuda::observe_still({N, scales, quats, opacities}, {out_factors, out_opacities}, stream);
+}
+
+void observe_still_backward(int64_t N, Address scales, Address quats, Address opacities, Address g_factors,
+                            Address g_opacities, Address out_scales, Address out_quats, Address out_opacities,
+                            Address stream) {
+    gsb::cuda::observe_still_backward({N, scales, quats, opacities}, {g_factors, g_opacities},
+                                      {out_scales, out_quats, out_opacities}, stream);
+}
+
 void show_colors(int64_t N, int degree, int bases, int waves, Address sh0, Address shN, Address means,
                  Address opacities, Address times, Address center, Address time, Address colors, Address stream) {
     gsb::cuda::show_colors({N, degree, bases, waves, sh0, shN, means, opacities, times, center, time}, colors, stream);
@@ -244,6 +256,8 @@ NB_MODULE(GSB_MODULE, m) {
     m.def("observe_triangular_backward", &observe_triangular_backward);
     m.def("observe_rotated", &observe_rotated);
     m.def("observe_rotated_backward", &observe_rotated_backward);
+    m.def("observe_still", &observe_still);
+    m.def("observe_still_backward", &observe_still_backward);
     m.def("show_colors", &show_colors);
     m.def("show_colors_backward", &show_colors_backward);
     m.def("refine", &refine);

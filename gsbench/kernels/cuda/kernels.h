@@ -108,6 +108,20 @@ struct RotatedGrads {
     float* lambda_t;  // [1], zero on entry
 };
 
+// 3D Gaussians with the factor R diag(exp scales), which are their own slice (3DGS).
+struct StillArgs {
+    int64_t N;
+    const float *scales, *quats, *opacities;  // [N, 3] [N, 4] [N] logits
+};
+
+struct StillSlice {  // or its gradients
+    float *factors, *opacities;  // [N, 3, 3] [N]
+};
+
+struct StillGrads {
+    float *scales, *quats, *opacities;
+};
+
 // The 3D Gaussians that an observation leaves, or their gradients.
 struct Observation {
     float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
@@ -194,6 +208,9 @@ void observe_triangular_backward(const TriangularArgs&, const Observation& grads
 
 void observe_rotated(const RotatedArgs&, const Observation&, Stream);
 void observe_rotated_backward(const RotatedArgs&, const Observation& grads, const RotatedGrads&, Stream);
+
+void observe_still(const StillArgs&, const StillSlice&, Stream);
+void observe_still_backward(const StillArgs&, const StillSlice& grads, const StillGrads&, Stream);
 
 void show_colors(const ColorArgs&, float* colors, Stream);
 void show_colors_backward(const ColorArgs&, const ColorGrads&, Stream);

@@ -71,6 +71,25 @@ def rotated_backward(
 
 
 @on_device
+def still(scales: Tensor, quats: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
+    """Factors [N, 3, 3] and opacities [N] of 3D Gaussians."""
+    N, arrays = len(scales), plain(scales, quats, opacities)
+    factors, out = (allocate("a slice's Gaussians", scales, N, *row) for row in ((3, 3), ()))
+    cuda().observe_still(N, *pointers(*arrays, factors, out), stream(scales))
+    return factors, out
+
+
+@on_device
+def still_backward(
+    scales: Tensor, quats: Tensor, opacities: Tensor, g_factors: Tensor, g_opacities: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of the first three."""
+    arrays, out = plain(scales, quats, opacities, g_factors, g_opacities), _like(scales, quats, opacities)
+    cuda().observe_still_backward(len(scales), *pointers(*arrays, *out), stream(scales))
+    return out[0], out[1], out[2]
+
+
+@on_device
 def show(
     sh0: Tensor, shN: Tensor, means: Tensor, opacities: Tensor, times: Tensor, center: Tensor,
     time: Tensor, degree: int, waves: int,

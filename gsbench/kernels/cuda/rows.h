@@ -17,16 +17,26 @@ __device__ inline void store_row(const float (&row)[COUNT], float* rows, int64_t
     GSB_UNROLL for (int k = 0; k < COUNT; ++k) rows[i * COUNT + k] = row[k];
 }
 
+template <int ROWS, int COUNT>
+__device__ inline void load_matrix(const float* rows, int64_t i, float (&out)[ROWS][COUNT]) {
+    GSB_UNROLL for (int row = 0; row < ROWS; ++row) load_row(rows, i * ROWS + row, out[row]);
+}
+
+template <int ROWS, int COUNT>
+__device__ inline void store_matrix(const float (&matrix)[ROWS][COUNT], float* rows, int64_t i) {
+    GSB_UNROLL for (int row = 0; row < ROWS; ++row) store_row(matrix[row], rows, i * ROWS + row);
+}
+
 __device__ inline void store_observed(const Observed<float>& seen, const Observation& out, int64_t i) {
     store_row(seen.mean, out.means, i);
-    GSB_UNROLL for (int row = 0; row < 3; ++row) store_row(seen.factor[row], out.factors, i * 3 + row);
+    store_matrix(seen.factor, out.factors, i);
     out.opacities[i] = seen.opacity;
 }
 
 __device__ inline Observed<float> load_observed(const Observation& o, int64_t i) {
     Observed<float> out;
     load_row(o.means, i, out.mean);
-    GSB_UNROLL for (int row = 0; row < 3; ++row) load_row(o.factors, i * 3 + row, out.factor[row]);
+    load_matrix(o.factors, i, out.factor);
     out.opacity = o.opacities[i];
     return out;
 }

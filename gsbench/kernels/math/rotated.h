@@ -1,6 +1,7 @@
 // One Gaussian over position and time with a rotated factor (4DGS): its slice at a time, and backwards.
 #pragma once
 
+#include "parameters.h"
 #include "slicing.h"
 #include "triangular.h"
 
@@ -11,22 +12,6 @@ template <class T>
 struct RotatedParameters {
     T mean[3], time, scales[4], left[4], right[4], opacity;  // log scales; the last a logit
     T lambda_t;                                              // in gradients only
-};
-
-// A quaternion at length 1, as torch normalises it.
-template <class T>
-struct UnitQuaternion {
-    T q[4], inverse_length;
-
-    GSB_HD explicit UnitQuaternion(const T (&raw)[4]) {
-        const T square = raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2] + raw[3] * raw[3];
-        inverse_length = T(1.0f) / max(sqrt(square), T(1e-12f));
-        GSB_UNROLL for (int i = 0; i < 4; ++i) q[i] = raw[i] * inverse_length;
-    }
-    GSB_HD void vjp(const T (&g)[4], T (&out)[4]) const {
-        const T along = g[0] * q[0] + g[1] * q[1] + g[2] * q[2] + g[3] * q[3];
-        GSB_UNROLL for (int i = 0; i < 4; ++i) out[i] = (g[i] - along * q[i]) * inverse_length;
-    }
 };
 
 // R = M_left(l) M_right(r) (4DGS eq. 7): entry (i, j) of either matrix is +- entry i xor j of its quaternion. Tables

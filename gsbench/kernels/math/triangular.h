@@ -2,22 +2,11 @@
 #pragma once
 
 #include "harmonics.h"
-#include "thresholds.h"
+#include "parameters.h"
 #include "subtraction.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
-
-// exp of a log size held to +-LOG_SIZE_MAX, and its derivative from the value, zero where it was held.
-template <class T>
-GSB_HD inline T size_of(T log) {
-    return exp(clamp(log, T(-LOG_SIZE_MAX), T(LOG_SIZE_MAX)));
-}
-
-template <class T>
-GSB_HD inline T size_vjp(T log, T size, T g) {
-    return select(max(log, T(0.0f) - log) <= T(LOG_SIZE_MAX), g * size, T(0.0f));
-}
 
 // What is the same for all Gaussians of a model.
 struct TriangularModel {

@@ -1,0 +1,38 @@
+// What raw parameters of every model mean: sizes by exp, rotations by quaternions.
+#pragma once
+
+#include "scalar.h"
+#include "thresholds.h"
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+// exp of a log size held to +-LOG_SIZE_MAX, and its derivative from the value, zero where it was held.
+template <class T>
+GSB_HD inline T size_of(T log) {
+    return exp(clamp(log, T(-LOG_SIZE_MAX), T(LOG_SIZE_MAX)));
+}
+
+template <class T>
+GSB_HD inline T size_vjp(T log, T size, T g) {
+    return select(max(log, T(0.0f) - log) <= T(LOG_SIZE_MAX), g * size, T(0.0f));
+}
+
+// A quaternion at length 1, as torch normalises it.
+template <class T>
+struct UnitQuaternion {
+    T q[4], inverse_length;
+
+    GSB_HD explicit UnitQuaternion(const T (&raw)[4]) {
+        const T square = raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2] + raw[3] * raw[3];
+        inverse_length = T(1.0f) / max(sqrt(square), T(1e-12f));
+        GSB_UNROLL for (int i = 0; i < 4; ++i) q[i] = raw[i] * inverse_length;
+    }
+    GSB_HD void vjp(const T (&g)[4], T (&out)[4]) const {
+        const T along = g[0] * q[0] + g[1] * q[1] + g[2] * q[2] + g[3] * q[3];
+        GSB_UNROLL for (int i = 0; i < 4; ++i) out[i] = (g[i] - along * q[i]) * inverse_length;
+    }
+};
+
+}  // namespace GSB_ISA
+}  // namespace gsb
