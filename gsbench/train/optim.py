@@ -1,14 +1,18 @@
 """Adam with a learning rate a parameter, whose moments follow the Gaussians when density control moves rows."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from gsbench.config import LearningRate, ModelConfig
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.adam import adam
 from gsbench.models import GaussianModel
+
+if TYPE_CHECKING:  # the configuration needs hydra, which a machine that checks kernels may not have
+    from gsbench.config import LearningRate, ModelConfig
 
 OPTIMIZERS = ("adam", "sparse_adam")
 

@@ -1,0 +1,34 @@
+"""`make gpu-check` on the machine it is written for, which has torch and what builds, but not all that gsbench needs."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+WITHOUT_HYDRA = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("hydra", "omegaconf", "lpips"):
+            raise ModuleNotFoundError(name)
+
+sys.meta_path.insert(0, Missing())
+"""
+
+
+def test_nothing_it_runs_needs_hydra() -> None:
+    """Catches an import by which a GPU machine's tests and benchmarks all fail, where none can be had to see it."""
+    collect = [
+        "-p",
+        "no:hydra_pytest",
+        "-p",
+        "no:cacheprovider",
+        "-q",
+        "--collect-only",
+        "tests/kernels",
+        "tests/raster",
+    ]
+    code = f"{WITHOUT_HYDRA}\nimport benchmarks.gpu, benchmarks.gpu_small, pytest\nsys.exit(pytest.main({collect}))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
