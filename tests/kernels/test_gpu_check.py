@@ -1,4 +1,4 @@
-"""`make gpu-check` on the machine it is written for, which has torch and what builds, but not all that gsbench needs."""
+"""`make gpu-check` on the machine it is written for: it has torch and what builds, not all that gsbench needs."""
 
 import subprocess
 import sys
