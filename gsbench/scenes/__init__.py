@@ -1,12 +1,11 @@
 """Scenes from files: `load(path)` finds the layout by what lies in the folder."""
 
+import importlib
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from gsbench.errors import InputError
-from gsbench.scenes import blender
 from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent
 
 __all__ = ["Camera", "Points", "Scene", "View", "load", "scene_extent"]
@@ -18,7 +17,7 @@ class _Layout:
 
     marker: str
     expected: str  # the files of the layout and where such data is published, for the message when nothing is found
-    load: Callable[..., Scene]  # (root, *, downscale, background)
+    reader: str  # module of this package with load(root, *, downscale, background); drawing a model needs none
 
 
 _LAYOUTS = (
@@ -26,7 +25,7 @@ _LAYOUTS = (
         "transforms_train.json",
         "transforms_{train,val,test}.json beside the PNG images they name (D-NeRF: data.zip, linked in "
         "github.com/albertpumarola/D-NeRF; 7DGS-PBR: the Data link of gaozhongpai.github.io/7dgs)",
-        blender.load,
+        "blender",
     ),
 )
 
@@ -52,7 +51,9 @@ def load(
     root = Path(path)
     for layout in _LAYOUTS:
         if (root / layout.marker).is_file():
-            return layout.load(root, downscale=downscale, background=background)
+            reader = importlib.import_module(f"gsbench.scenes.{layout.reader}")
+            scene: Scene = reader.load(root, downscale=downscale, background=background)
+            return scene
     found = "a folder without it" if root.is_dir() else "no such folder"
     layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
     raise InputError(f"{root}: {found}: looked for {layouts}")
