@@ -107,6 +107,10 @@ _observe_backward.register_kernel("cuda")(on_cuda.observe_backward)
 _observe.register_autograd(_observe_gradient, setup_context=_observe_context)
 
 
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # noqa: ARG001
+    ctx.save_for_backward(*inputs)
+
+
 def observe_rotated(
     means: Tensor,  # [N, 3]
     times: Tensor,  # [N, 1]
@@ -167,10 +171,6 @@ def _(*arrays: Any) -> tuple[Tensor, ...]:
     return *(rows_like(x) for x in arrays[:6]), rows_like(arrays[7])
 
 
-def _rotated_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # noqa: ARG001
-    ctx.save_for_backward(*inputs)
-
-
 def _rotated_gradient(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
     *g, g_lambda = _rotated_backward(*ctx.saved_tensors, *grads)
     return *g, None, g_lambda
@@ -178,7 +178,7 @@ def _rotated_gradient(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
 
 _rotated.register_kernel("cuda")(on_cuda.rotated)
 _rotated_backward.register_kernel("cuda")(on_cuda.rotated_backward)
-_rotated.register_autograd(_rotated_gradient, setup_context=_rotated_context)
+_rotated.register_autograd(_rotated_gradient, setup_context=_keep)
 
 
 def observe_still(
@@ -224,14 +224,10 @@ def _(*arrays: Tensor) -> tuple[Tensor, ...]:
     return tuple(rows_like(x) for x in arrays[:3])
 
 
-def _still_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # noqa: ARG001
-    ctx.save_for_backward(*inputs)
-
-
 def _still_gradient(ctx: Any, *grads: Tensor) -> tuple[Tensor, ...]:
     return tuple(_still_backward(*ctx.saved_tensors, *grads))
 
 
 _still.register_kernel("cuda")(on_cuda.still)
 _still_backward.register_kernel("cuda")(on_cuda.still_backward)
-_still.register_autograd(_still_gradient, setup_context=_still_context)
+_still.register_autograd(_still_gradient, setup_context=_keep)

@@ -17,6 +17,7 @@ from gsbench.models.replay import Replay
 from gsbench.raster.cuda import splat_within
 from gsbench.scenes.scene import Camera
 
+pytestmark = pytest.mark.filterwarnings("ignore:raster backend 'auto'")  # the shim is built, and there is no GPU
 BACKGROUND = (0.1, 0.5, 0.9)
 CONFIG: Any = SimpleNamespace(backend="auto", antialias=False)  # the schema needs hydra, which not every GPU has
 

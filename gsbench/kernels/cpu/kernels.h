@@ -4,6 +4,7 @@
 #include <cstdint>
 
 #include "../math/adam.h"
+#include "../slices.h"
 
 namespace gsb {
 
@@ -98,19 +99,6 @@ struct StillArgs {
     int64_t N;
     const float *scales, *quats, *opacities;  // [N, 3] [N, 4] [N] logits
     int threads;
-};
-
-struct StillSlice {  // or its gradients
-    float *factors, *opacities;  // [N, 3, 3] [N]
-};
-
-struct StillGrads {
-    float *scales, *quats, *opacities;
-};
-
-// The 3D Gaussians that an observation leaves, or their gradients.
-struct Observation {
-    float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
 };
 
 // Colours by spherical harmonics in the direction from `center`, times `waves` frequencies of time.

@@ -7,6 +7,8 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "../slices.h"
+
 struct CUstream_st;
 
 namespace gsb::cuda {
@@ -112,19 +114,6 @@ struct RotatedGrads {
 struct StillArgs {
     int64_t N;
     const float *scales, *quats, *opacities;  // [N, 3] [N, 4] [N] logits
-};
-
-struct StillSlice {  // or its gradients
-    float *factors, *opacities;  // [N, 3, 3] [N]
-};
-
-struct StillGrads {
-    float *scales, *quats, *opacities;
-};
-
-// The 3D Gaussians that an observation leaves, or their gradients.
-struct Observation {
-    float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
 };
 
 // Colours by spherical harmonics in the direction from `center`, times `waves` frequencies of time.
