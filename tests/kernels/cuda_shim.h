@@ -86,6 +86,7 @@ inline unsigned __ballot_sync(unsigned, bool predicate) {
 inline bool __any_sync(unsigned mask, bool predicate) { return __ballot_sync(mask, predicate) != 0; }
 
 inline float __fdividef(float x, float y) { return x / y; }
+inline float __log2f(float x) { return std::log2(x); }
 inline int __popc(unsigned x) { return __builtin_popcount(x); }
 inline uint32_t __float_as_uint(float x) { return gsb::cuda::shim::bits(x); }
 

@@ -5,15 +5,16 @@
 
 namespace gsb::cuda {
 
-constexpr float POWER_MARGIN = 0.01f;  // on log2(255 opacity), lest rounding cut off a pixel
+constexpr float POWER_MARGIN = 0.01f;  // on log2(255 opacity), lest rounding cut off a pixel; far above that of the
+                                       // instructions that divide and take logarithms fast
 
 struct Reach {
     float x, y, p, q, r, foot_x, foot_y, most_power;
 
     __device__ Reach(float2 mean, float4 root) : x(mean.x), y(mean.y), p(root.x), q(root.y), r(root.z) {
-        foot_y = -q / r;
-        foot_x = -q * r / (p * p + q * q);
-        most_power = log2f(255.0f * root.w) + POWER_MARGIN;
+        foot_y = __fdividef(-q, r);
+        foot_x = __fdividef(-q * r, p * p + q * q);
+        most_power = __log2f(255.0f * root.w) + POWER_MARGIN;
     }
 
     // By the centres of the pixels [left, left + width) x [top, top + height).
