@@ -86,70 +86,70 @@ struct Reflections {
     GSB_HD void reduce(const T (&rows)[N][N], Reduced<T, K>& t) {
         const T zero(0.0f), one(1.0f);
         T rest[N][N];
-        for (int i = 0; i < N; ++i) {
-            for (int j = 0; j < N; ++j) rest[i][j] = rows[i][j];
+        GSB_UNROLL for (int i = 0; i < N; ++i) {
+            GSB_UNROLL for (int j = 0; j < N; ++j) rest[i][j] = rows[i][j];
         }
         t.zero();
-        for (int k = 0; k < K; ++k) {
+        GSB_UNROLL for (int k = 0; k < K; ++k) {
             T square = zero;
-            for (int j = k; j < N; ++j) square = square + rest[k][j] * rest[k][j];
+            GSB_UNROLL for (int j = k; j < N; ++j) square = square + rest[k][j] * rest[k][j];
             const T length = select(square > zero, sqrt(select(square > zero, square, one)), zero);
             const T signed_length = select(rest[k][k] < zero, zero - length, length);
             T vv = zero;
-            for (int j = k; j < N; ++j) {
+            GSB_UNROLL for (int j = k; j < N; ++j) {
                 v[k][j] = j == k ? rest[k][j] + signed_length : rest[k][j];
                 vv = vv + v[k][j] * v[k][j];
             }
             step[k] = T(2.0f) / select(vv > zero, vv, one);
             t.qq[k][k] = zero - signed_length;
-            for (int j = k; j < N; ++j) before[k][k][j] = rest[k][j];
-            for (int i = k + 1; i < N; ++i) {
+            GSB_UNROLL for (int j = k; j < N; ++j) before[k][k][j] = rest[k][j];
+            GSB_UNROLL for (int i = k + 1; i < N; ++i) {
                 T along = zero;
-                for (int j = k; j < N; ++j) {
+                GSB_UNROLL for (int j = k; j < N; ++j) {
                     before[k][i][j] = rest[i][j];
                     along = along + rest[i][j] * v[k][j];
                 }
                 along = along * step[k];
-                for (int j = k; j < N; ++j) rest[i][j] = rest[i][j] - along * v[k][j];
+                GSB_UNROLL for (int j = k; j < N; ++j) rest[i][j] = rest[i][j] - along * v[k][j];
                 (i < K ? t.qq[i][k] : t.pq[i - K][k]) = rest[i][k];
             }
         }
-        for (int i = 0; i < 3; ++i) {
-            for (int j = 0; j < 3; ++j) t.pp[i][j] = rest[K + i][K + j];
+        GSB_UNROLL for (int i = 0; i < 3; ++i) {
+            GSB_UNROLL for (int j = 0; j < 3; ++j) t.pp[i][j] = rest[K + i][K + j];
         }
     }
 
     // The gradient of `rows`.
     GSB_HD void vjp(const Reduced<T, K>& g_t, T (&g)[N][N]) const {
         const T zero(0.0f), one(1.0f);
-        for (int i = 0; i < N; ++i) {
-            for (int j = 0; j < N; ++j) {
+        GSB_UNROLL for (int i = 0; i < N; ++i) {
+            GSB_UNROLL for (int j = 0; j < N; ++j) {
                 g[i][j] = i < K ? (j <= i ? g_t.qq[i][j] : zero) : j < K ? g_t.pq[i - K][j] : g_t.pp[i - K][j - K];
             }
         }
-        for (int k = K - 1; k >= 0; --k) {
+        GSB_UNROLL for (int k = K - 1; k >= 0; --k) {
             T g_v[N];
-            for (int j = k; j < N; ++j) g_v[j] = zero;
-            for (int i = k + 1; i < N; ++i) {
+            GSB_UNROLL for (int j = k; j < N; ++j) g_v[j] = zero;
+            GSB_UNROLL for (int i = k + 1; i < N; ++i) {
                 T along = zero, g_along = zero;
-                for (int j = k; j < N; ++j) {
+                GSB_UNROLL for (int j = k; j < N; ++j) {
                     along = along + before[k][i][j] * v[k][j];
                     g_along = g_along + g[i][j] * v[k][j];
                 }
                 along = along * step[k];
                 g_along = g_along * step[k];
-                for (int j = k; j < N; ++j) {
+                GSB_UNROLL for (int j = k; j < N; ++j) {
                     g_v[j] = g_v[j] - along * g[i][j] - g_along * before[k][i][j] + along * g_along * v[k][j];
                     g[i][j] = g[i][j] - g_along * v[k][j];
                 }
             }
             // Row k became -signed_length; v is the row plus signed_length in its first place.
             T square = zero;
-            for (int j = k; j < N; ++j) square = square + before[k][k][j] * before[k][k][j];
+            GSB_UNROLL for (int j = k; j < N; ++j) square = square + before[k][k][j] * before[k][k][j];
             const T first = before[k][k][k];
             const T inverse = select(square > zero, one / sqrt(select(square > zero, square, one)), zero);
             const T g_length = (g_v[k] - g[k][k]) * select(first < zero, zero - inverse, inverse);
-            for (int j = k; j < N; ++j) g[k][j] = g_v[j] + g_length * before[k][k][j];
+            GSB_UNROLL for (int j = k; j < N; ++j) g[k][j] = g_v[j] + g_length * before[k][k][j];
         }
     }
 };

@@ -61,8 +61,8 @@ struct TriangularGaussian {
             }
         } else {
             T rows[N][N];
-            for (int i = 0; i < N; ++i) {
-                for (int j = 0; j < N; ++j) rows[i][j] = j <= row(i) ? L[row(i)][j] : zero;
+            GSB_UNROLL for (int i = 0; i < N; ++i) {
+                GSB_UNROLL for (int j = 0; j < N; ++j) rows[i][j] = j <= row(i) ? L[row(i)][j] : zero;
             }
             reduction.reduce(rows, t);
         }
@@ -163,8 +163,8 @@ private:
         } else {
             T g_rows[N][N];
             reduction.vjp(g_t, g_rows);
-            for (int i = 0; i < N; ++i) {
-                for (int j = 0; j <= row(i); ++j) g_L[row(i)][j] = g_rows[i][j];
+            GSB_UNROLL for (int i = 0; i < N; ++i) {
+                GSB_UNROLL for (int j = 0; j <= row(i); ++j) g_L[row(i)][j] = g_rows[i][j];
             }
         }
         int at = 0;
