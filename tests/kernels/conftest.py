@@ -54,9 +54,10 @@ def cuda_device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     folder = Path(os.environ.get("GSBENCH_SHIM_BUILD") or tmp_path_factory.mktemp("cuda_shim"))
     options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Release", f"-DPython_EXECUTABLE={sys.executable}",
                f"-DGSB_SANITIZE={os.environ.get('GSBENCH_SANITIZE', '')}"]  # fmt: skip
+    plain = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}  # a sanitizer's is not cmake's
     for command in (["cmake", "-S", str(ROOT), "-B", str(folder), *options],
                     ["cmake", "--build", str(folder), "--target", "_cuda"]):  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True)
+        done = subprocess.run(command, capture_output=True, text=True, env=plain)
         assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     spec = importlib.util.spec_from_file_location("_cuda", next(folder.glob("_cuda.*.so")))
     assert spec is not None

@@ -13,6 +13,17 @@
 
 #include "../../gsbench/kernels/cuda/sort.h"
 
+#ifdef GSB_SHIM_RACES
+#include <sanitizer/tsan_interface.h>
+#else
+#define __tsan_get_current_fiber() nullptr
+#define __tsan_create_fiber(flags) nullptr
+#define __tsan_destroy_fiber(fiber)
+#define __tsan_switch_to_fiber(fiber, flags)
+#define __tsan_acquire(token)
+#define __tsan_release(token)
+#endif
+
 namespace gsb::cuda {
 namespace shim {
 
@@ -21,7 +32,7 @@ dim3 block_index, block_size, grid_size;
 
 namespace {
 
-constexpr size_t STACK = 64 * 1024;
+constexpr size_t STACK = 256 * 1024;
 enum class State { ready, at_warp, at_barrier, done };
 
 struct Fiber {
@@ -30,27 +41,47 @@ struct Fiber {
     std::unique_ptr<char[]> stack{new char[STACK]};
     State state = State::ready;
     uint32_t given = 0;
+    unsigned block_syncs = 0, warp_syncs = 0;  // that it took part in
+    void* sanitized = __tsan_create_fiber(0);
+
+    Fiber() = default;
+    Fiber(Fiber&&) = default;
+    ~Fiber() { __tsan_destroy_fiber(sanitized); }
 };
+
+// What the threads of a block or warp did before they met is known to each of them after. Two, as some are on the way to
+// the next meeting while others leave the last.
+using Meetings = std::array<char, 2>;
 
 struct Block {
     std::vector<Fiber> fibers;
     std::vector<std::array<uint32_t, 32>> exchanged;  // by warp
+    Meetings met;
+    std::vector<Meetings> warps_met;
+    char begun, ended;
     ucontext_t scheduler;
+    void* sanitized = __tsan_get_current_fiber();
     const std::function<void()>* body = nullptr;
 };
 Block* block = nullptr;
+constexpr unsigned UNORDERED = 1;  // switching alone makes nothing known: what races on a GPU, races here
 
 Fiber& current() { return block->fibers[thread->number]; }
 
 void wait(State state) {
     Fiber& fiber = current();
     fiber.state = state;
+    __tsan_switch_to_fiber(block->sanitized, UNORDERED);
     swapcontext(&fiber.context, &block->scheduler);
 }
 
 void enter() {
+    __tsan_acquire(&block->begun);
+    __tsan_acquire(&block->ended);  // blocks are taken to run one after the other
     (*block->body)();
+    __tsan_release(&block->ended);
     current().state = State::done;
+    __tsan_switch_to_fiber(block->sanitized, UNORDERED);
 }
 
 // Lets fibers [begin, end) go on if all that live wait in `state`. Returns whether any does.
@@ -79,6 +110,7 @@ void run_block() {
             Fiber& fiber = block->fibers[reversed ? count - 1 - i : i];
             if (fiber.state != State::ready) continue;
             thread = &fiber.thread;
+            __tsan_switch_to_fiber(fiber.sanitized, UNORDERED);
             swapcontext(&block->scheduler, &fiber.context);
         }
         bool progress = false;
@@ -96,7 +128,19 @@ void run_block() {
 
 }  // namespace
 
-void barrier() { wait(State::at_barrier); }
+void barrier() {
+    [[maybe_unused]] char& met = block->met[current().block_syncs++ % 2];
+    __tsan_release(&met);
+    wait(State::at_barrier);
+    __tsan_acquire(&met);
+}
+
+void sync_warp() {
+    [[maybe_unused]] char& met = block->warps_met[thread->number / 32][current().warp_syncs++ % 2];
+    __tsan_release(&met);
+    exchange(0);
+    __tsan_acquire(&met);
+}
 
 const uint32_t* exchange(uint32_t mine) {
     current().given = mine;
@@ -108,9 +152,11 @@ void run(dim3 grid, dim3 size, const std::function<void()>& body) {
     Block b;
     b.fibers = std::vector<Fiber>(size_t{size.x} * size.y * size.z);
     b.exchanged.resize((b.fibers.size() + 31) / 32);
+    b.warps_met.resize(b.exchanged.size());
     b.body = &body;
     block = &b;
     block_size = size, grid_size = grid;
+    __tsan_release(&b.begun);
     const unsigned blocks = grid.x * grid.y * grid.z;
     for (unsigned i = 0; i < blocks; ++i) {
         block_index = {i % grid.x, i / grid.x % grid.y, i / (grid.x * grid.y)};
@@ -126,6 +172,7 @@ void run(dim3 grid, dim3 size, const std::function<void()>& body) {
         }
         run_block();
     }
+    __tsan_acquire(&b.ended);
 }
 
 }  // namespace shim

@@ -1,8 +1,9 @@
 // CUDA on the CPU, as far as gsbench/kernels/cuda uses it: the threads of a block are fibers that take turns.
 //
 // A fiber runs until it needs the others: at a barrier, or where its warp exchanges values. Blocks run one after the
-// other. This proves what a kernel computes, not how fast it is, nor that it is free of races: of those it finds such as
-// show when fibers take turns in one order and then in the other (GSBENCH_SHIM_REVERSED).
+// other. This proves what a kernel computes, not how fast it is. Of races within a block it finds such as show when fibers
+// take turns in one order and then in the other (GSBENCH_SHIM_REVERSED); built with ThreadSanitizer (GSBENCH_SANITIZE=
+// thread) all that happen: there __syncthreads and __syncwarp order memory, and shuffles and votes do not, as CUDA has it.
 #pragma once
 
 #include <cmath>
@@ -37,7 +38,8 @@ extern const Thread* thread;  // that runs
 extern dim3 block_index, block_size, grid_size;
 
 void run(dim3 grid, dim3 block, const std::function<void()>& body);
-void barrier();                          // of the block
+void barrier();                           // of the block
+void sync_warp();
 const uint32_t* exchange(uint32_t mine);  // what the lanes of the warp gave, once all that live have; 0 of others
 
 template <class T>
@@ -63,7 +65,7 @@ T value(uint32_t bits) {
 #define gridDim (gsb::cuda::shim::grid_size)
 
 inline void __syncthreads() { gsb::cuda::shim::barrier(); }
-inline void __syncwarp() { gsb::cuda::shim::exchange(0); }
+inline void __syncwarp() { gsb::cuda::shim::sync_warp(); }
 
 template <class T>
 T __shfl_xor_sync(unsigned, T x, int offset) {
@@ -90,14 +92,16 @@ inline float __log2f(float x) { return std::log2(x); }
 inline int __popc(unsigned x) { return __builtin_popcount(x); }
 inline uint32_t __float_as_uint(float x) { return gsb::cuda::shim::bits(x); }
 
+#define GSB_ATOMIC __attribute__((no_sanitize("thread")))
+
 template <class T>
-T atomicAdd(T* at, T x) {
+GSB_ATOMIC T atomicAdd(T* at, T x) {
     const T old = *at;
     *at += x;
     return old;
 }
 template <class T>
-T atomicOr(T* at, T x) {
+GSB_ATOMIC T atomicOr(T* at, T x) {
     const T old = *at;
     *at |= x;
     return old;

@@ -1,6 +1,7 @@
 #!/bin/sh
-# Runs the kernel tests on kernels built with AddressSanitizer and UndefinedBehaviorSanitizer: any finding is a failure.
-# The CUDA kernels, too, by the shim that runs them on the CPU.
+# Runs the kernel tests on kernels built with AddressSanitizer and UndefinedBehaviorSanitizer, those for CUDA by the shim
+# that runs them on the CPU; then these once more with ThreadSanitizer, for races between the threads of a block. Any
+# finding is a failure.
 # Usage: tests/kernels/sanitize.sh [python]
 set -eu
 cd "$(dirname "$0")/../.."
@@ -22,3 +23,8 @@ LD_PRELOAD="$(c++ -print-file-name=libasan.so) $(c++ -print-file-name=libstdc++.
     GSBENCH_SANITIZE=address,undefined \
     "$python" -m pytest tests/kernels -o "pythonpath=$build/site tests" -p no:cacheprovider \
     --ignore tests/kernels/test_cuda_compiles.py  # nvcc does not run with that runtime loaded
+# Only the CUDA kernels are built with ThreadSanitizer: what else runs is not looked at. It needs addresses not shuffled.
+LD_PRELOAD="$(c++ -print-file-name=libtsan.so) $(c++ -print-file-name=libstdc++.so)" \
+    TSAN_OPTIONS=halt_on_error=1:ignore_noninstrumented_modules=1 OMP_NUM_THREADS=1 GSBENCH_SANITIZE=thread \
+    setarch "$(uname -m)" -R "$python" -m pytest tests/kernels/test_cuda.py tests/kernels/test_cuda_models.py \
+    tests/kernels/test_cuda_replay.py -p no:cacheprovider
