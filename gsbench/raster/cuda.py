@@ -79,7 +79,7 @@ def _flags(*values: Tensor) -> Tensor:
     `values` are means, factors, opacities, colors, viewmats, Ks, background.
     """
     means, _, _, colors, viewmats, *_ = values
-    flags = torch.zeros(1, dtype=torch.int64, device=means.device)
-    cuda().flag_values(len(means), len(viewmats), colors.numel(), colors.shape[-1], *pointers(*plain(*values), flags),
+    flags, rows = torch.zeros(1, dtype=torch.int64, device=means.device), plain(*values)
+    cuda().flag_values(len(means), len(viewmats), colors.numel(), colors.shape[-1], *pointers(*rows, flags),
                        stream(means))  # fmt: skip
     return flags

@@ -164,7 +164,9 @@ private:
             T g_rows[N][N];
             reduction.vjp(g_t, g_rows);
             GSB_UNROLL for (int i = 0; i < N; ++i) {
-                GSB_UNROLL for (int j = 0; j <= row(i); ++j) g_L[row(i)][j] = g_rows[i][j];
+                GSB_UNROLL for (int j = 0; j < N; ++j) {
+                    if (j <= row(i)) g_L[row(i)][j] = g_rows[i][j];
+                }
             }
         }
         int at = 0;
