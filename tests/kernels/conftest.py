@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -40,15 +41,12 @@ def threads() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def cuda_device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Where the CUDA kernels run: `cuda`, or `cpu` with the kernels replaced by those of the shim (cuda_shim.h).
+def shim(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
+    """The CUDA kernels built to run on the CPU (cuda_shim.h), once a session.
 
-    The shim is built once a session, or kept in the folder GSBENCH_SHIM_BUILD; with the sanitizers GSBENCH_SANITIZE
-    names. Skips without the tools to build it.
+    They are kept in the folder GSBENCH_SHIM_BUILD, and have the sanitizers GSBENCH_SANITIZE names. Skips without the
+    tools to build them.
     """
-    if cuda.available():
-        yield "cuda"
-        return
     if not all(map(shutil.which, ("cmake", "ninja", "c++"))):
         pytest.skip("needs a GPU and the built extension, or cmake, ninja and a C++ compiler for the shim")
     folder = Path(os.environ.get("GSBENCH_SHIM_BUILD") or tmp_path_factory.mktemp("cuda_shim"))
@@ -62,8 +60,15 @@ def cuda_device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     spec = importlib.util.spec_from_file_location("_cuda", next(folder.glob("_cuda.*.so")))
     assert spec is not None
     assert spec.loader is not None
-    shim = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(shim)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cuda, "_cuda", shim)
-        yield "cpu"
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def cuda_device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Where the CUDA kernels run: `cuda`, or `cpu` with the kernels replaced by those of the shim."""
+    if cuda.available():
+        return "cuda"
+    monkeypatch.setattr(cuda, "_cuda", request.getfixturevalue("shim"))
+    return "cpu"
