@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -108,16 +108,16 @@ class Case:
         return [place.cost(torch.no_grad()(call)), backward, place.cost(both)]
 
 
-def attempted(case: Callable[[], Case], name: str, section: str, place: Place) -> Iterator[Row]:
+def attempted(section: str, case: str, measure: Callable[[], Iterable[Row]]) -> Iterator[Row]:
     """The rows of a case, or one that says how it failed: the others are still measured."""
     try:
-        yield from case().rows(place)
+        yield from measure()
     except Exception as error:
-        yield failure(section, name, error)
+        yield {"section": section, "case": case, "failed": in_a_line(error)}
 
 
-def failure(section: str, case: str, error: Exception) -> Row:
-    return {"section": section, "case": case, "failed": f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"}
+def in_a_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
 def compared(section: str, case: str, way: str, ours: Cost, theirs: Cost | None) -> Row:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.compare import Call, Case, Cost, Place, Row, attempted, compared, failure
+from benchmarks.compare import Call, Case, Cost, Place, Row, attempted, compared
 from benchmarks.gsplat_way import gsplat_image
 from benchmarks.rows import useful_alphas
 from benchmarks.scene import camera, gaussians, model
@@ -36,7 +36,7 @@ def raster_rows(place: Place) -> Iterator[Row]:
     sizes = [(1_000, 64)] if not place.on_gpu else itertools.product((10_000, 100_000, 1_000_000), (400, 800, 1600))
     for N, size in sizes:
         case = f"{N} / {size}x{size}"
-        yield from attempted(lambda a=(place, case, N, size): raster_case(*a), case, "raster", place)
+        yield from attempted("raster", case, lambda a=(place, case, N, size): raster_case(*a).rows(place))
 
 
 def raster_case(place: Place, case: str, N: int, size: int) -> Case:
@@ -64,11 +64,13 @@ def backward_rows(place: Place) -> Iterator[Row]:
     """The raster's backward with a pixel a lane against a splat a lane (docs/gpu.md)."""
     sizes = itertools.product((10_000, 100_000, 1_000_000), (400, 800, 1600)) if place.on_gpu else ()
     for N, size in sizes:
-        name = f"{N} / {size}x{size}, theirs is a splat a lane"
-        try:
-            yield compared("backward", name, "backward", *(backward_cost(place, N, size, x) for x in (False, True)))
-        except Exception as error:
-            yield failure("backward", name, error)
+        case = f"{N} / {size}x{size}, theirs is a splat a lane"
+        yield from attempted("backward", case, lambda a=(place, case, N, size): [backward_row(*a)])
+
+
+def backward_row(place: Place, case: str, N: int, size: int) -> Row:
+    by_pixel, by_splat = (backward_cost(place, N, size, by_splat) for by_splat in (False, True))
+    return compared("backward", case, "backward", by_pixel, by_splat)
 
 
 def backward_cost(place: Place, N: int, size: int, by_splat: bool) -> Cost:
@@ -87,7 +89,7 @@ def frame_rows(place: Place) -> Iterator[Row]:
     N, sizes = (500, (48,)) if not place.on_gpu else (100_000, (400, 800))
     for name, agr, size in itertools.product(("4dgs", "6dgs", "7dgs"), (False, True), sizes):
         case = f"{name} {'with' if agr else 'without'} AGR, {N} / {size}x{size}"
-        yield from attempted(lambda a=(place, case, name, agr, N, size): frame_case(*a), case, "frame", place)
+        yield from attempted("frame", case, lambda a=(place, case, name, agr, N, size): frame_case(*a).rows(place))
 
 
 def frame_case(place: Place, case: str, name: str, agr: bool, N: int, size: int) -> Case:
@@ -120,16 +122,17 @@ def replay_rows(place: Place) -> Iterator[Row]:
     N, sizes = 100_000, (400, 800) if place.on_gpu else ()
     for name, agr, size in itertools.product(("3dgs", "4dgs", "6dgs", "7dgs"), (False, True), sizes):
         case = f"{name} {'with' if agr else 'without'} AGR, {N} / {size}x{size}, theirs is launched"
-        try:
-            fitted, background = model(name, N, agr=agr).to(place.device), torch.zeros(3, device=place.device)
-            viewmats, Ks = place.put(camera(size))
-            seen, config = Camera(viewmats[0], Ks[0], size, size), SimpleNamespace(backend="auto", antialias=False)
-            replay = Replay(fitted, background, config)
-            with torch.no_grad():
-                launched = place.cost(lambda a=(fitted, seen, TIME, background, config): render(*a))
-            yield compared("replay", case, "forward", place.cost(lambda a=replay, b=seen: a(b, TIME)), launched)
-        except Exception as error:
-            yield failure("replay", case, error)
+        yield from attempted("replay", case, lambda a=(place, case, name, agr, N, size): [replay_row(*a)])
+
+
+def replay_row(place: Place, case: str, name: str, agr: bool, N: int, size: int) -> Row:
+    fitted, background = model(name, N, agr=agr).to(place.device), torch.zeros(3, device=place.device)
+    viewmats, Ks = place.put(camera(size))
+    seen, config = Camera(viewmats[0], Ks[0], size, size), SimpleNamespace(backend="auto", antialias=False)
+    replay = Replay(fitted, background, config)
+    with torch.no_grad():
+        launched = place.cost(lambda: render(fitted, seen, TIME, background, config))
+    return compared("replay", case, "forward", place.cost(lambda: replay(seen, TIME)), launched)
 
 
 def step_rows(place: Place) -> Iterator[Row]:
@@ -137,11 +140,12 @@ def step_rows(place: Place) -> Iterator[Row]:
     N, sizes = (500, (48,)) if not place.on_gpu else (100_000, (400, 800))
     for agr, size in itertools.product((False, True), sizes):
         case = f"7dgs {'with' if agr else 'without'} AGR, {N} / {size}x{size}"
-        try:
-            ours, theirs = steps(place, agr, N, size)
-            yield compared("step", case, "all", place.cost(ours), place.cost(theirs) if place.gsplat else None)
-        except Exception as error:
-            yield failure("step", case, error)
+        yield from attempted("step", case, lambda a=(place, case, agr, N, size): [step_row(*a)])
+
+
+def step_row(place: Place, case: str, agr: bool, N: int, size: int) -> Row:
+    ours, theirs = steps(place, agr, N, size)
+    return compared("step", case, "all", place.cost(ours), place.cost(theirs) if place.gsplat else None)
 
 
 def steps(place: Place, agr: bool, N: int, size: int) -> list[Call]:

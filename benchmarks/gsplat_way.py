@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
-from benchmarks.compare import Place
+from benchmarks.compare import Place, in_a_line
 from benchmarks.scene import camera, gaussians
 
 
@@ -16,7 +16,7 @@ def why_not(place: Place) -> str | None:
         quats, scales = means.new_ones(10, 4), factors.norm(dim=1)
         gsplat_image(means, quats, scales, opacities, colors, viewmats=viewmats, Ks=Ks, size=16)
     except Exception as error:  # not installed, not built for this torch, no compiler, ..
-        return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        return in_a_line(error)
     return None
 
 

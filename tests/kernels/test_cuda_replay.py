@@ -14,6 +14,7 @@ from gsbench.errors import InputError
 from gsbench.models import replay
 from gsbench.models.render import render
 from gsbench.models.replay import Replay
+from gsbench.raster import EPS2D, FAR, NEAR
 from gsbench.raster.cuda import splat_within
 from gsbench.scenes.scene import Camera
 
@@ -103,7 +104,8 @@ def test_too_little_room_is_told(N: int, room: int, device: str) -> None:
         means, factors, opacities, colors = fitted.slice(seen.center, 0.4)
         image, needed = splat_within(
             means[:N], factors[:N], opacities[:N], colors[None, :N], seen.viewmat[None], seen.K[None],
-            torch.tensor(BACKGROUND, device=device), replay.View(seen.width, seen.height, 0.01, 1e10, 0.3, False), room,
+            torch.tensor(BACKGROUND, device=device),
+            replay.View(seen.width, seen.height, NEAR, FAR, EPS2D, antialias=False), room,
         )  # fmt: skip
     assert needed.tolist()[-1] == 0
     assert image.isfinite().all()

@@ -181,17 +181,17 @@ struct RefineValues {
     }
 };
 
-gsb::cuda::RefineArgs refine_args(int64_t N, const std::vector<int>& widths, const RefineValues& features,
+gsb::cuda::RefineArgs refine_args(int64_t N, const std::vector<int>& widths, const RefineValues& read,
                                   const RefineValues& moved, Address weight_in, Address bias_in, Address weight_out,
                                   Address bias_out) {
     using namespace gsb::cuda;
     RefineArgs args{N, 0, static_cast<int>(widths.size()), 0, {}, {}, {}, weight_in, bias_in, weight_out, bias_out};
     const auto fits = [](bool good) { if (!good) throw nb::value_error("networks too large, or not of these values"); };
-    fits(widths.size() <= MAX_NETWORKS && features.widths.size() + 1 == widths.size() && !moved.widths.empty());
-    for (size_t array = 0; array < features.widths.size(); ++array) {
-        for (int c = 0; c < features.widths[array]; ++c) {
+    fits(!widths.empty() && widths.size() <= MAX_NETWORKS && read.widths.size() >= widths.size());
+    for (size_t array = 0; array + 1 < widths.size(); ++array) {  // the features: what all networks but the last move
+        for (int c = 0; c < read.widths[array]; ++c) {
             fits(args.features_width < MAX_FEATURES - 1);
-            args.features[args.features_width++] = features.column(array, c);
+            args.features[args.features_width++] = read.column(array, c);
         }
     }
     size_t array = 0;
@@ -210,10 +210,8 @@ gsb::cuda::RefineArgs refine_args(int64_t N, const std::vector<int>& widths, con
 void refine(int64_t N, const std::vector<int>& widths, const std::vector<int>& value_widths,
             const std::vector<uintptr_t>& values, Address weight_in, Address bias_in, Address weight_out,
             Address bias_out, const std::vector<uintptr_t>& out, Address stream) {
-    const auto features = static_cast<std::ptrdiff_t>(widths.size()) - 1;
     const RefineValues moved{values, out, value_widths};
-    const RefineValues read{values, out, {value_widths.begin(), value_widths.begin() + features}};
-    gsb::cuda::refine(refine_args(N, widths, read, moved, weight_in, bias_in, weight_out, bias_out), stream);
+    gsb::cuda::refine(refine_args(N, widths, moved, moved, weight_in, bias_in, weight_out, bias_out), stream);
 }
 
 void refine_backward(int64_t N, const std::vector<int>& widths, const std::vector<int>& value_widths,
@@ -221,9 +219,8 @@ void refine_backward(int64_t N, const std::vector<int>& widths, const std::vecto
                      Address bias_out, const std::vector<uintptr_t>& g_out, const std::vector<uintptr_t>& out_features,
                      Address by_network, Address out_weight_in, Address out_bias_in, Address out_weight_out,
                      Address out_bias_out, Address stream) {
-    const auto features = static_cast<std::ptrdiff_t>(widths.size()) - 1;
     const RefineValues moved{g_out, std::vector<uintptr_t>(g_out.size()), value_widths};
-    const RefineValues read{values, out_features, {value_widths.begin(), value_widths.begin() + features}};
+    const RefineValues read{values, out_features, value_widths};
     gsb::cuda::refine_backward(refine_args(N, widths, read, moved, weight_in, bias_in, weight_out, bias_out),
                                {by_network, out_weight_in, out_bias_in, out_weight_out, out_bias_out}, stream);
 }

@@ -44,9 +44,8 @@ __global__ void __launch_bounds__(PATCHES * WARP) blend_kernel(BlendArgs a, Pict
 }  // namespace
 
 void blend(const BlendArgs& a, const Picture& out, Stream stream) {
-    const auto tiles = static_cast<unsigned>(a.C * tiles_along(a.width) * tiles_along(a.height));
     for (int first = 0; first < a.D; first += CHANNELS) {
-        launch(blend_kernel, tiles, PATCHES * WARP, stream, a, out, first);
+        launch(blend_kernel, tiles_of(a), PATCHES * WARP, stream, a, out, first);
     }
 }
 

@@ -84,8 +84,4 @@ __device__ inline float* sum_of(const BlendGrads& grads, const Patch& patch, int
 void blend_backward_by_pixel(const BlendArgs&, const Picture&, const BlendGrads&, int first_channel, Stream);
 void blend_backward_by_splat(const BlendArgs&, const Picture&, const BlendGrads&, int first_channel, Stream);
 
-inline unsigned tiles_of(const BlendArgs& a) {
-    return static_cast<unsigned>(a.C * tiles_along(a.width) * tiles_along(a.height));
-}
-
 }  // namespace gsb::cuda

@@ -7,43 +7,31 @@
 namespace gsb::cuda {
 namespace {
 
-struct Waiting {
-    int32_t id, position;
-};
-
 // Of a warp, in shared memory.
 struct Traffic {
     Place places[WARP];
     ColorGrad colors[WARP];
-    Waiting waiting[2 * WARP];  // splats that reach the patch, back to front: a ring
+    int waiting[2 * WARP];  // positions of splats that reach the patch, back to front: a ring
     alignas(16) float sums[WARP][12];  // of splats that all pixels have passed; nine of twelve, to be aligned
     int32_t ids[WARP];                 // theirs; -1: none
 };
 
-// A splat in its lane. Without one its alpha is zero.
-struct Host {
-    float x, y, p, q, r, opacity, color[CHANNELS];
-    int32_t id, position;
-
-    __device__ Host() : x(0), y(0), p(0), q(0), r(0), opacity(0), color{}, id(-1), position(0) {}
-
-    __device__ Host(const Patch& patch, Waiting w) : id(w.id), position(w.position) {
-        const float2 mean = reinterpret_cast<const float2*>(patch.args.means2d)[id];
-        const float4 root = reinterpret_cast<const float4*>(patch.args.roots)[id];
-        x = mean.x, y = mean.y, p = root.x, q = root.y, r = root.z, opacity = root.w;
-        patch.load_color(id, color);
-    }
-};
+// A lane without a splat: its alpha is zero.
+__device__ StagedSplat nobody() {
+    StagedSplat s{};
+    s.id = -1;
+    return s;
+}
 
 // Lets splats of the list wait until there is one for every lane or no more; `end` is where the list is not yet read.
-__device__ void let_wait(const Patch& patch, Waiting* waiting, int first, int& count, int& end) {
+__device__ void let_wait(const Patch& patch, int* waiting, int first, int& count, int& end) {
     while (count < WARP && end > 0) {
         const int position = end - 1 - patch.lane;
-        const bool reached = position >= 0 && patch.reached_at(position);
+        const bool reached = position >= 0 && patch.is_reached_by(patch.splat_at(position));
         const unsigned all = __ballot_sync(ALL_LANES, reached);
         if (reached) {
             const int place = first + count + __popc(all & ((1u << patch.lane) - 1));
-            waiting[place % (2 * WARP)] = {patch.id_at(position), position};
+            waiting[place % (2 * WARP)] = position;
         }
         count += __popc(all);
         end -= WARP;
@@ -64,13 +52,17 @@ __global__ void __launch_bounds__(PATCHES * WARP)
     Behind behind = start.behind;
     int first = 0, count = 0, end = last_stop(start.place.stop);  // of the ring; of the list
     if (end == 0) return;
-    Host host;
+    StagedSplat host = nobody();
     float sums[SUMS] = {};
     const int source = (patch.lane + WARP - 1) % WARP;
     for (int before = 0, n = WARP; n > 0;) {
         let_wait(patch, traffic.waiting, first, count, end);
         before = n, n = count < WARP ? count : WARP;
-        const Host next = patch.lane < n ? Host(patch, traffic.waiting[(first + patch.lane) % (2 * WARP)]) : Host();
+        StagedSplat next = nobody();
+        if (patch.lane < n) {
+            next = patch.splat_at(traffic.waiting[(first + patch.lane) % (2 * WARP)]);
+            patch.load_color(next);
+        }
         first += n, count -= n;
         const int steps = n > 0 ? WARP : before;  // at last, until the pixels have passed the splats before
         for (int step = 0; step < steps; ++step) {

@@ -20,6 +20,10 @@ struct alignas(16) StagedSplat {
     float color[CHANNELS];
 };
 
+inline unsigned tiles_of(const BlendArgs& a) {
+    return static_cast<unsigned>(a.C * tiles_along(a.width) * tiles_along(a.height));
+}
+
 struct Patch {
     const BlendArgs& args;
     int64_t camera;
@@ -45,18 +49,26 @@ struct Patch {
     __device__ bool inside(int k) const { return x(k) < args.width && y(k) < args.height; }
     __device__ int64_t pixel(int k) const { return (camera * args.height + y(k)) * args.width + x(k); }
 
-    __device__ int32_t id_at(int position) const { return args.ids[begin + position]; }
-
-    __device__ bool reached_at(int position) const {
-        const int32_t id = id_at(position);
-        return Reach(reinterpret_cast<const float2*>(args.means2d)[id], reinterpret_cast<const float4*>(args.roots)[id])
-            .touches(left, top, PATCH_X, PATCH_Y);
+    // The splat at a position of the list, but for its colour.
+    __device__ StagedSplat splat_at(int position) const {
+        StagedSplat s{};
+        s.id = args.ids[begin + position];
+        s.position = position;
+        const float2 mean = reinterpret_cast<const float2*>(args.means2d)[s.id];
+        const float4 root = reinterpret_cast<const float4*>(args.roots)[s.id];
+        s.x = mean.x, s.y = mean.y;
+        s.p = root.x, s.q = root.y, s.r = root.z, s.opacity = root.w;
+        return s;
     }
 
-    __device__ void load_color(int32_t id, float (&out)[CHANNELS]) const {
-        const int64_t row = args.color_per_camera ? id : id - camera * args.N;
+    __device__ bool is_reached_by(const StagedSplat& s) const {
+        return Reach({s.x, s.y}, {s.p, s.q, s.r, s.opacity}).touches(left, top, PATCH_X, PATCH_Y);
+    }
+
+    __device__ void load_color(StagedSplat& s) const {
+        const int64_t row = args.color_per_camera ? s.id : s.id - camera * args.N;
         const float* color = args.colors + row * args.D + first_channel;
-        for (int k = 0; k < CHANNELS; ++k) out[k] = k < count ? color[k] : 0.0f;
+        for (int k = 0; k < CHANNELS; ++k) s.color[k] = k < count ? color[k] : 0.0f;
     }
 
     // The splats at positions [first, first + 32) of the list that reach the patch, in order. Returns how many.
@@ -65,17 +77,12 @@ struct Patch {
         bool reached = false;
         StagedSplat s;
         if (position < size) {
-            s.id = id_at(position);
-            const float2 mean = reinterpret_cast<const float2*>(args.means2d)[s.id];
-            const float4 root = reinterpret_cast<const float4*>(args.roots)[s.id];
-            s.x = mean.x, s.y = mean.y;
-            s.p = root.x, s.q = root.y, s.r = root.z, s.opacity = root.w;
-            s.position = position;
-            reached = Reach(mean, root).touches(left, top, PATCH_X, PATCH_Y);
+            s = splat_at(position);
+            reached = is_reached_by(s);
         }
         const unsigned all = __ballot_sync(ALL_LANES, reached);
         if (reached) {
-            load_color(s.id, s.color);
+            load_color(s);
             staged[__popc(all & ((1u << lane) - 1))] = s;
         }
         __syncwarp();

@@ -34,7 +34,7 @@ class View(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """Gaussians as C cameras see them."""
+    """Gaussians as C cameras see them, in rows."""
 
     means2d: Tensor  # [C, N, 2] pixels
     roots: Tensor  # [C, N, 4]: p, q, r of the inverse 2D covariance's triangular root (math/projection.h); the opacity
@@ -42,9 +42,7 @@ class Splats(NamedTuple):
     half_sizes: Tensor  # [C, N, 2] pixels, beyond which alpha < 1/255; without a gradient
 
 
-def project(
-    means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, view: View
-) -> Splats:  # fmt: skip
+def project(means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, view: View) -> Splats:
     """Project Gaussians."""
     return Splats(*_Project.apply(means, factors, opacities, viewmats, Ks, view))
 
@@ -92,7 +90,6 @@ def bin_tiles(splats: Splats, view: View, flags: Tensor) -> tuple[Bins, int]:
     Raises:
         InputError: more pairs than int32 counts.
     """
-    splats = Splats(*plain(*splats))
     order, ends = _count(splats, view, flags)
     *total, flagged = ends[-2:].tolist()
     pairs = total[0] if total else 0
@@ -107,7 +104,6 @@ def bin_within(splats: Splats, view: View, flags: Tensor, room: int) -> tuple[Bi
 
     Returns how many there were, if there are Gaussians, and `flags`: [2] int64.
     """
-    splats = Splats(*plain(*splats))
     order, ends = _count(splats, view, flags)
     lists = _room(splats, room)
     lists[0].fill_(-1)  # no tile: what is not filled sorts behind all others
