@@ -7,6 +7,7 @@ from torch import Tensor
 
 from gsbench.models import GaussianModel, build
 from gsbench.models.base import Stage
+from gsbench.models.factors import KINDS
 from gsbench.scenes.scene import Points
 
 SIGMA = 0.0083  # median standard deviation along an axis: a mean 3-sigma radius of 5 pixels at 400 x 400
@@ -41,7 +42,7 @@ def model(name: str, N: int, *, agr: bool = False, seed: int = 0, **options: Any
     made.initialise(Points(torch.rand(N, 3, generator=g) * 2 - 1, torch.rand(N, 3, generator=g)), 1.0, g)
     with torch.no_grad():
         for key, parameter in made.splats.items():
-            if key in ("off_diagonal", "shN"):
+            if key in (*KINDS, "shN"):
                 parameter.add_(0.02 * torch.randn(parameter.shape, generator=g))
             if key == "opacities":
                 parameter.copy_(torch.randn(N, generator=g))

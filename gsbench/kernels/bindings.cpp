@@ -175,50 +175,56 @@ double l1_ssim(In<-1, -1, 3> image, In<-1, -1, 3> target, double ssim_weight, in
 }
 
 gsb::TriangularArgs triangular_args(const In<-1, 3>& means, const In<-1, 3>& directions, const In<-1>& times,
-                                    const In<-1, -1>& log_diagonal, const In<-1, -1>& off_diagonal,
+                                    const In<-1, -1>& log_diagonal, const In<-1, 3>& shape,
+                                    const In<-1, -1>& motion, const In<-1, -1>& coupling,
                                     const In<-1>& opacities, const In<3>& center, double time, double lambda_d,
-                                    double lambda_t, double half, bool conditioned_first, bool row_scaled,
-                                    bool subtracts, int threads) {
-    const int64_t N = size(means.shape(0)), n = size(log_diagonal.shape(1));
+                                    double lambda_t, double half, bool conditioned_first, int form, bool subtracts,
+                                    int threads) {
+    const int64_t N = size(means.shape(0)), n = size(log_diagonal.shape(1)), k = n - 3;
     const bool has_time = n == 7;
     if (n != 6 && n != 7) throw std::invalid_argument("expected a factor of 6 or 7 rows");
-    expect_all(N, "N", directions.shape(0), log_diagonal.shape(0), off_diagonal.shape(0), opacities.shape(0));
+    expect_all(N, "N", directions.shape(0), log_diagonal.shape(0), shape.shape(0), motion.shape(0), coupling.shape(0),
+               opacities.shape(0));
     expect_all(has_time ? N : 0, "times", times.shape(0));
-    expect_all(n * (n - 1) / 2, "the entries below the diagonal", off_diagonal.shape(1));
+    expect_all(3 * k, "the entries of motion", motion.shape(1));
+    expect_all(k * (k - 1) / 2, "the entries of coupling", coupling.shape(1));
     const Frame frame(1, 1, threads);
     const float *at = center.data(), *t = has_time ? times.data() : nullptr;
-    return {N, conditioned_first, row_scaled, subtracts, static_cast<float>(half), static_cast<float>(lambda_d),
-            static_cast<float>(lambda_t), static_cast<float>(time), {at[0], at[1], at[2]}, means.data(),
-            directions.data(), t, log_diagonal.data(), off_diagonal.data(), opacities.data(), threads};
+    return {N, conditioned_first, static_cast<gsb::OffDiagonal>(form), subtracts, static_cast<float>(half),
+            static_cast<float>(lambda_d), static_cast<float>(lambda_t), static_cast<float>(time),
+            {at[0], at[1], at[2]}, means.data(), directions.data(), t, log_diagonal.data(), shape.data(), motion.data(),
+            coupling.data(), opacities.data(), threads};
 }
 
 void observe_triangular(In<-1, 3> means, In<-1, 3> directions, In<-1> times, In<-1, -1> log_diagonal,
-                        In<-1, -1> off_diagonal, In<-1> opacities, In<3> center, double time, double lambda_d,
-                        double lambda_t, double half, bool conditioned_first, bool row_scaled, bool subtracts,
-                        int threads, Out<-1, 3> out_means, Out<-1, 3, 3> out_factors, Out<-1> out_opacities) {
-    const auto args = triangular_args(means, directions, times, log_diagonal, off_diagonal, opacities, center, time,
-                                      lambda_d, lambda_t, half, conditioned_first, row_scaled, subtracts, threads);
+                        In<-1, 3> shape, In<-1, -1> motion, In<-1, -1> coupling, In<-1> opacities, In<3> center,
+                        double time, double lambda_d, double lambda_t, double half, bool conditioned_first, int form,
+                        bool subtracts, int threads, Out<-1, 3> out_means, Out<-1, 3, 3> out_factors, Out<-1> out_opacities) {
+    const auto args = triangular_args(means, directions, times, log_diagonal, shape, motion, coupling, opacities, center,
+                                      time, lambda_d, lambda_t, half, conditioned_first, form, subtracts, threads);
     expect_all(args.N, "N", out_means.shape(0), out_factors.shape(0), out_opacities.shape(0));
     nb::gil_scoped_release release;
     active->observe_triangular(args, {out_means.data(), out_factors.data(), out_opacities.data()});
 }
 
 void observe_triangular_backward(In<-1, 3> means, In<-1, 3> directions, In<-1> times, In<-1, -1> log_diagonal,
-                                 In<-1, -1> off_diagonal, In<-1> opacities, In<3> center, double time, double lambda_d,
-                                 double lambda_t, double half, bool conditioned_first, bool row_scaled, bool subtracts,
-                                 int threads, Out<-1, 3> g_means, Out<-1, 3, 3> g_factors, Out<-1> g_opacities,
+                                 In<-1, 3> shape, In<-1, -1> motion, In<-1, -1> coupling, In<-1> opacities,
+                                 In<3> center, double time, double lambda_d, double lambda_t, double half,
+                                 bool conditioned_first, int form, bool subtracts, int threads, Out<-1, 3> g_means, Out<-1, 3, 3> g_factors, Out<-1> g_opacities,
                                  Out<-1, 3> out_means, Out<-1, 3> out_directions, Out<-1> out_times,
-                                 Out<-1, -1> out_log_diagonal, Out<-1, -1> out_off_diagonal, Out<-1> out_opacities,
-                                 Out<2> out_lambdas) {
-    const auto args = triangular_args(means, directions, times, log_diagonal, off_diagonal, opacities, center, time,
-                                      lambda_d, lambda_t, half, conditioned_first, row_scaled, subtracts, threads);
+                                 Out<-1, -1> out_log_diagonal, Out<-1, 3> out_shape, Out<-1, -1> out_motion,
+                                 Out<-1, -1> out_coupling, Out<-1> out_opacities, Out<2> out_lambdas) {
+    const auto args = triangular_args(means, directions, times, log_diagonal, shape, motion, coupling, opacities, center,
+                                      time, lambda_d, lambda_t, half, conditioned_first, form, subtracts, threads);
     expect_all(args.N, "N", g_means.shape(0), g_factors.shape(0), g_opacities.shape(0), out_means.shape(0),
                out_directions.shape(0), out_opacities.shape(0));
     expect_all(size(times.size()), "times", out_times.size());
     expect_all(size(log_diagonal.size()), "the diagonal", out_log_diagonal.size());
-    expect_all(size(off_diagonal.size()), "the entries below the diagonal", out_off_diagonal.size());
+    expect_all(args.N, "N", out_shape.shape(0));
+    expect_all(size(motion.size()), "the entries of motion", out_motion.size());
+    expect_all(size(coupling.size()), "the entries of coupling", out_coupling.size());
     gsb::TriangularGrads grads{out_means.data(), out_directions.data(), out_times.data(), out_log_diagonal.data(),
-                               out_off_diagonal.data(), out_opacities.data(), {}};
+                               out_shape.data(), out_motion.data(), out_coupling.data(), out_opacities.data(), {}};
     {
         nb::gil_scoped_release release;
         active->observe_triangular_backward(args, {g_means.data(), g_factors.data(), g_opacities.data()}, grads);

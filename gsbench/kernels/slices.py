@@ -14,8 +14,10 @@ def observe_triangular(
     means: Tensor,  # [N, 3]
     directions: Tensor,  # [N, 3]
     times: Tensor | None,  # [N, 1], None: time is not observed
-    log_diagonal: Tensor,  # [N, n], n = 6 without time, 7 with
-    off_diagonal: Tensor,  # [N, n (n - 1) / 2]
+    log_diagonal: Tensor,  # [N, k + 3], k = 3 without time, 4 with
+    shape: Tensor,  # [N, 3]
+    motion: Tensor,  # [N, 3 k]
+    coupling: Tensor,  # [N, k (k - 1) / 2]
     opacities: Tensor,  # [N] logits
     center: Tensor,  # [3]
     time: Tensor | None,  # []
@@ -23,7 +25,7 @@ def observe_triangular(
     lambda_t: Tensor | None,  # []
     *,
     conditioned_first: bool,
-    row_scaled: bool = False,
+    form: int = 0,
     directional_half: bool = True,
     subtracts: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -31,36 +33,38 @@ def observe_triangular(
 
     The square-root scheme of `gsbench.models.slicing` for the parameters of `gsbench.models.triangular`, with
     f_temp and f_dir (7DGS eq. 9 to 12) in the opacities. `conditioned_first` is the order of the factor's rows,
-    (d, t, p), else (p, t, d). With `subtracts` by the scheme `cholesky` instead, which is there on the CPU only.
+    (d, t, p), else (p, t, d); `form`, what its entries below the diagonal are, is a place in
+    `gsbench.models.factors.OFF_DIAGONALS`. With `subtracts` by the scheme `cholesky` instead, which is there on the CPU
+    only.
 
     Raises:
         InputError: not float32 on one device, shapes that do not fit, or a gradient by `center` is asked for.
     """
-    N, n = len(means), 6 if times is None else 7
+    N, k = len(means), 3 if times is None else 4
     empty = means.new_empty(0)
-    arrays = {"means": (means, (N, 3)), "directions": (directions, (N, 3)), "log_diagonal": (log_diagonal, (N, n)),
-              "off_diagonal": (off_diagonal, (N, n * (n - 1) // 2)), "opacities": (opacities, (N,)),
-              "center": (center, (3,))}  # fmt: skip
+    arrays = {"means": (means, (N, 3)), "directions": (directions, (N, 3)), "log_diagonal": (log_diagonal, (N, k + 3)),
+              "shape": (shape, (N, 3)), "motion": (motion, (N, 3 * k)), "coupling": (coupling, (N, k * (k - 1) // 2)),
+              "opacities": (opacities, (N,)), "center": (center, (3,))}  # fmt: skip
     if times is not None:
         arrays["times"] = (times, (N, 1))
     check("observe_triangular", arrays)
     check_constant("observe_triangular", "center", center)
     return _observe(
-        means, directions, empty if times is None else times[:, 0], log_diagonal, off_diagonal, opacities, center,
-        empty if time is None or times is None else time, lambda_d, empty if lambda_t is None else lambda_t,
-        0.5 if directional_half else 1.0, conditioned_first, row_scaled, subtracts,
+        means, directions, empty if times is None else times[:, 0], log_diagonal, shape, motion, coupling, opacities,
+        center, empty if time is None or times is None else time, lambda_d, empty if lambda_t is None else lambda_t,
+        0.5 if directional_half else 1.0, conditioned_first, form, subtracts,
     )  # fmt: skip
 
 
 @custom_op("gsbench::observe_triangular", mutates_args=())
 def _observe(
-    means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
-    center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
-    row_scaled: bool, subtracts: bool,
+    means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, shape: Tensor, motion: Tensor,
+    coupling: Tensor, opacities: Tensor, center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float,
+    conditioned_first: bool, form: int, subtracts: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     out = means.new_empty(len(means), 3), means.new_empty(len(means), 3, 3), means.new_empty(len(means))
-    arrays = plain(means, directions, times, log_diagonal, off_diagonal, opacities, center)
-    native().observe_triangular(*arrays, *map(number, (time, lambda_d, lambda_t)), half, conditioned_first, row_scaled,
+    arrays = plain(means, directions, times, log_diagonal, shape, motion, coupling, opacities, center)
+    native().observe_triangular(*arrays, *map(number, (time, lambda_d, lambda_t)), half, conditioned_first, form,
                                 subtracts, threads(), *out)  # fmt: skip
     return out
 
@@ -73,33 +77,33 @@ def _(means: Tensor, *_: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 @custom_op("gsbench::observe_triangular_backward", mutates_args=())
 def _observe_backward(
-    means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
-    center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
-    row_scaled: bool, subtracts: bool, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    arrays = plain(means, directions, times, log_diagonal, off_diagonal, opacities)
+    means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, shape: Tensor, motion: Tensor,
+    coupling: Tensor, opacities: Tensor, center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float,
+    conditioned_first: bool, form: int, subtracts: bool, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    arrays = plain(means, directions, times, log_diagonal, shape, motion, coupling, opacities)
     out = tuple(rows_like(x) for x in arrays)
     lambdas = means.new_empty(2)
     native().observe_triangular_backward(
-        *arrays, *plain(center), *map(number, (time, lambda_d, lambda_t)), half, conditioned_first, row_scaled,
+        *arrays, *plain(center), *map(number, (time, lambda_d, lambda_t)), half, conditioned_first, form,
         subtracts, threads(), *plain(g_means, g_factors, g_opacities), *out, lambdas,
     )  # fmt: skip
-    return out[0], out[1], out[2], out[3], out[4], out[5], lambdas
+    return out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7], lambdas
 
 
 @_observe_backward.register_fake
 def _(*arrays: Any) -> tuple[Tensor, ...]:
-    return *(rows_like(x) for x in arrays[:6]), arrays[0].new_empty(2)
+    return *(rows_like(x) for x in arrays[:8]), arrays[0].new_empty(2)
 
 
 def _observe_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # noqa: ARG001
-    ctx.save_for_backward(*inputs[:10])
-    ctx.rest = inputs[10:]
+    ctx.save_for_backward(*inputs[:12])
+    ctx.rest = inputs[12:]
 
 
 def _observe_gradient(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
     *g, lambdas = _observe_backward(*ctx.saved_tensors, *ctx.rest, *grads)
-    return *g, None, None, lambdas[0], lambdas[1] if ctx.needs_input_grad[9] else None, None, None, None, None
+    return *g, None, None, lambdas[0], lambdas[1] if ctx.needs_input_grad[11] else None, None, None, None, None
 
 
 _observe.register_kernel("cuda")(on_cuda.observe)

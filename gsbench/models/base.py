@@ -57,7 +57,7 @@ class GaussianModel(nn.Module, ABC):
 
     observes: ClassVar[tuple[str, ...]] = ()  # of "time", "direction"
     centers: ClassVar[tuple[str, ...]] = ("means",)  # raw parameters that are means: AGR reads and moves these ..
-    shape: ClassVar[tuple[str, ...]]  # .. and moves these, which make the factor
+    geometry: ClassVar[tuple[str, ...]]  # .. and moves these, which make the factor
     backend = "auto"  # who slices, paints and refines: as of `gsbench.raster.rasterize`
 
     def __init__(self, *, agr: bool = False, sh_degree: int = 3) -> None:
@@ -81,7 +81,7 @@ class GaussianModel(nn.Module, ABC):
 
     @abstractmethod
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Raw parameters named in `centers` and `shape`, less `means`; neighbours of points are at `distances` [N]."""
+        """Raw parameters named in `centers` and `geometry`, less `means`; `distances` [N] are those to neighbours."""
 
     @abstractmethod
     def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
@@ -129,7 +129,7 @@ class GaussianModel(nn.Module, ABC):
         raw |= self.initial_colors((points.colors - 0.5) / SH_C0)
         self.splats = nn.ParameterDict({name: nn.Parameter(value.clone()) for name, value in raw.items()})
         if self.agr:
-            shape = sum(raw[name].shape[-1] for name in self.shape)
+            shape = sum(raw[name].shape[-1] for name in self.geometry)
             self.refinement = Refinement([*(raw[name].shape[-1] for name in self.centers), shape], generator)
         self.set_stage(self.stage)
 
@@ -168,7 +168,7 @@ class GaussianModel(nn.Module, ABC):
         raw: Raw = dict(self.splats.items())
         if self.refinement is None or not self.stage.refine or time is None:
             return raw
-        names = (*self.centers, *self.shape)
+        names = (*self.centers, *self.geometry)
         moved = self.refinement([raw[name] for name in names], time, native=self.uses_kernels(raw["means"]))
         return raw | dict(zip(names, moved, strict=True))
 
@@ -215,7 +215,7 @@ class GaussianModel(nn.Module, ABC):
     @torch.no_grad()
     def split(self, rows: Tensor, generator: torch.Generator) -> None:
         """Turn rows [M], CHILDREN copies of each parent in a row, into its children."""
-        raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.shape)}
+        raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.geometry)}
         for name, value in self.divide(raw, generator).items():
             self.splats[name].data[rows] = value
 

@@ -4,8 +4,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.thresholds import LOG_SIZE_MAX
 from gsbench.models.slicing import triangularise
+
+OFF_DIAGONALS = ("relative", "raw", "row_scaled")  # forms of `Triangle`; math/off_diagonal.h has them in this order
+KINDS = ("shape", "motion", "coupling")  # of entries below the diagonal
 
 
 def sizes(logs: Tensor) -> Tensor:
@@ -13,42 +17,81 @@ def sizes(logs: Tensor) -> Tensor:
     return logs.clamp(-LOG_SIZE_MAX, LOG_SIZE_MAX).exp()
 
 
-def triangular(
-    log_diagonal: Tensor,  # [N, n]
-    off_diagonal: Tensor,  # [N, n(n-1)/2]
-    *,
-    row_scaled: bool = False,
-) -> Tensor:  # [N, n, n]
-    """Lower triangular L whose diagonal is positive by exp (7DGS, section 4.1).
+class Triangle:
+    """Which entries of a triangular factor over p, t and d are shape, motion and coupling, and what these are.
 
-    Args:
-        log_diagonal: logarithms of the diagonal.
-        off_diagonal: the entries below it, row by row.
-        row_scaled: an entry is (2 sigmoid(x) - 1) times its row's diagonal, as some 6DGS code has it, not x itself.
+    Below the diagonal of L there are three kinds of entries, each with its unit and so with its learning rate:
+    `shape` in the rows and columns of p is how a slice is skewed, relative to the Gaussian's own size; `motion` in the
+    rows of p and the columns of t and d is how far it moves for one standard deviation of t or d, in world units (over
+    (p, t, d): of t and d for one of p); `coupling` is what is left, among t and d.
     """
-    n = log_diagonal.shape[-1]
-    diagonal = sizes(log_diagonal)
-    rows = []
-    for i, (below, d) in enumerate(zip(off_diagonal.split(list(range(n)), -1), diagonal.split(1, -1), strict=True)):
-        entries = (2 * torch.sigmoid(below) - 1) * d if row_scaled else below
-        rows.append(F.pad(torch.cat([entries, d], -1), (0, n - 1 - i)))
-    return torch.stack(rows, 1)
 
+    def __init__(self, letters: str, form: str = "relative") -> None:
+        """Lay out the factor whose rows are `letters`, such as "dddtppp".
 
-def triangular_parameters(factor: Tensor, *, row_scaled: bool = False) -> tuple[Tensor, Tensor]:
-    """Undo `triangular`: log_diagonal [N, n] and off_diagonal [N, n(n-1)/2] of any square factor [N, n, n] of S.
+        Args:
+            letters: the variable of each row: "p", "t" or "d".
+            form: `relative`: an entry of shape is stated in units of its row's diagonal, so that it means the same for
+                a Gaussian of any size; `raw`: every entry is itself, as the 7DGS paper has it; `row_scaled`: every
+                entry is (2 sigmoid(x) - 1) times its row's diagonal, as the authors' later code has it.
 
-    With `row_scaled`, entries that form cannot reach (as large as their diagonal or larger) are cut to 99.9 % of it.
-    """
-    n = factor.shape[-1]
-    L, _ = triangularise(factor, n)
-    L = L * torch.where(L.diagonal(dim1=1, dim2=2) < 0, -1.0, 1.0)[:, None, :]
-    diagonal = L.diagonal(dim1=1, dim2=2)
-    i, j = torch.tril_indices(n, n, -1, device=factor.device)
-    off_diagonal = L[:, i, j]
-    if row_scaled:
-        off_diagonal = 2 * torch.atanh((off_diagonal / diagonal[:, i]).clamp(-0.999, 0.999))
-    return diagonal.log(), off_diagonal
+        Raises:
+            InputError: an unknown form.
+        """
+        if form not in OFF_DIAGONALS:
+            raise InputError(f"off_diagonal '{form}' is not known. {did_you_mean(form, OFF_DIAGONALS)}")
+        self.form = form
+        below = [(i, j) for i in range(len(letters)) for j in range(i)]  # row by row, as `entries` has them
+        places: dict[str, list[int]] = {"shape": [], "motion": [], "coupling": []}
+        for place, (i, j) in enumerate(below):
+            in_space = (letters[i] + letters[j]).count("p")
+            places[("coupling", "motion", "shape")[in_space]].append(place)
+        self.places = places  # by kind, where its entries stand among all
+        self.rows = [i for i, _ in below]
+        relative = {"relative": places["shape"], "raw": [], "row_scaled": range(len(below))}[form]
+        self.is_relative = torch.tensor([place in relative for place in range(len(below))])
+
+    def factor(self, log_diagonal: Tensor, kinds: dict[str, Tensor]) -> Tensor:
+        """Lower triangular L whose diagonal is positive by exp (7DGS, section 4.1).
+
+        Args:
+            log_diagonal: [N, n] logarithms of the diagonal.
+            kinds: the parameters of KINDS, [N, 3], [N, 3 k] and [N, k (k - 1) / 2] for n = k + 3.
+        """  # [N, n, n]
+        n = log_diagonal.shape[-1]
+        diagonal = sizes(log_diagonal)
+        x = self.join(kinds)
+        if self.form == "row_scaled":
+            x = 2 * torch.sigmoid(x) - 1
+        x = torch.where(self.is_relative.to(x.device), x * diagonal[:, self.rows], x)
+        rows = zip(x.split(list(range(n)), -1), diagonal.split(1, -1), strict=True)
+        return torch.stack([F.pad(torch.cat(row, -1), (0, n - 1 - i)) for i, row in enumerate(rows)], 1)
+
+    def parameters(self, factor: Tensor) -> dict[str, Tensor]:
+        """Undo `factor`: log_diagonal, shape, motion and coupling of any square factor [N, n, n] of S.
+
+        In the form `row_scaled`, entries that it cannot reach (as large as their diagonal or larger) are cut to 99.9 %
+        of it.
+        """
+        n = factor.shape[-1]
+        L, _ = triangularise(factor, n)
+        L = L * torch.where(L.diagonal(dim1=1, dim2=2) < 0, -1.0, 1.0)[:, None, :]
+        diagonal = L.diagonal(dim1=1, dim2=2)
+        i, j = torch.tril_indices(n, n, -1, device=factor.device)
+        x = L[:, i, j]
+        x = torch.where(self.is_relative.to(x.device), x / diagonal[:, self.rows], x)
+        if self.form == "row_scaled":
+            x = 2 * torch.atanh(x.clamp(-0.999, 0.999))
+        return {"log_diagonal": diagonal.log()} | self.split(x)
+
+    def split(self, below: Tensor) -> dict[str, Tensor]:
+        """Parameters below the diagonal, [N, n (n - 1) / 2] row by row, by their kind."""
+        return {kind: below[:, self.places[kind]] for kind in KINDS}
+
+    def join(self, kinds: dict[str, Tensor]) -> Tensor:
+        """Undo `split`."""
+        order = [place for kind in KINDS for place in self.places[kind]]
+        return torch.cat([kinds[kind] for kind in KINDS], -1)[:, sorted(range(len(order)), key=order.__getitem__)]
 
 
 def rotation(quaternions: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from gsbench.scenes.scene import Points
 class Gaussians3DModel(GaussianModel):
     """Means, log scales and quaternions: F = R S, cov = R S S R^T (3DGS eq. 6)."""
 
-    shape = ("scales", "quats")
+    geometry = ("scales", "quats")
 
     def __init__(self, **options: Any) -> None:
         """Options as `GaussianModel`."""

@@ -23,7 +23,7 @@ class Gaussians4DModel(GaussianModel):
 
     observes = ("time",)
     centers = ("means", "times")
-    shape = ("scales", "left_quats", "right_quats")
+    geometry = ("scales", "left_quats", "right_quats")
 
     def __init__(
         self, *, time_degree: int = 2, scheme: str = "square_root", lambda_t: float = 1.0, **options: Any

@@ -11,7 +11,7 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.slices import observe_triangular
 from gsbench.kernels.thresholds import EXPONENT_MAX
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
-from gsbench.models.factors import triangular, triangular_parameters
+from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.scene import Points
 
@@ -29,7 +29,7 @@ class TriangularModel(GaussianModel):
     reduced factor is the marginal one of d.
     """
 
-    shape = ("log_diagonal", "off_diagonal")
+    geometry = ("log_diagonal", *KINDS)
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class TriangularModel(GaussianModel):
         lambda_d: float,
         factor_order: str = "conditioned_first",
         scheme: str = "square_root",
-        row_scaled: bool = False,
+        off_diagonal: str = "relative",
         directional_half: bool = True,
         **options: Any,
     ) -> None:
@@ -47,7 +47,7 @@ class TriangularModel(GaussianModel):
             lambda_d: initial sensitivity of f_dir.
             factor_order: `paper`, the factor triangular over (p, t, d), or `conditioned_first`, over (d, t, p).
             scheme: of `slice_gaussians`.
-            row_scaled: see `triangular`.
+            off_diagonal: what the parameters below the diagonal are, the `form` of `Triangle`.
             directional_half: whether f_dir has the 1/2 of 7DGS eq. 12, which 6DGS lacks.
             options: as `GaussianModel`.
 
@@ -61,20 +61,21 @@ class TriangularModel(GaussianModel):
         self.modulate("direction", lambda_d)
         self.factor_order = factor_order
         self.scheme = scheme
-        self.row_scaled = row_scaled
         self.directional_half = directional_half
         # Row numbers of p, d and t in the triangular factor, and the order that sorts its rows to (p, d, t).
         letters = "".join(x * WIDTH[x] for x in FACTOR_ORDERS[factor_order] if x != "t" or "time" in self.observes)
         self.rows = {x: [i for i, letter in enumerate(letters) if letter == x] for x in "pdt"}
+        self.triangle = Triangle(letters, off_diagonal)
         self.is_reduced = factor_order == "conditioned_first" and scheme == "square_root"
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Spheres; directions uniform on the unit sphere, of scale 1; time scale sqrt(T / 10); no correlation."""
-        N, n = len(distances), sum(map(len, self.rows.values()))
-        log_diagonal = torch.zeros(N, n)
+        N = len(distances)
+        log_diagonal = torch.zeros(N, sum(map(len, self.rows.values())))
         log_diagonal[:, self.rows["p"]] = distances.log()[:, None]
         log_diagonal[:, self.rows["t"]] = 0.5 * math.log(1 / 10)
-        raw = {"log_diagonal": log_diagonal, "off_diagonal": torch.zeros(N, n * (n - 1) // 2)}
+        raw = {"log_diagonal": log_diagonal}
+        raw |= {kind: torch.zeros(N, len(places)) for kind, places in self.triangle.places.items()}
         raw["directions"] = F.normalize(torch.randn(N, 3, generator=generator), dim=-1)
         if "time" in self.observes:
             raw["times"] = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
@@ -114,14 +115,16 @@ class TriangularModel(GaussianModel):
             raw["directions"],
             raw["times"] if "time" in self.observes else None,
             raw["log_diagonal"],
-            raw["off_diagonal"],
+            raw["shape"],
+            raw["motion"],
+            raw["coupling"],
             raw["opacities"],
             camera_center,
             time,
             self.modulation("direction"),
             self.modulation("time") if "time" in self.observes else None,
             conditioned_first=self.factor_order == "conditioned_first",
-            row_scaled=self.row_scaled,
+            form=OFF_DIAGONALS.index(self.triangle.form),
             directional_half=self.directional_half,
             subtracts=self.scheme == "cholesky",
         )
@@ -155,12 +158,11 @@ class TriangularModel(GaussianModel):
         p_rows = torch.cat([gain @ T_qq, T_pp], -1)
         q_rows = torch.cat([T_qq, T_pp.new_zeros(len(T_qq), T_qq.shape[1], 3)], -1)
         factor = torch.cat([p_rows, q_rows], 1)[:, self._own_order()]
-        children["log_diagonal"], children["off_diagonal"] = triangular_parameters(factor, row_scaled=self.row_scaled)
-        return children
+        return children | self.triangle.parameters(factor)
 
     def factors(self, raw: Raw) -> Tensor:
         """The triangular factor with its rows sorted to (p, d, t), [N, n, n]."""
-        L = triangular(raw["log_diagonal"], raw["off_diagonal"], row_scaled=self.row_scaled)
+        L = self.triangle.factor(raw["log_diagonal"], raw)
         return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
 
     def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:

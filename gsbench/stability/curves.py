@@ -13,7 +13,7 @@ from gsbench import kernels
 from gsbench.measure.speed import synchroniser
 from gsbench.models import build
 from gsbench.models.slicing import SCHEMES
-from gsbench.models.triangular import FACTOR_ORDERS
+from gsbench.models.triangular import FACTOR_ORDERS, TriangularModel
 from gsbench.stability import picture_cases, pictures, population, slices
 from gsbench.stability.cases import backends_with, device_of
 from gsbench.stability.picture_cases import Arguments
@@ -92,7 +92,9 @@ def accuracy_for_time(backends: list[str]) -> Iterator[Point]:
 def _sliced(hard: population.Hard, known: population.Truth, scheme: str, backend: str, dtype: torch.dtype) -> Point:
     model = population.all_seen("paper", scheme, backend).to(dtype)
     device = device_of(backend)
-    raw = {name: value.to(device, dtype).requires_grad_() for name, value in population.raw_parameters(hard).items()}
+    raw = {
+        name: value.to(device, dtype).requires_grad_() for name, value in population.raw_parameters(hard, model).items()
+    }
     center, moment = torch.zeros(3, device=device, dtype=dtype), torch.zeros((), device=device, dtype=dtype)
 
     def both() -> Tensor:
@@ -151,11 +153,12 @@ def safety(backends: list[str]) -> Iterator[Cost]:
         for scheme in SCHEMES:
             for backend in backends_with(scheme, "7dgs", backends):
                 model = build("7dgs", lambda_d=0.35, lambda_t=0.35, factor_order=order, scheme=scheme)
+                assert isinstance(model, TriangularModel)
                 device, forward, backward = device_of(backend), [], []
                 wait = synchroniser(device)
                 model.backend = backend
                 model.to(device)
-                raw = {k: v.to(device).requires_grad_() for k, v in population.raw_parameters(hard).items()}
+                raw = {k: v.to(device).requires_grad_() for k, v in population.raw_parameters(hard, model).items()}
                 for _ in range(1 if backend == "reference" else REPEATS):
                     start = time.perf_counter()
                     out = model.observe(raw, torch.zeros(3, device=device), torch.zeros((), device=device))

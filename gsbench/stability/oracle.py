@@ -47,14 +47,20 @@ def evaluate(function: Function, at: Sequence[float]) -> Vector:
 
 
 def slice_triangular(x: Vector, layout: dict[str, int], order: str, half: float, log_lambda: dict[str, float],
-                     center: Sequence[float], time: float | None) -> Vector:  # fmt: skip
+                     center: Sequence[float], time: float | None, relative: bool = True) -> Vector:  # fmt: skip
     """6DGS and 7DGS (7DGS eq. 9 to 12). `x` holds the raw parameters named in `layout`, each of so many numbers.
 
-    `order` names the variable of each row of the triangular factor, such as `dddtppp`.
+    `order` names the variable of each row of the triangular factor, such as `dddtppp`. Where it is `relative`, entries
+    of shape are in units of their row's diagonal.
     """
     raw = _unpack(x, layout)
-    n, below = len(order), iter(raw["off_diagonal"])
-    L = [[next(below) for _ in range(i)] + [_size(raw["log_diagonal"][i])] for i in range(n)]
+    n = len(order)
+    L = [[mpf(0)] * i + [_size(raw["log_diagonal"][i])] for i in range(n)]
+    kinds = {0: iter(raw["coupling"]), 1: iter(raw["motion"]), 2: iter(raw["shape"])}  # by how many of two are p
+    for i in range(n):
+        for j in range(i):
+            in_space = (order[i] == "p") + (order[j] == "p")
+            L[i][j] = next(kinds[in_space]) * (L[i][i] if relative and in_space == 2 else 1)
     S = [[mp.fdot(L[i][: min(i, j) + 1], L[j][: min(i, j) + 1]) for j in range(n)] for i in range(n)]
     p, d, t = ([i for i in range(n) if order[i] == name] for name in "pdt")
     direction = unit([m - mpf(c) for m, c in zip(raw["means"], center, strict=True)])

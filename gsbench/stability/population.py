@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from gsbench.models import GaussianModel, build
+from gsbench.models.factors import KINDS, Triangle
 from gsbench.models.slicing import subtract
 from gsbench.models.triangular import FACTOR_ORDERS, TriangularModel
 from gsbench.stability import oracle
@@ -28,7 +29,7 @@ class Hard:
     """Raw parameters of 7D Gaussians with mu_p = 0, seen from there at t = 0: the query (d, t) is 0 and exact."""
 
     log_diagonal: Tensor  # [N, 7] float32
-    off_diagonal: Tensor  # [N, 21]
+    off_diagonal: Tensor  # [N, 21] the factor's entries themselves, row by row
     offset: Tensor  # [N, 4] mu_d, mu_t
 
     def __len__(self) -> int:
@@ -157,7 +158,16 @@ def verify(hard: Hard, order: str, count: int = 8) -> float:
     some = hard.rows(slice(count))
     found = truth(some, order)
     w, W = weights(count)
-    layout = {"log_diagonal": 7, "off_diagonal": 21, "means": 3, "directions": 3, "times": 1, "opacities": 1}
+    layout = {
+        "log_diagonal": 7,
+        "shape": 3,
+        "motion": 12,
+        "coupling": 6,
+        "means": 3,
+        "directions": 3,
+        "times": 1,
+        "opacities": 1,
+    }
     worst = 0.0
     for i in range(count):
         raw = [some.log_diagonal[i], some.off_diagonal[i], torch.zeros(3), some.offset[i], torch.zeros(1)]
@@ -174,7 +184,11 @@ def verify(hard: Hard, order: str, count: int = 8) -> float:
 def _slice(layout: dict[str, int], order: str) -> oracle.Function:
     names = "".join(x * (1 if x == "t" else 3) for x in FACTOR_ORDERS[order])
     log_lambda = {"direction": NEVER, "time": NEVER}
-    return lambda x: oracle.slice_triangular(x, layout, names, 0.5, log_lambda, [0.0] * 3, 0.0)
+    places = Triangle(names).places
+    kinds = [7 + place for kind in KINDS for place in places[kind]]
+    return lambda x: oracle.slice_triangular(
+        [*x[:7], *(x[i] for i in kinds), *x[28:]], layout, names, 0.5, log_lambda, [0.0] * 3, 0.0, relative=False
+    )
 
 
 def _relative(found: Floats, exact: Floats) -> float:
@@ -192,7 +206,7 @@ def judge(hard: Hard, known: Truth, order: str, scheme: str, backend: str) -> Er
 
 def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
     """A 7DGS that gates nothing away."""
-    model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme)
+    model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme, off_diagonal="raw")
     assert isinstance(model, TriangularModel)
     model.backend = backend
     for name in ("direction", "time"):
@@ -203,8 +217,9 @@ def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
 def _judge(
     model: TriangularModel, hard: Hard, known: Truth, w: Floats, W: Floats, rows: slice
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    raw = raw_parameters(hard.rows(rows))
-    shape = raw["log_diagonal"].requires_grad_(), raw["off_diagonal"].requires_grad_()
+    some = hard.rows(rows)
+    leaves = some.log_diagonal.clone().requires_grad_(), some.off_diagonal.clone().requires_grad_()
+    raw = raw_parameters(Hard(*leaves, some.offset), model)
     device = device_of(model.backend)
     there = {name: value.to(device) for name, value in raw.items()}
     out = model.observe(there, torch.zeros(3, device=device), torch.zeros((), device=device))
@@ -213,7 +228,7 @@ def _judge(
     cov = F.double() @ F.double().mT
     loss = (torch.from_numpy(w[rows]) * mean / exact_mean.norm(dim=1, keepdim=True)).sum()
     loss = loss + (torch.from_numpy(W[rows]) * cov / exact_cov.norm(dim=(1, 2), keepdim=True)).sum()
-    gradient = torch.cat(torch.autograd.grad(loss, shape), 1).double()
+    gradient = torch.cat(torch.autograd.grad(loss, leaves), 1).double()
     exact_gradient = torch.from_numpy(known.gradient[rows])
     bad = ~(mean.isfinite().all(1) & F.isfinite().all((1, 2)) & gradient.isfinite().all(1))
     bad |= indefinite(model, raw)
@@ -234,9 +249,9 @@ def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
     return ~finite | (least < 0)
 
 
-def raw_parameters(hard: Hard) -> dict[str, Tensor]:
-    """The raw parameters of 7DGS."""
+def raw_parameters(hard: Hard, model: TriangularModel) -> dict[str, Tensor]:
+    """The raw parameters of a 7DGS made by `all_seen`."""
     N = len(hard)
     return {"means": torch.zeros(N, 3), "directions": hard.offset[:, :3], "times": hard.offset[:, 3:],
-            "log_diagonal": hard.log_diagonal.clone(), "off_diagonal": hard.off_diagonal.clone(),
+            "log_diagonal": hard.log_diagonal, **model.triangle.split(hard.off_diagonal),
             "opacities": torch.zeros(N)}  # fmt: skip

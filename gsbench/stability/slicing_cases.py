@@ -7,6 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from gsbench.kernels.thresholds import LOG_SIZE_MAX
+from gsbench.models.factors import Triangle
 from gsbench.stability.cases import case
 
 COUNT = 4  # Gaussians a case: their truth takes a hundred evaluations each in a hundred digits
@@ -46,7 +47,7 @@ def ordinary(g: Generator, model: str) -> Observed:
     towards = torch.nn.functional.normalize(means - center, dim=-1)
     raw["directions"] = towards + 0.2 * torch.randn(COUNT, 3, generator=g)
     raw["log_diagonal"] = 0.3 * torch.randn(COUNT, n, generator=g) - 0.5
-    raw["off_diagonal"] = 0.3 * torch.randn(COUNT, n * (n - 1) // 2, generator=g)
+    raw |= Triangle(variables(model)).split(0.3 * torch.randn(COUNT, n * (n - 1) // 2, generator=g))
     log_lambda = {"direction": math.log(0.35)}
     if model == "7dgs":
         raw["times"] = time + 0.1 * torch.randn(COUNT, 1, generator=g)
@@ -62,17 +63,26 @@ def sizes(observed: Observed, variable: str) -> Tensor:
     return observed.raw["log_diagonal"][:, rows[0] : rows[-1] + 1]
 
 
+def below(observed: Observed) -> Tensor:
+    """The parameters below the diagonal, [COUNT, n (n - 1) / 2] row by row."""
+    return Triangle(variables(observed.model)).join(observed.raw)
+
+
+def set_below(observed: Observed, values: Tensor) -> None:
+    """Write them."""
+    observed.raw |= Triangle(variables(observed.model)).split(values)
+
+
 def upright(observed: Observed) -> None:
     """Turn a 4D Gaussian so that its last axis is time itself."""
     for name in ("left_quats", "right_quats"):
         observed.raw[name][:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
 
 
-def entries(observed: Observed, variable: str) -> list[tuple[int, int]]:
-    """Places (row, number among the off-diagonals) left of the diagonal in the rows of one variable."""
-    names = variables(observed.model)
-    rows = [i for i, name in enumerate(names) if name == variable]
-    return [(i, i * (i - 1) // 2 + j) for i in rows for j in range(i)]
+def entries(observed: Observed, variable: str) -> list[int]:
+    """Places among the parameters below the diagonal of those in the rows of one variable."""
+    rows = [i for i, name in enumerate(variables(observed.model)) if name == variable]
+    return [i * (i - 1) // 2 + j for i in rows for j in range(i)]
 
 
 @case("slicing", *ALL)
@@ -92,7 +102,7 @@ def diagonals_over_eight_decades(g: Generator, severity: float, model: str) -> O
     observed.raw[name] = -8 * LN_10 * severity * torch.rand(observed.raw[name].shape, generator=g)
     if model == "4dgs":
         return observed
-    observed.raw["off_diagonal"] = torch.randn(observed.raw["off_diagonal"].shape, generator=g)
+    set_below(observed, torch.randn(below(observed).shape, generator=g))
     observed.center, observed.raw["means"][:] = torch.ones(3), 1.0
     narrowest = sizes(observed, "d").amin(1, keepdim=True).clamp(min=-LOG_SIZE_MAX).exp()
     observed.raw["directions"] = 0.3 * narrowest * torch.randn(COUNT, 3, generator=g)
@@ -107,8 +117,9 @@ def narrow_in_direction(g: Generator, severity: float, model: str) -> Observed:
     """A highlight 10^-3 wide: d has an ulp of 6e-8, so float32 cannot place it to better than 6e-5 of its width."""
     observed = ordinary(g, model)
     sizes(observed, "d")[:] = -3 * LN_10 * severity
-    for _, at in entries(observed, "d"):
-        observed.raw["off_diagonal"][:, at] *= 10 ** (-3 * severity)
+    values = below(observed)
+    values[:, entries(observed, "d")] *= 10 ** (-3 * severity)
+    set_below(observed, values)
     offset = observed.raw["means"] - observed.center
     spread = 10 ** (-3 * severity) * torch.randn(COUNT, 3, generator=g)
     observed.raw["directions"] = torch.nn.functional.normalize(offset, dim=-1) + spread
@@ -126,8 +137,9 @@ def nearly_certain(g: Generator, severity: float, model: str) -> Observed:
             observed.raw[name][:] = torch.tensor([math.cos(half), math.sin(half), 0.0, 0.0])
         observed.raw["scales"][:, 2] = observed.raw["scales"][:, 3] + thin
         return observed
-    for row, at in entries(observed, "p"):
-        observed.raw["off_diagonal"][:, at] = 1.0 if row != at else 0.0
+    values = below(observed)
+    values[:, entries(observed, "p")] = 1.0
+    set_below(observed, values)
     sizes(observed, "p")[:] = thin
     return observed
 
@@ -139,8 +151,9 @@ def instant(g: Generator, severity: float, model: str) -> Observed:
     if model == "4dgs":
         upright(observed)
     else:
-        for _, at in entries(observed, "t"):
-            observed.raw["off_diagonal"][:, at] = 0.0
+        values = below(observed)
+        values[:, entries(observed, "t")] = 0.0
+        set_below(observed, values)
     sizes(observed, "t")[:] = -80 * severity
     observed.raw["times"][::2] = float(torch.tensor(observed.time))
     return observed

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models.factors import rotation4d, sizes, triangular
+from gsbench.models.factors import Triangle, rotation4d, sizes
 from gsbench.models.slicing import reduce, subtract
 from gsbench.stability.plots import save
 from gsbench.stability.population import Floats
@@ -53,8 +53,8 @@ def _splats(path: Path) -> dict[str, Tensor]:
 def joint_factors(splats: dict[str, Tensor], path: Path) -> tuple[Tensor, int]:
     """Factors [N, 3+k, 3+k] with rows (p, q), and k. Triangular ones are taken in the order (q, p), the default."""
     if "log_diagonal" in splats:
-        L = triangular(splats["log_diagonal"], splats["off_diagonal"])
-        k = L.shape[1] - 3
+        k = splats["log_diagonal"].shape[1] - 3
+        L = Triangle("dddtppp" if k == 4 else "dddppp").factor(splats["log_diagonal"], splats)
         return torch.cat([L[:, k:], L[:, :k]], 1), k
     if "left_quats" in splats:
         R = rotation4d(splats["left_quats"], splats["right_quats"])

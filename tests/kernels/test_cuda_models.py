@@ -14,6 +14,7 @@ from gsbench.kernels import colors, refine, slices
 from gsbench.kernels.cuda import observe as on_cuda
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
+from gsbench.models.factors import OFF_DIAGONALS
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.refinement import Refinement
 
@@ -58,10 +59,11 @@ def test_slice(timed: bool, options: dict[str, Any], move: Move) -> None:
     single = {name: move(value) for name, value in raw.items()}
     lambdas = {name: move(value) for name, value in model.log_modulation.items()}
     actual = list(slices.observe_triangular(
-        single["means"], single["directions"], single.get("times"), single["log_diagonal"], single["off_diagonal"],
-        single["opacities"], move(center), move(torch.tensor(0.4)), lambdas["direction"].exp(),
-        lambdas["time"].exp() if timed else None, conditioned_first=options.get("factor_order") != "paper",
-        row_scaled=model.row_scaled, directional_half=model.directional_half,
+        single["means"], single["directions"], single.get("times"), single["log_diagonal"], single["shape"],
+        single["motion"], single["coupling"], single["opacities"], move(center), move(torch.tensor(0.4)),
+        lambdas["direction"].exp(), lambdas["time"].exp() if timed else None,
+        conditioned_first=options.get("factor_order") != "paper", form=OFF_DIAGONALS.index(model.triangle.form),
+        directional_half=model.directional_half,
     ))  # fmt: skip
     assert_same(back(actual), expected)
     wanted = gradients(expected, [*raw.values(), *exact.log_modulation.values()])

@@ -13,6 +13,7 @@ from gsbench.kernels.refine import refine
 from gsbench.kernels.slices import observe_rotated, observe_still, observe_triangular
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
+from gsbench.models.factors import OFF_DIAGONALS
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.gaussians6d import Gaussians6DModel
@@ -23,15 +24,17 @@ from gsbench.models.triangular import TriangularModel
 VARIANTS: list[tuple[bool, dict[str, Any]]] = [
     (True, {}),
     (True, {"factor_order": "paper"}),
-    (True, {"row_scaled": True}),
+    (True, {"off_diagonal": "raw"}),
+    (True, {"off_diagonal": "row_scaled"}),
     (False, {}),
-    (False, {"factor_order": "paper", "row_scaled": True, "directional_half": False}),
+    (True, {"factor_order": "paper", "off_diagonal": "raw"}),
+    (False, {"factor_order": "paper", "off_diagonal": "row_scaled", "directional_half": False}),
 ]
 # The scheme that is there for comparison, where it keeps its digits.
 SUBTRACTING: list[tuple[bool, dict[str, Any]]] = [
     (True, {"scheme": "cholesky"}),
     (True, {"scheme": "cholesky", "factor_order": "paper"}),
-    (False, {"scheme": "cholesky", "row_scaled": True}),
+    (False, {"scheme": "cholesky", "off_diagonal": "row_scaled"}),
 ]
 
 
@@ -39,10 +42,11 @@ def model_and_raw(
     timed: bool, options: dict[str, Any], dtype: torch.dtype
 ) -> tuple[TriangularModel, dict[str, Tensor]]:
     g = torch.Generator().manual_seed(1)
-    n, N = 7 if timed else 6, 37
+    k, N = 4 if timed else 3, 37
     raw = {"means": torch.randn(N, 3, generator=g), "directions": torch.randn(N, 3, generator=g),
-           "log_diagonal": 0.3 * torch.randn(N, n, generator=g) - 0.5,
-           "off_diagonal": 0.5 * torch.randn(N, n * (n - 1) // 2, generator=g),
+           "log_diagonal": 0.3 * torch.randn(N, k + 3, generator=g) - 0.5,
+           "shape": 0.5 * torch.randn(N, 3, generator=g), "motion": 0.5 * torch.randn(N, 3 * k, generator=g),
+           "coupling": 0.5 * torch.randn(N, k * (k - 1) // 2, generator=g),
            "opacities": 2 * torch.randn(N, generator=g)}  # fmt: skip
     if options.get("scheme") != "cholesky":
         raw["log_diagonal"][3:6] = -4.0  # so narrow that next to nothing is left of them
@@ -81,10 +85,10 @@ def test_slice(timed: bool, options: dict[str, Any]) -> None:
     model, single = model_and_raw(timed, options, torch.float32)
     lambdas = list(model.log_modulation.parameters())
     actual = list(observe_triangular(
-        single["means"], single["directions"], single.get("times"), single["log_diagonal"], single["off_diagonal"],
-        single["opacities"], center, torch.tensor(0.4), model.modulation("direction"),
-        model.modulation("time") if timed else None,
-        conditioned_first=options.get("factor_order") != "paper", row_scaled=model.row_scaled,
+        single["means"], single["directions"], single.get("times"), single["log_diagonal"], single["shape"],
+        single["motion"], single["coupling"], single["opacities"], center, torch.tensor(0.4),
+        model.modulation("direction"), model.modulation("time") if timed else None,
+        conditioned_first=options.get("factor_order") != "paper", form=OFF_DIAGONALS.index(model.triangle.form),
         directional_half=model.directional_half, subtracts=model.scheme == "cholesky",
     ))  # fmt: skip
     assert_same(actual, expected)

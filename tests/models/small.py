@@ -22,7 +22,11 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     **{f"{name}_agr": (name, options | {"agr": True}) for name, options in MODELS.items()},
     "4dgs_constant_colors": ("4dgs", {"time_degree": 0}),
     **{f"{name}_paper": (name, MODELS[name] | {"factor_order": "paper"}) for name in ("6dgs", "7dgs")},
-    **{f"{name}_row_scaled": (name, MODELS[name] | {"row_scaled": True}) for name in ("6dgs", "7dgs")},
+    **{
+        f"{name}_{form}": (name, MODELS[name] | {"off_diagonal": form})
+        for name in ("6dgs", "7dgs")
+        for form in ("raw", "row_scaled")
+    },
 }
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from small import CAMERA, MODELS, N, fresh, joint, lively, raw, seeded
 
 from gsbench.models import GaussianModel, Gaussians3D
-from gsbench.models.factors import triangular_parameters
+from gsbench.models.factors import KINDS
 from gsbench.models.gaussians4d import TIME_GATE_MIN
 
 TIME = 0.45
@@ -32,9 +32,12 @@ def by_hand(model: GaussianModel, order: str, half: float) -> tuple[np.ndarray, 
     values = {name: value.numpy() for name, value in raw(model).items()}
     letters = "".join(x * (1 if x == "t" else 3) for x in order if x != "t" or "times" in values)
     p, t, d = ([i for i, x in enumerate(letters) if x == which] for which in "ptd")
+    below, form = model.triangle.join(raw(model)).numpy(), model.triangle.form
     means, covariances, opacities = [], [], []
     for i, mean in enumerate(values["means"]):
-        L = triangular_factor(values["log_diagonal"][i], values["off_diagonal"][i])
+        L = triangular_factor(values["log_diagonal"][i], below[i])
+        if form == "relative":
+            L[np.ix_(p, p)] = np.diag(L.diagonal()[p]) @ (np.tril(L[np.ix_(p, p)], -1) + np.eye(3))
         S = L @ L.T
         away = mean - CAMERA.numpy()
         offset_d = away / np.linalg.norm(away) - values["directions"][i]
@@ -56,12 +59,13 @@ def agree(sliced: Gaussians3D, means: np.ndarray, covariances: np.ndarray, opaci
     np.testing.assert_allclose(sliced.opacities.detach().numpy(), opacities, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.parametrize("form", ["relative", "raw"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("name", ["6dgs", "7dgs"])
-def test_triangular_models(name: str, order: str, scheme: str) -> None:
+def test_triangular_models(name: str, order: str, scheme: str, form: str) -> None:
     """Catches a wrong row order, a conditional block where f_temp or f_dir takes the marginal one, a wrong lambda."""
-    model = lively(name, factor_order=order, scheme=scheme)
+    model = lively(name, factor_order=order, scheme=scheme, off_diagonal=form)
     agree(model.slice(CAMERA, TIME), *by_hand(model, ORDERS[order], 1.0 if name == "6dgs" else 0.5))
 
 
@@ -83,7 +87,8 @@ def test_factor_orders_are_coordinates_of_one_family(name: str) -> None:
     n = joint(paper).shape[-1]
     to_own = [*range(3, n), 0, 1, 2]  # from (p, d, t) to (d, t, p)
     factor = paper.factors(raw(paper))[:, to_own]
-    first.splats["log_diagonal"].data, first.splats["off_diagonal"].data = triangular_parameters(factor)
+    for key, value in first.triangle.parameters(factor).items():
+        first.splats[key].data = value
     torch.testing.assert_close(joint(first), joint(paper))
     a, b = paper.slice(CAMERA, TIME), first.slice(CAMERA, TIME)
     covariance = (a.factors @ a.factors.mT).detach().numpy()
@@ -95,7 +100,8 @@ def test_factor_orders_are_coordinates_of_one_family(name: str) -> None:
 def test_far_from_the_query(name: str, order: str) -> None:
     """Catches 0 x inf in the gradient of a Gaussian so thin in t or d that nothing of it is seen (float32)."""
     model = fresh(name, factor_order=order)
-    model.splats["off_diagonal"].data.normal_(generator=seeded(1))
+    for kind in KINDS:
+        model.splats[kind].data.normal_(generator=seeded(1))
     model.splats["log_diagonal"].data.fill_(-30.0)
     sliced = model.slice(CAMERA.float(), TIME)
     sum(x.sum() for x in sliced).backward()

@@ -14,6 +14,7 @@ from gsbench.errors import InputError
 from gsbench.models import Stage, build
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
+from gsbench.models.factors import KINDS
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
 
@@ -62,7 +63,7 @@ def test_start_in_direction(variant: str) -> None:
     assert d.mean(0).abs().max() < 0.03
     torch.testing.assert_close((d.mT @ d) / 4000, torch.eye(3) / 3, rtol=0, atol=0.02)
     torch.testing.assert_close(model.factors(raw(model))[:, 3:6].square().sum(-1), torch.ones(4000, 3))
-    assert not raw(model)["off_diagonal"].any()
+    assert not any(raw(model)[kind].any() for kind in KINDS)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -185,7 +186,7 @@ def test_agr_moves_what_it_should(name: str) -> None:
     model = lively(f"{name}_agr")
     model.set_stage(Stage(3, True, False))
     before, after = raw(model), model.refined(torch.tensor(0.3, dtype=torch.float64))
-    names = [*model.centers, *model.shape]
+    names = [*model.centers, *model.geometry]
     moved = model.refinement([before[k] for k in names], torch.tensor(0.3, dtype=torch.float64))
     torch.testing.assert_close([after[k] for k in names], moved)
     assert not any(torch.equal(after[k], before[k]) for k in names)

@@ -72,7 +72,7 @@ def test_split_touches_only_its_rows(variant: str) -> None:
     after = raw(model)
     for name, value in after.items():
         assert torch.equal(value[:3], before[name][:3])
-        if name not in {*model.centers, *model.shape, "means"}:
+        if name not in {*model.centers, *model.geometry, "means"}:
             assert torch.equal(value, before[name])
     assert not torch.equal(after["means"][3], after["means"][4])
     assert all(value.isfinite().all() for value in after.values())
@@ -150,12 +150,11 @@ def test_long_in_time() -> None:
     model = fresh("7dgs")
     assert not model.long_in_time().any()  # nothing moves at first
     rows = model.rows
-    time, space = rows["t"][0], rows["p"][0]  # (d, t, p): time is row 3, the first of space row 4
-    entry = space * (space - 1) // 2 + time
-    off_diagonal, log_diagonal = model.splats["off_diagonal"].data, model.splats["log_diagonal"].data
+    time = rows["t"][0]
+    motion, log_diagonal = model.splats["motion"].data, model.splats["log_diagonal"].data
     for sigma, S_pt, expected in [(0.26, 0.11, True), (0.24, 0.11, False), (0.26, 0.09, False)]:
         log_diagonal[:, time] = math.log(sigma)
-        off_diagonal[:, entry] = S_pt / sigma
+        motion[:, 3] = S_pt / sigma  # of the first of p, after those with d
         assert (model.long_in_time() == expected).all()
     assert EXTENT == 2.0
     for name in ("3dgs", "4dgs", "6dgs"):

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsbench import models
 from gsbench.errors import InputError
+from gsbench.models.factors import KINDS
 from gsbench.stability import (
     __main__ as command,
 )
@@ -111,7 +112,8 @@ def test_resemblance_of_the_whole_model() -> None:
 def test_spectrum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches condition numbers of something else than the factor: a diagonal one has max / min, in space too."""
     model = trainer("7dgs").model
-    model.splats["off_diagonal"].data.zero_()
+    for kind in KINDS:
+        model.splats[kind].data.zero_()
     logs = torch.tensor([0.0, 0.0, 0.0, 3.0, -1.0, -2.0, -3.0])
     model.splats["log_diagonal"].data[:] = logs
     path = tmp_path / "checkpoint.pt"

@@ -4,6 +4,7 @@
 #include <cstdint>
 
 #include "../math/adam.h"
+#include "../math/off_diagonal.h"
 #include "../slices.h"
 
 namespace gsb {
@@ -67,17 +68,18 @@ struct SimilarityArgs {
 // Gaussians with a triangular factor over (p, d) or (p, t, d), observed from a place and at a time (6DGS, 7DGS).
 struct TriangularArgs {
     int64_t N;
-    bool conditioned_first, row_scaled;
+    bool conditioned_first;
+    OffDiagonal form;
     bool subtracts;  // by the scheme that forms S, for comparison
     float half, lambda_d, lambda_t, time, center[3];
     const float *means, *directions, *times;  // [N, 3] [N, 3] [N], null: time is not observed
-    const float *log_diagonal, *off_diagonal;  // [N, n] [N, n (n - 1) / 2]
-    const float* opacities;                    // [N] logits
+    const float *log_diagonal, *shape, *motion, *coupling;  // [N, k + 3] [N, 3] [N, 3 k] [N, k (k - 1) / 2]
+    const float* opacities;                                 // [N] logits
     int threads;
 };
 
 struct TriangularGrads {
-    float *means, *directions, *times, *log_diagonal, *off_diagonal, *opacities;
+    float *means, *directions, *times, *log_diagonal, *shape, *motion, *coupling, *opacities;
     float lambdas[2];  // of direction and time
 };
 

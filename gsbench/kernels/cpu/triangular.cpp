@@ -12,7 +12,7 @@ namespace {
 constexpr int64_t CHUNK = 512;  // Gaussians a task; the gradients of lambda are summed by chunks
 
 TriangularModel model_of(const TriangularArgs& a) {
-    return {a.conditioned_first, a.row_scaled, a.half, a.lambda_d, a.lambda_t,
+    return {a.conditioned_first, a.form, a.half, a.lambda_d, a.lambda_t,
             {a.center[0], a.center[1], a.center[2]}, a.time};
 }
 
@@ -22,7 +22,9 @@ GSB_HD inline void load(const TriangularArgs& a, int64_t i, int n, TriangularPar
     gather_row(a.directions, i, n, p.direction);
     if constexpr (TIME) p.time = load_first(a.times + i, n);
     gather_row(a.log_diagonal, i, n, p.log_diagonal);
-    gather_row(a.off_diagonal, i, n, p.off_diagonal);
+    gather_row(a.shape, i, n, p.shape);
+    gather_row(a.motion, i, n, p.motion);
+    gather_row(a.coupling, i, n, p.coupling);
     p.opacity = load_first(a.opacities + i, n);
 }
 
@@ -70,7 +72,9 @@ void observe_backward(const TriangularArgs& a, const Observation& grads, Triangu
             scatter_row(g.direction, out.directions, i, n);
             if constexpr (TIME) store_first(g.time, out.times + i, n);
             scatter_row(g.log_diagonal, out.log_diagonal, i, n);
-            scatter_row(g.off_diagonal, out.off_diagonal, i, n);
+            scatter_row(g.shape, out.shape, i, n);
+            scatter_row(g.motion, out.motion, i, n);
+            scatter_row(g.coupling, out.coupling, i, n);
             store_first(g.opacity, out.opacities + i, n);
             lambda_d += g.lambda_d;  // lanes past the end were given zero
             lambda_t += g.lambda_t;

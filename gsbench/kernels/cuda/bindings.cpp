@@ -98,35 +98,38 @@ void blend_backward(int64_t N, int64_t C, int D, bool color_per_camera, Address 
         stream);
 }
 
-gsb::cuda::TriangularArgs triangular_args(int64_t N, bool conditioned_first, bool row_scaled, float half, Address time,
+gsb::cuda::TriangularArgs triangular_args(int64_t N, bool conditioned_first, int form, float half, Address time,
                                           Address lambda_d, Address lambda_t, Address center, Address means,
-                                          Address directions, Address times, Address log_diagonal, Address off_diagonal,
-                                          Address opacities) {
-    return {N, conditioned_first, row_scaled, half, time, lambda_d, lambda_t, center, means, directions, times,
-            log_diagonal, off_diagonal, opacities};
+                                          Address directions, Address times, Address log_diagonal, Address shape,
+                                          Address motion, Address coupling, Address opacities) {
+    return {N, conditioned_first, static_cast<gsb::OffDiagonal>(form), half, time, lambda_d, lambda_t, center, means,
+            directions, times, log_diagonal, shape, motion, coupling, opacities};
 }
 
-void observe_triangular(int64_t N, bool conditioned_first, bool row_scaled, float half, Address time, Address lambda_d,
+void observe_triangular(int64_t N, bool conditioned_first, int form, float half, Address time, Address lambda_d,
                         Address lambda_t, Address center, Address means, Address directions, Address times,
-                        Address log_diagonal, Address off_diagonal, Address opacities, Address out_means,
-                        Address out_factors, Address out_opacities, Address stream) {
+                        Address log_diagonal, Address shape, Address motion, Address coupling, Address opacities,
+                        Address out_means, Address out_factors, Address out_opacities, Address stream) {
     gsb::cuda::observe_triangular(
-        triangular_args(N, conditioned_first, row_scaled, half, time, lambda_d, lambda_t, center, means, directions,
-                        times, log_diagonal, off_diagonal, opacities),
+        triangular_args(N, conditioned_first, form, half, time, lambda_d, lambda_t, center, means, directions, times,
+                        log_diagonal, shape, motion, coupling, opacities),
         {out_means, out_factors, out_opacities}, stream);
 }
 
-void observe_triangular_backward(int64_t N, bool conditioned_first, bool row_scaled, float half, Address time,
+void observe_triangular_backward(int64_t N, bool conditioned_first, int form, float half, Address time,
                                  Address lambda_d, Address lambda_t, Address center, Address means, Address directions,
-                                 Address times, Address log_diagonal, Address off_diagonal, Address opacities,
+                                 Address times, Address log_diagonal, Address shape, Address motion,
+                                 Address coupling, Address opacities,
                                  Address g_means, Address g_factors, Address g_opacities, Address out_means,
                                  Address out_directions, Address out_times, Address out_log_diagonal,
-                                 Address out_off_diagonal, Address out_opacities, Address out_lambdas, Address stream) {
+                                 Address out_shape, Address out_motion, Address out_coupling, Address out_opacities,
+                                 Address out_lambdas, Address stream) {
     gsb::cuda::observe_triangular_backward(
-        triangular_args(N, conditioned_first, row_scaled, half, time, lambda_d, lambda_t, center, means, directions,
-                        times, log_diagonal, off_diagonal, opacities),
+        triangular_args(N, conditioned_first, form, half, time, lambda_d, lambda_t, center, means, directions, times,
+                        log_diagonal, shape, motion, coupling, opacities),
         {g_means, g_factors, g_opacities},
-        {out_means, out_directions, out_times, out_log_diagonal, out_off_diagonal, out_opacities, out_lambdas}, stream);
+        {out_means, out_directions, out_times, out_log_diagonal, out_shape, out_motion, out_coupling, out_opacities,
+         out_lambdas}, stream);
 }
 
 void observe_rotated(int64_t N, Address time, Address lambda_t, Address means, Address times, Address scales,

@@ -14,35 +14,37 @@ from gsbench.kernels.cuda import allocate, cuda, on_device, pointers, stream
 
 @on_device
 def observe(
-    means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
-    center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
-    row_scaled: bool, subtracts: bool,
+    means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, shape: Tensor, motion: Tensor,
+    coupling: Tensor, opacities: Tensor, center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float,
+    conditioned_first: bool, form: int, subtracts: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Means [N, 3], factors [N, 3, 3] and opacities [N] of a slice; empty `times`: time is not observed."""
     if subtracts:
         raise InputError("observe_triangular: expected the square-root scheme on a GPU, got one that subtracts")
     out = _observation(means)
-    arrays = plain(time, lambda_d, lambda_t, center, means, directions, times, log_diagonal, off_diagonal, opacities)
-    cuda().observe_triangular(len(means), conditioned_first, row_scaled, half, *pointers(*arrays), *pointers(*out),
+    arrays = plain(time, lambda_d, lambda_t, center, means, directions, times, log_diagonal, shape, motion, coupling,
+                   opacities)  # fmt: skip
+    cuda().observe_triangular(len(means), conditioned_first, form, half, *pointers(*arrays), *pointers(*out),
                               stream(means))  # fmt: skip
     return out
 
 
 @on_device
 def observe_backward(
-    means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, off_diagonal: Tensor, opacities: Tensor,
-    center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float, conditioned_first: bool,
-    row_scaled: bool, subtracts: bool, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Gradients of the first six, and of (lambda_d, lambda_t) [2]."""
+    means: Tensor, directions: Tensor, times: Tensor, log_diagonal: Tensor, shape: Tensor, motion: Tensor,
+    coupling: Tensor, opacities: Tensor, center: Tensor, time: Tensor, lambda_d: Tensor, lambda_t: Tensor, half: float,
+    conditioned_first: bool, form: int, subtracts: bool, g_means: Tensor, g_factors: Tensor, g_opacities: Tensor,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    """Gradients of the first eight, and of (lambda_d, lambda_t) [2]."""
     assert not subtracts, "`observe` has refused it"
-    arrays = plain(time, lambda_d, lambda_t, center, means, directions, times, log_diagonal, off_diagonal, opacities)
-    out = _like(means, directions, times, log_diagonal, off_diagonal, opacities)
+    arrays = plain(time, lambda_d, lambda_t, center, means, directions, times, log_diagonal, shape, motion, coupling,
+                   opacities)  # fmt: skip
+    out = _like(means, directions, times, log_diagonal, shape, motion, coupling, opacities)
     lambdas = means.new_zeros(2)
     given = plain(g_means, g_factors, g_opacities)
-    cuda().observe_triangular_backward(len(means), conditioned_first, row_scaled, half, *pointers(*arrays),
+    cuda().observe_triangular_backward(len(means), conditioned_first, form, half, *pointers(*arrays),
                                        *pointers(*given, *out, lambdas), stream(means))  # fmt: skip
-    return out[0], out[1], out[2], out[3], out[4], out[5], lambdas
+    return *out, lambdas
 
 
 @on_device

@@ -9,7 +9,7 @@ namespace {
 // CONDITIONED is known to the compiler: where the factor is triangular in the right order, no reflection is compiled in.
 template <bool TIME, bool CONDITIONED>
 __device__ TriangularModel model_of(const TriangularArgs& a) {
-    return {CONDITIONED, a.row_scaled, a.half, *a.lambda_d, TIME ? *a.lambda_t : 0.0f,
+    return {CONDITIONED, a.form, a.half, *a.lambda_d, TIME ? *a.lambda_t : 0.0f,
             {a.center[0], a.center[1], a.center[2]}, TIME ? *a.time : 0.0f};
 }
 
@@ -20,7 +20,9 @@ __device__ TriangularParameters<float, TIME> parameters(const TriangularArgs& a,
     load_row(a.directions, i, p.direction);
     if constexpr (TIME) p.time = a.times[i];
     load_row(a.log_diagonal, i, p.log_diagonal);
-    load_row(a.off_diagonal, i, p.off_diagonal);
+    load_row(a.shape, i, p.shape);
+    load_row(a.motion, i, p.motion);
+    load_row(a.coupling, i, p.coupling);
     p.opacity = a.opacities[i];
     return p;
 }
@@ -49,7 +51,9 @@ __global__ void observe_backward_kernel(TriangularArgs a, Observation grads, Tri
         store_row(g.direction, out.directions, i);
         if constexpr (TIME) out.times[i] = g.time;
         store_row(g.log_diagonal, out.log_diagonal, i);
-        store_row(g.off_diagonal, out.off_diagonal, i);
+        store_row(g.shape, out.shape, i);
+        store_row(g.motion, out.motion, i);
+        store_row(g.coupling, out.coupling, i);
         out.opacities[i] = g.opacity;
     }
     const float lambda_d = warp_sum(g.lambda_d), lambda_t = warp_sum(g.lambda_t);

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "harmonics.h"
+#include "off_diagonal.h"
 #include "parameters.h"
 #include "subtraction.h"
 
@@ -11,7 +12,7 @@ inline namespace GSB_ISA {
 // What is the same for all Gaussians of a model.
 struct TriangularModel {
     bool conditioned_first;  // rows of the factor are (d, t, p); else (p, t, d), as in the paper
-    bool row_scaled;         // entries below the diagonal are (2 sigmoid(x) - 1) times their row's diagonal
+    OffDiagonal form;        // what the parameters below the diagonal are
     float half;              // of f_dir's exponent: 1/2 (7DGS eq. 12) or 1 (6DGS)
     float lambda_d, lambda_t;
     float center[3], time;  // where from and when it is observed
@@ -25,9 +26,11 @@ struct Observed {
 
 template <class T, bool TIME>
 struct TriangularParameters {
-    static constexpr int K = TIME ? 4 : 3, N = K + 3, OFF = N * (N - 1) / 2;
-    T mean[3], direction[3], time, log_diagonal[N], off_diagonal[OFF], opacity;  // the last a logit
-    T lambda_d, lambda_t;                                                        // in gradients only
+    static constexpr int K = TIME ? 4 : 3, N = K + 3;
+    T mean[3], direction[3], time, log_diagonal[N];
+    T shape[3], motion[3 * K], coupling[K * (K - 1) / 2];  // below the diagonal, row by row: `entry` says which is which
+    T opacity;                                             // a logit
+    T lambda_d, lambda_t;                                  // in gradients only
 };
 
 template <class T, bool TIME, template <class, int> class Reduction = Reflections>
@@ -141,13 +144,35 @@ private:
     // Nothing is left to do for a square root of that order; a scheme that subtracts never knows.
     GSB_HD bool is_reduced() const { return model.conditioned_first && Reduction<T, K>::KEEPS_REDUCED; }
 
+    // The parameter of the entry (i, j) below the diagonal: shape in a row and a column of p, motion in one of them,
+    // coupling in neither.
+    template <bool FIRST, class P>
+    GSB_HD static auto& entry(P& p, int i, int j) {
+        constexpr int Q = FIRST ? 0 : 3, SPACE = FIRST ? K : 0;  // the first row of q, and of p
+        const bool row_in_space = FIRST ? i >= K : i < 3, column_in_space = FIRST ? j >= K : j < 3;
+        if (row_in_space && column_in_space) return p.shape[(i - SPACE) * (i - SPACE - 1) / 2 + j - SPACE];
+        if (row_in_space) return p.motion[(i - SPACE) * K + j];
+        if (column_in_space) return p.motion[(i - Q) * 3 + j];
+        return p.coupling[(i - Q) * (i - Q - 1) / 2 + j - Q];
+    }
+
+    // Whether the entry (i, j) is stated in units of its row's diagonal.
+    template <bool FIRST>
+    GSB_HD bool is_relative(int i, int j) const {
+        const bool is_shape = FIRST ? j >= K : i < 3;
+        return model.form == OffDiagonal::row_scaled || (model.form == OffDiagonal::relative && is_shape);
+    }
+
+    GSB_HD void make_factor() { model.conditioned_first ? make_factor<true>() : make_factor<false>(); }
+
+    template <bool FIRST>
     GSB_HD void make_factor() {
-        int at = 0;
         GSB_UNROLL for (int i = 0; i < N; ++i) {
             L[i][i] = size_of(raw.log_diagonal[i]);
             GSB_UNROLL for (int j = 0; j < i; ++j) {
-                const T x = raw.off_diagonal[at++];
-                L[i][j] = model.row_scaled ? (sigmoid(x) * 2.0f - 1.0f) * L[i][i] : x;
+                const T x = entry<FIRST>(raw, i, j);
+                const T bounded = model.form == OffDiagonal::row_scaled ? sigmoid(x) * 2.0f - 1.0f : x;
+                L[i][j] = is_relative<FIRST>(i, j) ? bounded * L[i][i] : bounded;
             }
         }
     }
@@ -169,17 +194,25 @@ private:
                 }
             }
         }
-        int at = 0;
+        model.conditioned_first ? entries_vjp<true>(g_L, out) : entries_vjp<false>(g_L, out);
+    }
+
+    template <bool FIRST>
+    GSB_HD void entries_vjp(const T (&g_L)[N][N], Parameters& out) const {
         GSB_UNROLL for (int i = 0; i < N; ++i) {
             T g_diagonal = g_L[i][i];
-            GSB_UNROLL for (int j = 0; j < i; ++j, ++at) {
-                if (model.row_scaled) {
-                    const T s = sigmoid(raw.off_diagonal[at]);
-                    g_diagonal = g_diagonal + g_L[i][j] * (s * 2.0f - 1.0f);
-                    out.off_diagonal[at] = g_L[i][j] * L[i][i] * s * (T(1.0f) - s) * 2.0f;
-                } else {
-                    out.off_diagonal[at] = g_L[i][j];
+            GSB_UNROLL for (int j = 0; j < i; ++j) {
+                const T x = entry<FIRST>(raw, i, j);
+                T g = g_L[i][j];
+                if (model.form == OffDiagonal::row_scaled) {
+                    const T s = sigmoid(x);
+                    g_diagonal = g_diagonal + g * (s * 2.0f - 1.0f);
+                    g = g * L[i][i] * s * (T(1.0f) - s) * 2.0f;
+                } else if (is_relative<FIRST>(i, j)) {
+                    g_diagonal = g_diagonal + g * x;
+                    g = g * L[i][i];
                 }
+                entry<FIRST>(out, i, j) = g;
             }
             out.log_diagonal[i] = size_vjp(raw.log_diagonal[i], L[i][i], g_diagonal);
         }

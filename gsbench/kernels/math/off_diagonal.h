@@ -1,0 +1,12 @@
+// What the parameters of a triangular factor below its diagonal are; gsbench.models.factors has the forms in this order.
+#pragma once
+
+namespace gsb {
+
+enum class OffDiagonal : int {
+    relative,    // shape in units of its row's diagonal, motion and coupling as they are
+    raw,         // all as they are
+    row_scaled,  // all (2 sigmoid(x) - 1) times their row's diagonal
+};
+
+}  // namespace gsb
