@@ -16,7 +16,7 @@ from gsbench.config import Config
 from gsbench.errors import InputError, did_you_mean
 from gsbench.measure import record as records
 from gsbench.measure.provenance import config_hash, provenance
-from gsbench.measure.quality import Quality, evaluate
+from gsbench.measure.quality import Quality, evaluate, evenly
 from gsbench.measure.record import Cost, Effects, Record
 from gsbench.measure.speed import peak_memory, reset_peak_memory, synchroniser, time_renders
 from gsbench.models import GaussianModel
@@ -204,6 +204,7 @@ def fit_and_measure(this: Run, scene: Scene, model: GaussianModel) -> Record:
         peak_memory=peak_memory(config.device),
     )
     metrics, missing = with_best(quality, trainer, config)
+    metrics["psnr_train"] = trainer.psnr(evenly(scene.train, len(views)))
     record = unfinished(this, scene, model, "ok", None)
     return replace(
         record, protocol=record.protocol | made,

@@ -20,6 +20,7 @@ def scores(results: Path) -> dict[tuple[str, str], float]:
         psnr = one.metrics["psnr"]
         assert psnr is not None
         background = one.metrics["psnr_background_only"]
+        assert one.metrics["psnr_train"] is not None
         assert background is not None
         assert psnr > background + 3, f"{one.scene} {one.model}: {psnr:.2f} dB, an empty picture has {background:.2f}"
         found[one.scene, one.model] = psnr

@@ -4,11 +4,12 @@ Images are [H, W, 3] tensors of floats, meant in [0, 1] and clamped to it. Pixel
 Where published code disagrees on a definition, the choice made here is stated in its function.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import fmean
+from typing import TypeVar
 
 import torch
 from skimage.metrics import structural_similarity
@@ -19,7 +20,15 @@ from gsbench.measure import perceptual
 from gsbench.measure.perceptual import BACKBONES, BackboneMissing
 from gsbench.measure.record import ViewScore
 
+T = TypeVar("T")
+
 SSIM_LEAST_SIDE = 11  # pixels: the window of a Gaussian of sigma 1.5, cut at 3.5 sigma
+
+
+def evenly(items: Sequence[T], count: int) -> list[T]:
+    """At most `count` of them, evenly spaced from the first on: the fixed subset of views that a split is judged by."""
+    count = min(count, len(items))
+    return [items[i * len(items) // count] for i in range(count)]
 
 
 def psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each

@@ -23,6 +23,7 @@ FILE_NAME = "record.json"
 STATUSES = ("ok", "failed", "diverged")
 METRICS = (
     "psnr",  # dB, joint over H x W x 3, final iteration, mean over the views of the evaluated split
+    "psnr_train",  # dB, on as many training views as are evaluated, evenly spaced: the gap to `psnr` is overfitting
     "psnr_channel_mean",  # dB, mean of the three channels' PSNR
     "ssim",
     "lpips_alex",

@@ -12,9 +12,11 @@ def main(arguments: list[str] | None = None) -> int:
     """Print the tables, write ``table.md`` and ``table.csv``; return 2 where there is nothing to show."""
     parser = argparse.ArgumentParser(prog="python -m gsbench.report", description=__doc__)
     parser.add_argument("results", type=Path, metavar="RESULTS_DIR", help="a folder with records, at any depth")
-    folder = parser.parse_args(arguments).results
+    parser.add_argument("--train", action="store_true", help="also PSNR on training views: the gap is overfitting")
+    asked = parser.parse_args(arguments)
+    folder = asked.results
     try:
-        print(layout.terminal(tables.write(tables.load(folder), folder)))
+        print(layout.terminal(tables.write(tables.load(folder), folder, train=asked.train)))
     except InputError as error:
         print(f"gsbench.report: {error}", file=sys.stderr)
         return 2

@@ -24,6 +24,7 @@ COLUMNS = (  # their keys are columns of `tidy`
     Column("fps", "FPS", None, "fps"),
     Column("num_gaussians", "#Gaussians", 0, "num_gaussians"),
 )
+TRAIN = Column("psnr_train", "PSNR train", 2)  # shown on request
 EXTRA_COLUMNS = (Column("lpips_vgg", "LPIPS-VGG", 3), Column(LEAKS, LEAKS, 2))  # where a run has them
 
 PAPER = (
@@ -79,23 +80,24 @@ def _quantities(r: Record) -> dict[str, Any]:
     return flat | {name: getattr(r.provenance, name) for name in names}
 
 
-def build(records: list[Record]) -> list[Table]:
-    """A table for every experiment and data set among `records`, sorted by name."""
+def build(records: list[Record], *, train: bool = False) -> list[Table]:
+    """A table for every experiment and data set among `records`, sorted by name; `train` adds `psnr_train`."""
     groups: dict[tuple[str, str], list[Record]] = {}
     for record in sorted(records, key=lambda r: (r.experiment, r.dataset, r.scene, r.model, r.seed)):
         groups.setdefault((record.experiment, record.dataset), []).append(record)
-    return [_Builder(group).table() for group in groups.values()]
+    return [_Builder(group, train).table() for group in groups.values()]
 
 
 class _Builder:
     """Makes the table of one experiment on one data set; collects what the marks in its cells refer to."""
 
-    def __init__(self, records: list[Record]) -> None:
+    def __init__(self, records: list[Record], train: bool) -> None:
         self.records = records
         self.scenes = sorted({r.scene for r in records})
         self.models = sorted({r.model for r in records})
         flat = [_quantities(r) for r in records]
-        self.columns = [*COLUMNS, *(c for c in EXTRA_COLUMNS if any(q[c.key] is not None for q in flat))]
+        shown = [COLUMNS[0], *([TRAIN] if train else []), *COLUMNS[1:]]
+        self.columns = [*shown, *(c for c in EXTRA_COLUMNS if any(q[c.key] is not None for q in flat))]
         finished: dict[tuple[str, str], list[dict[str, Any]]] = {}
         for q in flat:
             if q["status"] == "ok":
@@ -210,9 +212,9 @@ def _leader(rows: list[dict[str, list[float]]]) -> str | None:
     return COLUMNS[0].show(max(means)) if means else None
 
 
-def write(records: list[Record], folder: Path) -> list[Table]:
-    """Write ``table.md`` and ``table.csv`` into `folder`, each atomically, and return the tables."""
-    tables = build(records)
+def write(records: list[Record], folder: Path, *, train: bool = False) -> list[Table]:
+    """Write ``table.md`` and ``table.csv`` into `folder`, each atomically, return the tables; `train` as in `build`."""
+    tables = build(records, train=train)
     write_atomically(folder / "table.md", layout.markdown(tables).encode())
     write_atomically(folder / "table.csv", tidy(records).to_csv(index=False).encode())
     return tables

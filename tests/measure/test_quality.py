@@ -230,3 +230,11 @@ def test_a_gpu_gives_the_same_numbers():
     assert quality.lpips(a.cuda(), b.cuda(), "alex", TRUNK) == pytest.approx(
         quality.lpips(a, b, "alex", TRUNK), abs=1e-4
     )
+
+
+def test_evenly_spaced_views():
+    """Catches a subset of the first views only, of more than there are, or of another number than asked for."""
+    assert quality.evenly(range(10), 5) == [0, 2, 4, 6, 8]
+    assert quality.evenly(range(7), 3) == [0, 2, 4]
+    assert quality.evenly(range(3), 10) == [0, 1, 2]
+    assert quality.evenly([], 4) == []

@@ -166,6 +166,14 @@ def test_columns_that_leak_or_are_rare_say_so():
     assert "LPIPS-VGG has no column: no trunk weights" in page(make())
 
 
+def test_training_views_are_shown_on_request():
+    """Catches a gap to the training views that cannot be seen, or that nobody asked for; an older record says why."""
+    seen = [dataclasses.replace(r, metrics=r.metrics and r.metrics | {"psnr_train": 33.25}) for r in records()]
+    assert "PSNR train" not in page(*seen)
+    assert "33.25" in layout.markdown(tables.build(seen, train=True))
+    assert "PSNR train is empty: not measured" in layout.markdown(tables.build(records(), train=True))
+
+
 def test_text_from_a_record_cannot_break_the_page_or_the_terminal():
     """Would catch a reason with a pipe, a newline or an escape code that breaks the table or colours the terminal."""
     run = failed(reason="a | b\nc <script> \x1b[31m *d*", dataset="x|y\x07")
