@@ -41,6 +41,7 @@ class LearningRate:
     start: float = MISSING
     end: float | None = None  # None: constant
     per_extent: bool = False  # times the scene's extent
+    per_run: bool = False  # times sqrt(recipe_iterations / iterations): a shorter run goes as far in fewer steps
 
 
 @dataclass
@@ -50,6 +51,7 @@ class ModelConfig:
     name: str = MISSING
     published_with_agr: bool = False  # whether AGR is part of the method as its authors describe it
     agr: bool = "${.published_with_agr}"  # type: ignore[assignment]  # an interpolation, typed when resolved
+    agr_octaves: int = 4  # K of AGR's time encoding; the paper's 10 learn every frame by heart: docs/tuning.md
     sh_degree: int = 3
     min_opacity: float = 0.005  # pruned below
     lr: dict[str, LearningRate] = field(default_factory=dict)  # by parameter

@@ -56,8 +56,7 @@ def run(composed: DictConfig) -> Record:
     """
     this = identify(composed)
     config = this.config
-    model = models.build(config.model.name, agr=config.agr, sh_degree=config.model.sh_degree, **config.model.options)
-    model.backend = config.raster.backend
+    model = build(config)
     scene = load_scene(config)
     done = finished(this, scene)
     if done is not None:
@@ -75,6 +74,19 @@ def run(composed: DictConfig) -> Record:
     records.write(record, this.folder / records.FILE_NAME)
     print(f"{_name(this)}: {summary(record)}; {this.folder / records.FILE_NAME}, pictures.png beside it")
     return record
+
+
+def build(config: Config) -> GaussianModel:
+    """The model of a config, without Gaussians yet; raises InputError as `models.build`."""
+    model = models.build(
+        config.model.name,
+        agr=config.agr,
+        agr_octaves=config.model.agr_octaves,
+        sh_degree=config.model.sh_degree,
+        **config.model.options,
+    )
+    model.backend = config.raster.backend
+    return model
 
 
 def identify(composed: DictConfig) -> Run:

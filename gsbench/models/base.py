@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.colors import show_colors
 from gsbench.models.appearance import sh_colors
-from gsbench.models.refinement import Refinement
+from gsbench.models.refinement import OCTAVES, Refinement
 from gsbench.raster import choose_backend
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
@@ -24,6 +24,7 @@ Raw = dict[str, Tensor]  # raw parameters by name, N rows each
 CHILDREN = 2  # a split leaves two Gaussians ..
 SHRINK = 0.8 * CHILDREN  # .. each 1.6 times smaller (3DGS, gaussian_model.py)
 INITIAL_OPACITY = 0.1
+LENGTHS = ("means", "motion")  # raw parameters in world units; sizes are logarithms, to which a unit adds a constant
 
 
 class Gaussians3D(NamedTuple):
@@ -60,11 +61,16 @@ class GaussianModel(nn.Module, ABC):
     geometry: ClassVar[tuple[str, ...]]  # .. and moves these, which make the factor
     backend = "auto"  # who slices, paints and refines: as of `gsbench.raster.rasterize`
 
-    def __init__(self, *, agr: bool = False, sh_degree: int = 3) -> None:
+    def __init__(self, *, agr: bool = False, agr_octaves: int = OCTAVES, sh_degree: int = 3) -> None:
         """Make a model without Gaussians; `initialise` gives it some, `load_state` others.
 
+        Args:
+            agr: whether the adaptive Gaussian refinement moves the Gaussians.
+            agr_octaves: K of AGR's time encoding.
+            sh_degree: of the spherical harmonics, 0 to 3.
+
         Raises:
-            InputError: sh_degree is not 0, 1, 2 or 3.
+            InputError: an option out of its range.
         """
         super().__init__()
         if sh_degree not in range(4):
@@ -72,7 +78,10 @@ class GaussianModel(nn.Module, ABC):
         self.splats = nn.ParameterDict()
         self.log_modulation = nn.ParameterDict()  # ln lambda_t, ln lambda_d of the models that have them
         self.refinement: Refinement | None = None
+        if not isinstance(agr_octaves, int) or not 0 <= agr_octaves <= 32:
+            raise InputError(f"agr_octaves: expected 0, 1, .., 32, got {agr_octaves}")
         self.agr = agr
+        self.agr_octaves = agr_octaves
         self.sh_degree = sh_degree
         self.extent = 1.0  # of the scene, world units
         self.stage = Stage(sh_degree, agr, False)
@@ -94,6 +103,10 @@ class GaussianModel(nn.Module, ABC):
     @abstractmethod
     def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Raw geometry of the children of parents, of which `raw` holds CHILDREN copies in a row."""
+
+    def hold_sizes(self, least: Tensor) -> None:
+        """Raise raw sizes in space to at least `least` [N], world units; none here, where they are not known."""
+        return
 
     def long_in_time(self) -> Tensor:
         """Which Gaussians are split, rather than cloned, for their extent in time, [N] bool (7DGS, section 4.4)."""
@@ -129,8 +142,11 @@ class GaussianModel(nn.Module, ABC):
         raw |= self.initial_colors((points.colors - 0.5) / SH_C0)
         self.splats = nn.ParameterDict({name: nn.Parameter(value.clone()) for name, value in raw.items()})
         if self.agr:
-            shape = sum(raw[name].shape[-1] for name in self.geometry)
-            self.refinement = Refinement([*(raw[name].shape[-1] for name in self.centers), shape], generator)
+            widths = {name: raw[name].shape[-1] for name in (*self.centers, *self.geometry)}
+            outputs = [*(widths[name] for name in self.centers), sum(widths[name] for name in self.geometry)]
+            unit = size_of(points)
+            units = torch.cat([torch.full((n,), unit if name in LENGTHS else 1.0) for name, n in widths.items()])
+            self.refinement = Refinement(outputs, generator, self.agr_octaves, units)
         self.set_stage(self.stage)
 
     def slice(self, camera_center: Tensor, time: float | Tensor | None) -> Gaussians3D:
@@ -242,6 +258,15 @@ class GaussianModel(nn.Module, ABC):
         for name, parameter in self.splats.items():
             parameter.data = torch.empty_like(state[f"splats.{name}"], device=parameter.device)
         self.load_state_dict(state)
+
+
+def size_of(points: Points) -> float:
+    """How large a scene is, world units: the standard deviation of its points along an axis; 1 of a single point.
+
+    Cameras that stand far off do not change it, unlike the extent.
+    """
+    size = float(points.means.std(0).mean()) if len(points.means) > 1 else 0.0
+    return size if 0 < size < math.inf else 1.0
 
 
 def unit(vectors: Tensor) -> Tensor:

@@ -42,6 +42,10 @@ class Gaussians3DModel(GaussianModel):
         """Largest of the three scales."""
         return self.splats["scales"].detach().amax(-1).exp()
 
+    def hold_sizes(self, least: Tensor) -> None:
+        """All three scales."""
+        self.splats["scales"].data.clamp_(min=least.log()[:, None])
+
     def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Children drawn from the parent's own distribution, 1.6 times smaller (3DGS, section 5.2)."""
         z = torch.randn(raw["means"].shape, generator=generator).to(raw["means"])

@@ -11,7 +11,7 @@ from gsbench.kernels.colors import MAX_WAVES, show_colors
 from gsbench.kernels.slices import observe_rotated
 from gsbench.kernels.thresholds import TIME_GATE_MIN
 from gsbench.models.appearance import sh_time_colors
-from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register
+from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register, size_of
 from gsbench.models.factors import rotation4d, sizes
 from gsbench.models.slicing import check_scheme, mahalanobis, slice_gaussians
 from gsbench.scenes.scene import Points
@@ -19,7 +19,13 @@ from gsbench.scenes.scene import Points
 
 @register("4dgs")
 class Gaussians4DModel(GaussianModel):
-    """Means and times, four log scales and two quaternions: F = M_left(l) M_right(r) S over (x, y, z, t)."""
+    """Means and times, four log scales and two quaternions: F = M_left(l) M_right(r) S over (x, y, z, t).
+
+    A rotation of space and time needs one unit for both: it sees the clip as long as the scene is large (`clock`), so
+    that a scene in metres and the same in centimetres are one. The fourth scale is such a length; `times` are not.
+    """
+
+    clock: Tensor  # [] world units a clip
 
     observes = ("time",)
     centers = ("means", "times")
@@ -46,11 +52,14 @@ class Gaussians4DModel(GaussianModel):
         self.time_degree = time_degree
         self.scheme = scheme
         self.modulate("time", lambda_t)
+        self.register_buffer("clock", torch.ones(()))
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Spheres in space, times uniform over the clip and a tenth of it beyond, time scale sqrt(T / 5)."""
         N = len(distances)
-        scales = torch.cat([distances.log()[:, None].repeat(1, 3), torch.full((N, 1), 0.5 * math.log(1 / 5))], -1)
+        self.clock.fill_(size_of(points))
+        duration = self.clock.log() + 0.5 * math.log(1 / 5)
+        scales = torch.cat([distances.log()[:, None].repeat(1, 3), duration.expand(N, 1)], -1)
         quats = torch.zeros(N, 4)
         quats[:, 0] = 1
         times = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
@@ -77,12 +86,12 @@ class Gaussians4DModel(GaussianModel):
         assert time is not None
         return observe_rotated(
             raw["means"],
-            raw["times"],
+            raw["times"] * self.clock,
             raw["scales"],
             raw["left_quats"],
             raw["right_quats"],
             raw["opacities"],
-            time,
+            time * self.clock,
             self.modulation("time"),
         )
 
@@ -110,6 +119,10 @@ class Gaussians4DModel(GaussianModel):
         """Largest of the three spatial scales, as 4DGS' density control has it."""
         return self.splats["scales"].detach()[:, :3].amax(-1).exp()
 
+    def hold_sizes(self, least: Tensor) -> None:
+        """The three spatial scales."""
+        self.splats["scales"].data[:, :3].clamp_(min=least.log()[:, None])
+
     def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Children drawn from the parent's distribution in space and time, all scales 1.6 times smaller."""
         z = torch.randn(len(raw["means"]), 4, generator=generator).to(raw["means"])
@@ -124,10 +137,10 @@ class Gaussians4DModel(GaussianModel):
         """f_temp of factors [N, 4, 4], delta [N, 1] away in time, [N]."""
         return torch.exp(-0.5 * self.modulation("time") * mahalanobis(factor[:, 3:], delta))
 
-    @staticmethod
-    def factors(raw: Raw) -> Tensor:
-        """R S, [N, 4, 4]."""
-        return rotation4d(raw["left_quats"], raw["right_quats"]) * sizes(raw["scales"])[:, None, :]
+    def factors(self, raw: Raw) -> Tensor:
+        """R S with rows (x, y, z, t), t in clips, [N, 4, 4]."""
+        factor = rotation4d(raw["left_quats"], raw["right_quats"]) * sizes(raw["scales"])[:, None, :]
+        return torch.cat([factor[:, :3], factor[:, 3:] / self.clock], 1)
 
 
 def _leading_first(factor: Tensor) -> Tensor:

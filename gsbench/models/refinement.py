@@ -9,20 +9,20 @@ from torch import Tensor, nn
 
 from gsbench.kernels.refine import refine
 
-OCTAVES = 10  # K of the time encoding
+OCTAVES = 10  # K of the time encoding in the 7DGS paper
 HIDDEN = 64
 
 
-def encode_time(time: Tensor) -> Tensor:
-    """gamma(t) = (sin 2^0 pi t, cos 2^0 pi t, .., sin 2^9 pi t, cos 2^9 pi t), [] -> [20]."""
-    angles = time * _frequencies(time.device, time.dtype)
+def encode_time(time: Tensor, octaves: int = OCTAVES) -> Tensor:
+    """gamma(t) = (sin 2^0 pi t, cos 2^0 pi t, .., sin 2^(K-1) pi t, cos 2^(K-1) pi t), [] -> [2 K]."""
+    angles = time * _frequencies(octaves, time.device, time.dtype)
     return torch.stack([angles.sin(), angles.cos()], -1).flatten()
 
 
 @functools.cache
-def _frequencies(device: torch.device, dtype: torch.dtype) -> Tensor:
-    """2^k pi, [10]: made once, as on a GPU every operation of a few numbers costs as much as one of thousands."""
-    return math.pi * 2.0 ** torch.arange(OCTAVES, device=device, dtype=dtype)
+def _frequencies(octaves: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """2^k pi, [K]: made once, as on a GPU every operation of a few numbers costs as much as one of thousands."""
+    return math.pi * 2.0 ** torch.arange(octaves, device=device, dtype=dtype)
 
 
 class Refinement(nn.Module):
@@ -32,11 +32,25 @@ class Refinement(nn.Module):
     depend on the view.
     """
 
-    def __init__(self, outputs: list[int], generator: torch.Generator) -> None:
-        """Make one network for each entry of `outputs`, its width; the last is of what is no mean."""
+    units: Tensor  # [sum of outputs]
+
+    def __init__(
+        self, outputs: list[int], generator: torch.Generator, octaves: int = OCTAVES, units: Tensor | None = None
+    ) -> None:
+        """Make the networks, their output layers zero.
+
+        Args:
+            outputs: the width of each network; the last is of what is no mean.
+            generator: the first layers are drawn from it.
+            octaves: K of gamma(t). Many octaves on few frames tell every frame apart, and learn each by heart.
+            units: [sum of outputs] what the networks measure each number in, so that they see a scene of any size
+                alike; ones by default.
+        """
         super().__init__()
         self.features = sum(outputs[:-1])
-        width = self.features + 2 * OCTAVES
+        self.octaves = octaves
+        self.register_buffer("units", torch.ones(sum(outputs)) if units is None else units)
+        width = self.features + 2 * octaves
         # The first layers of all networks read the same f: they are one matrix, 64 rows for each.
         self.weight_in = nn.Parameter(torch.empty(HIDDEN * len(outputs), width))
         self.bias_in = nn.Parameter(torch.empty(HIDDEN * len(outputs)))
@@ -51,15 +65,19 @@ class Refinement(nn.Module):
 
         With `native`, by the kernel (float32), which never writes a hidden layer to memory.
         """
-        weight_in, bias_in = self.weight_in[:, : self.features], self.at_time(time)
+        # The units are those of the layers' rows and columns: no Gaussian's number is scaled.
+        weight_in, bias_in = self.weight_in[:, : self.features] / self.units[: self.features], self.at_time(time)
+        units = self.units.split([len(w) for w in self.weights_out])
+        weights_out = [w * unit[:, None] for w, unit in zip(self.weights_out, units, strict=True)]
+        biases_out = [b * unit for b, unit in zip(self.biases_out, units, strict=True)]
         if native:
-            return refine(values, weight_in, bias_in, list(self.weights_out), list(self.biases_out))
+            return refine(values, weight_in, bias_in, weights_out, biases_out)
         features = torch.cat(values[: len(self.weights_out) - 1], -1)
         parts = torch.relu(F.linear(features, weight_in, bias_in)).split(HIDDEN, -1)
-        layers = zip(parts, self.weights_out, self.biases_out, strict=True)
+        layers = zip(parts, weights_out, biases_out, strict=True)
         residuals = torch.cat([F.linear(h, w, b) for h, w, b in layers], -1).split([x.shape[-1] for x in values], -1)
         return [x + residual for x, residual in zip(values, residuals, strict=True)]
 
     def at_time(self, time: Tensor) -> Tensor:
-        """What gamma(t), the same for all Gaussians, adds to every hidden unit: one vector, not 20 more columns."""
-        return F.linear(encode_time(time), self.weight_in[:, self.features :], self.bias_in)
+        """What gamma(t), the same for all Gaussians, adds to every hidden unit: one vector, not 2 K more columns."""
+        return F.linear(encode_time(time, self.octaves), self.weight_in[:, self.features :], self.bias_in)

@@ -134,6 +134,11 @@ class TriangularModel(GaussianModel):
         T_pp = reduce(self.factors(dict(self.splats.items())).detach()).T_pp
         return torch.linalg.matrix_norm(T_pp, ord=2)
 
+    def hold_sizes(self, least: Tensor) -> None:
+        """The diagonal of L_pp."""
+        space = self.rows["p"]
+        self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=least.log()[:, None])
+
     def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Children along the parent's path where it is long in time, else drawn from its slice; K is theirs too.
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from gsbench import models
 from gsbench.errors import InputError
+from gsbench.experiment import build
 from gsbench.models import GaussianModel
 from gsbench.scenes.scene import Camera, Points, Scene, View
 from gsbench.stability.cases import Case, Cell, device_of
@@ -65,8 +65,7 @@ def fit(training: Training, backend: str) -> Trainer:
     config, scene = training.config, training.scene
     config.raster.backend = backend
     config.train.curve_points = 1
-    model = models.build(config.model.name, agr=config.agr, sh_degree=config.model.sh_degree, **config.model.options)
-    model.backend = backend
+    model = build(config)
     assert scene.points is not None
     model.initialise(scene.points, scene.extent, generator(config.seed))
     dtype, config.device = scene.train[0].image.dtype, device_of(backend)

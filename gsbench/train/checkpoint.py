@@ -10,7 +10,7 @@ import torch
 from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 
-VERSION = 2
+VERSION = 3
 FILE_NAME = "checkpoint.pt"
 
 

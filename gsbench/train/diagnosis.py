@@ -58,4 +58,7 @@ def _log_size_in_time(model: GaussianModel, sizes: Tensor) -> float | None:
     if "time" not in model.observes:
         return None
     rows = getattr(model, "rows", None)  # of the triangular models
-    return float(sizes[rows["t"][0]] if rows else sizes[3])
+    if rows:
+        return float(sizes[rows["t"][0]])
+    clock: Tensor = model.clock  # type: ignore[assignment]  # of 4DGS
+    return float(sizes[3] - clock.log())

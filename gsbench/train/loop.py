@@ -20,6 +20,7 @@ from gsbench.models import GaussianModel
 from gsbench.models.render import draw, render
 from gsbench.scenes import Scene, View
 from gsbench.train.density import DensityControl
+from gsbench.train.floor import Floor
 from gsbench.train.losses import photometric
 from gsbench.train.optim import Optimizer
 from gsbench.train.schedule import Schedule, batch, generator
@@ -54,8 +55,9 @@ class Trainer:
         self.config = config
         self.background = torch.tensor(scene.background, device=config.device)
         self.schedule = Schedule(train, config.model.sh_degree, config.agr)
-        self.optimizer = Optimizer(model, config.model, scene.extent, train.iterations, config.optim)
+        self.optimizer = Optimizer(model, config.model, train, scene.extent, config.optim)
         self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity, len(scene.train))
+        self.floor = Floor(model, [view.camera for view in scene.train])
         self.stages = Stages(config.device)
         self.watch = Watch(config.device)
         if config.device.startswith("cuda"):  # there a bad step is found later, and must not be applied meanwhile
@@ -121,11 +123,14 @@ class Trainer:
         self.watch.see(step, torch.stack(losses).sum(), self.model.groups())
         with stages("optimizer"):
             self.optimizer.step(step, drawn=self.density.unseen < len(views))
+            self.floor.hold()
         with stages("density"):
             if self.schedule.densifies(step):
                 self.density.densify(generator(self.config.seed, step), self.schedule.has_reset(step))
             if self.schedule.resets(step):
                 self.density.reset_opacities()
+            if (step + 1) % self.schedule.densify_every == 0:
+                self.floor.update()
 
     def _measure(self) -> None:
         """Add a point to the curve; its cost is in no stage, so in no training time."""
@@ -159,6 +164,7 @@ class Trainer:
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.adam.state_dict(),
             "density": self.density.state_dict(),
+            "floor": self.floor.state_dict(),
             "stages": self.stages.state_dict(),
             "curve": self.curve.state_dict(),
             "best": vars(self.best).copy(),
@@ -170,6 +176,7 @@ class Trainer:
         self.model.load_state(state["model"])
         self.optimizer.adam.load_state_dict(state["optimizer"])
         self.density.load_state_dict(state["density"])
+        self.floor.load_state_dict(state["floor"])
         self.stages.load_state_dict(state["stages"])
         self.curve.load_state_dict(state["curve"])
         self.best = Best(**state["best"])

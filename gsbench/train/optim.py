@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,7 +13,7 @@ from gsbench.kernels.adam import adam
 from gsbench.models import GaussianModel
 
 if TYPE_CHECKING:  # the configuration needs hydra, which a machine that checks kernels may not have
-    from gsbench.config import LearningRate, ModelConfig
+    from gsbench.config import LearningRate, ModelConfig, TrainConfig
 
 OPTIMIZERS = ("adam", "sparse_adam")
 
@@ -25,9 +26,16 @@ class Optimizer:
     """
 
     def __init__(
-        self, model: GaussianModel, config: ModelConfig, extent: float, iterations: int, kind: str = "adam"
+        self, model: GaussianModel, config: ModelConfig, train: TrainConfig, extent: float, kind: str = "adam"
     ) -> None:
-        """One group for each name of `model.groups()`; `kind` is one of OPTIMIZERS.
+        """One group for each name of `model.groups()`.
+
+        Args:
+            model: initialised.
+            config: has the learning rates.
+            train: has the length of the run, and the length that the rates are stated for.
+            extent: of the scene, world units.
+            kind: one of OPTIMIZERS.
 
         Raises:
             InputError: a parameter without a learning rate, or a rate for a parameter no variant of the model has.
@@ -41,8 +49,8 @@ class Optimizer:
                 raise InputError(f"model.lr: model '{config.name}' has no '{name}'. {did_you_mean(name, groups)}")
         self.rates = {name: config.lr[name] for name in groups}
         self.model = model
+        self.train = train
         self.extent = extent
-        self.iterations = iterations
         self.is_sparse = kind == "sparse_adam"
         self.adam = torch.optim.Adam(
             [{"params": parameters, "name": name} for name, parameters in groups.items()], lr=0.0, eps=1e-15, fused=True
@@ -63,7 +71,7 @@ class Optimizer:
             drawn = drawn & (skip == 0)
         counts = 1 if skip is None else 1 - skip
         for group in self.adam.param_groups:
-            group["lr"] = rate_at(self.rates[group["name"]], step / self.iterations, self.extent)
+            group["lr"] = rate_at(self.rates[group["name"]], step, self.train, self.extent)
             if self.is_sparse and group["name"] in self.model.splats:
                 self._step_rows(group, drawn, counts)
         self.adam.step()
@@ -103,9 +111,17 @@ class Optimizer:
                 self.adam.state[parameter][name].zero_()
 
 
-def rate_at(rate: LearningRate, progress: float, extent: float) -> float:
-    """The learning rate when `progress` in [0, 1] of the run is done: log-linear from start to end (3DGS)."""
+def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) -> float:
+    """The learning rate of a step counted from 0: log-linear from start to end over the run (3DGS).
+
+    Where it is `per_run`, times sqrt(recipe_iterations / iterations). Adam's steps are as long as its rate, whatever
+    the gradient; their sum over a run, where gradients keep their sign, goes with the run's length, and where they are
+    noise, with its square root. The root was better than nothing for every model (docs/tuning.md).
+    """
     scale = extent if rate.per_extent else 1.0
+    if rate.per_run:
+        scale *= math.sqrt(train.recipe_iterations / train.iterations)
+    progress = step / train.iterations
     if rate.end is None:
         return rate.start * scale
     return float(rate.start ** (1 - progress) * rate.end**progress * scale)

@@ -131,13 +131,27 @@ def test_4dgs(scheme: str) -> None:
     means, covariances, opacities = [], [], []
     for i, mean in enumerate(values["means"]):
         F = rotor_factor(values["left_quats"][i], values["right_quats"][i], values["scales"][i])
-        S, offset = F @ F.T, TIME - values["times"][i, 0]
+        S, offset = F @ F.T, (TIME - values["times"][i, 0]) * model.clock.item()
         f = math.exp(-0.5 * offset**2 / S[3, 3])
         means.append(mean + S[:3, 3] / S[3, 3] * offset * (f > 0.05))  # what is not drawn stays at mu_p
         covariances.append(S[:3, :3] - np.outer(S[:3, 3], S[:3, 3]) / S[3, 3])
         opacities.append((f if f > 0.05 else 0.0) / (1 + math.exp(-values["opacities"][i])))
     agree(model.slice(CAMERA, TIME), np.stack(means), np.stack(covariances), np.array(opacities))
     assert 0 < opacities.count(0) < N
+
+
+@pytest.mark.parametrize("native", [False, True])
+def test_4dgs_is_the_same_in_metres_and_centimetres(native: bool) -> None:
+    """Catches a rotation of space into time whose angle is a speed in one unit of length only."""
+    dtype = torch.float32 if native else torch.float64
+    model, larger = lively("4dgs").to(dtype), lively("4dgs").to(dtype)
+    larger.clock *= 100
+    for name, times, plus in (("means", 100.0, 0.0), ("scales", 1.0, math.log(100.0))):
+        larger.splats[name].data.mul_(times).add_(plus)
+    a, b = model.slice(CAMERA.to(dtype), TIME), larger.slice(100 * CAMERA.to(dtype), TIME)
+    torch.testing.assert_close(100 * a.means, b.means, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(100 * a.factors @ a.factors.mT, b.factors @ b.factors.mT / 100, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(a.opacities, b.opacities, rtol=1e-4, atol=1e-6)
 
 
 def test_4dgs_leaves_out_what_is_far_in_time() -> None:

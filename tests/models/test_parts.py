@@ -187,10 +187,24 @@ def test_time_colors() -> None:
 
 
 def test_time_encoding() -> None:
-    """Catches another octave, order or factor than (sin 2^k pi t, cos 2^k pi t), k = 0..9."""
+    """Catches another octave, order or factor than (sin 2^k pi t, cos 2^k pi t), k = 0..K-1; the paper's K is 10."""
     t = 0.37
     expected = [f(2**k * math.pi * t) for k in range(10) for f in (math.sin, math.cos)]
-    np.testing.assert_allclose(encode_time(torch.tensor(t, dtype=torch.float64)).numpy(), expected, atol=1e-10)
+    for arguments, K in (((), 10), ((3,), 3), ((0,), 0)):
+        encoded = encode_time(torch.tensor(t, dtype=torch.float64), *arguments)
+        np.testing.assert_allclose(encoded.numpy(), expected[: 2 * K], atol=1e-10)
+
+
+def test_refinement_measures_in_units() -> None:
+    """Catches a scene of another size that is refined otherwise: lengths 100 times longer move 100 times further."""
+    units = torch.tensor([100.0] * 3 + [1.0] * 4 + [1.0, 100.0])
+    small, large = (Refinement([3, 1, 3, 2], torch.Generator().manual_seed(0), 4, u) for u in (None, units))
+    for i, (a, b) in enumerate(zip(small.parameters(), large.parameters(), strict=True)):
+        a.data = b.data = normal(i, *a.shape).float()
+    values, time = normal(9, 6, 9).float(), torch.tensor(0.3)
+    moved = torch.cat(small(list(values.split([3, 1, 3, 2], -1)), time), -1)
+    again = torch.cat(large(list((values * units).split([3, 1, 3, 2], -1)), time), -1)
+    torch.testing.assert_close(again, moved * units, rtol=1e-4, atol=1e-4)
 
 
 def test_refinement_starts_at_zero_but_learns() -> None:

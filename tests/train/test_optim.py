@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsbench import kernels
-from gsbench.config import DensifyConfig, LearningRate, ModelConfig
+from gsbench.config import DensifyConfig, LearningRate, ModelConfig, TrainConfig
 from gsbench.errors import InputError
 from gsbench.kernels.adam import adam
 from gsbench.models import GaussianModel, build
@@ -25,7 +25,7 @@ def fitted(
     model = build("3dgs")
     random = torch.Generator().manual_seed(0)
     model.initialise(random_points(count, 1.0, random), extent=2.0, generator=random)
-    return model, Optimizer(model, ModelConfig("3dgs", lr=rates), extent=2.0, iterations=100, kind=kind)
+    return model, Optimizer(model, ModelConfig("3dgs", lr=rates), TrainConfig(iterations=100), 2.0, kind)
 
 
 def descend(model: GaussianModel, optimizer: Optimizer, step: int, drawn: torch.Tensor | None = None) -> None:
@@ -38,11 +38,21 @@ def descend(model: GaussianModel, optimizer: Optimizer, step: int, drawn: torch.
 def test_rate_is_log_linear() -> None:
     """Catches a linear or stepwise decay: half way, the rate is the geometric mean (3DGS' xyz rate)."""
     rate = LearningRate(1.6e-4, 1.6e-6, per_extent=True)
-    assert rate_at(rate, 0, 5) == pytest.approx(8e-4)
-    assert rate_at(rate, 0.5, 5) == pytest.approx(8e-5)
-    assert rate_at(rate, 1, 5) == pytest.approx(8e-6)
-    assert rate_at(LearningRate(0.05), 0.7, 5) == 0.05
-    assert math.isclose(rate_at(LearningRate(0.0), 0.7, 5), 0.0)
+    train = TrainConfig(iterations=100)
+    assert rate_at(rate, 0, train, 5) == pytest.approx(8e-4)
+    assert rate_at(rate, 50, train, 5) == pytest.approx(8e-5)
+    assert rate_at(rate, 100, train, 5) == pytest.approx(8e-6)
+    assert rate_at(LearningRate(0.05), 70, train, 5) == 0.05
+    assert math.isclose(rate_at(LearningRate(0.0), 70, train, 5), 0.0)
+
+
+def test_rates_of_short_runs() -> None:
+    """Catches rates of 30,000 steps in a run of 300, and rates that change where the recipe is as long as the run."""
+    rate = LearningRate(1e-3, 1e-5, per_run=True)
+    assert rate_at(rate, 0, TrainConfig(iterations=300), 5) == pytest.approx(1e-2)
+    assert rate_at(rate, 300, TrainConfig(iterations=300), 5) == pytest.approx(1e-4)
+    assert rate_at(rate, 0, TrainConfig(), 5) == pytest.approx(1e-3)
+    assert rate_at(LearningRate(1e-3), 0, TrainConfig(iterations=300), 5) == 1e-3
 
 
 def test_a_copied_gaussian_does_not_inherit_momentum() -> None:

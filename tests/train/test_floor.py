@@ -1,0 +1,57 @@
+"""The least size of a Gaussian: seen by no camera, and held."""
+
+import math
+
+import pytest
+import torch
+
+from gsbench.config import RasterConfig
+from gsbench.models import GaussianModel, build
+from gsbench.models.render import render
+from gsbench.scenes import Camera
+from gsbench.scenes.points import random_points
+from gsbench.train.floor import LEAST_PIXELS, Floor
+
+OPTIONS = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_d": 0.05, "lambda_t": 0.05}}
+
+
+def camera(distance: float, focal: float = 50.0) -> Camera:
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = distance
+    return Camera(viewmat, torch.tensor([[focal, 0, 24], [0, focal, 24], [0, 0, 1]]), 48, 48)
+
+
+def flat(name: str) -> GaussianModel:
+    """A model whose Gaussians are flatter than 1e6 : 1 along one axis."""
+    model = build(name, **OPTIONS[name])
+    generator = torch.Generator().manual_seed(0)
+    model.initialise(random_points(200, 1.0, generator), 4.0, generator)
+    column = model.rows["p"][2] if name in ("6dgs", "7dgs") else 2
+    model.splats["log_diagonal" if name in ("6dgs", "7dgs") else "scales"].data[:, column] = math.log(1e-7)
+    return model
+
+
+def test_the_floor_is_a_part_of_a_pixel_at_the_nearest_camera() -> None:
+    """Catches the farthest camera, a mean over cameras, or a focal length that is left out."""
+    model = flat("3dgs")
+    model.splats["means"].data.zero_()
+    floor = Floor(model, [camera(4.0), camera(2.0), camera(2.5, focal=100.0)])
+    torch.testing.assert_close(floor.least, torch.full((200,), LEAST_PIXELS * 2.5 / 100))
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_no_camera_sees_the_floor(name: str) -> None:
+    """Catches a bound that touches the image, one on another axis or on time, and one that is not held."""
+    model, eye = flat(name), camera(4.0)
+    background = torch.zeros(3)
+    before = render(model, eye, 0.5, background, RasterConfig())
+    others = {n: p.detach().clone() for n, p in model.splats.items() if n not in ("scales", "log_diagonal")}
+    durations = model.splats["scales"].detach()[:, 3:].clone() if name == "4dgs" else None
+    floor = Floor(model, [eye])
+    floor.hold()
+    after = render(model, eye, 0.5, background, RasterConfig())
+    assert 0 < (after - before).abs().max() < 1 / 255
+    factors = model.slice(eye.center, 0.5).factors
+    assert (torch.linalg.svdvals(factors)[:, 2] >= 0.99 * floor.least).all()
+    assert all(torch.equal(model.splats[n], p) for n, p in others.items())
+    assert durations is None or torch.equal(model.splats["scales"][:, 3:], durations)
