@@ -1,0 +1,60 @@
+"""The recipes in conf/: rates that mean the same for a run of any length, and the published ones as published."""
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from gsbench.__main__ import CONF
+from gsbench.config import Config, register_schema
+from gsbench.experiment import build
+from gsbench.scenes.points import random_points
+from gsbench.train.optim import Optimizer, rate_at
+
+
+def composed(*overrides: str) -> Config:
+    register_schema()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config: Config = OmegaConf.to_object(compose("config", ["+exp=mini", "scene=suzanne", *overrides]))  # type: ignore[assignment]
+    return config
+
+
+def rates(config: Config, progress: float) -> dict[str, float]:
+    """By parameter, after a part of the run, in a scene of extent 5."""
+    model, random = build(config), torch.Generator().manual_seed(0)
+    model.initialise(random_points(10, 1.0, random), 5.0, random)
+    optimizer = Optimizer(model, config.model, config.train, 5.0)
+    step = round(progress * config.train.iterations)
+    return {name: rate_at(rate, step, config.train, 5.0) for name, rate in optimizer.rates.items()}
+
+
+def test_rates_of_the_paper() -> None:
+    """Catches a published rate that falls, or that depends on the run's length or the scene's size."""
+    for iterations in (1000, 30_000):
+        config = composed("model=7dgs", "+recipe=paper", f"train.iterations={iterations}")
+        for progress in (0.0, 0.5):
+            found = rates(config, progress)
+            assert found["times"] == found["directions"] == 2.5e-2
+            assert found["log_diagonal"] == 5e-2
+            assert found["shape"] == found["motion"] == found["coupling"] == 1e-2
+        assert (config.agr, config.model.agr_octaves) == (True, 10)
+        assert config.model.options["factor_order"] == "paper"
+        assert config.model.options["off_diagonal"] == "raw"
+
+
+def test_rates_of_the_authors_code() -> None:
+    """Catches AGR, which that code does not have, a lambda that learns, and entries that are not row-scaled."""
+    config = composed("model=7dgs", "+recipe=authors")
+    found = rates(config, 0.5)
+    assert (found["log_diagonal"], found["shape"], found["motion"], found["modulation"]) == (5e-3, 1e-3, 1e-3, 0)
+    assert not config.agr
+    assert config.model.options["lambda_t"] == config.model.options["lambda_d"] == 0.01
+    assert config.model.options["off_diagonal"] == "row_scaled"
+
+
+def test_every_model_goes_as_far_in_a_short_run() -> None:
+    """Catches a model whose geometry keeps the rates of 30,000 steps at 300: all are ten times faster, colours not."""
+    for model in ("3dgs", "4dgs", "6dgs", "7dgs"):
+        short, long = (rates(composed(f"model={model}", f"train.iterations={n}"), 0.0) for n in (300, 30_000))
+        for name in long.keys() - {"modulation"}:
+            expected = 1 if name in ("opacities", "sh0", "shN", "refinement") else 10
+            assert abs(short[name] / long[name] - expected) < 1e-9, f"{model}: {name}"
