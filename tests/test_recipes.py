@@ -1,5 +1,8 @@
 """The recipes in conf/: rates that mean the same for a run of any length, and the published ones as published."""
 
+from pathlib import Path
+
+import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
@@ -14,7 +17,8 @@ from gsbench.train.optim import Optimizer, rate_at
 def composed(*overrides: str) -> Config:
     register_schema()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        config: Config = OmegaConf.to_object(compose("config", ["+exp=mini", "scene=suzanne", *overrides]))  # type: ignore[assignment]
+        names = [*([] if "+exp=tuning" in overrides else ["+exp=mini"]), "scene=suzanne", *overrides]
+        config: Config = OmegaConf.to_object(compose("config", names))  # type: ignore[assignment]
     return config
 
 
@@ -58,3 +62,27 @@ def test_every_model_goes_as_far_in_a_short_run() -> None:
         for name in long.keys() - {"modulation"}:
             expected = 1 if name in ("opacities", "sh0", "shN", "refinement") else 10
             assert abs(short[name] / long[name] - expected) < 1e-9, f"{model}: {name}"
+
+
+TRIALS = sorted((CONF / "trial").rglob("*.yaml"))
+
+
+@pytest.mark.parametrize("path", TRIALS, ids=lambda path: str(path.relative_to(CONF / "trial")))
+def test_trials_change_what_they_say(path: Path) -> None:
+    """Catches a trial that names a parameter its model lacks, changes nothing, or lies over another's results."""
+    trial = str(path.relative_to(CONF / "trial").with_suffix(""))
+    model = trial.split("/")[0] if "/" in trial else "7dgs"
+    tuning = (f"model={model}", "+exp=tuning", "data.root=here")
+    config, recipe = composed(*tuning, f"+trial={trial}"), composed(*tuning)
+    assert config.experiment == f"tuning.{path.stem}"
+    rates(config, 0.0)
+    changed = (config.model.lr, config.train) != (recipe.model.lr, recipe.train)
+    assert changed == (trial != "recipe")
+
+
+def test_every_model_has_the_same_number_of_trials() -> None:
+    """Catches a model that was tuned more than another."""
+    folders = [folder for folder in (CONF / "trial").iterdir() if folder.is_dir()]
+    own = {folder.name: sorted(path.name for path in folder.glob("*.yaml")) for folder in folders}
+    assert own.keys() == {"3dgs", "4dgs", "6dgs", "7dgs"}
+    assert len({tuple(names) for names in own.values()}) == 1

@@ -30,8 +30,8 @@ def larger(scene: Scene) -> Scene:
 def test_a_larger_scene_trains_alike(name: str) -> None:
     """Catches a rate in world units without the extent, a rate of time with it, and networks that read metres.
 
-    AGR acts and Gaussians are cloned and split in these 40 steps; docs/tuning.md has 1,000 on moving-matte. (Longer ones
-    of 3DGS part: the gradient that turns a sphere is rounding, and Adam makes a step of it.)
+    AGR acts and Gaussians are cloned and split in these 40 steps; docs/protocol.md has 1,000 on moving-matte. (Longer
+    ones of 3DGS part: the gradient that turns a sphere is rounding, and Adam makes a step of it.)
     """
     scene = moving_square()
     config = compose(name, 40, "agr=true", "train.densify.every=10")
