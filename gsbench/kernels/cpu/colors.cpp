@@ -47,31 +47,84 @@ struct Picked {
 
 // Sixteen picked rows, or what is left of them; lanes without one read zero.
 struct Rows {
-    uint32_t lanes;
+    int count;
     alignas(64) int32_t ones[LANES] = {}, threes[LANES] = {}, all[LANES] = {}, packed[LANES] = {};
 
-    GSB_HD Rows(const Picked& picked, int first, int stride) {
-        const int n = lanes_from(first, picked.count);
-        lanes = ALL_LANES >> (LANES - n);
-        for (int k = 0; k < n; ++k) {
+    GSB_HD Rows(const Picked& picked, int first, int stride) : count(lanes_from(first, picked.count)) {
+        for (int k = 0; k < count; ++k) {
             ones[k] = static_cast<int32_t>(picked.which[first + k]);
             threes[k] = ones[k] * 3;
             all[k] = ones[k] * stride;
             packed[k] = (first + k) * stride;
         }
     }
-    GSB_HD Vec load(const float* p, const int32_t (&offsets)[LANES]) const {
-        return gather_at(p, Places(offsets), lanes);
-    }
-    GSB_HD void store(Vec x, float* p, const int32_t (&offsets)[LANES]) const {
-        scatter_at(x, p, Places(offsets), lanes);
-    }
+    GSB_HD Vec load(const float* p, const int32_t (&offsets)[LANES]) const { return gather_rows(p, offsets, count); }
+    GSB_HD void store(Vec x, float* p, const int32_t (&offsets)[LANES]) const { scatter_rows(x, p, offsets, count); }
     GSB_HD void load3(const float* p, Vec (&out)[3]) const {
         for (int k = 0; k < 3; ++k) out[k] = load(p + k, threes);
     }
     GSB_HD void store3(const Vec (&x)[3], float* p) const {
         for (int k = 0; k < 3; ++k) store(x[k], p + k, threes);
     }
+};
+
+// `width` columns of picked rows, one after the other. A column's floats are far apart, a row's are not: sixteen columns
+// are read as pieces of rows, and turned.
+class ColumnsIn {
+public:
+    GSB_HD ColumnsIn(const float* p, const int32_t (&offsets)[LANES], int count, int width)
+        : p(p), offsets(offsets), count(count), left(width) {}
+
+    GSB_HD Vec next() {
+        if (at == LANES) fill();
+        return block[at++];
+    }
+
+private:
+    GSB_HD void fill() {
+        const int n = left < LANES ? left : LANES;
+        for (int i = 0; i < LANES; ++i) block[i] = i < count ? load_some(p + offsets[i], n) : Vec(0.0f);
+        transpose(block);
+        p += n;
+        left -= n;
+        at = 0;
+    }
+
+    const float* p;
+    const int32_t (&offsets)[LANES];
+    int count, left, at = LANES;
+    Vec block[LANES];
+};
+
+// The same, to be written; `flush` at the end.
+class ColumnsOut {
+public:
+    GSB_HD ColumnsOut(float* p, const int32_t (&offsets)[LANES], int count) : p(p), offsets(offsets), count(count) {
+        for (auto& column : block) column = Vec(0.0f);
+    }
+
+    GSB_HD void put(Vec x) {
+        block[at++] = x;
+        if (at == LANES) flush();
+    }
+    // Goes on at another column.
+    GSB_HD void move_to(float* to) {
+        flush();
+        p = to;
+    }
+    GSB_HD void flush() {
+        if (at == 0) return;
+        transpose(block);
+        for (int i = 0; i < count; ++i) store_first(block[i], p + offsets[i], at);
+        p += at;
+        at = 0;
+    }
+
+private:
+    float* p;
+    const int32_t (&offsets)[LANES];
+    int count, at = 0;
+    Vec block[LANES];
 };
 
 // What the colours of sixteen Gaussians are made of.
@@ -85,23 +138,35 @@ struct Shades {
         waves_of(a.times ? Vec(a.time) - rows.load(a.times, rows.ones) : Vec(0.0f), a.waves, cosines, sines);
     }
 
-    // The constant's are kept in an array of their own.
-    GSB_HD static Vec coefficient(const ColorArgs& a, const Rows& rows, int k, int channel) {
-        return k ? rows.load(a.shN + (k - 1) * 3 + channel, rows.all) : rows.load(a.sh0 + channel, rows.threes);
+    // Where a wave's coefficients begin in a row of shN, and how many floats of them are used. The constant's are kept in
+    // an array of their own, sh0.
+    GSB_HD static int begin(const ColorArgs& a, int wave) { return wave ? (wave * a.bases - 1) * 3 : 0; }
+    GSB_HD int width(int wave) const { return (used - (wave == 0)) * 3; }
+
+    // Calls f(wave, basis, coefficients of the three channels) for every basis that is used.
+    template <class F>
+    GSB_HD void each(const ColorArgs& a, const Rows& rows, F f) const {
+        for (int wave = 0; wave < a.waves; ++wave) {
+            ColumnsIn columns(a.shN + begin(a, wave), rows.all, rows.count, width(wave));
+            for (int basis = 0; basis < used; ++basis) {
+                Vec c[3];
+                if (wave == 0 && basis == 0) {
+                    rows.load3(a.sh0, c);
+                } else {
+                    for (auto& channel : c) channel = columns.next();
+                }
+                f(wave, basis, c);
+            }
+        }
     }
 
     // Before they are clamped.
     GSB_HD void sum(const ColorArgs& a, const Rows& rows, Vec (&color)[3]) const {
         for (auto& channel : color) channel = Vec(0.5f);
-        for (int wave = 0; wave < a.waves; ++wave) {
-            for (int basis = 0; basis < used; ++basis) {
-                const int k = wave * a.bases + basis;
-                const Vec weight = Y[basis] * cosines[wave];
-                for (int channel = 0; channel < 3; ++channel) {
-                    color[channel] += coefficient(a, rows, k, channel) * weight;
-                }
-            }
-        }
+        each(a, rows, [&](int wave, int basis, const Vec (&c)[3]) {
+            const Vec weight = Y[basis] * cosines[wave];
+            for (int channel = 0; channel < 3; ++channel) color[channel] += c[channel] * weight;
+        });
     }
 
     GSB_HD static Vec3<Vec> offset(const ColorArgs& a, const Rows& rows) {
@@ -163,20 +228,25 @@ GSB_HD inline void backward_rows(const ColorArgs& a, const ColorGrads& out, cons
     rows.load3(out.colors, g);
     for (int k = 0; k < 3; ++k) g[k] = select(color[k] >= zero, g[k], zero);
     for (auto& y : g_Y) y = zero;
-    for (int wave = 0; wave < a.waves; ++wave) {
-        for (int basis = 0; basis < s.used; ++basis) {
-            const int k = wave * a.bases + basis;
-            const Vec weight = s.Y[basis] * s.cosines[wave];
-            Vec along(0.0f);
-            for (int channel = 0; channel < 3; ++channel) {
-                along += Shades::coefficient(a, rows, k, channel) * g[channel];
-                k ? rows.store(g[channel] * weight, out.shN + (k - 1) * 3 + channel, out.by_rows ? rows.packed : rows.all)
-                  : rows.store(g[channel] * weight, out.sh0 + channel, rows.threes);
-            }
-            g_Y[basis] += along * s.cosines[wave];
-            g_time += along * s.Y[basis] * s.sines[wave] * (TURN * static_cast<float>(wave));  // by mu_t
+    const int32_t(&places)[LANES] = out.by_rows ? rows.packed : rows.all;
+    ColumnsOut columns(out.shN, places, rows.count);
+    s.each(a, rows, [&](int wave, int basis, const Vec (&c)[3]) {
+        if (basis == 0) columns.move_to(out.shN + Shades::begin(a, wave));
+        const Vec weight = s.Y[basis] * s.cosines[wave];
+        Vec along(0.0f), g_c[3];
+        for (int channel = 0; channel < 3; ++channel) {
+            along += c[channel] * g[channel];
+            g_c[channel] = g[channel] * weight;
         }
-    }
+        if (wave == 0 && basis == 0) {
+            rows.store3(g_c, out.sh0);
+        } else {
+            for (const auto& channel : g_c) columns.put(channel);
+        }
+        g_Y[basis] += along * s.cosines[wave];
+        g_time += along * s.Y[basis] * s.sines[wave] * (TURN * static_cast<float>(wave));  // by mu_t
+    });
+    columns.flush();
     const Vec3<Vec> g_mean = s.unit.vjp(harmonics_vjp(s.unit.direction, a.degree, g_Y));
     rows.store3({g_mean.x, g_mean.y, g_mean.z}, out.means);
     if (a.times) rows.store(g_time, out.times, rows.ones);

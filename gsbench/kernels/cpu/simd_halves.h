@@ -181,6 +181,32 @@ GSB_HD inline void scatter(Vec x, float* p, int stride, int n = LANES) {
     for (int i = 0; i < n; ++i) p[i * stride] = lane[i];
 }
 
+// p[offsets[lane]] of the first n lanes, zero in the others; and back.
+GSB_HD inline Vec gather_rows(const float* p, const int32_t* offsets, int n) {
+    alignas(64) float lane[LANES];
+    if (n == LANES) {
+        GSB_UNROLL for (int i = 0; i < LANES; ++i) lane[i] = p[offsets[i]];
+    } else {
+        for (int i = 0; i < LANES; ++i) lane[i] = i < n ? p[offsets[i]] : 0.0f;
+    }
+    return Vec::load(lane);
+}
+GSB_HD inline void scatter_rows(Vec x, float* p, const int32_t* offsets, int n) {
+    alignas(64) float lane[LANES];
+    x.store(lane);
+    for (int i = 0; i < n; ++i) p[offsets[i]] = lane[i];
+}
+
+// Sixteen rows of sixteen floats as sixteen columns.
+GSB_HD inline void transpose(Vec (&x)[LANES]) {
+    alignas(64) float rows[LANES][LANES];
+    for (int i = 0; i < LANES; ++i) x[i].store(rows[i]);
+    for (int k = 0; k < LANES; ++k) x[k] = Vec::gather(rows[0] + k, LANES);
+}
+
+// The first n floats of p, zero in the other lanes.
+GSB_HD inline Vec load_some(const float* p, int n) { return n == LANES ? Vec::load(p) : gather(p, 1, n); }
+
 // Sixteen offsets, for reading and writing p[offset] of the lanes whose bit is set.
 struct Places {
     const int32_t* offset;
@@ -205,7 +231,6 @@ GSB_HD inline void scatter_at(Vec x, float* p, Places places, uint32_t bits) {
         for (; bits; bits &= bits - 1) p[places.offset[__builtin_ctz(bits)]] = lane[__builtin_ctz(bits)];
     }
 }
-
 
 // Four rows of four pixels of three channels, `stride` floats apart.
 GSB_HD inline void store_rgb(Vec r, Vec g, Vec b, float* out, int64_t stride) {
