@@ -10,11 +10,8 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.config import register_schema
+from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError, did_you_mean
-
-HERE = Path(__file__).parent
-CONF = HERE / "conf" if (HERE / "conf").is_dir() else HERE.parent / "conf"  # in a wheel, else in a checkout
 
 _failures: list[str] = []  # one line for each run that did not end well; Hydra's own sweeps go on past them
 

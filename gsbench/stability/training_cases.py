@@ -9,8 +9,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 from torch import Generator, Tensor
 
-from gsbench.__main__ import CONF
-from gsbench.config import Config, register_schema
+from gsbench.config import CONF, Config, register_schema
 from gsbench.scenes.scene import Camera, Points, Scene, View
 from gsbench.stability.cases import case
 

@@ -30,13 +30,14 @@ def larger(scene: Scene) -> Scene:
 def test_a_larger_scene_trains_alike(name: str) -> None:
     """Catches a rate in world units without the extent, a rate of time with it, and networks that read metres.
 
-    AGR acts and Gaussians are cloned and split in these 40 steps; docs/protocol.md has 1,000 on moving-matte. (Longer
-    ones of 3DGS part: the gradient that turns a sphere is rounding, and Adam makes a step of it.)
+    AGR acts and Gaussians are cloned and split in these 40 steps; docs/protocol.md has 1,000 on moving-matte.
     """
+    # What turns a sphere is a rounding, of which Adam makes a step: 3DGS starts from spheres, and is not turned here.
+    still = ["model.lr.quats={start: 0, end: null}"] if name == "3dgs" else []
     scene = moving_square()
-    config = compose(name, 40, "agr=true", "train.densify.every=10")
+    config = compose(name, 40, "agr=true", "train.densify.every=10", *still)
     small, large = (fit(Training(name, config, s), "auto") for s in (scene, larger(scene)))
     assert psnr(small) > 13  # black alone has 10.5
-    assert abs(psnr(small) - psnr(large)) < 0.05
-    assert abs(len(small.model) - len(large.model)) <= 3
+    assert abs(psnr(small) - psnr(large)) < 0.001
+    assert len(small.model) == len(large.model)
     assert torch.isfinite(large.model.splats["means"]).all()
