@@ -48,6 +48,14 @@ def test_the_error_does_not_depend_on_its_sign_or_its_neighbours():
     assert (plus == beside).all()
 
 
+def test_the_scale_of_the_error_is_what_the_header_says():
+    """Would catch another scale than 0 to 0.2, which every strip ever written has."""
+    truth = np.full((4, 300, 3), 0.5)
+    below, at, above = (cells(pictures.strip([(truth + e, truth)]), 4, 300)[2][0, 0] for e in (0.19, 0.2, 0.4))
+    assert (at == above).all()
+    assert (at != below).any()
+
+
 def test_the_error_is_the_mean_over_channels():
     """Would catch a maximum: an error in one channel is a third of the same error in all."""
     truth = np.zeros((4, 300, 3))

@@ -1,0 +1,207 @@
+"""The trainer's wiring: which gradient, which views, which rows and which rate go where, asked of a real trainer."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gsbench.experiment import build
+from gsbench.measure.curve import Point
+from gsbench.raster import RasterInfo
+from gsbench.scenes.scene import Scene
+from gsbench.stability.training_cases import compose, moving_square
+from gsbench.train.loop import Trainer
+from gsbench.train.optim import rate_at
+from gsbench.train.schedule import generator
+
+
+def trainer(model: str = "7dgs", *overrides: str, scene: Scene | None = None) -> Trainer:
+    """A trainer at its step 0, of a scene with three views of val and two of test."""
+    config = compose(model, 100, *overrides)
+    made = build(config)
+    if scene is None:
+        square = moving_square()
+        scene = replace(square, val=square.train[:3], test=square.train[3:5])
+    assert scene.points is not None
+    made.initialise(scene.points, scene.extent, generator(config.seed))
+    return Trainer(made, scene, scene.test, config)
+
+
+def gradient_of_a_step(batch: int) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """Of the means, and of the 2D means as density control collected it; and the loss. All views are one view."""
+    square = moving_square()
+    fitted = trainer("3dgs", f"train.batch_size={batch}", scene=replace(square, train=square.train[:1] * 4))
+    means = fitted.model.splats["means"]
+    seen = []
+    fitted.optimizer.step = lambda *_, **__: seen.append(means.grad)  # type: ignore[method-assign]
+    fitted._descend()
+    assert means.grad is not None
+    return means.grad.clone(), fitted.density.gradient / fitted.density.seen.clamp(min=1), fitted.watch.loss
+
+
+def test_a_batch_is_a_mean() -> None:
+    """Catches a loss summed over the batch, and a density gradient that is not scaled back to one view."""
+    one, four = gradient_of_a_step(1), gradient_of_a_step(4)
+    torch.testing.assert_close(four[0], one[0], rtol=1e-4, atol=1e-8)
+    torch.testing.assert_close(four[1], one[1], rtol=1e-4, atol=1e-8)
+    assert one[1].max() > 0
+    assert four[2] == pytest.approx(one[2], rel=1e-5)
+
+
+def test_density_gradients_are_of_one_view_in_half_images() -> None:
+    """Catches a gradient that is not rescaled by the batch, or that is left in pixels."""
+    density = trainer("3dgs").density
+    N = len(density.model)
+    means2d = torch.zeros(1, N, 2, requires_grad=True)
+    means2d.grad = torch.tensor([3e-3, 4e-3]).expand(1, N, 2).clone()
+    info = RasterInfo(torch.ones(1, N, dtype=torch.int32), means2d, torch.ones(1, N), 0)
+    density.observe(info, width=20, height=20, views=4)
+    torch.testing.assert_close(density.gradient, torch.full((N,), 5e-3 * 4 * 10))
+
+
+def test_the_curve_is_of_val_and_the_best_of_the_evaluated_split() -> None:
+    """Catches a curve measured on test, and a best on val that stores val's own score."""
+    fitted = trainer()
+    scores = {id(fitted.scene.val): [20.0, 21.0, 20.5], id(fitted.views): [15.0, 14.0, 16.0]}
+    fitted.psnr = lambda views: scores[id(views)].pop(0)  # type: ignore[method-assign]
+    for step in (0, 1, 2):
+        fitted.step = step
+        fitted._measure()
+    assert [point.psnr_val for point in fitted.curve.points] == [20.0, 21.0, 20.5]
+    assert isinstance(fitted.curve.last, Point)
+    assert (fitted.best.val, fitted.best.eval_at_best_val, fitted.best.eval) == (21.0, 14.0, None)
+
+
+def test_opacities_are_reset_when_the_schedule_says() -> None:
+    """Catches a reset that is never called, is called every step, or leaves any of Adam's two moments."""
+    fitted = trainer()
+    fitted.schedule.resets = lambda step: step == 1  # type: ignore[method-assign]
+    opacities = fitted.model.splats["opacities"]
+    with torch.no_grad():
+        opacities.fill_(2.0)
+    ceiling = 2 * fitted.config.model.min_opacity
+    for step in (0, 1):
+        fitted.step = step
+        fitted._descend()
+        assert (torch.sigmoid(opacities).max().item() <= ceiling * 1.001) == (step == 1)
+    state = fitted.optimizer.adam.state[opacities]
+    assert not state["exp_avg"].any()
+    assert not state["exp_avg_sq"].any()
+
+
+def test_large_gaussians_go_once_opacities_were_reset() -> None:
+    """Catches pruning by size that is never asked for, or asked for from the start."""
+    fitted = trainer()
+    asked = []
+    fitted.density.densify = lambda _, prune_large: asked.append(prune_large)  # type: ignore[method-assign]
+    fitted.schedule.densifies = lambda _: True  # type: ignore[method-assign]
+    fitted.schedule.resets = lambda _: False  # type: ignore[method-assign]
+    for step in (0, fitted.schedule.reset_every - 1, fitted.schedule.reset_every):
+        fitted.step = step
+        fitted._descend()
+    assert asked == [False, False, True]
+
+
+def test_rates_fall_in_the_optimizer() -> None:
+    """Catches rates that are set once: the optimizer's own are those of the step."""
+    fitted = trainer("7dgs")
+    for step in (0, 50, 99):
+        fitted.step = step
+        fitted._descend()
+        rates = {group["name"]: group["lr"] for group in fitted.optimizer.adam.param_groups}
+        for name, rate in fitted.config.model.lr.items():
+            if name in rates:
+                assert rates[name] == rate_at(rate, step, fitted.config.train, fitted.scene.extent)
+
+
+def test_what_is_long_in_time_is_split_along_its_path() -> None:
+    """Catches 7DGS never splitting in time: a small Gaussian that asks for density and moves gets two times."""
+    fitted = trainer("7dgs")
+    model, density = fitted.model, fitted.density
+    with torch.no_grad():
+        model.splats["log_diagonal"][:, 4:] = math.log(1e-3)  # small: in space it would be cloned
+        model.splats["motion"][0, 3] = 10.0
+        model.splats["opacities"].fill_(2.0)
+    density.gradient[:2], density.seen[:2] = 1.0, 1.0
+    times = model.splats["times"].detach()[:2].clone()
+    N = len(model)
+    density.densify(generator(0), prune_large=False)
+    assert len(model) == N + 2
+    children, clone = model.splats["times"].detach()[-2:], model.splats["times"].detach()[-3]
+    assert (children != times[0]).all()
+    assert clone == times[1]
+
+
+def test_children_in_time_stay_near_the_clip() -> None:
+    """Catches a split in time that draws from all of a Gaussian that lasts for ever: AGR read times of -240."""
+    model = trainer("7dgs").model
+    with torch.no_grad():
+        model.splats["log_diagonal"][:, 3] = math.log(1e4)
+        model.splats["motion"][:, 3] = 100.0
+    before = model.splats["times"].detach().clone()
+    assert model.long_in_time().all()
+    model.split(torch.arange(len(model)), generator(0))
+    moved = (model.splats["times"].detach() - before).abs()
+    assert 0.5 < moved.max() < 6
+
+
+@pytest.mark.parametrize("half", [True, False])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("name", ["3dgs", "4dgs", "6dgs", "7dgs"])
+def test_a_model_shows_the_same_by_kernels_and_in_torch(name: str, degree: int, half: bool) -> None:
+    """Catches a kernel's path that ignores directional_half, the harmonics' schedule, or AGR."""
+    option = [f"model.options.directional_half={half}"] if name in ("6dgs", "7dgs") else []
+    fitted = trainer(name, "agr=true", *option)
+    model = fitted.model
+    random = generator(1)
+    with torch.no_grad():
+        for splat in model.splats.values():
+            splat.add_(0.3 * torch.randn(splat.shape, generator=random))
+        assert model.refinement is not None
+        for weight in model.refinement.weights_out:
+            weight.normal_(0, 0.02, generator=random)
+    model.set_stage(replace(model.stage, sh_degree=degree, refine=True))
+    shown = []
+    for backend in ("auto", "reference"):
+        model.backend = backend
+        shown.append(model.slice(fitted.scene.train[2].camera.center, 0.4))
+    drawn = shown[1].opacities > 1 / 200  # colours of what is not drawn are not computed
+    assert drawn.sum() > 10
+    for a, b in zip(*shown, strict=True):
+        torch.testing.assert_close(a[drawn], b[drawn], rtol=1e-3, atol=1e-4)
+
+
+def test_agr_starts_as_linear_layers_do() -> None:
+    """Catches another initialisation than torch.nn.Linear's: uniform within 1 / sqrt(width), output layers zero."""
+    refinement = trainer("7dgs").model.refinement
+    assert refinement is not None
+    bound = 1 / math.sqrt(7 + 2 * refinement.octaves)
+    for values in (refinement.weight_in, refinement.bias_in):
+        assert 0.9 * bound < values.abs().max() <= bound
+        assert values.mean().abs() < 0.1 * bound
+    assert refinement.weight_in.std().item() == pytest.approx(bound / math.sqrt(3), rel=0.05)
+    assert not any(weight.any() for weight in [*refinement.weights_out, *refinement.biases_out])
+
+
+def test_the_size_of_4dgs_is_its_largest_in_space() -> None:
+    """Catches the smallest scale, and a duration that counts as a size."""
+    model = trainer("4dgs").model
+    with torch.no_grad():
+        model.splats["scales"].copy_(torch.tensor([0.0, 1.0, -1.0, 5.0]).expand(len(model), 4))
+    torch.testing.assert_close(model.scales(), torch.full((len(model),), math.e))
+
+
+def test_the_floor_is_held_in_training_and_follows_the_rows() -> None:
+    """Catches a floor that is never held, or that is of other Gaussians once rows were moved."""
+    fitted = trainer("7dgs", "train.densify.every=1")
+    sizes = fitted.model.splats["log_diagonal"]
+    for step in (0, 60):
+        with torch.no_grad():
+            sizes[:, 4:] = -20.0
+        fitted.step = step
+        fitted._descend()
+        held = fitted.model.splats["log_diagonal"].detach()[:, 4:].amin(1)
+        assert len(held) == len(fitted.floor.least)
+        if step == 0:
+            torch.testing.assert_close(held, fitted.floor.least.log(), rtol=1e-2, atol=0)
