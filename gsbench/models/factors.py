@@ -41,13 +41,15 @@ class Triangle:
         if form not in OFF_DIAGONALS:
             raise InputError(f"off_diagonal '{form}' is not known. {did_you_mean(form, OFF_DIAGONALS)}")
         self.form = form
-        below = [(i, j) for i in range(len(letters)) for j in range(i)]  # row by row, as `entries` has them
+        below = [(i, j) for i in range(len(letters)) for j in range(i)]  # row by row, as `split` takes them
         places: dict[str, list[int]] = {"shape": [], "motion": [], "coupling": []}
         for place, (i, j) in enumerate(below):
             in_space = (letters[i] + letters[j]).count("p")
             places[("coupling", "motion", "shape")[in_space]].append(place)
         self.places = places  # by kind, where its entries stand among all
         self.rows = [i for i, _ in below]
+        order = [place for kind in KINDS for place in places[kind]]
+        self.columns = sorted(range(len(order)), key=order.__getitem__)  # of (shape, motion, coupling), for each place
         relative = {"relative": places["shape"], "raw": [], "row_scaled": range(len(below))}[form]
         self.is_relative = torch.tensor([place in relative for place in range(len(below))])
 
@@ -90,8 +92,7 @@ class Triangle:
 
     def join(self, kinds: dict[str, Tensor]) -> Tensor:
         """Undo `split`."""
-        order = [place for kind in KINDS for place in self.places[kind]]
-        return torch.cat([kinds[kind] for kind in KINDS], -1)[:, sorted(range(len(order)), key=order.__getitem__)]
+        return torch.cat([kinds[kind] for kind in KINDS], -1)[:, self.columns]
 
 
 def rotation(quaternions: Tensor) -> Tensor:

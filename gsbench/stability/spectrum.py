@@ -51,7 +51,7 @@ def _splats(path: Path) -> dict[str, Tensor]:
 
 
 def joint_factors(splats: dict[str, Tensor], path: Path) -> tuple[Tensor, int]:
-    """Factors [N, 3+k, 3+k] with rows (p, q), and k. Triangular ones are taken in the order (q, p), the default."""
+    """Factors [N, 3+k, 3+k] with rows (p, q), and k. Triangular ones are taken as by default, (q, p) and `relative`."""
     if "log_diagonal" in splats:
         k = splats["log_diagonal"].shape[1] - 3
         L = Triangle("dddtppp" if k == 4 else "dddppp").factor(splats["log_diagonal"], splats)
