@@ -7,9 +7,14 @@ from typing import Any
 import torch
 
 from benchmarks.scene import camera, gaussians, model
+from gsbench.backends import BACKENDS, CPU, REFERENCE
 from gsbench.kernels.loss import l1_ssim
+from gsbench.measure.speed import Stages
+from gsbench.models import GaussianModel, Query
 from gsbench.raster import rasterize
+from gsbench.scenes import Camera, View
 from gsbench.train.losses import photometric
+from gsbench.train.step import Step
 
 RASTER_TARGETS = {(10_000, 400): (2.8, 3.8), (100_000, 800): (30.0, 37.0)}  # ms forward, backward
 
@@ -68,16 +73,16 @@ def observing() -> Iterator[Row]:
     center = torch.tensor([0.0, 0.0, -4.0])
     for name, agr in (("3dgs", False), ("4dgs", False), ("6dgs", False), ("7dgs", False), ("7dgs", True)):
         for backend in ("cpu", "reference"):
-            observed = model(name, 100_000, agr=agr)
-            observed.backend = backend
+            observed = model(name, 100_000, agr=agr, backend=BACKENDS[backend])
             time = 0.4 if "time" in observed.observes else None
             parameters = [p for p in observed.parameters() if p.requires_grad]
-            out = observed.slice(center, time)
+            query = Query.at(center, time)
+            out = observed.slice(query)
             upstream = [torch.ones_like(x) for x in out]
             targets = (15.0, 25.0) if name == "7dgs" and not agr and backend == "cpu" else (None, None)
             title = f"{name}{'+agr' if agr else ''} 100k slice and colours, {backend}"
             values = sum(p.numel() for p in observed.splats.values())
-            yield Row("observe", f"{title} forward", lambda o=observed, t=time: o.slice(center, t), targets[0],
+            yield Row("observe", f"{title} forward", lambda o=observed, q=query: o.slice(q), targets[0],
                       ("bytes", 4 * values))  # fmt: skip
             yield Row("observe", f"{title} backward", lambda o=out, p=parameters, u=upstream: torch.autograd.grad(
                 o, p, u, retain_graph=True, allow_unused=True), targets[1], ("bytes", 12 * values))  # fmt: skip
@@ -92,12 +97,12 @@ def refining() -> Iterator[Row]:
     values = [torch.randn(100_000, width).requires_grad_() for width in widths]
     multiplications = 100_000 * 64 * (4 * 7 + 35)
     for native in (True, False):
-        out = refinement(values, torch.tensor(0.3), native=native)
+        out = refinement(values, torch.tensor(0.3), by_kernel=native)
         upstream = [torch.ones_like(x) for x in out]
         inputs = [*values, *refinement.parameters()]
         backend = "cpu" if native else "reference"
         yield Row("agr", f"AGR 100k forward, {backend}",
-                  lambda n=native: refinement(values, torch.tensor(0.3), native=n), 20.0 if native else None,
+                  lambda n=native: refinement(values, torch.tensor(0.3), by_kernel=n), 20.0 if native else None,
                   ("flops", 2 * multiplications))  # fmt: skip
         yield Row("agr", f"AGR 100k backward, {backend}",
                   lambda o=out, u=upstream, i=inputs: torch.autograd.grad(o, i, u, retain_graph=True),
@@ -114,27 +119,36 @@ def loss() -> Iterator[Row]:
         yield Row("loss", f"{size}x{size} forward + backward, cpu", lambda a=image, b=target: torch.autograd.grad(
             l1_ssim(a, b, 0.2), a), 6.0 if size == 400 else None, work)  # fmt: skip
         yield Row("loss", f"{size}x{size} forward + backward, reference", lambda a=image, b=target: torch.autograd.grad(
-            photometric(a, b, 0.2, "reference"), a), None, work)  # fmt: skip
+            photometric(a, b, 0.2, REFERENCE), a), None, work)  # fmt: skip
 
 
 def step() -> Iterator[Row]:
-    """A whole training step: slice, raster, loss, backward, Adam, with 10k Gaussians at 400x400."""
-    viewmats, Ks = camera(400)
-    target = torch.rand(400, 400, 3, generator=torch.Generator().manual_seed(0))
+    """A whole training step of one view, as the trainer makes it: gradients, then Adam."""
     for name, agr in (("3dgs", False), ("4dgs", False), ("6dgs", False), ("7dgs", False), ("7dgs", True)):
-        for backend in ("cpu", "reference"):
-            fitted = model(name, 10_000, agr=agr)
-            fitted.backend = backend
-            adam = torch.optim.Adam([p for p in fitted.parameters() if p.requires_grad], lr=1e-9, fused=True)
+        for backend in (CPU, REFERENCE):
+            yield Row("step", f"{name}{'+agr' if agr else ''} 10k / 400x400, {backend.name}",
+                      training_step(model(name, 10_000, agr=agr, backend=backend), 400, 1))  # fmt: skip
+    for N, size in ((16, 16), (1_000, 80), (5_000, 80), (10_000, 400), (50_000, 400)):
+        for name, agr in (("7dgs", False), ("4dgs", False), ("7dgs", True)):
+            for threads in (1, 2):
+                title = f"{name}{'+agr' if agr else ''} {N} / {size}x{size}, 4 views, {threads} threads"
+                yield Row("step", title, training_step(model(name, N, agr=agr), size, 4), threads=threads)
 
-            def call(fitted: Any = fitted, adam: Any = adam, backend: str = backend) -> None:
-                slice_ = fitted.slice(torch.tensor([0.0, 0.0, -4.0]), 0.4)
-                image = rasterize(*slice_, viewmats, Ks, 400, 400, backend=backend).image[0]
-                photometric(image, target, 0.2, backend).backward()
-                adam.step()
-                adam.zero_grad()
 
-            yield Row("step", f"{name}{'+agr' if agr else ''} 10k / 400x400, {backend}", call)
+def training_step(fitted: GaussianModel, size: int, views: int) -> Callable[[], None]:
+    """The gradients of a batch, and Adam at a rate that moves nothing."""
+    viewmats, Ks = camera(size)
+    target = torch.rand(size, size, 3, generator=torch.Generator().manual_seed(0))
+    batch = [View(str(i), Camera(viewmats[0], Ks[0], size, size), 0.4, target) for i in range(views)]
+    gradients = Step(fitted, torch.zeros(3), 0.2, False, Stages())
+    adam = torch.optim.Adam([p for p in fitted.parameters() if p.requires_grad], lr=1e-9, fused=True)
+
+    def call() -> None:
+        gradients(batch)
+        adam.step()
+        adam.zero_grad()
+
+    return call
 
 
 SECTIONS = {"raster": raster, "observe": observing, "loss": loss, "step": step}

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from gsbench import models, scenes
+from gsbench.backends import resolve
 from gsbench.config import Config
 from gsbench.errors import InputError, did_you_mean
 from gsbench.measure import record as records
@@ -21,7 +22,6 @@ from gsbench.measure.record import Cost, Effects, Record
 from gsbench.measure.speed import peak_memory, reset_peak_memory, synchroniser, time_renders
 from gsbench.models import GaussianModel
 from gsbench.models.replay import Replay
-from gsbench.raster import choose_backend
 from gsbench.report.pictures import strip, write_png
 from gsbench.scenes import Scene, View
 from gsbench.scenes.points import random_points
@@ -78,15 +78,14 @@ def run(composed: DictConfig) -> Record:
 
 def build(config: Config) -> GaussianModel:
     """The model of a config, without Gaussians yet; raises InputError as `models.build`."""
-    model = models.build(
+    return models.build(
         config.model.name,
         agr=config.agr,
         agr_octaves=config.model.agr_octaves,
         sh_degree=config.model.sh_degree,
+        backend=resolve(config.raster.backend, torch.device(config.device).type),
         **config.model.options,
     )
-    model.backend = config.raster.backend
-    return model
 
 
 def identify(composed: DictConfig) -> Run:
@@ -111,7 +110,7 @@ def identify(composed: DictConfig) -> Run:
         if count < 1:
             raise InputError(f"train.{key}: expected at least 1, got {count}")
     choose_device(config.device)
-    choose_backend(config.raster.backend, torch.device(config.device).type)
+    resolve(config.raster.backend, torch.device(config.device).type)
     as_published = config.agr == config.model.published_with_agr
     label = config.model.name + ("" if as_published else "_agr" if config.agr else "_noagr")
     folder = records.run_path(Path(config.results), config.experiment, config.scene.name, label, config.seed)
@@ -227,9 +226,9 @@ def fit_and_measure(this: Run, scene: Scene, model: GaussianModel) -> Record:
 def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dict[str, str]]:
     """What FPS is measured on, and on a GPU how it makes frames: `replayed` as a CUDA graph, or `launched` anew."""
     config = trainer.config
-    if choose_backend(config.raster.backend, torch.device(config.device).type) != "cuda":
+    if trainer.model.backend.name != "cuda":
         return trainer.render, {}
-    replay = Replay(trainer.model, trainer.background, config.raster)
+    replay = Replay(trainer.model, trainer.background, config.raster.antialias)
     try:
         replay(first.camera, first.time)
     except RuntimeError as error:  # an operation that waits for the device, in a model or a scheme written in torch
@@ -272,7 +271,7 @@ def unfinished(this: Run, scene: Scene, model: GaussianModel, status: str, reaso
             "resolution": f"{scene.train[0].camera.width}x{scene.train[0].camera.height}",
             "eval_split": config.scene.eval_split,
             "quantise": config.protocol.quantise,
-            "backend": choose_backend(config.raster.backend, torch.device(config.device).type),
+            "backend": model.backend.name,
             "paper_dataset": config.data.paper_dataset,
         },
         provenance=provenance(

@@ -159,12 +159,12 @@ def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(error: str, square:
     code = (
         "import sys, torch\n"
         "from gsbench import errors\n"
-        "from gsbench.train import loop\n"
-        "draw = loop.draw\n"
+        "from gsbench.train import step\n"
+        "rasterize = step.rasterize_slice\n"
         "def full(*arguments):\n"
-        "    loop.draw = draw\n"  # the next run has memory again
+        "    step.rasterize_slice = rasterize\n"  # the next run has memory again
         f"    raise {error}\n"
-        "loop.draw = full\n"
+        "step.rasterize_slice = full\n"
         f"sys.argv = {['gsbench', *sweep]}\n"
         "from gsbench.__main__ import main\n"
         "main()"

@@ -1,4 +1,4 @@
-"""The machine room: compiled kernels as torch operations, with their gradients, for tensors on the CPU.
+"""The machine room: compiled kernels, and the operations on tensors that are made of them.
 
 The extension `_native` is optional. Where it was not built, importing this package still works, `available()` is False
 and every operation raises `InputError`; the reference backend does the same work in torch.
@@ -8,8 +8,6 @@ import importlib
 import importlib.util
 import os
 from types import ModuleType
-
-import torch
 
 from gsbench.errors import InputError, did_you_mean
 
@@ -47,11 +45,6 @@ def use_instruction_set(name: str) -> None:
     if name not in known:
         raise InputError(f"instruction set '{name}' is not built or does not run here. {did_you_mean(name, known)}")
     native().use(name)
-
-
-def threads() -> int:
-    """How many threads the kernels use: as many as torch does."""
-    return torch.get_num_threads()
 
 
 if _native is not None and os.environ.get("GSBENCH_ISA"):

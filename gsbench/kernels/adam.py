@@ -2,14 +2,13 @@
 
 import torch
 from torch import Tensor
-from torch.library import custom_op
 
 from gsbench.errors import InputError
-from gsbench.kernels import native, threads
-from gsbench.kernels.arrays import check
-from gsbench.kernels.cuda import adam as on_cuda
+from gsbench.kernels.library import library_of
+from gsbench.kernels.operation import address
 
 
+@torch.no_grad()
 def adam(
     parameter: Tensor,  # [N, ...]
     gradient: Tensor,  # [N, ...]
@@ -23,37 +22,38 @@ def adam(
 ) -> None:
     """One update, the `step`-th from 1, of the rows `drawn` (Kingma & Ba 2015, algorithm 1).
 
-    `mean` and `square` are the running means of the gradient and of its square.
+    Args:
+        parameter: what is moved.
+        gradient: of the loss by it.
+        mean: the running mean of the gradient.
+        square: that of its square.
+        drawn: which rows are updated.
+        rate: the learning rate.
+        betas: how much of the two means is kept.
+        eps: added to the root of the mean square.
+        step: the number of this update.
 
     Raises:
         InputError: not contiguous float32 on one device, or shapes that do not fit.
     """
-    shape = tuple(parameter.shape)
     named = {"parameter": parameter, "gradient": gradient, "mean": mean, "square": square}
-    check("adam", {name: (tensor, shape) for name, tensor in named.items()} | {"step": (step, ())})
-    if drawn.shape != shape[:1] or drawn.dtype != torch.bool or drawn.device != parameter.device:
-        raise InputError(f"adam: expected drawn as bool of shape {list(shape[:1])} on {parameter.device}, got "
-                         f"{drawn.dtype} of shape {list(drawn.shape)} on {drawn.device}")  # fmt: skip
-    if not all(tensor.is_contiguous() for tensor in (parameter, mean, square)):
+    for name, x in named.items():
+        if x.shape != parameter.shape:
+            raise InputError(f"adam: expected {name} of shape {list(parameter.shape)}, got {list(x.shape)}")
+        if x.dtype != torch.float32 or x.device != parameter.device:
+            raise InputError(f"adam: expected {name} as float32 on {parameter.device}, got {x.dtype} on {x.device}")
+    if drawn.shape != parameter.shape[:1] or drawn.dtype != torch.bool or drawn.device != parameter.device:
+        raise InputError(f"adam: expected drawn as bool of shape {list(parameter.shape[:1])} on {parameter.device}, "
+                         f"got {drawn.dtype} of shape {list(drawn.shape)} on {drawn.device}")  # fmt: skip
+    if step.shape != () or step.dtype != torch.float32 or step.device != parameter.device:
+        raise InputError(f"adam: expected step as float32 of shape [] on {parameter.device}, got {step.dtype} of "
+                         f"{list(step.shape)} on {step.device}")  # fmt: skip
+    if not all(x.is_contiguous() for x in (parameter, mean, square)):
         raise InputError("adam: expected parameter, mean and square row by row in memory: call .contiguous()")
-    if len(parameter):
-        _adam(parameter, gradient, mean, square, drawn, rate, betas, eps, step)
-
-
-@custom_op("gsbench::adam", mutates_args=("parameter", "mean", "square"))
-def _adam(
-    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, drawn: Tensor, rate: float, betas: list[float],
-    eps: float, step: Tensor,
-) -> None:  # fmt: skip
-    rows = [t.detach().view(len(t), -1) for t in (parameter, gradient.contiguous(), mean, square)]
-    count = step.item()
-    unbias = [1 / (1 - betas[0] ** count), (1 - betas[1] ** count) ** -0.5]
-    native().adam(*rows, drawn.contiguous(), rate, *betas, eps, *unbias, threads())
-
-
-@_adam.register_fake
-def _(*_: object) -> None:
-    return None
-
-
-_adam.register_kernel("cuda")(on_cuda.adam)
+    if not len(parameter):
+        return
+    rows, of = gradient.contiguous(), drawn.contiguous()
+    slots = {"N": len(parameter), "width": parameter[0].numel(), "drawn": address(of), "gradient": address(rows),
+             "rate": rate, "beta1": betas[0], "beta2": betas[1], "eps": eps, "step": address(step),
+             "out.parameter": address(parameter), "out.mean": address(mean), "out.square": address(square)}  # fmt: skip
+    library_of(parameter.device.type).call("adam", slots, parameter)

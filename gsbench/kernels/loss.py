@@ -1,65 +1,68 @@
-"""The training loss as one torch operation: (1 - w) L1 + w (1 - SSIM) of two pictures, with its gradient."""
+"""The training loss (1 - w) L1 + w (1 - SSIM) of two images, its gradient computed along with it."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.library import custom_op
 
 from gsbench.errors import InputError
-from gsbench.kernels import native, threads
-from gsbench.kernels.cuda import loss as on_cuda
+from gsbench.kernels.library import Slots, allocate, library_of
+from gsbench.kernels.operation import Operation, Tensors, address, in_rows
+
+
+class _Similarity(Operation):
+    """Its gradient comes with its value, so backward is a product."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "l1_ssim", inputs={"image": "?one height width 3", "target": "?one height width 3"},
+            outputs={"loss": "", "gradient": "numbers"}, numbers={"ssim_weight": float, "with_gradient": bool},
+            constant=["target"], passive=["gradient"],
+            derive=lambda given, numbers: {"numbers": given["image"].numel() if numbers["with_gradient"] else 0},
+        )  # fmt: skip
+
+    def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
+        slots = self.match(tensors, numbers).copy()
+        image, target = in_rows(tensors)
+        height, width = slots["height"], slots["width"]
+        library = library_of(image.device.type)
+        parts = image.new_empty(library.similarity_parts(height, width))
+        gradient = allocate("the gradient of the loss", image, (slots["numbers"],))
+        scratch = None
+        if library.needs_scratch and slots["with_gradient"]:
+            scratch = allocate("derivatives of SSIM", image, (3, 3, height, width))
+        slots |= {"image": image.data_ptr(), "target": target.data_ptr(), "out.loss": parts.data_ptr(),
+                  "out.gradient": gradient.data_ptr(), "out.scratch": address(scratch)}  # fmt: skip
+        library.call(self.name, slots, image)
+        return [parts.sum() if parts.shape[0] > 1 else parts[0], gradient], slots
+
+    def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
+        return {}
+
+    def backward(
+        self, tensors: Tensors, slots: Slots, outputs: Tensors, given: Sequence[Tensor | None],
+        wanted: Sequence[bool], sums: dict[int, Tensor] | None = None,
+    ) -> list[Tensor | None]:  # fmt: skip
+        return [None if given[0] is None else (given[0] * outputs[1]).view_as(tensors[0]), None]
+
+
+_similarity = _Similarity()
 
 
 def l1_ssim(
-    image: Tensor,  # [H, W, 3]
-    target: Tensor,  # [H, W, 3]
+    image: Tensor,  # [H, W, 3] or [1, H, W, 3]
+    target: Tensor,  # the same
     ssim_weight: float,
 ) -> Tensor:  # []
     """The loss 3DGS trains with (eq. 7), differentiable in `image`: 11 x 11 Gaussian window, sigma 1.5, zero padded.
 
-    Same value as `gsbench.train.losses.photometric`; the gradient is computed along with it, where one is wanted.
+    Same value as `gsbench.train.losses.photometric`.
 
     Raises:
-        InputError: not two float32 pictures of one size on one device, or a gradient by `target` is asked for.
+        InputError: not two float32 images of one size on one device, or a gradient by `target` is asked for.
     """
-    for name, tensor in {"image": image, "target": target}.items():
-        if tensor.dim() != 3 or tensor.shape[-1] != 3 or tensor.shape != image.shape or not tensor.numel():
-            raise InputError(f"l1_ssim: expected image and target [H, W, 3] of one size, got {list(image.shape)} and "
-                             f"{list(target.shape)}")  # fmt: skip
-        if tensor.dtype != torch.float32 or tensor.device != image.device or tensor.device.type not in ("cpu", "cuda"):
-            raise InputError(f"l1_ssim: expected {name} as float32 on the CPU or a GPU, as the other picture, got "
-                             f"{tensor.dtype} on {tensor.device}")  # fmt: skip
-    if target.requires_grad:
-        raise InputError("l1_ssim has no gradient by target: detach it")
-    if image.is_cuda:
-        return on_cuda.l1_ssim(image, target, ssim_weight)
-    loss, _ = _l1_ssim(image, target, ssim_weight, image.requires_grad and torch.is_grad_enabled())
-    return loss
-
-
-@custom_op("gsbench::l1_ssim", mutates_args=())
-def _l1_ssim(image: Tensor, target: Tensor, ssim_weight: float, with_gradient: bool) -> tuple[Tensor, Tensor]:
-    grad = image.new_empty(image.shape if with_gradient else (0, 0, 3))
-    pictures = image.detach().contiguous(), target.detach().contiguous()
-    loss = native().l1_ssim(*pictures, ssim_weight, threads(), grad)
-    return image.new_tensor(loss), grad
-
-
-@_l1_ssim.register_fake
-def _(image: Tensor, target: Tensor, ssim_weight: float, with_gradient: bool) -> tuple[Tensor, Tensor]:  # noqa: ARG001
-    return image.new_empty(()), image.new_empty(image.shape if with_gradient else (0, 0, 3))
-
-
-def _context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:  # noqa: ARG001
-    ctx.save_for_backward(output[1])
-    ctx.mark_non_differentiable(output[1])
-    ctx.set_materialize_grads(False)
-
-
-def _gradient(ctx: Any, g_loss: Tensor | None, _: Tensor | None) -> tuple[Tensor | None, None, None, None]:
-    (grad,) = ctx.saved_tensors
-    return None if g_loss is None else g_loss * grad, None, None, None
-
-
-_l1_ssim.register_autograd(_gradient, setup_context=_context)
+    if image.dim() not in (3, 4) or image.shape[-1] != 3 or target.shape != image.shape or not image.numel():
+        raise InputError(f"l1_ssim: expected image and target [H, W, 3] or [1, H, W, 3] of one size, got "
+                         f"{list(image.shape)} and {list(target.shape)}")  # fmt: skip
+    return _similarity(image, target, ssim_weight, image.requires_grad and torch.is_grad_enabled())[0]

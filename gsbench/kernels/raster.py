@@ -1,178 +1,218 @@
-"""Torch operations of the rasterizer: project (differentiable) -> bin -> blend (differentiable), on the CPU.
+"""The rasterizer's operations: project Gaussians to splats, list each tile's splats, blend them into images."""
 
-The last step's results before the picture are the operations' own: `roots` [C, N, 3] (p, q, r of the inverse 2D
-covariance's triangular root, see math/projection.h), `half_sizes` [C, N, 2] (where alpha >= 1/255), `offsets`
-[C * tiles + 1] and `ids` [pairs] (each tile's Gaussians front to back).
-"""
-
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.library import custom_op
 
 from gsbench.errors import InputError
-from gsbench.kernels import native, threads
-from gsbench.kernels.arrays import plain, rows_like
+from gsbench.kernels.library import Library, allocate, library_of
 from gsbench.kernels.memory import require
+from gsbench.kernels.operation import Operation, address
 
-TILE = 16  # as kernels.h has it
+TILE = 16  # pixels a side, as cpu/kernels.h and cuda/launch.h have it
 TILE_PIXELS = TILE * TILE
-MAX_GAUSSIANS = 1 << 24  # positions in a tile's list are kept as float
-MAX_PAIRS = (1 << 31) - 1
+MAX_PAIRS = (1 << 31) - 1  # splats, and pairs of a tile and a splat, are numbered by int32
+GEOMETRY = 6  # of a splat: x, y, p, q, r, opacity
+
+
+class Viewport(NamedTuple):
+    """How Gaussians are looked at: what `rasterize` is told beside the tensors."""
+
+    width: int
+    height: int
+    near: float
+    far: float
+    eps2d: float
+    antialias: bool
+
+
+class Splats(NamedTuple):
+    """Gaussians as C cameras see them."""
+
+    means2d: Tensor  # [C, N, 2] pixels
+    roots: Tensor  # [C, N, 4]: p, q, r of the inverse 2D covariance's triangular root (math/projection.h); the opacity
+    depths: Tensor  # [C, N]
+    half_sizes: Tensor  # [C, N, 2] pixels, beyond which alpha < 1/255; 0: not drawn; without a gradient
+
+
+class Bins(NamedTuple):
+    """Each tile's splats, front to back."""
+
+    offsets: Tensor  # [C * tiles + 1] int32: tile t's list is ids[offsets[t] : offsets[t + 1]]
+    ids: Tensor  # [pairs] int32
 
 
 def count_tiles(width: int, height: int) -> int:
-    """Tiles of one picture."""
+    """Tiles of one image."""
     return -(-width // TILE) * -(-height // TILE)
 
 
-@custom_op("gsbench::project", mutates_args=())
+_project = Operation(
+    "project",
+    inputs={"means": "N 3", "factors": "N 3 3", "opacities": "N", "viewmats": "C 4 4", "Ks": "C 3 3"},
+    outputs={"means2d": "C N 2", "roots": "C N 4", "depths": "C N", "half_sizes": "C N 2"},
+    numbers={"width": int, "height": int, "near": float, "far": float, "eps2d": float, "antialias": bool},
+    constant=["Ks"],
+    passive=["half_sizes"],
+    on_request=["viewmats"],
+    memory="projected Gaussians",
+)
+
+
 def project(
-    means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, near: float, far: float, eps2d: float, antialias: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Project Gaussians: means2d [C, N, 2], roots [C, N, 3], opacities [C, N], depths [C, N], half_sizes [C, N, 2]."""
-    C, N = len(viewmats), len(means)
-    shapes = ((C, N, 2), (C, N, 3), (C, N), (C, N), (C, N, 2))
-    out = tuple(means.new_empty(shape) for shape in shapes)
-    native().project(*plain(means, factors, opacities, viewmats, Ks),
-                     width, height, near, far, eps2d, antialias, threads(), *out)  # fmt: skip
-    return out[0], out[1], out[2], out[3], out[4]
+    means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, viewport: Viewport
+) -> Splats:
+    """Project Gaussians (EWA splatting, eq. 29), differentiable but by Ks; shapes as of `gsbench.raster.rasterize`."""
+    return Splats(*_project(means, factors, opacities, viewmats, Ks, *viewport))
 
 
-@project.register_fake
-def _(means: Tensor, _factors: Tensor, _opacities: Tensor, viewmats: Tensor, *_: Any) -> tuple[Tensor, ...]:
-    C, N = len(viewmats), len(means)
-    return tuple(means.new_empty(shape) for shape in ((C, N, 2), (C, N, 3), (C, N), (C, N), (C, N, 2)))
+def _of_images(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
+    colors = given["colors"]
+    C, D, sets = given["means2d"].shape[0], colors.shape[-1], colors.shape[0] if colors.dim() == 3 else 1
+    if sets not in (1, C):
+        raise InputError(f"blend: expected one set of colours, or one a camera, got {sets} for {C} cameras")
+    tiles = C * count_tiles(numbers["width"], numbers["height"])
+    return {"color_per_camera": int(C > 1 and sets == C), "lists": tiles + 1, "sums": GEOMETRY + D, "D": D,
+            "state": tiles // C * TILE_PIXELS}  # fmt: skip
 
 
-@custom_op("gsbench::project_backward", mutates_args=())
-def project_backward(
-    means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, near: float, far: float, eps2d: float, antialias: bool,
-    g_means2d: Tensor, g_roots: Tensor, g_opacities: Tensor, g_depths: Tensor, cameras: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Gradients of means, factors, opacities and, if `cameras`, viewmats (else empty)."""
-    out = (rows_like(means), rows_like(factors), rows_like(opacities),
-           viewmats.new_empty(len(viewmats) if cameras else 0, 4, 4))  # fmt: skip
-    native().project_backward(
-        *plain(means, factors, opacities, viewmats, Ks), width, height, near, far, eps2d, antialias, threads(),
-        *plain(g_means2d, g_roots, g_opacities, g_depths), *out,
-    )  # fmt: skip
-    return out
+_blend = Operation(
+    "blend",
+    inputs={"means2d": "C N 2", "roots": "C N 4", "half_sizes": "C N 2", "colors": "?sets N D", "background": "D",
+            "offsets": "lists", "ids": "pairs"},
+    outputs={"image": "C height width D", "alpha": "C height width 1", "transmittance": "C state", "stop": "C state"},
+    numbers={"width": int, "height": int},
+    passive=["half_sizes", "offsets", "ids", "transmittance", "stop"],
+    on_request=["background"],
+    integers=["offsets", "ids"],
+    derive=_of_images,
+    scratch="C N sums",
+    memory="images",
+)  # fmt: skip
 
 
-@project_backward.register_fake
-def _(means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, *rest: Any) -> tuple[Tensor, ...]:
-    cameras = viewmats.new_empty(len(viewmats) if rest[-1] else 0, 4, 4)
-    return rows_like(means), rows_like(factors), rows_like(opacities), cameras
+def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewport: Viewport) -> tuple[Tensor, Tensor]:
+    """Blend each tile's splats front to back (3DGS eq. 3): image [C, H, W, D], alpha [C, H, W, 1].
+
+    Colours are [N, D] for all cameras or [C, N, D]; the background is [D].
+    """
+    means2d, roots, _, half_sizes = splats
+    image, alpha, *_ = _blend(means2d, roots, half_sizes, colors, background, *bins, viewport.width, viewport.height)
+    return image, alpha
 
 
-def _project_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    ctx.save_for_backward(*inputs[:5])
-    ctx.rest = inputs[5:]
-    ctx.set_materialize_grads(False)
-    ctx.mark_non_differentiable(output[4])
+def flag_values(*values: Tensor) -> Tensor:
+    """Not zero where a value is not finite or out of range, [1] int64: found on the device, and not waited for.
+
+    `values` are means, factors, opacities, colours, viewmats, Ks, background, as of `rasterize`.
+    """
+    means, _, _, colors, viewmats, *_ = values
+    flags, rows = torch.zeros(1, dtype=torch.int64, device=means.device), [x.contiguous() for x in values]
+    names = ("means", "factors", "opacities", "colors", "viewmats", "Ks", "background")
+    slots = {"N": len(means), "C": len(viewmats), "all_colors": colors.numel(), "D": colors.shape[-1],
+             "out.flags": address(flags)}  # fmt: skip
+    library_of(means.device.type).call("flag_values", slots | dict(zip(names, map(address, rows), strict=True)), means)
+    return flags
 
 
-def _project_gradient(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-    means, factors, opacities, viewmats, Ks = ctx.saved_tensors
-    C, N = len(viewmats), len(means)
-    given = [means.new_zeros(shape) if g is None else g
-             for g, shape in zip(grads[:4], ((C, N, 2), (C, N, 3), (C, N), (C, N)), strict=True)]  # fmt: skip
-    cameras = ctx.needs_input_grad[3]
-    out = project_backward(means, factors, opacities, viewmats, Ks, *ctx.rest, *given, cameras)
-    return *out[:3], out[3] if cameras else None, *(None,) * 7
+@torch.no_grad()
+def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, int]:
+    """Sort splats by depth and list each tile's, ties by index. Returns `flags` [1] int64 as an int, too.
+
+    On a GPU this waits for the device, once, for the number of pairs; `flags` comes along.
+
+    Raises:
+        InputError: more pairs than int32 counts, or than memory holds.
+    """
+    library = library_of(splats.depths.device.type)
+    if not library.needs_scratch:
+        return _bin_on_cpu(library, splats, viewport), int(flags.item())
+    order, ends = _sort_on_gpu(library, splats, viewport, flags)
+    *total, flagged = ends[-2:].tolist()
+    pairs = _countable(total[0] if total else 0)
+    return _list_on_gpu(library, splats, viewport, (order, ends), _room(splats, pairs)), flagged
 
 
-project.register_autograd(_project_gradient, setup_context=_project_context)
+@torch.no_grad()
+def bin_within(splats: Splats, viewport: Viewport, flags: Tensor, room: int) -> tuple[Bins, Tensor]:
+    """`bin_tiles` on a GPU that waits for nothing, where there is room for a number of pairs; others are left out.
+
+    Returns how many there were, if there are Gaussians, and `flags`: [2] int64.
+    """
+    library = library_of(splats.depths.device.type)
+    order, ends = _sort_on_gpu(library, splats, viewport, flags)
+    lists = _room(splats, room)
+    lists[0].fill_(-1)  # no tile: what is not filled sorts behind all others
+    return _list_on_gpu(library, splats, viewport, (order, ends), lists), ends[-2:]
 
 
-@custom_op("gsbench::bin_tiles", mutates_args=())
-def bin_tiles(means2d: Tensor, depths: Tensor, half_sizes: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Each tile's Gaussians, front to back, ties by index: offsets [C * tiles + 1] int64, ids [pairs] int32."""
-    splats = plain(means2d, depths, half_sizes)
-    offsets = means2d.new_empty(len(means2d) * count_tiles(width, height) + 1, dtype=torch.int64)
-    pairs = native().count_tiles(*splats, width, height, threads(), offsets)
+def _countable(pairs: int) -> int:
     if pairs > MAX_PAIRS:
         raise InputError(f"{pairs} pairs of a tile and a Gaussian are more than {MAX_PAIRS}: "
-                         "draw fewer cameras at once, a smaller picture, or fewer large Gaussians")  # fmt: skip
+                         "draw fewer cameras at once, a smaller image, or fewer large Gaussians")  # fmt: skip
+    return pairs
+
+
+def _splat_slots(splats: Splats, viewport: Viewport) -> dict[str, Any]:
+    C, N = splats.depths.shape
+    return {"N": N, "C": C, "width": viewport.width, "height": viewport.height} | {
+        key: address(x) for key, x in splats._asdict().items()
+    }
+
+
+def _bin_on_cpu(library: Library, splats: Splats, viewport: Viewport) -> Bins:
+    like, slots = splats.depths, _splat_slots(splats, viewport)
+    offsets = like.new_empty(len(like) * count_tiles(viewport.width, viewport.height) + 1, dtype=torch.int32)
+    total = like.new_empty(1, dtype=torch.int64)
+    library.call("count_tiles", slots | {"out.offsets": address(offsets), "out.pairs": address(total)}, like)
+    pairs = _countable(int(total.item()))
     require(4 * pairs, f"the lists of {pairs} pairs of a tile and a Gaussian")
-    ids = means2d.new_empty(pairs, dtype=torch.int32)
-    native().fill_tiles(*splats, width, height, threads(), offsets, ids)
-    return offsets, ids
+    ids = like.new_empty(pairs, dtype=torch.int32)
+    library.call("fill_tiles", slots | {"out.offsets": address(offsets), "out.ids": address(ids)}, like)
+    return Bins(offsets, ids)
 
 
-@bin_tiles.register_fake
-def _(means2d: Tensor, _depths: Tensor, _half: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    pairs = torch.library.get_ctx().new_dynamic_size()
-    offsets = means2d.new_empty(len(means2d) * count_tiles(width, height) + 1, dtype=torch.int64)
-    return offsets, means2d.new_empty(pairs, dtype=torch.int32)
+PAIRS = "lists of each tile's Gaussians"
 
 
-@custom_op("gsbench::blend", mutates_args=())
-def blend(
-    means2d: Tensor, roots: Tensor, opacities: Tensor, half_sizes: Tensor, colors: Tensor, background: Tensor,
-    offsets: Tensor, ids: Tensor, width: int, height: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Blend each tile's Gaussians: image [C, H, W, D], alpha [C, H, W, 1], and the tiles' state for backward.
-
-    `colors` are [1, N, D] for all cameras or [C, N, D].
-    """
-    out = _blend_outputs(means2d, colors, width, height)
-    native().blend(*plain(means2d, roots, opacities, half_sizes, colors, background),
-                   offsets, ids, width, height, threads(), *out)  # fmt: skip
-    return out
-
-
-@blend.register_fake
-def _(means2d: Tensor, _roots: Tensor, _opacities: Tensor, _half: Tensor, colors: Tensor, *rest: Any) -> Any:
-    return _blend_outputs(means2d, colors, rest[-2], rest[-1])
+def _sort_on_gpu(library: Library, splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Tensor, Tensor]:
+    """Splats by depth [C * N] int32; the running sum of the tiles they reach, then `flags`, [C * N + 1] int64."""
+    like, count = splats.depths, splats.depths.numel()
+    keys, indices, sorted_keys, order = allocate("depths to sort", like, (4, count), torch.int32).unbind()
+    ends = allocate("numbers of tiles", like, (count + 1,), torch.int64)
+    scratch = _scratch(library, count, like)
+    out = {"keys": keys, "indices": indices, "sorted_keys": sorted_keys, "order": order, "ends": ends,
+           "scratch": scratch}  # fmt: skip
+    slots = _splat_slots(splats, viewport) | {f"out.{key}": address(x) for key, x in out.items()}
+    library.call("count_tiles", slots | {"out.scratch_bytes": len(scratch)}, like)
+    ends[-1:].copy_(flags)
+    return order, ends
 
 
-def _blend_outputs(means2d: Tensor, colors: Tensor, width: int, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    C, D = len(means2d), colors.shape[-1]
-    state = C * count_tiles(width, height) * TILE_PIXELS
-    return (means2d.new_empty(C, height, width, D), means2d.new_empty(C, height, width, 1),
-            means2d.new_empty(state), means2d.new_empty(state))  # fmt: skip
+def _room(splats: Splats, pairs: int) -> tuple[Tensor, ...]:
+    """For tiles, splats, sorted tiles, sorted splats: [pairs] int32. The last, of its own, lives until backward."""
+    rows = allocate(PAIRS, splats.depths, (3, pairs), torch.int32)
+    return *rows.unbind(), allocate(PAIRS, splats.depths, (pairs,), torch.int32)
 
 
-@custom_op("gsbench::blend_backward", mutates_args=())
-def blend_backward(
-    means2d: Tensor, roots: Tensor, opacities: Tensor, half_sizes: Tensor, colors: Tensor, background: Tensor,
-    offsets: Tensor, ids: Tensor, width: int, height: int,
-    transmittance: Tensor, stop: Tensor, g_image: Tensor, g_alpha: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Gradients of means2d, roots, opacities, colors and background."""
-    inputs = means2d, roots, opacities, colors, background
-    out = tuple(rows_like(x) for x in inputs)
-    require(4 * len(ids) * (6 + colors.shape[-1]), f"the gradients of {len(ids)} pairs of a tile and a Gaussian")
-    native().blend_backward(*plain(means2d, roots, opacities, half_sizes, colors, background), offsets, ids,
-                            width, height, threads(), *plain(transmittance, stop, g_image, g_alpha), *out)  # fmt: skip
-    return out[0], out[1], out[2], out[3], out[4]
+def _list_on_gpu(
+    library: Library, splats: Splats, viewport: Viewport, by_depth: tuple[Tensor, Tensor], lists: tuple[Tensor, ...]
+) -> Bins:
+    """List and sort the pairs that `lists` have room for."""
+    like, ids = splats.depths, lists[-1]
+    tiles = len(like) * count_tiles(viewport.width, viewport.height)
+    offsets = allocate("lists of tiles", like, (tiles + 1,), torch.int32)
+    scratch = _scratch(library, len(ids), like)
+    out = dict(zip(("tiles", "splats", "sorted_tiles", "ids"), lists, strict=True))
+    out |= {"offsets": offsets, "scratch": scratch}
+    slots = _splat_slots(splats, viewport) | {f"out.{key}": address(x) for key, x in out.items()}
+    slots |= {"order": address(by_depth[0]), "ends": address(by_depth[1]), "pairs": len(ids),
+              "out.scratch_bytes": len(scratch)}  # fmt: skip
+    library.call("fill_tiles", slots, like)
+    return Bins(offsets, ids)
 
 
-@blend_backward.register_fake
-def _(means2d: Tensor, roots: Tensor, opacities: Tensor, _half: Tensor, colors: Tensor, background: Tensor,
-      *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
-    return tuple(rows_like(x) for x in (means2d, roots, opacities, colors, background))
-
-
-def _blend_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    ctx.save_for_backward(*inputs[:8], output[2], output[3])
-    ctx.size = inputs[8:]
-    ctx.shapes = output[0].shape, output[1].shape
-    ctx.set_materialize_grads(False)
-    ctx.mark_non_differentiable(output[2], output[3])
-
-
-def _blend_gradient(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-    *inputs, transmittance, stop = ctx.saved_tensors
-    given = [inputs[0].new_zeros(shape) if g is None else g
-             for g, shape in zip(grads[:2], ctx.shapes, strict=True)]  # fmt: skip
-    g = blend_backward(*inputs, *ctx.size, transmittance, stop, *given)
-    return g[0], g[1], g[2], None, g[3], g[4], None, None, None, None
-
-
-blend.register_autograd(_blend_gradient, setup_context=_blend_context)
+def _scratch(library: Library, items: int, like: Tensor) -> Tensor:
+    """What sorting and summing so many items need."""
+    return allocate("scratch space to sort", like, (library.extension.scratch_bytes(items),), torch.uint8)

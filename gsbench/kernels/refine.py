@@ -1,96 +1,156 @@
-"""AGR's perceptrons as one torch operation: hidden layers stay in cache, and backward computes them again."""
+"""Move Gaussians by AGR's perceptrons: hidden layers stay in cache, and backward computes them again."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
-from torch.library import custom_op
 
 from gsbench.errors import InputError
-from gsbench.kernels import native, threads
-from gsbench.kernels.arrays import check, plain, rows_like
-from gsbench.kernels.cuda import observe as on_cuda
+from gsbench.kernels.library import Slots, allocate, library_of
+from gsbench.kernels.operation import Operation, Tensors, address, in_rows
 
 HIDDEN = 64
+MAX_NETWORKS, MAX_VALUES = 4, 12  # as arguments.h has them
+
+
+class _Refine(Operation):
+    """The one operation on a list of arrays: values, then weight_in, bias_in, weights_out, biases_out, units, gamma.
+
+    What all Gaussians have in common is done here, on the weights: gamma(t) is part of the first layers' biases, and
+    the units are part of their columns and of the last layers' rows.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("refine", inputs={}, outputs={}, numbers={"networks": int}, memory="refinements")
+
+    def split(self, arguments: Sequence[Any]) -> tuple[Tensors, tuple[Any, ...]]:
+        *tensors, networks = arguments
+        return list(tensors), (networks,)
+
+    def differentiable(self, tensors: Tensors) -> list[bool]:
+        return [True] * (len(tensors) - 2) + [False] * 2
+
+    def carries_gradient(self, outputs: Tensors) -> list[bool]:
+        return [True] * len(outputs)
+
+    def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
+        values, weights = self._layers(tensors, numbers[0])
+        out = [allocate(self._memory, x, x.shape) for x in values]
+        slots = self._slots(values, weights)
+        slots["rows"] = values, weights
+        library_of(values[0].device.type).call("refine", slots | {"out.values": _addresses(out)}, values[0])
+        return out, slots
+
+    def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
+        values, weights = self._layers(tensors, numbers[0])
+        return self._slots(values, weights) | {"rows": (values, weights)}
+
+    def backward(
+        self, tensors: Tensors, slots: Slots, outputs: Tensors, given: Sequence[Tensor | None],
+        wanted: Sequence[bool], sums: dict[int, Tensor] | None = None,
+    ) -> list[Tensor | None]:  # fmt: skip
+        values, weights = slots["rows"]
+        like, networks = values[0], slots["networks"]
+        library, features = library_of(like.device.type), networks - 1
+        dense = [torch.zeros_like(x) if g is None else g.contiguous() for g, x in zip(given, values, strict=True)]
+        moved = [allocate("gradients of AGR's features", x, x.shape) for x in values[:features]]
+        g_weights = {key: torch.zeros_like(x) for key, x in weights.items()}
+        scratch = None
+        if library.needs_scratch:
+            shape = networks, slots["N"], slots["features"]
+            scratch = allocate("gradients of AGR's features", like, shape)
+        slots |= {"given.values": _addresses(dense), "grad.values": _addresses(moved), "grad.scratch": address(scratch)}
+        slots |= {f"grad.{key}": g.data_ptr() for key, g in g_weights.items()}
+        library.call("refine_backward", slots, like)
+        return [*moved, *dense[features:], *self._of_layers(tensors, networks, g_weights), None, None]
+
+    def _layers(self, tensors: Tensors, networks: int) -> tuple[Tensors, dict[str, Tensor]]:
+        """The arrays, and the weights as the kernels take them."""
+        *values, weight_in, bias_in = tensors[: -2 - 2 * networks]
+        weights_out, biases_out = tensors[-2 - 2 * networks : -2 - networks], tensors[-2 - networks : -2]
+        units, gamma = tensors[-2:]
+        read = weight_in.shape[1] - gamma.shape[0]
+        weights = {
+            "weight_in": weight_in.detach()[:, :read] / units[:read],
+            "bias_in": F.linear(gamma, weight_in.detach()[:, read:], bias_in.detach()),
+            "weight_out": torch.cat(weights_out).detach() * units[:, None],
+            "bias_out": torch.cat(biases_out).detach() * units,
+        }
+        return in_rows(values), weights
+
+    def _of_layers(self, tensors: Tensors, networks: int, g: dict[str, Tensor]) -> Tensors:
+        """The gradients of the layers' own weights."""
+        *_, units, gamma = tensors
+        widths = [x.shape[0] for x in tensors[-2 - networks : -2]]
+        read = g["weight_in"].shape[1]
+        g_in = torch.cat([g["weight_in"] / units[:read], torch.outer(g["bias_in"], gamma)], 1)
+        g_out, g_bias = g["weight_out"] * units[:, None], g["bias_out"] * units
+        return [g_in, g["bias_in"], *g_out.split(widths), *g_bias.split(widths)]
+
+    def _slots(self, values: Tensors, weights: dict[str, Tensor]) -> Slots:
+        widths = tuple(x.shape[1] for x in values)
+        networks, features = weights["bias_in"].shape[0] // HIDDEN, weights["weight_in"].shape[1]
+        own = widths[: networks - 1]
+        sizes: Slots = {"N": values[0].shape[0], "features": features, "networks": networks, "arrays": len(values),
+                        "outputs": sum(widths), "widths": (*own, sum(widths) - sum(own)), "value_widths": widths,
+                        "values": _addresses(values)}  # fmt: skip
+        return sizes | {key: x.data_ptr() for key, x in weights.items()}
+
+    def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
+        return [x.new_empty(x.shape) for x in tensors[: -4 - 2 * numbers[0]]]
+
+
+def _addresses(tensors: Tensors) -> tuple[int, ...]:
+    return tuple([x.data_ptr() for x in tensors])
+
+
+_refine = _Refine()
 
 
 def refine(
-    values: list[Tensor],  # of [N, c]; those of the first P - 1 are the features, F numbers in all
-    weight_in: Tensor,  # [P * 64, F]
+    values: Tensors,  # of [N, c]; those of the first P - 1 are the features, F numbers in all
+    weight_in: Tensor,  # [P * 64, F + G]
     bias_in: Tensor,  # [P * 64]
-    weights_out: list[Tensor],  # P of [c, 64]
-    biases_out: list[Tensor],  # P of [c]
-) -> list[Tensor]:  # of [N, c], as `values`
-    """Values moved by P perceptrons F x 64 x c with ReLU, x + phi(features) (7DGS eq. 14 and 15).
+    weights_out: Tensors,  # P of [c, 64]
+    biases_out: Tensors,  # P of [c]
+    units: Tensor,  # [sum of c]
+    gamma: Tensor,  # [G]
+) -> Tensors:  # of [N, c], as `values`
+    """Values moved by P perceptrons (F + G) x 64 x c with ReLU, x + phi(features, gamma) (7DGS eq. 14 and 15).
 
-    Perceptron i moves values i; the last one all that are left, in their order. What does not change from Gaussian to
-    Gaussian, as gamma(t), belongs into `bias_in`.
+    Perceptron i moves values i; the last one all that are left, in their order.
+
+    Args:
+        values: raw parameters, those that are read first.
+        weight_in: the first layers of all perceptrons, 64 rows each.
+        bias_in: theirs.
+        weights_out: the second layers.
+        biases_out: theirs.
+        units: what the perceptrons measure each number in.
+        gamma: what is the same for all Gaussians, the encoded time.
 
     Raises:
         InputError: not float32 on one device, or shapes that do not fit.
     """
-    widths = [len(w) for w in weights_out]
+    widths, moved = [w.shape[0] for w in weights_out], [x.shape[-1] for x in values]
     last, rows = len(widths) - 1, HIDDEN * len(widths)
-    moved = [x.shape[-1] for x in values]
     if last < 1 or [*moved[:last], sum(moved[last:])] != widths:
         raise InputError(f"refine: expected a perceptron for each feature and one for all other values, got outputs "
                          f"of {widths} numbers for values of {moved}")  # fmt: skip
-    N, F = len(values[0]), sum(widths[:last])
-    arrays: dict[str, tuple[Tensor, tuple[int, ...]]] = {
-        f"values[{i}]": (x, (N, c)) for i, (x, c) in enumerate(zip(values, moved, strict=True))
-    }
-    arrays |= {"weight_in": (weight_in, (rows, F)), "bias_in": (bias_in, (rows,))}
-    for i, (w, b, c) in enumerate(zip(weights_out, biases_out, widths, strict=True)):
-        arrays |= {f"weights_out[{i}]": (w, (c, HIDDEN)), f"biases_out[{i}]": (b, (c,))}
-    check("refine", arrays)
-    out: list[Tensor] = _refine(values, weight_in, bias_in, torch.cat(weights_out), torch.cat(biases_out), widths)
-    return out
-
-
-@custom_op("gsbench::refine", mutates_args=())
-def _refine(
-    values: list[Tensor], weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int]
-) -> list[Tensor]:
-    out = [rows_like(x) for x in values]
-    native().refine(list(plain(*values)), *plain(weight_in, bias_in, weight_out, bias_out), widths, threads(), out)
-    return out
-
-
-@_refine.register_fake
-def _(values: list[Tensor], *_: Any) -> list[Tensor]:
-    return [rows_like(x) for x in values]
-
-
-@custom_op("gsbench::refine_backward", mutates_args=())
-def _refine_backward(
-    values: list[Tensor], weight_in: Tensor, bias_in: Tensor, weight_out: Tensor, bias_out: Tensor, widths: list[int],
-    g_out: list[Tensor],
-) -> list[Tensor]:  # fmt: skip
-    """Gradients of the features, then of the weights; that of any other value is its `g_out`."""
-    weights = plain(weight_in, bias_in, weight_out, bias_out)
-    features, out = [rows_like(x) for x in values[: len(widths) - 1]], [rows_like(x) for x in weights]
-    native().refine_backward(list(plain(*values)), *weights, widths, threads(), list(plain(*g_out)), features, *out)
-    return features + out
-
-
-@_refine_backward.register_fake
-def _(values: list[Tensor], *arrays: Any) -> list[Tensor]:
-    return [rows_like(x) for x in (*values[: len(arrays[4]) - 1], *arrays[:4])]
-
-
-def _context(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:  # noqa: ARG001
-    values, *weights, widths = inputs
-    ctx.save_for_backward(*values, *weights)
-    ctx.widths = widths
-
-
-def _gradient(ctx: Any, g_out: list[Tensor]) -> tuple[Any, ...]:
-    *values, weight_in, bias_in, weight_out, bias_out = ctx.saved_tensors
-    features = len(ctx.widths) - 1
-    got = _refine_backward(values, weight_in, bias_in, weight_out, bias_out, ctx.widths, g_out)
-    return [*got[:features], *g_out[features:]], *got[features:], None
-
-
-_refine.register_kernel("cuda")(on_cuda.refine)
-_refine_backward.register_kernel("cuda")(on_cuda.refine_backward)
-_refine.register_autograd(_gradient, setup_context=_context)
+    if len(widths) > MAX_NETWORKS or len(values) > MAX_VALUES:
+        raise InputError(f"refine: expected at most {MAX_NETWORKS} perceptrons and {MAX_VALUES} arrays of values, got "
+                         f"{len(widths)} and {len(values)}")  # fmt: skip
+    N, G = values[0].shape[0], gamma.shape[0]
+    shapes: list[tuple[str, Tensor, tuple[int, ...]]] = []
+    shapes += [("values", x, (N, c)) for x, c in zip(values, moved, strict=True)]
+    shapes += [("weight_in", weight_in, (rows, sum(widths[:last]) + G)), ("bias_in", bias_in, (rows,))]
+    shapes += [("weights_out", w, (c, HIDDEN)) for w, c in zip(weights_out, widths, strict=True)]
+    shapes += [("biases_out", b, (c,)) for b, c in zip(biases_out, widths, strict=True)]
+    shapes += [("units", units, (sum(widths),)), ("gamma", gamma, (G,))]
+    for name, x, shape in shapes:
+        if tuple(x.shape) != shape or x.dtype != torch.float32 or x.device != values[0].device:
+            raise InputError(f"refine: expected {name} as float32 of shape {list(shape)} on {values[0].device}, got "
+                             f"{x.dtype} of {list(x.shape)} on {x.device}")  # fmt: skip
+    return _refine(*values, weight_in, bias_in, *weights_out, *biases_out, units, gamma, len(widths))

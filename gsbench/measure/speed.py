@@ -101,6 +101,13 @@ class Stages:
             while self._ended and self._clock.has_passed(self._ended[0][2]):
                 self._add_one()
 
+    def share(self, lanes: list[dict[str, float]], wall: float) -> None:
+        """Add `wall` seconds in which lanes ran side by side, by the share each stage had of all lanes' time."""
+        total = sum(sum(seconds.values()) for seconds in lanes) or 1.0
+        for seconds in lanes:
+            for name, own in seconds.items():
+                self._seconds[name] = self._seconds.get(name, 0.0) + wall * own / total
+
     @property
     def seconds(self) -> dict[str, float]:
         """The sums so far; waits for the device."""

@@ -1,22 +1,19 @@
-"""What every model is: N Gaussians with raw parameters, observed by `slice`, and edited row by row; the registry."""
+"""Hold N Gaussians with raw parameters, which `slice` observes and density control edits row by row."""
 
-import importlib
-import inspect
 import math
-import pkgutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from gsbench.errors import InputError, did_you_mean
+from gsbench.backends import AUTO, Backend
+from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.models.appearance import sh_colors
+from gsbench.models.query import Query
 from gsbench.models.refinement import OCTAVES, Refinement
-from gsbench.raster import choose_backend
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
 
@@ -59,15 +56,17 @@ class GaussianModel(nn.Module, ABC):
     observes: ClassVar[tuple[str, ...]] = ()  # of "time", "direction"
     centers: ClassVar[tuple[str, ...]] = ("means",)  # raw parameters that are means: AGR reads and moves these ..
     geometry: ClassVar[tuple[str, ...]]  # .. and moves these, which make the factor
-    backend = "auto"  # who slices, paints and refines: as of `gsbench.raster.rasterize`
 
-    def __init__(self, *, agr: bool = False, agr_octaves: int = OCTAVES, sh_degree: int = 3) -> None:
+    def __init__(
+        self, *, agr: bool = False, agr_octaves: int = OCTAVES, sh_degree: int = 3, backend: Backend = AUTO
+    ) -> None:
         """Make a model without Gaussians; `initialise` gives it some, `load_state` others.
 
         Args:
             agr: whether the adaptive Gaussian refinement moves the Gaussians.
             agr_octaves: K of AGR's time encoding.
             sh_degree: of the spherical harmonics, 0 to 3.
+            backend: who slices, colours and refines.
 
         Raises:
             InputError: an option out of its range.
@@ -83,6 +82,7 @@ class GaussianModel(nn.Module, ABC):
         self.agr = agr
         self.agr_octaves = agr_octaves
         self.sh_degree = sh_degree
+        self.backend = backend
         self.extent = 1.0  # of the scene, world units
         self.stage = Stage(sh_degree, agr, False)
 
@@ -93,7 +93,7 @@ class GaussianModel(nn.Module, ABC):
         """Raw parameters named in `centers` and `geometry`, less `means`; `distances` [N] are those to neighbours."""
 
     @abstractmethod
-    def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
+    def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Slice Gaussians with raw parameters `raw` at what this model observes."""
 
     @abstractmethod
@@ -117,7 +117,7 @@ class GaussianModel(nn.Module, ABC):
         rest = dc.new_zeros(len(dc), (self.sh_degree + 1) ** 2 - 1, 3)
         return {"sh0": dc[:, None], "shN": rest}
 
-    def show(self, raw: Raw, directions: Tensor, time: Tensor | None) -> Tensor:
+    def show(self, raw: Raw, directions: Tensor, query: Query) -> Tensor:
         """Colours [N, 3] in unit directions [N, 3]."""
         return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), directions, self.stage.sh_degree)
 
@@ -149,43 +149,37 @@ class GaussianModel(nn.Module, ABC):
             self.refinement = Refinement(outputs, generator, self.agr_octaves, units)
         self.set_stage(self.stage)
 
-    def slice(self, camera_center: Tensor, time: float | Tensor | None) -> Gaussians3D:
-        """Observe the model from a place [3] at a time in [0, 1]: 3D Gaussians for the rasterizer.
-
-        A time [] on the device is read there, so that what is recorded once can be replayed for another.
+    def slice(self, query: Query) -> Gaussians3D:
+        """Observe the model from a place at a time: 3D Gaussians for the rasterizer.
 
         Raises:
             InputError: the model needs a time and got none.
         """
-        if time is None and ("time" in self.observes or self.agr):
+        if query.time is None and ("time" in self.observes or self.agr):
             raise InputError(f"{type(self).__name__}: expected a time in [0, 1], got none: this model observes time")
-        t = camera_center.new_full((), time) if isinstance(time, float | int) else time  # no copy, which would wait
-        raw = self.refined(t)
-        means, factors, opacities = self.observe(raw, camera_center, t)
-        return Gaussians3D(means, factors, opacities, self.paint(raw, means, opacities, camera_center, t))
+        raw = self.refined(query)
+        means, factors, opacities = self.observe(raw, query)
+        return Gaussians3D(means, factors, opacities, self.paint(raw, means, opacities, query))
 
-    def observe(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """Means, factors and opacities of a slice; models with a kernel for it call that instead."""
-        means, factors, gate = self.condition(raw, camera_center, time)
+        means, factors, gate = self.condition(raw, query)
         return means, factors, torch.sigmoid(raw["opacities"]) * gate
 
-    def paint(self, raw: Raw, means: Tensor, opacities: Tensor, camera_center: Tensor, time: Tensor | None) -> Tensor:
+    def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
         """Colours of a slice; the kernel leaves out what `opacities` say cannot be drawn."""
-        if type(self).show is GaussianModel.show and self.uses_kernels(means):
-            return show_colors(raw["sh0"], raw["shN"], means, opacities, camera_center, self.stage.sh_degree)
-        return self.show(raw, unit(means - camera_center), time)
+        if type(self).show is GaussianModel.show and self.backend.serves(means):
+            return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, self.stage.sh_degree)
+        return self.show(raw, unit(means - query.center), query)
 
-    def uses_kernels(self, tensor: Tensor) -> bool:
-        """Whether the native kernels serve this model's tensors and were not switched off."""
-        return choose_backend(self.backend, tensor.device.type, tensor.dtype) != "reference"
-
-    def refined(self, time: Tensor | None) -> Raw:
+    def refined(self, query: Query) -> Raw:
         """Raw parameters after AGR: raw + phi(f) (7DGS eq. 15), on log-diagonals before the exp."""
         raw: Raw = dict(self.splats.items())
-        if self.refinement is None or not self.stage.refine or time is None:
+        if self.refinement is None or not self.stage.refine or query.time is None:
             return raw
         names = (*self.centers, *self.geometry)
-        moved = self.refinement([raw[name] for name in names], time, native=self.uses_kernels(raw["means"]))
+        by_kernel = self.backend.serves(raw["means"])
+        moved = self.refinement([raw[name] for name in names], query.time, by_kernel=by_kernel)
         return raw | dict(zip(names, moved, strict=True))
 
     def modulate(self, name: str, value: float) -> None:
@@ -274,43 +268,3 @@ def unit(vectors: Tensor) -> Tensor:
     square = vectors.square().sum(-1, keepdim=True)
     defined = square > 1e-20
     return torch.where(defined, vectors * torch.where(defined, square, 1.0).rsqrt(), 0.0)
-
-
-_REGISTRY: dict[str, type[GaussianModel]] = {}
-M = TypeVar("M", bound=type[GaussianModel])
-
-
-def register(name: str) -> Callable[[M], M]:
-    """Class decorator: `build` finds the model by this name."""
-
-    def enter(model: M) -> M:
-        _REGISTRY[name] = model
-        return model
-
-    return enter
-
-
-def build(name: str, **options: Any) -> GaussianModel:
-    """Make the model registered as `name`, without Gaussians yet.
-
-    Every module of `gsbench.models` is imported first, so that a new model is one new file in that folder.
-
-    Raises:
-        InputError: no such model, an option it does not have, or one that it needs and did not get.
-    """
-    package = importlib.import_module("gsbench.models")
-    for module in pkgutil.iter_modules(package.__path__):
-        importlib.import_module(f"gsbench.models.{module.name}")
-    if name not in _REGISTRY:
-        raise InputError(f"model '{name}' is not known. {did_you_mean(name, _REGISTRY)}")
-    model = _REGISTRY[name]
-    # A constructor passes on what it does not name itself: its options are those of all classes it stands on.
-    signatures = [inspect.signature(cls.__init__) for cls in model.__mro__ if issubclass(cls, GaussianModel)]
-    known = {p.name: p.default for s in signatures for p in s.parameters.values() if p.kind is p.KEYWORD_ONLY}
-    for option in options:
-        if option not in known:
-            raise InputError(f"model '{name}' has no option '{option}'. {did_you_mean(option, known)}")
-    for option, default in known.items():
-        if default is inspect.Parameter.empty and option not in options:
-            raise InputError(f"model '{name}' needs the option '{option}', which has no default")
-    return model(**options)

@@ -7,8 +7,10 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.slices import observe_still
-from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register
+from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
 from gsbench.models.factors import rotation, sizes
+from gsbench.models.query import Query
+from gsbench.models.registry import register
 from gsbench.scenes.scene import Points
 
 
@@ -28,14 +30,14 @@ class Gaussians3DModel(GaussianModel):
         quats[:, 0] = 1
         return {"scales": distances.log()[:, None].repeat(1, 3), "quats": quats}
 
-    def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
+    def condition(self, raw: Raw, query: Query) -> Conditioned:
         """The Gaussian as it is."""
         return Conditioned(raw["means"], self.factors(raw), torch.ones_like(raw["opacities"]))
 
-    def observe(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """By the native kernel, where it serves."""
-        if not self.uses_kernels(raw["means"]):
-            return super().observe(raw, camera_center, time)
+        if not self.backend.serves(raw["means"]):
+            return super().observe(raw, query)
         return raw["means"], *observe_still(raw["scales"], raw["quats"], raw["opacities"])
 
     def scales(self) -> Tensor:

@@ -11,8 +11,10 @@ from gsbench.kernels.colors import MAX_WAVES, show_colors
 from gsbench.kernels.slices import observe_rotated
 from gsbench.kernels.thresholds import TIME_GATE_MIN
 from gsbench.models.appearance import sh_time_colors
-from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, register, size_of
+from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, size_of
 from gsbench.models.factors import rotation4d, sizes
+from gsbench.models.query import Query
+from gsbench.models.registry import register
 from gsbench.models.slicing import check_scheme, mahalanobis, slice_gaussians
 from gsbench.scenes.scene import Points
 
@@ -65,8 +67,9 @@ class Gaussians4DModel(GaussianModel):
         times = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
         return {"times": times, "scales": scales, "left_quats": quats, "right_quats": quats.clone()}
 
-    def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
+    def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Slice at t; f_temp = exp(-1/2 lambda_t (t - mu_t)^2 / S_t)."""
+        time = query.time
         assert time is not None
         factor, delta = _leading_first(self.factors(raw)), time - raw["times"]
         # A Gaussian that is not drawn at this time stays at mu_p, as if it were seen at its own: else the huge numbers
@@ -74,34 +77,35 @@ class Gaussians4DModel(GaussianModel):
         with torch.no_grad():
             seen = self._gate(factor, delta) > TIME_GATE_MIN
         mean = torch.cat([raw["means"], raw["times"]], -1)
-        query = torch.where(seen[:, None], time, raw["times"])
-        means, factors, _ = slice_gaussians(mean, factor, query, scheme=self.scheme)
+        at = torch.where(seen[:, None], time, raw["times"])
+        means, factors, _ = slice_gaussians(mean, factor, at, scheme=self.scheme)
         gate = self._gate(factor, torch.where(seen[:, None], delta, 0.0))
         return Conditioned(means, factors, torch.where(seen, gate, 0.0))
 
-    def observe(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """The square-root scheme by the native kernel, where it serves."""
-        if self.scheme != "square_root" or not self.uses_kernels(raw["means"]):
-            return super().observe(raw, camera_center, time)
-        assert time is not None
+        if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
+            return super().observe(raw, query)
+        assert query.time is not None
         return observe_rotated(
             raw["means"],
-            raw["times"] * self.clock,
+            raw["times"],
             raw["scales"],
             raw["left_quats"],
             raw["right_quats"],
             raw["opacities"],
-            time * self.clock,
-            self.modulation("time"),
+            self.clock,
+            query.time,
+            self.log_modulation["time"],
         )
 
-    def paint(self, raw: Raw, means: Tensor, opacities: Tensor, camera_center: Tensor, time: Tensor | None) -> Tensor:
+    def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
         """4DSH by the native kernel, where it serves."""
-        if self.time_degree >= MAX_WAVES or not self.uses_kernels(means):
-            return super().paint(raw, means, opacities, camera_center, time)
-        assert time is not None
+        if self.time_degree >= MAX_WAVES or not self.backend.serves(means):
+            return super().paint(raw, means, opacities, query)
+        assert query.time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.stage.sh_degree, self.time_degree + 1
-        return show_colors(sh0, raw["shN"], means, opacities, camera_center, degree, raw["times"], time, waves)
+        return show_colors(sh0, raw["shN"], means, opacities, query.center, degree, raw["times"], query.time, waves)
 
     def initial_colors(self, dc: Tensor) -> Raw:
         """4DSH coefficients [N, time_degree + 1, K, 3]: only the constant one is not zero."""
@@ -109,11 +113,11 @@ class Gaussians4DModel(GaussianModel):
         waves = dc.new_zeros(len(dc), self.time_degree + 1, K, 3)
         return {"sh0": dc[:, None, None], "shN": waves.flatten(1, 2)[:, 1:]}
 
-    def show(self, raw: Raw, directions: Tensor, time: Tensor | None) -> Tensor:
+    def show(self, raw: Raw, directions: Tensor, query: Query) -> Tensor:
         """4DSH."""
-        assert time is not None
+        assert query.time is not None
         coefficients = torch.cat([raw["sh0"].flatten(1, 2), raw["shN"]], 1).unflatten(1, (self.time_degree + 1, -1))
-        return sh_time_colors(coefficients, directions, self.stage.sh_degree, time - raw["times"][:, 0])
+        return sh_time_colors(coefficients, directions, self.stage.sh_degree, query.time - raw["times"][:, 0])
 
     def scales(self) -> Tensor:
         """Largest of the three spatial scales, as 4DGS' density control has it."""

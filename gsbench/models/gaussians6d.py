@@ -1,6 +1,6 @@
 """6DGS: Gaussians over position and direction, for effects that depend on the view (Gao et al. 2024)."""
 
-from gsbench.models.base import register
+from gsbench.models.registry import register
 from gsbench.models.triangular import TriangularModel
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsbench.models.base import register
+from gsbench.models.registry import register
 from gsbench.models.triangular import TriangularModel
 
 

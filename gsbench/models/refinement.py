@@ -60,18 +60,20 @@ class Refinement(nn.Module):
         self.weights_out = nn.ParameterList([nn.Parameter(torch.zeros(width, HIDDEN)) for width in outputs])
         self.biases_out = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in outputs])
 
-    def forward(self, values: list[Tensor], time: Tensor, *, native: bool = False) -> list[Tensor]:
+    def forward(self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False) -> list[Tensor]:
         """Raw parameters [N, c] at one time [], moved: those that are read, then the others.
 
-        With `native`, by the kernel (float32), which never writes a hidden layer to memory.
+        `by_kernel` (float32), no hidden layer is written to memory.
         """
+        if by_kernel:
+            gamma = encode_time(time, self.octaves)
+            return refine(values, self.weight_in, self.bias_in, list(self.weights_out), list(self.biases_out),
+                          self.units, gamma)  # fmt: skip
         # The units are those of the layers' rows and columns: no Gaussian's number is scaled.
         weight_in, bias_in = self.weight_in[:, : self.features] / self.units[: self.features], self.at_time(time)
         units = self.units.split([len(w) for w in self.weights_out])
         weights_out = [w * unit[:, None] for w, unit in zip(self.weights_out, units, strict=True)]
         biases_out = [b * unit for b, unit in zip(self.biases_out, units, strict=True)]
-        if native:
-            return refine(values, weight_in, bias_in, weights_out, biases_out)
         features = torch.cat(values[: len(self.weights_out) - 1], -1)
         parts = torch.relu(F.linear(features, weight_in, bias_in)).split(HIDDEN, -1)
         layers = zip(parts, weights_out, biases_out, strict=True)

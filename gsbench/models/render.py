@@ -1,21 +1,18 @@
-"""One picture of a model: slice it, draw the slice."""
-
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+"""Render one image of a model: slice it, rasterize the slice."""
 
 from torch import Tensor
 
+from gsbench.backends import Backend
 from gsbench.models.base import GaussianModel, Gaussians3D
+from gsbench.models.query import Query
 from gsbench.raster import RasterOutput, rasterize
 from gsbench.scenes.scene import Camera
 
-if TYPE_CHECKING:  # the configuration needs hydra, which building and drawing a model does not
-    from gsbench.config import RasterConfig
 
-
-def draw(gaussians: Gaussians3D, camera: Camera, background: Tensor, config: RasterConfig) -> RasterOutput:
-    """Draw one slice from one camera, before a background colour [3]."""
+def rasterize_slice(
+    gaussians: Gaussians3D, camera: Camera, background: Tensor, backend: Backend, antialias: bool = False
+) -> RasterOutput:
+    """Rasterize one slice for one camera, before a background colour [3]."""
     return rasterize(
         *gaussians,
         camera.viewmat[None],
@@ -23,13 +20,14 @@ def draw(gaussians: Gaussians3D, camera: Camera, background: Tensor, config: Ras
         camera.width,
         camera.height,
         background=background,
-        backend=config.backend,
-        antialias=config.antialias,
+        backend=backend,
+        antialias=antialias,
     )
 
 
 def render(
-    model: GaussianModel, camera: Camera, time: float | None, background: Tensor, config: RasterConfig
+    model: GaussianModel, camera: Camera, time: float | None, background: Tensor, antialias: bool = False
 ) -> Tensor:
-    """The picture [H, W, 3] of a model from a camera at a time."""
-    return draw(model.slice(camera.center, time), camera, background, config).image[0]
+    """The image [H, W, 3] of a model from a camera at a time, by the model's own backend."""
+    seen = model.slice(Query.of(camera, time))
+    return rasterize_slice(seen, camera, background, model.backend, antialias).image[0]

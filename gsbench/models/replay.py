@@ -1,23 +1,20 @@
 """Renders of a model as a CUDA graph: what a picture launches is recorded once, and replayed for cameras and times."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
+from gsbench.backends import resolve
 from gsbench.errors import InputError
-from gsbench.kernels.cuda.raster import View
+from gsbench.kernels.raster import Viewport
 from gsbench.models.base import GaussianModel
-from gsbench.models.render import draw
-from gsbench.raster import EPS2D, FAR, NEAR, choose_backend
-from gsbench.raster.cuda import splat_within
+from gsbench.models.query import Query
+from gsbench.models.render import rasterize_slice
+from gsbench.raster import EPS2D, FAR, NEAR
+from gsbench.raster.native import draw_within
 from gsbench.scenes.scene import Camera
-
-if TYPE_CHECKING:  # the configuration needs hydra, which building and drawing a model does not
-    from gsbench.config import RasterConfig
 
 MARGIN = 1.25  # room for pairs, over what the picture at hand needs
 T = TypeVar("T")
@@ -42,19 +39,19 @@ class Replay:
     picture at hand and is looked at when a picture is done. One beyond it is recorded again with more room.
     """
 
-    def __init__(self, model: GaussianModel, background: Tensor, config: RasterConfig) -> None:
+    def __init__(self, model: GaussianModel, background: Tensor, antialias: bool = False) -> None:
         """Render `model`, whose parameters may change in value but not in number, before a background colour [3].
 
         Raises:
             InputError: pictures of this model are not drawn by the CUDA backend.
         """
-        place = model.splats["means"]
-        backend = choose_backend(config.backend, place.device.type, place.dtype)
-        if backend != "cuda":
-            raise InputError(f"replay: expected raster.backend=cuda, got '{backend}': only a GPU records what it does")
+        backend = resolve(model.backend.name, model.splats["means"].device.type)
+        if backend.name != "cuda":
+            raise InputError(f"replay: expected raster.backend=cuda, got '{backend.name}': only a GPU records what it "
+                             "does")  # fmt: skip
         self.model = model
         self.background = background
-        self.config = config
+        self.antialias = antialias
         self._recordings: dict[tuple[int, int, bool], _Recording] = {}
 
     @torch.no_grad()
@@ -81,15 +78,16 @@ class Replay:
         return recording.image
 
     def _record(self, camera: Camera, time: float | None) -> _Recording:
-        seen = self.model.slice(camera.center, time)
-        room = 1 + int(MARGIN * draw(seen, camera, self.background, self.config).info.pairs)
+        seen = self.model.slice(Query.of(camera, time))
+        drawn = rasterize_slice(seen, camera, self.background, self.model.backend, self.antialias)
+        room = 1 + int(MARGIN * drawn.info.pairs)
         own = Camera(camera.viewmat.clone(), camera.K.clone(), camera.width, camera.height)
         own_time = None if time is None else own.K.new_full((), time)
-        view = View(camera.width, camera.height, NEAR, FAR, EPS2D, self.config.antialias)
+        view = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, self.antialias)
 
         def frame() -> tuple[Tensor, Tensor]:
-            means, factors, opacities, colors = self.model.slice(own.center, own_time)
-            return splat_within(means, factors, opacities, colors[None], own.viewmat[None], own.K[None],
+            means, factors, opacities, colors = self.model.slice(Query.of(own, own_time))
+            return draw_within(means, factors, opacities, colors[None], own.viewmat[None], own.K[None],
                                 self.background, view, room)  # fmt: skip
 
         with torch.cuda.device_of(own.K):

@@ -12,6 +12,7 @@ from gsbench.kernels.slices import observe_triangular
 from gsbench.kernels.thresholds import EXPONENT_MAX
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle
+from gsbench.models.query import Query
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.scene import Points
 
@@ -81,16 +82,16 @@ class TriangularModel(GaussianModel):
             raw["times"] = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
         return raw
 
-    def condition(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> Conditioned:
+    def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Slice at d = the unit vector from the camera to mu_p, and t (7DGS, algorithm 1)."""
         factor = self.factors(raw)
         mean = torch.cat([raw["means"], raw["directions"]], -1)
-        query = unit(raw["means"] - camera_center)
-        if time is not None and "time" in self.observes:
+        at = unit(raw["means"] - query.center)
+        if query.time is not None and "time" in self.observes:
             mean = torch.cat([mean, raw["times"]], -1)
-            query = torch.cat([query, time.expand(len(query), 1)], -1)
+            at = torch.cat([at, query.time.expand(len(at), 1)], -1)
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
-        delta = query - mean[:, 3:]
+        delta = at - mean[:, 3:]
         # A Gaussian so far from the query that nothing is left of it is left out of what follows, lest its huge
         # numbers reach a gradient as 0 x inf: it stays at mu_p, gated to zero, as if it were a unit one at the query.
         with torch.no_grad():
@@ -102,14 +103,14 @@ class TriangularModel(GaussianModel):
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
-            means, factors, _ = slice_gaussians(mean, factor, query, scheme=self.scheme)
+            means, factors, _ = slice_gaussians(mean, factor, at, scheme=self.scheme)
         return Conditioned(means, factors, gate)
 
-    def observe(self, raw: Raw, camera_center: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """By the native kernel where there is one: for the square-root scheme, and on the CPU for `cholesky`."""
         has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
-        if not has_kernel or not self.uses_kernels(raw["means"]):
-            return super().observe(raw, camera_center, time)
+        if not has_kernel or not self.backend.serves(raw["means"]):
+            return super().observe(raw, query)
         return observe_triangular(
             raw["means"],
             raw["directions"],
@@ -119,10 +120,10 @@ class TriangularModel(GaussianModel):
             raw["motion"],
             raw["coupling"],
             raw["opacities"],
-            camera_center,
-            time,
-            self.modulation("direction"),
-            self.modulation("time") if "time" in self.observes else None,
+            query.center,
+            query.time,
+            self.log_modulation["direction"],
+            self.log_modulation["time"] if "time" in self.observes else None,
             conditioned_first=self.factor_order == "conditioned_first",
             form=OFF_DIAGONALS.index(self.triangle.form),
             directional_half=self.directional_half,

@@ -1,42 +1,77 @@
-"""The rasterizer on the native CPU kernels: the picture of `reference`, in float32 and much faster."""
+"""The rasterizer by kernels, on the CPU and on a GPU: the image of `reference`, in float32 and much faster."""
 
-import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.memory import require
-from gsbench.kernels.raster import MAX_GAUSSIANS, TILE_PIXELS, bin_tiles, blend, count_tiles, project
-from gsbench.raster import RasterInfo, RasterOutput
+from gsbench.kernels.raster import (
+    MAX_PAIRS,
+    TILE_PIXELS,
+    Viewport,
+    bin_tiles,
+    bin_within,
+    blend,
+    count_tiles,
+    flag_values,
+    project,
+)
+from gsbench.raster.checks import check_values
+from gsbench.raster.output import RasterInfo, RasterOutput
+
+MAX_GAUSSIANS = 1 << 24  # on the CPU, where positions in a tile's list are kept as float
 
 
 def draw(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, background: Tensor, near: float, far: float, eps2d: float, antialias: bool,
+    background: Tensor, viewport: Viewport,
 ) -> RasterOutput:  # fmt: skip
-    """Draw every camera; arguments as `gsbench.raster.rasterize`, colours [C, N, D].
+    """Draw every camera; arguments as `gsbench.raster.rasterize`. Intrinsics have no gradient here.
 
-    Same inputs, same bits, for any number of threads. Intrinsics have no gradient here.
+    On the CPU the same inputs give the same bits, for any number of threads. On a GPU gradients are sums in the order
+    that threads come by, and the device is waited for once, for the number of pairs to sort.
 
     Raises:
-        InputError: not float32 on the CPU, a gradient by `Ks` is asked for, or memory would not suffice.
+        InputError: a gradient by `Ks` is asked for, a value is out of range, or memory would not suffice.
+        torch.OutOfMemoryError: on a GPU, naming the buffer, its size and what to lower.
     """
-    if means.dtype != torch.float32 or means.device.type != "cpu":
-        raise InputError(f"raster backend 'cpu': expected float32 tensors on the CPU, got {means.dtype} on "
-                         f"{means.device}; backend 'reference' takes any")  # fmt: skip
+    device = means.device.type
     if Ks.requires_grad:
-        raise InputError("raster backend 'cpu' has no gradient by Ks: detach them, or use backend 'reference'")
-    C, N, D = colors.shape
+        raise InputError(f"raster backend '{device}' has no gradient by Ks: detach them, or use backend 'reference'")
+    C, N, D = viewmats.shape[0], means.shape[0], colors.shape[-1]
+    if device == "cpu":
+        _check_room(C, N, D, viewport)
+    if C * N > MAX_PAIRS:
+        raise InputError(f"raster backend '{device}': expected at most {MAX_PAIRS} Gaussians times cameras, got "
+                         f"{C * N}")  # fmt: skip
+    flags = flag_values(means, factors, opacities, colors, viewmats, Ks, background)
+    splats = project(means, factors, opacities, viewmats, Ks, viewport)
+    bins, flagged = bin_tiles(splats, viewport, flags)
+    if flagged:  # looked at by the kernel, so that only a bad value waits for the words
+        check_values(means, factors, opacities, colors, viewmats, Ks, background)
+    image, alpha = blend(splats, colors, background, bins, viewport)
+    radii = splats.half_sizes.amax(-1).ceil_().int()
+    return RasterOutput(image, alpha, RasterInfo(radii, splats.means2d, splats.depths, len(bins.ids)))
+
+
+def draw_within(
+    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+    background: Tensor, viewport: Viewport, room: int,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """The image [C, H, W, D] without waiting for a GPU, where `room` pairs of a tile and a Gaussian are enough.
+
+    Whether they were is for the caller to see: the second tensor, [2] int64, is how many there were, and not zero where
+    a value was out of range.
+    """
+    flags = flag_values(means, factors, opacities, colors, viewmats, Ks, background)
+    splats = project(means, factors, opacities, viewmats, Ks, viewport)
+    bins, needed = bin_within(splats, viewport, flags, room)
+    return blend(splats, colors, background, bins, viewport)[0], needed
+
+
+def _check_room(C: int, N: int, D: int, viewport: Viewport) -> None:
+    """Raise InputError for more Gaussians than are counted, and where memory would not suffice."""
     if N >= MAX_GAUSSIANS:
         raise InputError(f"raster backend 'cpu': expected fewer than {MAX_GAUSSIANS} Gaussians, got {N}")
-    pixels = C * count_tiles(width, height) * TILE_PIXELS
-    require(4 * (pixels * (2 * D + 4) + C * N * 20), f"{C} pictures of {width}x{height} with {N} Gaussians")
-
-    shared = C == 1 or colors.stride(0) == 0  # one set of colours, seen by every camera
-    means2d, roots, opacities, depths, half_sizes = project(
-        means, factors, opacities, viewmats, Ks, width, height, near, far, eps2d, antialias
-    )
-    offsets, ids = bin_tiles(means2d, depths, half_sizes, width, height)
-    image, alpha, _, _ = blend(means2d, roots, opacities, half_sizes, colors[:1] if shared else colors, background,
-                               offsets, ids, width, height)  # fmt: skip
-    radii = half_sizes.amax(-1).ceil_().int()
-    return RasterOutput(image, alpha, RasterInfo(radii, means2d, depths, len(ids)))
+    pixels = C * count_tiles(viewport.width, viewport.height) * TILE_PIXELS
+    size = f"{C} images of {viewport.width}x{viewport.height} with {N} Gaussians"
+    require(4 * (pixels * (2 * D + 4) + C * N * 20), size)

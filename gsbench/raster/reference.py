@@ -9,11 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsbench.raster import RasterInfo, RasterOutput
+from gsbench.kernels.raster import Viewport
+from gsbench.kernels.thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from gsbench.raster.output import RasterInfo, RasterOutput
 
-ALPHA_MAX = 0.999
-ALPHA_MIN = 1.0 / 255.0
-TRANSMITTANCE_MIN = 1e-4
 TILE = 8  # pixels a side; small tiles waste fewer of the pairs that blending evaluates
 CHUNK = 1 << 21  # (Gaussian, pixel) products blended at a time: bounds memory, and fits caches
 
@@ -30,18 +29,19 @@ class Splats(NamedTuple):
 
 def draw(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, background: Tensor, near: float, far: float, eps2d: float, antialias: bool,
+    background: Tensor, viewport: Viewport,
 ) -> RasterOutput:  # fmt: skip
-    """Draw every camera in turn; arguments as `gsbench.raster.rasterize`, colours [C, N, D]."""
+    """Draw every camera in turn; arguments as `gsbench.raster.rasterize`."""
+    if colors.dim() == 2:
+        colors = colors.expand(len(viewmats), *colors.shape)
     splats = [
-        project(means, factors, opacities, viewmat, K, width, height, near, far, eps2d, antialias)
-        for viewmat, K in zip(viewmats, Ks, strict=True)
+        project(means, factors, opacities, viewmat, K, *viewport) for viewmat, K in zip(viewmats, Ks, strict=True)
     ]
     means2d = torch.stack([s.means2d for s in splats])  # every picture is drawn from it, so it has a gradient
     images, alphas, pairs = [], [], 0
     for splat, mean2d, color in zip(splats, means2d, colors, strict=True):
-        tiles, gaussians = bin_tiles(splat, width, height)
-        image, alpha = blend(splat._replace(means2d=mean2d), color, tiles, gaussians, width, height)
+        tiles, gaussians = bin_tiles(splat, viewport.width, viewport.height)
+        image, alpha = blend(splat._replace(means2d=mean2d), color, tiles, gaussians, viewport.width, viewport.height)
         images.append(image + (1 - alpha) * background)
         alphas.append(alpha)
         pairs += len(tiles)

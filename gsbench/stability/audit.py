@@ -10,12 +10,12 @@ from typing import TypeVar
 import torch
 from tqdm import tqdm
 
+from gsbench.backends import resolve
 from gsbench.errors import InputError
 from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS
-from gsbench.raster import choose_backend
 from gsbench.stability import colors, curves, pictures, population, slices, trainings
-from gsbench.stability.cases import Bound, Cell, backends_with, of_area
+from gsbench.stability.cases import Bound, Cell, backends_with, device_of, of_area
 from gsbench.stability.training_cases import LONG_STEPS
 
 BACKENDS = ("cpu", "cuda", "reference")
@@ -50,7 +50,7 @@ def present() -> list[str]:
     found = []
     for name in BACKENDS:
         try:
-            found.append(choose_backend(name, "cuda" if name == "cuda" else "cpu"))
+            found.append(resolve(name, device_of(name)).name)
         except InputError:
             continue
     return found

@@ -8,7 +8,8 @@ import torch
 from mpmath import mpf
 from torch import Generator, Tensor
 
-from gsbench.models import build
+from gsbench.backends import BACKENDS
+from gsbench.models import Query, build
 from gsbench.stability import oracle
 from gsbench.stability.cases import Case, Cell, case, device_of
 from gsbench.stability.slices import fastest, worst
@@ -107,14 +108,14 @@ def truth(shown: Shown, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
 
 def differentiate(shown: Shown, backend: str, weight: Tensor, copies: int) -> tuple[Tensor, Tensor]:
     """Colours [N, 3] and their gradients [N, 4 + coefficients], computed in float32."""
-    model, device = build(shown.model), device_of(backend)
-    model.backend = backend
+    model, device = build(shown.model, backend=BACKENDS[backend]), device_of(backend)
     rows = torch.arange(COUNT).repeat(copies)
     inputs = [value[rows].requires_grad_() for value in (shown.means, shown.times, shown.sh)]
     means, times, sh = (value.to(device) for value in inputs)
     sh0 = sh[:, None, :1] if shown.model == "4dgs" else sh[:, :1]
     raw = {"means": means, "times": times, "sh0": sh0, "shN": sh[:, 1:]}
     moment = torch.tensor(shown.time, device=device)
-    color = model.paint(raw, means, torch.ones_like(means[:, 0]), shown.center.to(device), moment).cpu()
+    query = Query(shown.center.to(device), moment)
+    color = model.paint(raw, means, torch.ones_like(means[:, 0]), query).cpu()
     gradients = torch.autograd.grad(color.double(), inputs, weight.repeat(copies, 1), materialize_grads=True)
     return color.detach().double(), torch.cat([g.flatten(1).double() for g in gradients], 1)

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from gsbench import kernels
+from gsbench.backends import BACKENDS
 from gsbench.measure.speed import synchroniser
-from gsbench.models import build
+from gsbench.models import Query, build
 from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS, TriangularModel
 from gsbench.stability import picture_cases, pictures, population, slices
@@ -98,7 +99,7 @@ def _sliced(hard: population.Hard, known: population.Truth, scheme: str, backend
     center, moment = torch.zeros(3, device=device, dtype=dtype), torch.zeros((), device=device, dtype=dtype)
 
     def both() -> Tensor:
-        out = model.observe(raw, center, moment)
+        out = model.observe(raw, Query(center, moment))
         torch.autograd.grad(out, list(raw.values()), [torch.ones_like(x) for x in out], allow_unused=True)
         synchroniser(device)()
         return out[1].detach().cpu().double()
@@ -152,16 +153,16 @@ def safety(backends: list[str]) -> Iterator[Cost]:
         hard = population.draw(torch.Generator().manual_seed(3), TIMED, order, 1.0)
         for scheme in SCHEMES:
             for backend in backends_with(scheme, "7dgs", backends):
-                model = build("7dgs", lambda_d=0.35, lambda_t=0.35, factor_order=order, scheme=scheme)
+                model = build("7dgs", lambda_d=0.35, lambda_t=0.35, factor_order=order, scheme=scheme,
+                              backend=BACKENDS[backend])  # fmt: skip
                 assert isinstance(model, TriangularModel)
                 device, forward, backward = device_of(backend), [], []
                 wait = synchroniser(device)
-                model.backend = backend
                 model.to(device)
                 raw = {k: v.to(device).requires_grad_() for k, v in population.raw_parameters(hard, model).items()}
                 for _ in range(1 if backend == "reference" else REPEATS):
                     start = time.perf_counter()
-                    out = model.observe(raw, torch.zeros(3, device=device), torch.zeros((), device=device))
+                    out = model.observe(raw, Query(torch.zeros(3, device=device), torch.zeros((), device=device)))
                     wait()
                     middle = time.perf_counter()
                     torch.autograd.grad(out, list(raw.values()), [torch.ones_like(x) for x in out], allow_unused=True)

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from gsbench.models import GaussianModel, build
+from gsbench.backends import BACKENDS
+from gsbench.models import GaussianModel, Query, build
 from gsbench.models.factors import KINDS, Triangle
 from gsbench.models.slicing import subtract
 from gsbench.models.triangular import FACTOR_ORDERS, TriangularModel
@@ -206,9 +207,9 @@ def judge(hard: Hard, known: Truth, order: str, scheme: str, backend: str) -> Er
 
 def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
     """A 7DGS that gates nothing away."""
-    model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme, off_diagonal="raw")
+    model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme, off_diagonal="raw",
+                  backend=BACKENDS[backend])  # fmt: skip
     assert isinstance(model, TriangularModel)
-    model.backend = backend
     for name in ("direction", "time"):
         model.log_modulation[name] = nn.Parameter(torch.tensor(NEVER))
     return model.to(device_of(backend))
@@ -220,9 +221,9 @@ def _judge(
     some = hard.rows(rows)
     leaves = some.log_diagonal.clone().requires_grad_(), some.off_diagonal.clone().requires_grad_()
     raw = raw_parameters(Hard(*leaves, some.offset), model)
-    device = device_of(model.backend)
+    device = device_of(model.backend.name)
     there = {name: value.to(device) for name, value in raw.items()}
-    out = model.observe(there, torch.zeros(3, device=device), torch.zeros((), device=device))
+    out = model.observe(there, Query(torch.zeros(3, device=device), torch.zeros((), device=device)))
     mean, F = out[0].cpu(), out[1].cpu()
     exact_mean, exact_cov = torch.from_numpy(known.mean[rows]), torch.from_numpy(known.cov[rows])
     cov = F.double() @ F.double().mT

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gsbench.models import GaussianModel, build
+from gsbench.backends import BACKENDS
+from gsbench.models import GaussianModel, Query, build
 from gsbench.models.slicing import SCHEMES
 from gsbench.stability import oracle
 from gsbench.stability.cases import Case, Cell, backends_with, device_of
@@ -85,8 +86,7 @@ def exact(observed: Observed) -> oracle.Function:
 
 def load(observed: Observed, scheme: str, backend: str, copies: int = 1) -> tuple[GaussianModel, dict[str, Tensor]]:
     """A model that holds the case's Gaussians, `copies` times."""
-    model = build(observed.model, scheme=scheme, **OPTIONS[observed.model])
-    model.backend = backend
+    model = build(observed.model, scheme=scheme, backend=BACKENDS[backend], **OPTIONS[observed.model])
     for name, value in observed.log_lambda.items():
         model.log_modulation[name] = nn.Parameter(torch.tensor(value))
     model.to(device_of(backend))
@@ -98,10 +98,11 @@ def differentiate(
     model: GaussianModel, raw: dict[str, Tensor], observed: Observed, weights: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Outputs [N, 13] and gradients [N, parameters] in float64, computed in float32 where the model's backend is."""
-    device = device_of(model.backend)
+    device = device_of(model.backend.name)
     moment = torch.tensor(observed.time, device=device) if "time" in model.observes else None
     there = {name: value.to(device) for name, value in raw.items()}
-    mean, F, opacity = (x.cpu().double() for x in model.observe(there, observed.center.to(device), moment))
+    seen = model.observe(there, Query(observed.center.to(device), moment))
+    mean, F, opacity = (x.cpu().double() for x in seen)
     outputs = torch.cat([mean, (F @ F.mT).flatten(1), opacity[:, None]], 1)
     inputs = list(raw.values())
     gradients = torch.autograd.grad(outputs, inputs, weights, materialize_grads=True)

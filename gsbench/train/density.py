@@ -6,7 +6,6 @@ from torch import Tensor
 from gsbench.config import DensifyConfig
 from gsbench.models import GaussianModel
 from gsbench.models.base import CHILDREN
-from gsbench.raster import RasterInfo
 from gsbench.train.optim import Optimizer
 
 
@@ -32,15 +31,21 @@ class DensityControl:
         self.seen = torch.zeros_like(like)  # [N] number of views that drew the Gaussian
 
     @torch.no_grad()
-    def observe(self, info: RasterInfo, width: int, height: int, views: int) -> None:
-        """Add one view's gradients, of a loss that is a mean over `views`, in units of half the picture (NDC)."""
-        assert info.means2d.grad is not None, "call info.means2d.retain_grad() before backward()"
-        x, y = info.means2d.grad.unbind(-1)  # scaled apart: a tensor of both sizes would be waited for on a GPU
+    def observe(
+        self,
+        radii: Tensor,  # [C, N]
+        g_means2d: Tensor,  # [C, N, 2] by pixels
+        width: int,
+        height: int,
+        views: int,
+    ) -> None:
+        """Add one view's gradients, of a loss that is a mean over `views`, in units of half the image (NDC)."""
+        x, y = g_means2d.unbind(-1)  # scaled apart: a tensor of both sizes would be waited for on a GPU
         self.gradient += torch.hypot(x * (views * width / 2), y * (views * height / 2)).sum(0)
-        drawn = (info.radii > 0).sum(0)
+        drawn = (radii > 0).sum(0)
         self.seen += drawn
         # [N] views since the last that drew the Gaussian
-        self.unseen = torch.where(drawn > 0, 0, self.unseen + len(info.radii))
+        self.unseen = torch.where(drawn > 0, 0, self.unseen + len(radii))
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator, prune_large: bool) -> None:

@@ -12,18 +12,18 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gsbench.config import Config
-from gsbench.errors import InputError, TooLargeError
+from gsbench.errors import InputError
 from gsbench.measure.curve import Curve
 from gsbench.measure.quality import psnr
 from gsbench.measure.speed import Stages
 from gsbench.models import GaussianModel
-from gsbench.models.render import draw, render
+from gsbench.models.render import render
 from gsbench.scenes import Scene, View
 from gsbench.train.density import DensityControl
 from gsbench.train.floor import Floor
-from gsbench.train.losses import photometric
 from gsbench.train.optim import Optimizer
 from gsbench.train.schedule import Schedule, batch, generator
+from gsbench.train.step import Step
 from gsbench.train.watch import DivergedError, Watch
 
 
@@ -59,6 +59,7 @@ class Trainer:
         self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity, len(scene.train))
         self.floor = Floor(model, [view.camera for view in scene.train])
         self.stages = Stages(config.device)
+        self.gradients = Step(model, self.background, train.ssim_weight, config.raster.antialias, self.stages)
         self.watch = Watch(config.device)
         if config.device.startswith("cuda"):  # there a bad step is found later, and must not be applied meanwhile
             self.optimizer.adam.found_inf = self.watch.skip  # type: ignore[attr-defined]
@@ -99,28 +100,14 @@ class Trainer:
         step, train, stages = self.step, self.config.train, self.stages
         self.model.set_stage(self.schedule.stage(step))
         views = [self.scene.train[i] for i in batch(step, len(self.scene.train), train.batch_size, self.config.seed)]
-        losses = []
-        for view in views:
-            with stages("slice"):
-                gaussians = self.model.slice(view.camera.center, view.time)
-            with stages("raster"):
-                try:
-                    output = draw(gaussians, view.camera, self.background, self.config.raster)
-                except TooLargeError:
-                    raise
-                except InputError as error:  # the rasterizer's door is the first to see a slice that is not finite
-                    raise DivergedError(f"step {step}: {error}") from None
-                output.info.means2d.retain_grad()
-            with stages("loss"):
-                loss = photometric(output.image[0], view.image, train.ssim_weight, self.config.raster.backend) / len(
-                    views
-                )
-                losses.append(loss.detach())
-            with stages("backward"):
-                loss.backward()
-            with stages("density"):
-                self.density.observe(output.info, view.camera.width, view.camera.height, len(views))
-        self.watch.see(step, torch.stack(losses).sum(), self.model.groups())
+        try:
+            seen = self.gradients(views)
+        except DivergedError as error:
+            raise DivergedError(f"step {step}: {error}") from None
+        with stages("density"):
+            for view, one in zip(views, seen, strict=True):
+                self.density.observe(one.radii, one.g_means2d, view.camera.width, view.camera.height, len(views))
+        self.watch.see(step, torch.stack([one.loss for one in seen]).sum(), self.model.groups())
         with stages("optimizer"):
             self.optimizer.step(step, drawn=self.density.unseen < len(views))
             self.floor.hold()
@@ -154,7 +141,7 @@ class Trainer:
     @torch.no_grad()
     def render(self, view: View) -> Tensor:
         """The model's picture of a view, [H, W, 3]."""
-        return render(self.model, view.camera, view.time, self.background, self.config.raster)
+        return render(self.model, view.camera, view.time, self.background, self.config.raster.antialias)
 
     def state_dict(self) -> dict[str, Any]:
         """All that the next step depends on, and all that was measured so far; raises DivergedError as `run`."""

@@ -6,16 +6,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsbench.backends import AUTO, Backend
 from gsbench.kernels.loss import l1_ssim
-from gsbench.raster import choose_backend
 
 WINDOW = 11
 SIGMA = 1.5
 
 
-def photometric(image: Tensor, target: Tensor, ssim_weight: float, backend: str = "auto") -> Tensor:
-    """The training loss of one picture, [H, W, 3] and [H, W, 3] in [0, 1] -> []; `backend` as of `rasterize`."""
-    if choose_backend(backend, image.device.type, image.dtype) != "reference":
+def photometric(image: Tensor, target: Tensor, ssim_weight: float, backend: Backend = AUTO) -> Tensor:
+    """The training loss of one image, two of [H, W, 3] or [1, H, W, 3] in [0, 1] -> []."""
+    if backend.serves(image):
         return l1_ssim(image, target, ssim_weight)
     loss = F.l1_loss(image, target)
     if ssim_weight == 0:
@@ -27,7 +27,7 @@ def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
     """Mean SSIM in an 11 x 11 Gaussian window, zero padded, as 3DGS trains with; results are measured by
     `gsbench.measure.quality.ssim` instead (Wang et al. 2004).
     """  # fmt: skip
-    a, b = a.permute(2, 0, 1), b.permute(2, 0, 1)
+    a, b = (x.reshape(x.shape[-3:]).permute(2, 0, 1) for x in (a, b))
     moments = _blur(torch.cat([a, b, a * a, b * b, a * b]))
     mean_a, mean_b, aa, bb, ab = moments.split(len(a))
     variances, covariance = aa - mean_a**2 + bb - mean_b**2, ab - mean_a * mean_b

@@ -87,7 +87,7 @@ class Optimizer:
             state["step"] = torch.zeros((), device=parameter.device)
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
         state["step"] += counts
-        update = adam if self.model.uses_kernels(parameter) else adam_reference
+        update = adam if self.model.backend.serves(parameter) else adam_reference
         moments = state["exp_avg"], state["exp_avg_sq"]
         with torch.no_grad():
             update(parameter, parameter.grad, *moments, drawn, group["lr"], list(group["betas"]), group["eps"],

@@ -12,6 +12,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels import colors, refine, slices
 from gsbench.kernels.cuda import observe as on_cuda
+from gsbench.models import Query
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
 from gsbench.models.factors import OFF_DIAGONALS
@@ -53,7 +54,7 @@ def test_slice(timed: bool, options: dict[str, Any], move: Move) -> None:
     """Catches a wrong row order, reflection, gate or derivative of any parameter."""
     center = torch.tensor([0.3, -0.2, -3.0])
     exact, raw = model_and_raw(timed, options, torch.float64)
-    seen = exact.condition(raw, center.double(), torch.tensor(0.4, dtype=torch.float64))
+    seen = exact.condition(raw, Query(center.double(), torch.tensor(0.4, dtype=torch.float64)))
     expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
     model, _ = model_and_raw(timed, options, torch.float32)
     single = {name: move(value) for name, value in raw.items()}
@@ -75,7 +76,7 @@ def test_slice(timed: bool, options: dict[str, Any], move: Move) -> None:
 def test_rotated_slice(move: Move) -> None:
     """Catches a wrong sign of a quaternion's matrix, row order, gate or derivative of any parameter."""
     exact, raw = rotated(torch.float64)
-    seen = exact.condition(raw, torch.zeros(3, dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64))
+    seen = exact.condition(raw, Query(torch.zeros(3, dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64)))
     expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
     single = [move(x) for x in raw.values()]
     log_lambda = move(exact.log_modulation["time"])

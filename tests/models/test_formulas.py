@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from small import CAMERA, MODELS, N, fresh, joint, lively, raw, seeded
 
-from gsbench.models import GaussianModel, Gaussians3D
+from gsbench.models import GaussianModel, Gaussians3D, Query
 from gsbench.models.factors import KINDS
 from gsbench.models.gaussians4d import TIME_GATE_MIN
 
@@ -66,7 +66,7 @@ def agree(sliced: Gaussians3D, means: np.ndarray, covariances: np.ndarray, opaci
 def test_triangular_models(name: str, order: str, scheme: str, form: str) -> None:
     """Catches a wrong row order, a conditional block where f_temp or f_dir takes the marginal one, a wrong lambda."""
     model = lively(name, factor_order=order, scheme=scheme, off_diagonal=form)
-    agree(model.slice(CAMERA, TIME), *by_hand(model, ORDERS[order], 1.0 if name == "6dgs" else 0.5))
+    agree(model.slice(Query.at(CAMERA, TIME)), *by_hand(model, ORDERS[order], 1.0 if name == "6dgs" else 0.5))
 
 
 @pytest.mark.parametrize("half", [True, False])
@@ -74,7 +74,7 @@ def test_triangular_models(name: str, order: str, scheme: str, form: str) -> Non
 def test_directional_half(name: str, half: bool) -> None:
     """Catches the 1/2 of 7DGS in 6DGS, or its option without effect; the 1/2 of f_temp stays."""
     model = lively(name, directional_half=half)
-    agree(model.slice(CAMERA, TIME), *by_hand(model, "dtp", 0.5 if half else 1.0))
+    agree(model.slice(Query.at(CAMERA, TIME)), *by_hand(model, "dtp", 0.5 if half else 1.0))
     assert MODELS["6dgs"]["directional_half"] is False
 
 
@@ -90,7 +90,7 @@ def test_factor_orders_are_coordinates_of_one_family(name: str) -> None:
     for key, value in first.triangle.parameters(factor).items():
         first.splats[key].data = value
     torch.testing.assert_close(joint(first), joint(paper))
-    a, b = paper.slice(CAMERA, TIME), first.slice(CAMERA, TIME)
+    a, b = paper.slice(Query.at(CAMERA, TIME)), first.slice(Query.at(CAMERA, TIME))
     covariance = (a.factors @ a.factors.mT).detach().numpy()
     agree(b, a.means.detach().numpy(), covariance, a.opacities.detach().numpy())
 
@@ -103,7 +103,7 @@ def test_far_from_the_query(name: str, order: str) -> None:
     for kind in KINDS:
         model.splats[kind].data.normal_(generator=seeded(1))
     model.splats["log_diagonal"].data.fill_(-30.0)
-    sliced = model.slice(CAMERA.float(), TIME)
+    sliced = model.slice(Query.at(CAMERA.float(), TIME))
     sum(x.sum() for x in sliced).backward()
     assert all(x.isfinite().all() for x in sliced)
     assert all(p.grad.isfinite().all() for p in model.splats.values())
@@ -136,7 +136,7 @@ def test_4dgs(scheme: str) -> None:
         means.append(mean + S[:3, 3] / S[3, 3] * offset * (f > 0.05))  # what is not drawn stays at mu_p
         covariances.append(S[:3, :3] - np.outer(S[:3, 3], S[:3, 3]) / S[3, 3])
         opacities.append((f if f > 0.05 else 0.0) / (1 + math.exp(-values["opacities"][i])))
-    agree(model.slice(CAMERA, TIME), np.stack(means), np.stack(covariances), np.array(opacities))
+    agree(model.slice(Query.at(CAMERA, TIME)), np.stack(means), np.stack(covariances), np.array(opacities))
     assert 0 < opacities.count(0) < N
 
 
@@ -148,7 +148,7 @@ def test_4dgs_is_the_same_in_metres_and_centimetres(native: bool) -> None:
     larger.clock *= 100
     for name, times, plus in (("means", 100.0, 0.0), ("scales", 1.0, math.log(100.0))):
         larger.splats[name].data.mul_(times).add_(plus)
-    a, b = model.slice(CAMERA.to(dtype), TIME), larger.slice(100 * CAMERA.to(dtype), TIME)
+    a, b = model.slice(Query.at(CAMERA.to(dtype), TIME)), larger.slice(Query.at(100 * CAMERA.to(dtype), TIME))
     torch.testing.assert_close(100 * a.means, b.means, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(100 * a.factors @ a.factors.mT, b.factors @ b.factors.mT / 100, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(a.opacities, b.opacities, rtol=1e-4, atol=1e-6)
@@ -160,7 +160,7 @@ def test_4dgs_leaves_out_what_is_far_in_time() -> None:
     sigma = math.sqrt(1 / 5)
     for factor, drawn in [(1 - 1e-4, True), (1 + 1e-4, False)]:
         model.splats["times"].data.fill_(TIME + factor * sigma * math.sqrt(-2 * math.log(0.05)))
-        assert ((model.slice(CAMERA, TIME).opacities > 0) == drawn).all()
+        assert ((model.slice(Query.at(CAMERA, TIME)).opacities > 0) == drawn).all()
     assert TIME_GATE_MIN == 0.05
 
 
@@ -175,7 +175,7 @@ def test_4dgs_at_a_time_of_its_own_is_3dgs() -> None:
     np.testing.assert_allclose(F[:, :3, 3], 0, atol=1e-12)
     R = F[:, :3, :3] / np.exp(raw(model)["scales"].numpy())[:, None, :3]
     assert np.abs(Rotation.from_matrix(R).as_matrix() - R).max() < 1e-9
-    sliced = model.slice(CAMERA, TIME)
+    sliced = model.slice(Query.at(CAMERA, TIME))
     covariance = (sliced.factors @ sliced.factors.mT).detach().numpy()
     np.testing.assert_allclose(covariance, F[:, :3, :3] @ F[:, :3, :3].swapaxes(1, 2), atol=1e-12)
     torch.testing.assert_close(sliced.means.data, model.splats["means"].data)

@@ -11,7 +11,7 @@ from small import CAMERA, EXTENT, MODELS, VARIANTS, N, fresh, lively, raw, seede
 from torch import Tensor, nn
 
 from gsbench.errors import InputError
-from gsbench.models import Stage, build
+from gsbench.models import Query, Stage, build
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
 from gsbench.models.factors import KINDS
@@ -33,7 +33,7 @@ def test_start(variant: str) -> None:
     torch.testing.assert_close(torch.sigmoid(model.splats["opacities"]).data, torch.full((N,), 0.1))
     size = nearest_distances(points.means)
     torch.testing.assert_close(model.scales(), size)
-    sliced = model.slice(CAMERA.float(), 0.4)
+    sliced = model.slice(Query.at(CAMERA.float(), 0.4))
     torch.testing.assert_close(sliced.means.data, points.means)
     covariance = (sliced.factors @ sliced.factors.mT).data
     torch.testing.assert_close(covariance, size.square()[:, None, None] * torch.eye(3))
@@ -92,7 +92,7 @@ def test_slice_has_gradients(variant: str) -> None:
 
     def sliced(*values: Tensor) -> tuple[Tensor, ...]:
         model.splats = dict(zip(names, values, strict=True))
-        return tuple(model.slice(CAMERA, 0.45))
+        return tuple(model.slice(Query.at(CAMERA, 0.45)))
 
     output = sliced(*values)
     assert (output[2] > 0).any()
@@ -105,7 +105,7 @@ def test_slice_has_gradients(variant: str) -> None:
 @given(st.sampled_from(sorted(VARIANTS)), st.integers(0, 2**31), st.floats(-1, 2))
 def test_slices_can_be_drawn(variant: str, seed: int, time: float) -> None:
     """Catches NaN, opacities outside [0, 1] and negative colours at any time, also beyond the clip."""
-    sliced = lively(variant, seed=seed).slice(CAMERA, time)
+    sliced = lively(variant, seed=seed).slice(Query.at(CAMERA, time))
     assert [tuple(x.shape) for x in sliced] == [(N, 3), (N, 3, 3), (N,), (N, 3)]
     assert all(x.isfinite().all() for x in sliced)
     assert (sliced.opacities >= 0).all()
@@ -124,7 +124,7 @@ def test_slice_at_its_own_mean_is_the_gaussian(variant: str) -> None:
         at = {name: value[i] for name, value in raw(model).items()}
         mean, direction = at["means"], at.get("directions", torch.tensor([0, 0.6, 0.8]).double())
         time = at["times"].item() if "times" in at else 0.5
-        sliced = model.slice(mean - 3 * direction, time)
+        sliced = model.slice(Query.at(mean - 3 * direction, time))
         torch.testing.assert_close(sliced.means[i], mean)
         torch.testing.assert_close(sliced.opacities[i], torch.sigmoid(model.splats["opacities"][i]))
 
@@ -133,9 +133,9 @@ def test_slice_at_its_own_mean_is_the_gaussian(variant: str) -> None:
 def test_colors_are_seen_from_the_camera(variant: str) -> None:
     """Catches a colour looked up in the direction to the camera, or to where the Gaussian is not at that time."""
     model = lively(variant)
-    sliced = model.slice(CAMERA, 0.5)
+    sliced = model.slice(Query.at(CAMERA, 0.5))
     d = nn.functional.normalize(sliced.means - CAMERA, dim=-1)
-    values = model.refined(torch.tensor(0.5, dtype=torch.float64))
+    values = model.refined(Query.at(CAMERA, 0.5))
     coefficients = torch.cat([values["sh0"].flatten(1, -2), values["shN"]], 1)
     if variant.startswith("4dgs"):
         expected = sh_time_colors(coefficients.unflatten(1, (-1, 16)), d, 3, 0.5 - values["times"][:, 0])
@@ -148,7 +148,7 @@ def test_colors_are_seen_from_the_camera(variant: str) -> None:
 def test_camera_on_a_mean(variant: str) -> None:
     """Catches 0/0: d is undefined there and taken as zero, and its gradient too."""
     model = lively(variant)
-    sliced = model.slice(model.splats["means"].data[0], 0.5)
+    sliced = model.slice(Query.at(model.splats["means"].data[0], 0.5))
     sum(x.sum() for x in sliced).backward()
     assert all(x.isfinite().all() for x in sliced)
     assert all(p.grad.isfinite().all() for p in model.splats.values())
@@ -160,9 +160,9 @@ def test_time_is_asked_for_where_it_is_needed(variant: str) -> None:
     model = fresh(variant)
     if "time" in model.observes or model.agr:
         with pytest.raises(InputError, match="expected a time"):
-            model.slice(CAMERA.float(), None)
+            model.slice(Query.at(CAMERA.float(), None))
     else:
-        assert model.slice(CAMERA.float(), None).means.shape == (N, 3)
+        assert model.slice(Query.at(CAMERA.float(), None)).means.shape == (N, 3)
 
 
 # ---- AGR and stages
@@ -175,9 +175,9 @@ def test_agr_changes_nothing_at_first(name: str) -> None:
     for p in [*model.refinement.weights_out, *model.refinement.biases_out]:
         p.data.zero_()
     model.set_stage(Stage(3, False, False))
-    off = model.slice(CAMERA, 0.3)
+    off = model.slice(Query.at(CAMERA, 0.3))
     model.set_stage(Stage(3, True, False))
-    assert all(torch.equal(a, b) for a, b in zip(off, model.slice(CAMERA, 0.3), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(off, model.slice(Query.at(CAMERA, 0.3)), strict=True))
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -185,7 +185,7 @@ def test_agr_moves_what_it_should(name: str) -> None:
     """Catches residuals added to the wrong parameter, after the exp, or to colours and opacity."""
     model = lively(f"{name}_agr")
     model.set_stage(Stage(3, True, False))
-    before, after = raw(model), model.refined(torch.tensor(0.3, dtype=torch.float64))
+    before, after = raw(model), model.refined(Query.at(CAMERA, 0.3))
     names = [*model.centers, *model.geometry]
     moved = model.refinement([before[k] for k in names], torch.tensor(0.3, dtype=torch.float64))
     torch.testing.assert_close([after[k] for k in names], moved)
@@ -204,7 +204,7 @@ def test_what_is_off_does_not_learn(name: str) -> None:
     for refine, tune in [(False, False), (True, False), (False, True), (True, True)]:
         model.set_stage(Stage(3, refine, tune))
         model.zero_grad(set_to_none=True)
-        sum(x.square().sum() for x in model.slice(CAMERA, 0.3)).backward()
+        sum(x.square().sum() for x in model.slice(Query.at(CAMERA, 0.3))).backward()
         assert all((p.grad is not None and p.grad.any().item()) == refine for p in model.refinement.weights_out)
         assert all((p.grad is not None and p.grad.any().item()) == tune for p in model.log_modulation.parameters())
     for p in model.log_modulation.parameters():
@@ -224,10 +224,10 @@ def test_sh_degree_grows_with_the_stage() -> None:
     """Catches colours that use coefficients of a degree not yet on."""
     model = lively("3dgs")
     model.set_stage(Stage(0, False, False))
-    flat = model.slice(CAMERA, None).colors
+    flat = model.slice(Query.at(CAMERA, None)).colors
     torch.testing.assert_close(flat, (SH_C0 * model.splats["sh0"][:, 0] + 0.5).clamp(min=0))
     model.set_stage(Stage(1, False, False))
-    assert not torch.allclose(model.slice(CAMERA, None).colors, flat)
+    assert not torch.allclose(model.slice(Query.at(CAMERA, None)).colors, flat)
 
 
 # ---- build
@@ -268,4 +268,4 @@ def test_build_takes_every_option_of_the_bases(variant: str) -> None:
     model = fresh(variant, agr=True, sh_degree=1)
     assert model.sh_degree == 1
     assert model.refinement is not None
-    assert model.slice(CAMERA.float(), 0.2).colors.isfinite().all()
+    assert model.slice(Query.at(CAMERA.float(), 0.2)).colors.isfinite().all()

@@ -3,15 +3,16 @@
 import contextlib
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
 from gsbench import models
 from gsbench.errors import InputError
 from gsbench.models.factors import KINDS
+from gsbench.scenes import View
 from gsbench.stability import (
     __main__ as command,
 )
@@ -26,6 +27,7 @@ from gsbench.stability.cases import CASES
 from gsbench.train import checkpoint, diagnosis
 from gsbench.train.loop import Trainer
 from gsbench.train.schedule import generator
+from gsbench.train.step import Seen
 from gsbench.train.watch import DivergedError
 
 POISONED = 7
@@ -40,27 +42,28 @@ def trainer(name: str, steps: int = 12) -> Trainer:
     return Trainer(model, scene, scene.train, config)
 
 
-def poison(model: models.GaussianModel, parameter: str, after: int) -> None:
-    """From so many backward passes on, one Gaussian's gradient is NaN."""
-    passes = [0]
+def poison(run: Trainer, parameter: str, after: int) -> None:
+    """From so many steps on, one Gaussian's gradient is NaN."""
+    gradients, steps = run.gradients, [0]
 
-    def hook(gradient: Tensor) -> Tensor:
-        passes[0] += 1
-        if passes[0] > after:
-            gradient = gradient.clone()
+    def poisoned(batch: Sequence[View]) -> list[Seen]:
+        seen = gradients(batch)
+        steps[0] += 1
+        if steps[0] > after:
+            gradient = run.model.splats[parameter].grad
+            assert gradient is not None
             gradient[POISONED] = math.nan
-        return gradient
+        return seen
 
-    model.splats[parameter].register_hook(hook)
+    run.gradients = poisoned  # type: ignore[assignment]
 
 
 def test_the_step_the_parameter_the_gaussian_and_the_case(tmp_path: Path) -> None:
     """Catches a NaN that is noticed steps later, is blamed on something else, or reaches a parameter or checkpoint."""
     run = trainer("7dgs")
-    batch = run.config.train.batch_size
     run.model.splats["log_diagonal"].data[POISONED, 3] = -14.0  # e^-14 of the clip: an instant
     run.config.train.checkpoint_minutes = 0  # after every step
-    poison(run.model, "log_diagonal", after=5 * batch)
+    poison(run, "log_diagonal", after=5)
     path = tmp_path / "checkpoint.pt"
     with contextlib.redirect_stderr(io.StringIO()), pytest.raises(DivergedError, match=r"step 5.*'log_diagonal'"):
         run.run(lambda state: checkpoint.save(path, "config", "data", state), "poisoned")

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsbench.models import GaussianModel
+from gsbench.backends import BACKENDS
+from gsbench.models import GaussianModel, Query
 from gsbench.raster import rasterize
 from gsbench.stability import colors, picture_cases, slices  # noqa: F401  # their cases enter the list
 from gsbench.stability.audit import present
@@ -36,14 +37,14 @@ def whole_path(model: GaussianModel, raw: dict[str, Tensor], center: Tensor, tim
     """Slice, draw, compare with a photograph, and differentiate; everything must be finite."""
     inputs = {name: value.clone().requires_grad_() for name, value in raw.items()}
     moment = torch.tensor(time)
-    means, factors, opacities = model.observe(inputs, center, moment)
-    shown = model.paint(inputs, means, opacities, center, moment)
+    means, factors, opacities = model.observe(inputs, Query(center, moment))
+    shown = model.paint(inputs, means, opacities, Query(center, moment))
     viewmat = torch.eye(4)
     viewmat[:3, 3] = -center
     K = torch.tensor([[20.0, 0, WIDTH / 2], [0, 20.0, HEIGHT / 2], [0, 0, 1]])
     image = rasterize(means, factors, opacities, shown, viewmat[None], K[None], WIDTH, HEIGHT, backend=backend).image[0]
     target = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
-    loss = photometric(image, target, 0.2, backend)
+    loss = photometric(image, target, 0.2, BACKENDS[backend])
     assert loss.isfinite()
     gradients = torch.autograd.grad(loss, list(inputs.values()), materialize_grads=True)
     for name, gradient in zip(inputs, gradients, strict=True):

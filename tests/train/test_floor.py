@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from gsbench.config import RasterConfig
-from gsbench.models import GaussianModel, build
+from gsbench.models import GaussianModel, Query, build
 from gsbench.models.render import render
 from gsbench.scenes import Camera
 from gsbench.scenes.points import random_points
@@ -44,14 +43,14 @@ def test_no_camera_sees_the_floor(name: str) -> None:
     """Catches a bound that touches the image, one on another axis or on time, and one that is not held."""
     model, eye = flat(name), camera(4.0)
     background = torch.zeros(3)
-    before = render(model, eye, 0.5, background, RasterConfig())
+    before = render(model, eye, 0.5, background)
     others = {n: p.detach().clone() for n, p in model.splats.items() if n not in ("scales", "log_diagonal")}
     durations = model.splats["scales"].detach()[:, 3:].clone() if name == "4dgs" else None
     floor = Floor(model, [eye])
     floor.hold()
-    after = render(model, eye, 0.5, background, RasterConfig())
+    after = render(model, eye, 0.5, background)
     assert 0 < (after - before).abs().max() < 1 / 255
-    factors = model.slice(eye.center, 0.5).factors
+    factors = model.slice(Query.at(eye.center, 0.5)).factors
     assert (torch.linalg.svdvals(factors)[:, 2] >= 0.99 * floor.least).all()
     assert all(torch.equal(model.splats[n], p) for n, p in others.items())
     assert durations is None or torch.equal(model.splats["scales"][:, 3:], durations)

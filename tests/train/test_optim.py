@@ -11,7 +11,6 @@ from gsbench.config import DensifyConfig, LearningRate, ModelConfig, TrainConfig
 from gsbench.errors import InputError
 from gsbench.kernels.adam import adam
 from gsbench.models import GaussianModel, build
-from gsbench.raster import RasterInfo
 from gsbench.scenes.points import random_points
 from gsbench.train.density import DensityControl
 from gsbench.train.optim import Optimizer, adam_reference, rate_at
@@ -80,11 +79,10 @@ def test_rates_and_parameters_must_match() -> None:
         fitted(rates={**RATES, "sacles": LearningRate(1.0)})
 
 
-def info_with_gradient(gradients: torch.Tensor, drawn: torch.Tensor | None = None) -> RasterInfo:  # [N, 2]
-    means2d = torch.zeros(1, *gradients.shape)
-    means2d.grad = gradients[None]
+def drawn_with(gradients: torch.Tensor, drawn: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Radii [1, N] and gradients of 2D means [1, N, 2] of one view."""
     radii = torch.ones(1, len(gradients), dtype=torch.int32) if drawn is None else drawn[None].int()
-    return RasterInfo(radii, means2d, torch.ones(1, len(gradients)), 0)
+    return radii, gradients[None]
 
 
 def test_density_control_clones_small_splits_large_prunes_faint() -> None:
@@ -101,7 +99,7 @@ def test_density_control_clones_small_splits_large_prunes_faint() -> None:
     gradients = torch.zeros(6, 2)
     gradients[[0, 3]] = torch.tensor([0.03, 0.0])  # x 100 / 2 pixels x 1 view = 1.5 > 1
     gradients[1] = torch.tensor([0.0, 0.03])  # x 50 / 2 = 0.75 < 1
-    control.observe(info_with_gradient(gradients), width=100, height=50, views=1)
+    control.observe(*drawn_with(gradients), width=100, height=50, views=1)
     control.densify(torch.Generator().manual_seed(1), prune_large=False)
     means = model.splats["means"].detach()[:, 0]
     assert len(model) == 7  # 1, 2, 4 kept; 0 cloned to two; 3 split in two; 5 pruned
@@ -122,7 +120,7 @@ def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
 
     def look(drawn: torch.Tensor, times: int) -> list[float]:
         for _ in range(times):
-            control.observe(info_with_gradient(torch.zeros(4, 2)[: len(model)], drawn), 10, 10, views=1)
+            control.observe(*drawn_with(torch.zeros(4, 2)[: len(model)], drawn), 10, 10, views=1)
         control.densify(torch.Generator(), prune_large=False)
         return model.splats["means"].detach()[:, 0].tolist()
 

@@ -6,9 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from gsbench.backends import AUTO, REFERENCE
 from gsbench.experiment import build
 from gsbench.measure.curve import Point
-from gsbench.raster import RasterInfo
+from gsbench.models import Query
 from gsbench.scenes.scene import Scene
 from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.loop import Trainer
@@ -53,10 +54,8 @@ def test_density_gradients_are_of_one_view_in_half_images() -> None:
     """Catches a gradient that is not rescaled by the batch, or that is left in pixels."""
     density = trainer("3dgs").density
     N = len(density.model)
-    means2d = torch.zeros(1, N, 2, requires_grad=True)
-    means2d.grad = torch.tensor([3e-3, 4e-3]).expand(1, N, 2).clone()
-    info = RasterInfo(torch.ones(1, N, dtype=torch.int32), means2d, torch.ones(1, N), 0)
-    density.observe(info, width=20, height=20, views=4)
+    gradient = torch.tensor([3e-3, 4e-3]).expand(1, N, 2).clone()
+    density.observe(torch.ones(1, N, dtype=torch.int32), gradient, width=20, height=20, views=4)
     torch.testing.assert_close(density.gradient, torch.full((N,), 5e-3 * 4 * 10))
 
 
@@ -163,9 +162,9 @@ def test_a_model_shows_the_same_by_kernels_and_in_torch(name: str, degree: int, 
             weight.normal_(0, 0.02, generator=random)
     model.set_stage(replace(model.stage, sh_degree=degree, refine=True))
     shown = []
-    for backend in ("auto", "reference"):
+    for backend in (AUTO, REFERENCE):
         model.backend = backend
-        shown.append(model.slice(fitted.scene.train[2].camera.center, 0.4))
+        shown.append(model.slice(Query.at(fitted.scene.train[2].camera.center, 0.4)))
     drawn = shown[1].opacities > 1 / 200  # colours of what is not drawn are not computed
     assert drawn.sum() > 10
     for a, b in zip(*shown, strict=True):

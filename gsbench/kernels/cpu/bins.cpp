@@ -61,11 +61,10 @@ void each_rect(const BinArgs& a, int64_t camera, F f) {
 
 }  // namespace
 
-// offsets [C * tiles + 1]: where each tile's list starts. Returns the length of all lists.
-int64_t count_tiles(const BinArgs& a, int64_t* offsets) {
+void count_tiles(const BinArgs& a, const TileOffsets& out) {
     const int across = tiles_along(a.width), down = tiles_along(a.height);
     const int64_t tiles = static_cast<int64_t>(across) * down;
-    std::memset(offsets, 0, sizeof(int64_t) * static_cast<size_t>(a.C * tiles + 1));
+    Buffer<int64_t> counts(static_cast<size_t>(a.C * tiles));
     // Four additions a splat, whatever its size: differences first, summed up along both axes after.
     Buffer<int64_t> corners(static_cast<size_t>(across + 1) * (down + 1));
     for (int64_t c = 0; c < a.C; ++c) {
@@ -81,23 +80,27 @@ int64_t count_tiles(const BinArgs& a, int64_t* offsets) {
             for (int x = 0; x < across; ++x) {
                 const size_t i = static_cast<size_t>(y) * (across + 1) + x;
                 row += corners[i];
-                const int64_t above = y > 0 ? offsets[c * tiles + (y - 1) * across + x + 1] : 0;
-                offsets[c * tiles + static_cast<int64_t>(y) * across + x + 1] = above + row;
+                const size_t tile = static_cast<size_t>(c * tiles + static_cast<int64_t>(y) * across + x);
+                counts[tile] = row + (y > 0 ? counts[tile - static_cast<size_t>(across)] : 0);
             }
         }
     }
-    for (int64_t t = 0; t < a.C * tiles; ++t) offsets[t + 1] += offsets[t];
-    return offsets[a.C * tiles];
+    int64_t pairs = 0;
+    for (int64_t t = 0; t <= a.C * tiles; ++t) {
+        out.offsets[t] = static_cast<int32_t>(pairs);  // of no use where there are more than fit, which `pairs` tells
+        if (t < a.C * tiles) pairs += counts[static_cast<size_t>(t)];
+    }
+    *out.pairs = pairs;
 }
 
-void fill_tiles(const BinArgs& a, const int64_t* offsets, int32_t* ids) {
+void fill_tiles(const BinArgs& a, const TileLists& lists) {
     const int across = tiles_along(a.width), down = tiles_along(a.height);
     const int64_t tiles = static_cast<int64_t>(across) * down;
     Buffer<Key> keys(static_cast<size_t>(a.N)), spare(static_cast<size_t>(a.N));
     Buffer<Entry> entries(static_cast<size_t>(a.N));
-    Buffer<int64_t> cursors(static_cast<size_t>(tiles));
+    Buffer<int32_t> cursors(static_cast<size_t>(tiles));
     for (int64_t c = 0; c < a.C; ++c) {
-        const int64_t* begin = offsets + c * tiles;
+        const int32_t* begin = lists.offsets + c * tiles;
         int64_t n = 0;
         each_rect(a, c, [&](int64_t i, const TileRect& r) {
             const auto tile = [](int x) { return static_cast<uint16_t>(x); };
@@ -107,13 +110,13 @@ void fill_tiles(const BinArgs& a, const int64_t* offsets, int32_t* ids) {
             ++n;
         });
         const Key* sorted = radix_sort(keys.data(), spare.data(), n);
-        std::memcpy(cursors.data(), begin, sizeof(int64_t) * static_cast<size_t>(tiles));
+        std::memcpy(cursors.data(), begin, sizeof(int32_t) * static_cast<size_t>(tiles));
         // A task walks all splats but deals to its own rows of tiles, so that every list keeps the depth order.
         const int tasks = a.threads < down ? a.threads : down;
 #pragma omp parallel for num_threads(a.threads) schedule(static, 1)
         for (int task = 0; task < tasks; ++task) {
             const auto first_row = [&](int t) {  // rows that hold an equal share of the pairs
-                const int64_t share = begin[0] + (begin[tiles] - begin[0]) * t / tasks;
+                const int64_t share = begin[0] + static_cast<int64_t>(begin[tiles] - begin[0]) * t / tasks;
                 int y = 0;
                 while (y < down && begin[static_cast<int64_t>(y) * across] < share) ++y;
                 return t == tasks ? down : y;
@@ -124,8 +127,8 @@ void fill_tiles(const BinArgs& a, const int64_t* offsets, int32_t* ids) {
                 const Entry e = entries[static_cast<size_t>(sorted[k].entry)];
                 const int y0 = e.y0 > low ? e.y0 : low, y1 = e.y1 < high ? e.y1 : high;
                 for (int y = y0; y < y1; ++y) {
-                    int64_t* row = &cursors[static_cast<size_t>(y) * across];
-                    for (int x = e.x0; x < e.x1; ++x) ids[row[x]++] = e.id;
+                    int32_t* row = &cursors[static_cast<size_t>(y) * across];
+                    for (int x = e.x0; x < e.x1; ++x) lists.ids[row[x]++] = e.id;
                 }
             }
         }

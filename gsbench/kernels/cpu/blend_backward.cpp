@@ -15,8 +15,8 @@ constexpr int64_t SPLATS_PER_TASK = 512;
 
 struct TileJob {
     const BlendArgs& args;
-    const Picture& picture;
-    const BlendGrads& grads;
+    const BlendState& picture;
+    const PictureGrads& grads;
     const Record* records;
     const float* colors;
     int64_t tile, camera;
@@ -56,7 +56,7 @@ void load_state(const TileJob& job, const TileGrid& grid, Blocks blocks) {
         const Vec T = Vec::load(job.picture.transmittance + at);
         T.store(blocks.transmittance(b));
         Vec::load(job.picture.stop + at).store(blocks.stop(b));
-        Vec behind = inside ? -gather_at(job.grads.alpha + pixel, pixels, inside) : Vec(0.0f);
+        Vec behind = inside && job.grads.alpha ? -gather_at(job.grads.alpha + pixel, pixels, inside) : Vec(0.0f);
         Vec rgb[3];
         const bool whole = D == 3 && inside == ALL_LANES;
         if (whole) load_rgb(job.grads.image + pixel * 3, static_cast<int64_t>(a.width) * 3, rgb);
@@ -178,15 +178,14 @@ void reduce_splat(const BlendArgs& a, const BlendGrads& out, int64_t camera, int
     const int64_t at = camera * a.N + i;
     out.means2d[at * 2] = g[0];
     out.means2d[at * 2 + 1] = g[1];
-    for (int k = 0; k < 3; ++k) out.roots[at * 3 + k] = g[2 + k];
-    out.opacities[at] = g[5];
+    for (int k = 0; k < 4; ++k) out.roots[at * 4 + k] = g[2 + k];
     float* g_color = out.colors + (a.color_per_camera ? at : i) * a.D;
     for (int k = 0; k < a.D; ++k) g_color[k] = color[k] + (a.color_per_camera || camera == 0 ? 0.0f : g_color[k]);
 }
 
 }  // namespace
 
-void blend_backward(const BlendArgs& a, const Picture& picture, const BlendGrads& out) {
+void blend_backward(const BlendArgs& a, const BlendState& picture, const PictureGrads& grads, const BlendGrads& out) {
     const int across = tiles_along(a.width), tiles = across * tiles_along(a.height);
     const size_t D = static_cast<size_t>(a.D), threads = static_cast<size_t>(a.threads);
     int64_t most_pairs = 0;
@@ -200,7 +199,6 @@ void blend_backward(const BlendArgs& a, const Picture& picture, const BlendGrads
     Buffer<float> scratch(scratch_size * threads), pair_sums(static_cast<size_t>(most_pairs) * (GEOMETRY + D));
     Buffer<uint8_t> pair_seen(static_cast<size_t>(most_pairs));
     Buffer<float> background(D * static_cast<size_t>(tiles));
-    for (size_t k = 0; k < D; ++k) out.background[k] = 0.0f;
 
     for (int64_t c = 0; c < a.C; ++c) {
         make_records(a, c, records.data(), first_pairs.data());
@@ -210,7 +208,7 @@ void blend_backward(const BlendArgs& a, const Picture& picture, const BlendGrads
 #pragma omp parallel for num_threads(a.threads) schedule(dynamic, 4)
         for (int tile = 0; tile < tiles; ++tile) {
             float* mine = scratch.data() + scratch_size * static_cast<size_t>(thread_index());
-            const TileJob job{a, picture, out, records.data(), colors, c * tiles + tile, c, tile % across,
+            const TileJob job{a, picture, grads, records.data(), colors, c * tiles + tile, c, tile % across,
                               tile / across, mine, mine + Blocks::size(a.D), pair_sums.data(), pair_seen.data(),
                               background.data() + D * static_cast<size_t>(tile)};
             a.D == 3 ? backward_tile<3>(job) : backward_tile<0>(job);
@@ -222,7 +220,7 @@ void blend_backward(const BlendArgs& a, const Picture& picture, const BlendGrads
             reduce_splat(a, out, c, i, records[splat], first_pairs[splat], first_pairs[splat + 1], pair_sums.data(),
                          pair_seen.data(), color);
         }
-        for (size_t k = 0; k < D; ++k) {
+        for (size_t k = 0; out.background && k < D; ++k) {
             double total = 0.0;
             for (size_t tile = 0; tile < static_cast<size_t>(tiles); ++tile) total += background[tile * D + k];
             out.background[k] += static_cast<float>(total);

@@ -27,11 +27,6 @@ struct Picked {
         }
     }
 
-    // The given rows of a chunk that begins at `first`.
-    GSB_HD Picked(const int64_t* rows, int64_t number, int64_t first) : count(static_cast<int>(number)) {
-        for (int k = 0; k < count; ++k) which[k] = static_cast<uint32_t>(rows[k] - first);
-    }
-
     // Calls f(first, end) for each run of Gaussians that were not picked.
     template <class F>
     GSB_HD void each_gap(int size, F f) const {
@@ -48,20 +43,22 @@ struct Picked {
 // Sixteen picked rows, or what is left of them; lanes without one read zero.
 struct Rows {
     int count;
-    alignas(64) int32_t ones[LANES] = {}, threes[LANES] = {}, all[LANES] = {}, packed[LANES] = {};
+    alignas(64) int32_t ones[LANES] = {}, threes[LANES] = {}, all[LANES] = {};
 
     GSB_HD Rows(const Picked& picked, int first, int stride) : count(lanes_from(first, picked.count)) {
         for (int k = 0; k < count; ++k) {
             ones[k] = static_cast<int32_t>(picked.which[first + k]);
             threes[k] = ones[k] * 3;
             all[k] = ones[k] * stride;
-            packed[k] = (first + k) * stride;
         }
     }
     GSB_HD Vec load(const float* p, const int32_t (&offsets)[LANES]) const { return gather_rows(p, offsets, count); }
     GSB_HD void store(Vec x, float* p, const int32_t (&offsets)[LANES]) const { scatter_rows(x, p, offsets, count); }
     GSB_HD void load3(const float* p, Vec (&out)[3]) const {
         for (int k = 0; k < 3; ++k) out[k] = load(p + k, threes);
+    }
+    GSB_HD void add3(const Vec (&x)[3], float* p) const {
+        for (int k = 0; k < 3; ++k) store(load(p + k, threes) + x[k], p + k, threes);
     }
     GSB_HD void store3(const Vec (&x)[3], float* p) const {
         for (int k = 0; k < 3; ++k) store(x[k], p + k, threes);
@@ -96,7 +93,7 @@ private:
     Vec block[LANES];
 };
 
-// The same, to be written; `flush` at the end.
+// The same, to be added to; `flush` at the end.
 class ColumnsOut {
 public:
     GSB_HD ColumnsOut(float* p, const int32_t (&offsets)[LANES], int count) : p(p), offsets(offsets), count(count) {
@@ -115,7 +112,7 @@ public:
     GSB_HD void flush() {
         if (at == 0) return;
         transpose(block);
-        for (int i = 0; i < count; ++i) store_first(block[i], p + offsets[i], at);
+        for (int i = 0; i < count; ++i) store_first(load_some(p + offsets[i], at) + block[i], p + offsets[i], at);
         p += at;
         at = 0;
     }
@@ -135,7 +132,7 @@ struct Shades {
 
     GSB_HD Shades(const ColorArgs& a, const Rows& rows) : unit(offset(a, rows)) {
         used = harmonics(unit.direction, a.degree, Y);
-        waves_of(a.times ? Vec(a.time) - rows.load(a.times, rows.ones) : Vec(0.0f), a.waves, cosines, sines);
+        waves_of(a.times ? Vec(*a.time) - rows.load(a.times, rows.ones) : Vec(0.0f), a.waves, cosines, sines);
     }
 
     // Where a wave's coefficients begin in a row of shN, and how many floats of them are used. The constant's are kept in
@@ -188,10 +185,9 @@ GSB_HD inline ColorArgs chunk_of(ColorArgs a, int64_t first) {
     if (a.times) a.times += first;
     return a;
 }
-GSB_HD inline ColorGrads chunk_of(ColorGrads g, const ColorArgs& a, int64_t first, int64_t first_of_shN) {
-    g.colors += first * 3;
+GSB_HD inline ColorGrads chunk_of(ColorGrads g, const ColorArgs& a, int64_t first) {
     g.sh0 += first * 3;
-    g.shN += first_of_shN * stride_of(a);
+    g.shN += first * stride_of(a);
     g.means += first * 3;
     if (a.times) g.times += first;
     return g;
@@ -199,20 +195,10 @@ GSB_HD inline ColorGrads chunk_of(ColorGrads g, const ColorArgs& a, int64_t firs
 
 GSB_HD inline Mask drawn(const ColorArgs& a, int i, int n) { return load_first(a.opacities + i, n) >= Vec(ALPHA_MIN); }
 
-GSB_HD inline Mask learns(const ColorArgs& a, const ColorGrads& g, int i, int n) {
+GSB_HD inline Mask learns(const ColorArgs& a, const float* g_colors, int i, int n) {
     Vec color[3];
-    gather_row(g.colors, i, n, color);
+    gather_row(g_colors, i, n, color);
     return drawn(a, i, n) & !((color[0] == Vec(0.0f)) & (color[1] == Vec(0.0f)) & (color[2] == Vec(0.0f)));
-}
-
-// How many of the ascending rows are below `limit`. (std::lower_bound would be shared between the instruction sets.)
-GSB_HD inline int64_t count_below(const ColorGrads& g, int64_t limit) {
-    int64_t low = 0, high = g.count;
-    while (low < high) {
-        const int64_t middle = (low + high) / 2;
-        g.rows[middle] < limit ? low = middle + 1 : high = middle;
-    }
-    return low;
 }
 
 GSB_HD inline void fill_zero(float* rows, int width, int first, int end) {
@@ -220,16 +206,15 @@ GSB_HD inline void fill_zero(float* rows, int width, int first, int end) {
                      sizeof(float) * static_cast<size_t>(end - first) * static_cast<size_t>(width));
 }
 
-GSB_HD inline void backward_rows(const ColorArgs& a, const ColorGrads& out, const Rows& rows) {
+GSB_HD inline void backward_rows(const ColorArgs& a, const float* g_colors, const ColorGrads& out, const Rows& rows) {
     const Vec zero(0.0f);
     Vec color[3], g[3], g_Y[MAX_BASIS], g_time(0.0f);
     const Shades s(a, rows);
     s.sum(a, rows, color);
-    rows.load3(out.colors, g);
+    rows.load3(g_colors, g);
     for (int k = 0; k < 3; ++k) g[k] = select(color[k] >= zero, g[k], zero);
     for (auto& y : g_Y) y = zero;
-    const int32_t(&places)[LANES] = out.by_rows ? rows.packed : rows.all;
-    ColumnsOut columns(out.shN, places, rows.count);
+    ColumnsOut columns(out.shN, rows.all, rows.count);
     s.each(a, rows, [&](int wave, int basis, const Vec (&c)[3]) {
         if (basis == 0) columns.move_to(out.shN + Shades::begin(a, wave));
         const Vec weight = s.Y[basis] * s.cosines[wave];
@@ -239,7 +224,7 @@ GSB_HD inline void backward_rows(const ColorArgs& a, const ColorGrads& out, cons
             g_c[channel] = g[channel] * weight;
         }
         if (wave == 0 && basis == 0) {
-            rows.store3(g_c, out.sh0);
+            rows.add3(g_c, out.sh0);
         } else {
             for (const auto& channel : g_c) columns.put(channel);
         }
@@ -254,12 +239,12 @@ GSB_HD inline void backward_rows(const ColorArgs& a, const ColorGrads& out, cons
 
 }  // namespace
 
-void show_colors(const ColorArgs& all, float* colors) {
+void show_colors(const ColorArgs& all, const Colors& shown) {
 #pragma omp parallel for num_threads(all.threads) schedule(static) if (all.N > CHUNK)
     for (int64_t first = 0; first < all.N; first += CHUNK) {
         const ColorArgs a = chunk_of(all, first);
         const int size = static_cast<int>(a.N);
-        float* out = colors + first * 3;
+        float* out = shown.colors + first * 3;
         const Picked picked(size, [&](int i, int n) { return drawn(a, i, n); });
         picked.each_gap(size, [&](int from, int end) { fill_zero(out, 3, from, end); });
         for (int k = 0; k < picked.count; k += LANES) {
@@ -272,24 +257,19 @@ void show_colors(const ColorArgs& all, float* colors) {
     }
 }
 
-void show_colors_backward(const ColorArgs& all, const ColorGrads& grads) {
+void show_colors_backward(const ColorArgs& all, const GivenColors& given, const ColorGrads& grads) {
 #pragma omp parallel for num_threads(all.threads) schedule(static) if (all.N > CHUNK)
     for (int64_t first = 0; first < all.N; first += CHUNK) {
         const ColorArgs a = chunk_of(all, first);
+        const ColorGrads out = chunk_of(grads, all, first);
+        const float* g_colors = given.colors + first * 3;
         const int size = static_cast<int>(a.N);
-        const int64_t begin = count_below(grads, first), end = count_below(grads, first + size);  // of its rows
-        const ColorGrads out = chunk_of(grads, all, first, grads.by_rows ? begin : first);
-        const Picked picked = grads.by_rows ? Picked(grads.rows + begin, end - begin, first)
-                                            : Picked(size, [&](int i, int n) { return learns(a, out, i, n); });
-        const bool partly = (a.degree + 1) * (a.degree + 1) < a.bases;  // coefficients that nothing below writes
-        if (partly) fill_zero(out.shN, stride_of(a), 0, grads.by_rows ? picked.count : size);
+        const Picked picked(size, [&](int i, int n) { return learns(a, g_colors, i, n); });
         picked.each_gap(size, [&](int from, int end) {
-            if (!partly && !grads.by_rows) fill_zero(out.shN, stride_of(a), from, end);
-            fill_zero(out.sh0, 3, from, end);
             fill_zero(out.means, 3, from, end);
             if (a.times) fill_zero(out.times, 1, from, end);
         });
-        for (int k = 0; k < picked.count; k += LANES) backward_rows(a, out, Rows(picked, k, stride_of(a)));
+        for (int k = 0; k < picked.count; k += LANES) backward_rows(a, g_colors, out, Rows(picked, k, stride_of(a)));
     }
 }
 

@@ -47,25 +47,25 @@ Projection<Vec> load(const ProjectArgs& a, const Camera& camera, int64_t i, int 
     return Projection<Vec>(camera, gather3(a.means + i * 3, 3, n), factor, load_first(a.opacities + i, n));
 }
 
-Splat<Vec> load_splat(const Splats& s, int64_t i, int n) {
+Splat<Vec> load_splat(const SplatGrads& s, int64_t i, int n) {
     Splat<Vec> out;
     out.x = gather(s.means2d + i * 2, 2, n);
     out.y = gather(s.means2d + i * 2 + 1, 2, n);
-    out.p = gather(s.roots + i * 3, 3, n);
-    out.q = gather(s.roots + i * 3 + 1, 3, n);
-    out.r = gather(s.roots + i * 3 + 2, 3, n);
-    out.opacity = load_first(s.opacities + i, n);
-    out.depth = load_first(s.depths + i, n);
+    out.p = gather(s.roots + i * 4, 4, n);
+    out.q = gather(s.roots + i * 4 + 1, 4, n);
+    out.r = gather(s.roots + i * 4 + 2, 4, n);
+    out.opacity = gather(s.roots + i * 4 + 3, 4, n);
+    out.depth = s.depths ? load_first(s.depths + i, n) : Vec(0.0f);
     return out;
 }
 
 void store_splat(const Splat<Vec>& s, const Splats& out, int64_t i, int n) {
     scatter(s.x, out.means2d + i * 2, 2, n);
     scatter(s.y, out.means2d + i * 2 + 1, 2, n);
-    scatter(s.p, out.roots + i * 3, 3, n);
-    scatter(s.q, out.roots + i * 3 + 1, 3, n);
-    scatter(s.r, out.roots + i * 3 + 2, 3, n);
-    store_first(s.opacity, out.opacities + i, n);
+    scatter(s.p, out.roots + i * 4, 4, n);
+    scatter(s.q, out.roots + i * 4 + 1, 4, n);
+    scatter(s.r, out.roots + i * 4 + 2, 4, n);
+    scatter(s.opacity, out.roots + i * 4 + 3, 4, n);
     store_first(s.depth, out.depths + i, n);
     scatter(s.half_x, out.half_sizes + i * 2, 2, n);
     scatter(s.half_y, out.half_sizes + i * 2 + 1, 2, n);
@@ -88,7 +88,7 @@ void project(const ProjectArgs& a, const Splats& out) {
     }
 }
 
-void project_backward(const ProjectArgs& a, const Splats& grads, const ProjectGrads& out) {
+void project_backward(const ProjectArgs& a, const SplatGrads& grads, const ProjectGrads& out) {
     const int64_t chunks = (a.N + CHUNK - 1) / CHUNK;
     Buffer<float> camera_grads(static_cast<size_t>(chunks * a.C * 12));
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (chunks > 1)

@@ -11,12 +11,13 @@ namespace {
 
 constexpr int64_t CHUNK = 512;  // Gaussians a task; the gradient of lambda is summed by chunks
 
+// Times are as long as the clock says: a rotation of space and time needs one unit for both.
 GSB_HD inline void load(const RotatedArgs& a, int64_t i, int n, RotatedParameters<Vec>& p) {
     gather_row(a.means, i, n, p.mean);
-    p.time = load_first(a.times + i, n);
+    p.time = load_first(a.times + i, n) * *a.clock;
     gather_row(a.scales, i, n, p.scales);
-    gather_row(a.left, i, n, p.left);
-    gather_row(a.right, i, n, p.right);
+    gather_row(a.left_quats, i, n, p.left);
+    gather_row(a.right_quats, i, n, p.right);
     p.opacity = load_first(a.opacities + i, n);
     if (n == LANES) return;
     const Mask real = Vec::load(INDEX) < Vec(static_cast<float>(n));  // what is no Gaussian gets harmless quaternions
@@ -27,25 +28,27 @@ GSB_HD inline void load(const RotatedArgs& a, int64_t i, int n, RotatedParameter
 }  // namespace
 
 void observe_rotated(const RotatedArgs& a, const Observation& out) {
+    const float lambda_t = expf(*a.log_lambda_t), time = *a.time * *a.clock;
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
     for (int64_t i = 0; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
         RotatedParameters<Vec> raw;
         load(a, i, n, raw);
-        const Observed<Vec> seen = RotatedGaussian<Vec>(raw, a.lambda_t, a.time).observe();
+        const Observed<Vec> seen = RotatedGaussian<Vec>(raw, lambda_t, time).observe();
         scatter_row(seen.mean, out.means, i, n);
         scatter_matrix(seen.factor, out.factors, i, n);
         store_first(seen.opacity, out.opacities + i, n);
     }
 }
 
-void observe_rotated_backward(const RotatedArgs& a, const Observation& grads, RotatedGrads& out) {
+void observe_rotated_backward(const RotatedArgs& a, const ObservationGrads& grads, const RotatedGrads& out) {
+    const float lambda_t = expf(*a.log_lambda_t), time = *a.time * *a.clock;
     const int64_t chunks = (a.N + CHUNK - 1) / CHUNK;
     Buffer<float> lambdas(static_cast<size_t>(chunks));
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (chunks > 1)
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
         const int64_t end = (chunk + 1) * CHUNK < a.N ? (chunk + 1) * CHUNK : a.N;
-        Vec lambda_t(0.0f);
+        Vec g_lambda(0.0f);
         for (int64_t i = chunk * CHUNK; i < end; i += LANES) {
             const int n = lanes_from(i, end);
             RotatedParameters<Vec> raw, g;
@@ -54,22 +57,22 @@ void observe_rotated_backward(const RotatedArgs& a, const Observation& grads, Ro
             gather_row(grads.means, i, n, given.mean);
             gather_matrix(grads.factors, i, n, given.factor);
             given.opacity = load_first(grads.opacities + i, n);
-            RotatedGaussian<Vec> gaussian(raw, a.lambda_t, a.time);
+            RotatedGaussian<Vec> gaussian(raw, lambda_t, time);
             gaussian.observe();
             gaussian.vjp(given, g);
             scatter_row(g.mean, out.means, i, n);
-            store_first(g.time, out.times + i, n);
+            store_first(g.time * *a.clock, out.times + i, n);
             scatter_row(g.scales, out.scales, i, n);
-            scatter_row(g.left, out.left, i, n);
-            scatter_row(g.right, out.right, i, n);
+            scatter_row(g.left, out.left_quats, i, n);
+            scatter_row(g.right, out.right_quats, i, n);
             store_first(g.opacity, out.opacities + i, n);
-            lambda_t += g.lambda_t;  // lanes past the end were given zero
+            g_lambda += g.lambda_t;  // lanes past the end were given zero
         }
-        lambdas[static_cast<size_t>(chunk)] = sum(lambda_t);
+        lambdas[static_cast<size_t>(chunk)] = sum(g_lambda);
     }
     double total = 0.0;
     for (size_t k = 0; k < static_cast<size_t>(chunks); ++k) total += lambdas[k];
-    out.lambda_t = static_cast<float>(total);
+    *out.log_lambda_t = static_cast<float>(total) * lambda_t;
 }
 
 }  // namespace GSB_ISA

@@ -30,7 +30,7 @@ void observe_still(const StillArgs& a, const StillSlice& out) {
     }
 }
 
-void observe_still_backward(const StillArgs& a, const StillSlice& grads, const StillGrads& out) {
+void observe_still_backward(const StillArgs& a, const StillSliceGrads& grads, const StillGrads& out) {
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > FEW)
     for (int64_t i = 0; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);

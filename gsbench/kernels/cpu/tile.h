@@ -30,14 +30,14 @@ struct alignas(64) Record {
 
 inline Record make_record(const BlendArgs& a, int64_t camera, int64_t i, const TileRect& rect) {
     const int64_t at = camera * a.N + i;
-    const float *mean = a.means2d + at * 2, *root = a.roots + at * 3;
+    const float *mean = a.means2d + at * 2, *root = a.roots + at * 4;
     Record s{};
     s.x = mean[0];
     s.y = mean[1];
     s.p = root[0];
     s.q = root[1];
     s.r = root[2];
-    s.opacity = a.opacities[at];
+    s.opacity = root[3];
     const float reach = a.half_sizes[at * 2] * s.p;
     s.reach = reach * reach;
     s.foot_y = -s.q / s.r;

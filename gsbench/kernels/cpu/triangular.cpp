@@ -12,8 +12,8 @@ namespace {
 constexpr int64_t CHUNK = 512;  // Gaussians a task; the gradients of lambda are summed by chunks
 
 TriangularModel model_of(const TriangularArgs& a) {
-    return {a.conditioned_first, a.form, a.half, a.lambda_d, a.lambda_t,
-            {a.center[0], a.center[1], a.center[2]}, a.time};
+    return {a.conditioned_first, a.form, a.half, expf(*a.log_lambda_d), a.times ? expf(*a.log_lambda_t) : 0.0f,
+            {a.center[0], a.center[1], a.center[2]}, a.times ? *a.time : 0.0f};
 }
 
 template <bool TIME>
@@ -28,7 +28,7 @@ GSB_HD inline void load(const TriangularArgs& a, int64_t i, int n, TriangularPar
     p.opacity = load_first(a.opacities + i, n);
 }
 
-GSB_HD inline void load(const Observation& o, int64_t i, int n, Observed<Vec>& out) {
+GSB_HD inline void load(const ObservationGrads& o, int64_t i, int n, Observed<Vec>& out) {
     gather_row(o.means, i, n, out.mean);
     gather_matrix(o.factors, i, n, out.factor);
     out.opacity = load_first(o.opacities + i, n);
@@ -51,7 +51,7 @@ void observe(const TriangularArgs& a, const Observation& out) {
 }
 
 template <bool TIME, template <class, int> class Reduction>
-void observe_backward(const TriangularArgs& a, const Observation& grads, TriangularGrads& out) {
+void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     const TriangularModel model = model_of(a);
     const int64_t chunks = (a.N + CHUNK - 1) / CHUNK;
     Buffer<float> lambdas(static_cast<size_t>(chunks) * 2);
@@ -84,8 +84,8 @@ void observe_backward(const TriangularArgs& a, const Observation& grads, Triangu
     }
     double totals[2] = {};
     for (size_t k = 0; k < static_cast<size_t>(chunks) * 2; ++k) totals[k % 2] += lambdas[k];
-    out.lambdas[0] = static_cast<float>(totals[0]);
-    out.lambdas[1] = static_cast<float>(totals[1]);
+    *out.log_lambda_d = static_cast<float>(totals[0]) * model.lambda_d;
+    if constexpr (TIME) *out.log_lambda_t = static_cast<float>(totals[1]) * model.lambda_t;
 }
 
 }  // namespace
@@ -98,7 +98,7 @@ void observe_triangular(const TriangularArgs& a, const Observation& out) {
     }
 }
 
-void observe_triangular_backward(const TriangularArgs& a, const Observation& grads, TriangularGrads& out) {
+void observe_triangular_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     if (a.subtracts) {
         a.times ? observe_backward<true, Subtraction>(a, grads, out) : observe_backward<false, Subtraction>(a, grads, out);
     } else {

@@ -1,24 +1,30 @@
 // Adam on the rows of a parameter that were drawn, a number a thread; the mathematics is math/adam.h.
 #include "../math/adam.h"
 
+#include <cmath>
+
 #include "launch.h"
 
 namespace gsb::cuda {
 namespace {
 
-__global__ void adam_kernel(AdamArgs a) {
+__global__ void adam_kernel(AdamArgs a, AdamState state, AdamRule rule, float log_beta1, float log_beta2) {
     const int64_t k = global_thread();
     if (k >= a.N * a.width || !a.drawn[k / a.width]) return;
     // 1 - beta^step, exact where beta^step is near 1; the step stays on the device, where nothing waits for it.
-    const float left1 = -expm1f(*a.step * a.log_beta1), left2 = -expm1f(*a.step * a.log_beta2);
-    const AdamRule rule{a.rate, a.beta1, a.beta2, a.eps, 1.0f / left1, 1.0f / sqrtf(left2)};
-    adam_update(rule, a.gradients[k], a.parameters[k], a.means[k], a.squares[k]);
+    const float left1 = -expm1f(*a.step * log_beta1), left2 = -expm1f(*a.step * log_beta2);
+    rule.unbias1 = 1.0f / left1, rule.unbias2 = 1.0f / sqrtf(left2);
+    adam_update(rule, a.gradient[k], state.parameter[k], state.mean[k], state.square[k]);
 }
 
 }  // namespace
 
-void adam(const AdamArgs& a, Stream stream) {
-    if (a.N > 0) launch(adam_kernel, blocks_for(a.N * a.width), THREADS, stream, a);
+void adam(const AdamArgs& a, const AdamState& state, Stream stream) {
+    if (a.N * a.width == 0) return;
+    const auto f = [](double x) { return static_cast<float>(x); };
+    const AdamRule rule{f(a.rate), f(a.beta1), f(a.beta2), f(a.eps), 0.0f, 0.0f};  // the step's are the kernel's
+    launch(adam_kernel, blocks_for(a.N * a.width), THREADS, stream, a, state, rule, f(std::log(a.beta1)),
+           f(std::log(a.beta2)));
 }
 
 }  // namespace gsb::cuda

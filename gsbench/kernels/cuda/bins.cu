@@ -55,13 +55,12 @@ __global__ void count_kernel(BinArgs a, const uint32_t* order, int64_t* counts) 
 }
 
 // Pairs beyond the number there is room for are left out.
-__global__ void fill_kernel(BinArgs a, const uint32_t* order, const int64_t* ends, int64_t room, int64_t no_tile,
-                            uint32_t* tiles, uint32_t* splats) {
+__global__ void fill_kernel(BinArgs a, TileOrder by_depth, int64_t no_tile, uint32_t* tiles, uint32_t* splats) {
     const int64_t k = global_thread() / WARP;
     if (k >= a.N * a.C) return;
     const unsigned lane = threadIdx.x % WARP;
-    const int64_t end = ends[k] < room ? ends[k] : room, s = order[k];
-    int64_t at = k > 0 ? ends[k - 1] : 0;
+    const int64_t all = by_depth.ends[k], end = all < by_depth.pairs ? all : by_depth.pairs, s = by_depth.order[k];
+    int64_t at = k > 0 ? by_depth.ends[k - 1] : 0;
     const int64_t first_tile = s / a.N * tiles_along(a.width) * tiles_along(a.height);
     each_tile(a, s, [&](bool reached, int tile, unsigned others) {
         const int64_t mine = at + __popc(others & ((1u << lane) - 1));
@@ -94,24 +93,23 @@ int bit_width(int64_t x) {
 
 }  // namespace
 
-void count_tiles(const BinArgs& a, uint32_t* keys, uint32_t* indices, uint32_t* sorted_keys, uint32_t* order,
-                 int64_t* ends, void* scratch, size_t bytes, Stream stream) {
+void count_tiles(const BinArgs& a, const TileCounts& out, Stream stream) {
     if (a.N * a.C == 0) return;
-    launch(key_kernel, blocks_for(a.N * a.C), THREADS, stream, a, keys, indices);
-    sort_pairs(scratch, bytes, keys, sorted_keys, indices, order, a.N * a.C, 32, stream);
-    launch(count_kernel, blocks_for(a.N * a.C * WARP), THREADS, stream, a, order, ends);
-    running_sum(scratch, bytes, ends, a.N * a.C, stream);
+    launch(key_kernel, blocks_for(a.N * a.C), THREADS, stream, a, out.keys, out.indices);
+    sort_pairs(out.scratch, out.scratch_bytes, out.keys, out.sorted_keys, out.indices, out.order, a.N * a.C, 32,
+               stream);
+    launch(count_kernel, blocks_for(a.N * a.C * WARP), THREADS, stream, a, out.order, out.ends);
+    running_sum(out.scratch, out.scratch_bytes, out.ends, a.N * a.C, stream);
 }
 
-void fill_tiles(const BinArgs& a, const uint32_t* order, const int64_t* ends, int64_t pairs, uint32_t* tiles,
-                uint32_t* splats, uint32_t* sorted_tiles, uint32_t* ids, int32_t* offsets, void* scratch, size_t bytes,
-                Stream stream) {
-    const int64_t count = a.C * tiles_along(a.width) * tiles_along(a.height);
+void fill_tiles(const BinArgs& a, const TileOrder& by_depth, const TileLists& out, Stream stream) {
+    const int64_t count = a.C * tiles_along(a.width) * tiles_along(a.height), pairs = by_depth.pairs;
     if (pairs > 0) {
-        launch(fill_kernel, blocks_for(a.N * a.C * WARP), THREADS, stream, a, order, ends, pairs, count, tiles, splats);
-        sort_pairs(scratch, bytes, tiles, sorted_tiles, splats, ids, pairs, bit_width(count), stream);
+        launch(fill_kernel, blocks_for(a.N * a.C * WARP), THREADS, stream, a, by_depth, count, out.tiles, out.splats);
+        sort_pairs(out.scratch, out.scratch_bytes, out.tiles, out.sorted_tiles, out.splats, out.ids, pairs,
+                   bit_width(count), stream);
     }
-    launch(offset_kernel, blocks_for(pairs + 1), THREADS, stream, sorted_tiles, pairs, count, offsets);
+    launch(offset_kernel, blocks_for(pairs + 1), THREADS, stream, out.sorted_tiles, pairs, count, out.offsets);
 }
 
 }  // namespace gsb::cuda

@@ -38,7 +38,7 @@ __global__ void __launch_bounds__(PATCHES * WARP) blend_kernel(BlendArgs a, Pict
     }
     out.alpha[pixel] = 1.0f - T;
     out.transmittance[pixel] = T;
-    out.stop[pixel] = stop;
+    reinterpret_cast<int32_t*>(out.stop)[pixel] = stop;  // the place of the last splat that counts, plus one
 }
 
 }  // namespace

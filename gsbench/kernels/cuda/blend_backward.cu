@@ -1,16 +1,17 @@
-// The derivative of blending: sums over pixels by one of two kernels, then each splat's gradient from its sums.
+// The derivative of blending: sums over pixels by one of two kernels, then each splat's gradient from its sums; and the
+// background's.
 #include "blend_backward.h"
 
 namespace gsb::cuda {
 namespace {
 
 // A Gaussian's rows of sums to the gradients of its splats and of its colour.
-__global__ void finish_kernel(BlendArgs a, BlendGrads grads) {
+__global__ void finish_kernel(BlendArgs a, BlendGrads out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
     for (int64_t c = 0; c < a.C; ++c) {
         const int64_t s = c * a.N + i;
-        const float* sums = grads.sums + s * (GEOMETRY + a.D);
+        const float* sums = out.scratch + s * (GEOMETRY + a.D);
         bool any = false;
         for (int k = 0; k < GEOMETRY; ++k) any |= sums[k] != 0.0f;
         float g[GEOMETRY] = {};
@@ -19,22 +20,53 @@ __global__ void finish_kernel(BlendArgs a, BlendGrads grads) {
             const float4 root = reinterpret_cast<const float4*>(a.roots)[s];
             splat_gradient(m, root.x, root.y, root.z, root.w, g);
         }
-        reinterpret_cast<float2*>(grads.means2d)[s] = {g[0], g[1]};
-        reinterpret_cast<float4*>(grads.roots)[s] = {g[2], g[3], g[4], g[5]};
-        float* color = grads.colors + (a.color_per_camera ? s : i) * a.D;
+        reinterpret_cast<float2*>(out.means2d)[s] = {g[0], g[1]};
+        reinterpret_cast<float4*>(out.roots)[s] = {g[2], g[3], g[4], g[5]};
+        float* color = out.colors + (a.color_per_camera ? s : i) * a.D;
         for (int k = 0; k < a.D; ++k) {
             color[k] = sums[GEOMETRY + k] + (a.color_per_camera || c == 0 ? 0.0f : color[k]);
         }
     }
 }
 
+// What is seen of the background at a pixel is what the splats have left of the light.
+__global__ void background_kernel(BlendArgs a, BlendState picture, PictureGrads grads, float* out, int first_channel) {
+    const int64_t pixels = a.C * a.height * a.width, step = static_cast<int64_t>(gridDim.x) * blockDim.x;
+    const int count = a.D - first_channel < CHANNELS ? a.D - first_channel : CHANNELS;
+    float sums[CHANNELS] = {};
+    for (int64_t pixel = global_thread(); pixel < pixels; pixel += step) {
+        const float* g = grads.image + pixel * a.D + first_channel;
+        for (int c = 0; c < CHANNELS; ++c) sums[c] += c < count ? g[c] * picture.transmittance[pixel] : 0.0f;
+    }
+    for (int c = 0; c < CHANNELS; ++c) {
+        const float sum = warp_sum(sums[c]);
+        if (threadIdx.x % WARP == 0 && c < count) atomicAdd(out + first_channel + c, sum);
+    }
+}
+
+void backward(SumUp sum_up, const BlendArgs& a, const BlendState& picture, const PictureGrads& grads,
+              const BlendGrads& out, Stream stream) {
+    constexpr unsigned MOST_BLOCKS = 256;  // their warps wait for each other to add to the background's few numbers
+    const unsigned blocks = blocks_for(a.C * a.height * a.width);
+    for (int first = 0; first < a.D; first += CHANNELS) {
+        if (a.N > 0) sum_up(a, picture, grads, out, first, stream);
+        if (!out.background) continue;
+        launch(background_kernel, blocks < MOST_BLOCKS ? blocks : MOST_BLOCKS, THREADS, stream, a, picture, grads,
+               out.background, first);
+    }
+    if (a.N > 0) launch(finish_kernel, blocks_for(a.N), THREADS, stream, a, out);
+}
+
 }  // namespace
 
-void blend_backward(const BlendArgs& a, const Picture& picture, const BlendGrads& grads, bool by_splat, Stream stream) {
-    if (a.N == 0) return;
-    const auto sum_up = by_splat ? blend_backward_by_splat : blend_backward_by_pixel;
-    for (int first = 0; first < a.D; first += CHANNELS) sum_up(a, picture, grads, first, stream);
-    launch(finish_kernel, blocks_for(a.N), THREADS, stream, a, grads);
+void blend_backward(const BlendArgs& a, const BlendState& picture, const PictureGrads& grads, const BlendGrads& out,
+                    Stream stream) {
+    backward(sum_by_pixel, a, picture, grads, out, stream);
+}
+
+void blend_backward_by_splat(const BlendArgs& a, const BlendState& picture, const PictureGrads& grads,
+                             const BlendGrads& out, Stream stream) {
+    backward(sum_by_splat, a, picture, grads, out, stream);
 }
 
 }  // namespace gsb::cuda

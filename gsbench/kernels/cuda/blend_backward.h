@@ -32,15 +32,15 @@ struct BackwardPixel {
     Behind behind{1.0f, 0.0f};
 
     // Pixel number `k` of the patch; outside the picture nothing was blended.
-    __device__ BackwardPixel(const Patch& patch, int k, const Picture& picture, const BlendGrads& grads) {
+    __device__ BackwardPixel(const Patch& patch, int k, const BlendState& picture, const PictureGrads& grads) {
         place.x = static_cast<float>(patch.x(k)) + 0.5f, place.y = static_cast<float>(patch.y(k)) + 0.5f;
         if (!patch.inside(k)) return;
         const BlendArgs& a = patch.args;
         const int64_t pixel = patch.pixel(k);
-        place.stop = picture.stop[pixel];
+        place.stop = reinterpret_cast<const int32_t*>(picture.stop)[pixel];
         behind.T = picture.transmittance[pixel];
         if (grads.alpha && patch.first_channel == 0) place.alpha = grads.alpha[pixel];
-        for (int c = 0; grads.image && c < patch.count; ++c) {
+        for (int c = 0; c < patch.count; ++c) {
             color.of[c] = grads.image[pixel * a.D + patch.first_channel + c];
             behind.seen += color.of[c] * a.background[patch.first_channel + c];
         }
@@ -75,13 +75,14 @@ __device__ inline void unblend(const Falloff<float>& f, const float (&color)[CHA
 }
 
 // Where sum `column` of a splat is added up, for a launch that blends channels from `first_channel` on.
-__device__ inline float* sum_of(const BlendGrads& grads, const Patch& patch, int32_t id, int column) {
+__device__ inline float* sum_of(const BlendGrads& out, const Patch& patch, int32_t id, int column) {
     const int at = column < GEOMETRY ? column : column + patch.first_channel;
-    return grads.sums + static_cast<int64_t>(id) * (GEOMETRY + patch.args.D) + at;
+    return out.scratch + static_cast<int64_t>(id) * (GEOMETRY + patch.args.D) + at;
 }
 
 // One kernel for each, with the same arguments.
-void blend_backward_by_pixel(const BlendArgs&, const Picture&, const BlendGrads&, int first_channel, Stream);
-void blend_backward_by_splat(const BlendArgs&, const Picture&, const BlendGrads&, int first_channel, Stream);
+using SumUp = void(const BlendArgs&, const BlendState&, const PictureGrads&, const BlendGrads&, int first_channel,
+                   Stream);
+SumUp sum_by_pixel, sum_by_splat;
 
 }  // namespace gsb::cuda

@@ -33,7 +33,7 @@ struct NineSums {
 static_assert(SUMS == 9);
 
 __global__ void __launch_bounds__(PATCHES * WARP)
-    by_pixel_kernel(BlendArgs a, Picture picture, BlendGrads grads, int first_channel) {
+    by_pixel_kernel(BlendArgs a, BlendState picture, PictureGrads grads, BlendGrads out, int first_channel) {
     __shared__ StagedSplat shared[PATCHES][WARP];
     StagedSplat* staged = shared[threadIdx.x / WARP];
     const Patch patch(a, first_channel);
@@ -49,7 +49,7 @@ __global__ void __launch_bounds__(PATCHES * WARP)
             float sums[SUMS] = {};
             if (blended) unblend(f, s.color, place, grad, behind, sums);
             const float sum = NineSums::reduce(sums, patch.lane);
-            if (writes) atomicAdd(sum_of(grads, patch, s.id, my_value), sum);
+            if (writes) atomicAdd(sum_of(out, patch, s.id, my_value), sum);
         }
         __syncwarp();
     }
@@ -57,9 +57,9 @@ __global__ void __launch_bounds__(PATCHES * WARP)
 
 }  // namespace
 
-void blend_backward_by_pixel(const BlendArgs& a, const Picture& picture, const BlendGrads& grads, int first_channel,
-                             Stream stream) {
-    launch(by_pixel_kernel, tiles_of(a), PATCHES * WARP, stream, a, picture, grads, first_channel);
+void sum_by_pixel(const BlendArgs& a, const BlendState& picture, const PictureGrads& grads, const BlendGrads& out,
+                  int first_channel, Stream stream) {
+    launch(by_pixel_kernel, tiles_of(a), PATCHES * WARP, stream, a, picture, grads, out, first_channel);
 }
 
 }  // namespace gsb::cuda

@@ -40,7 +40,7 @@ __device__ void let_wait(const Patch& patch, int* waiting, int first, int& count
 }
 
 __global__ void __launch_bounds__(PATCHES * WARP)
-    by_splat_kernel(BlendArgs a, Picture picture, BlendGrads grads, int first_channel) {
+    by_splat_kernel(BlendArgs a, BlendState picture, PictureGrads grads, BlendGrads out, int first_channel) {
     __shared__ Traffic shared[PATCHES];
     Traffic& traffic = shared[threadIdx.x / WARP];
     const Patch patch(a, first_channel);
@@ -83,7 +83,7 @@ __global__ void __launch_bounds__(PATCHES * WARP)
         for (int k = patch.lane; k < steps * SUMS; k += WARP) {
             const int row = k / SUMS, column = k % SUMS;
             if (traffic.ids[row] < 0 || column >= GEOMETRY + patch.count) continue;
-            atomicAdd(sum_of(grads, patch, traffic.ids[row], column), traffic.sums[row][column]);
+            atomicAdd(sum_of(out, patch, traffic.ids[row], column), traffic.sums[row][column]);
         }
         __syncwarp();
     }
@@ -91,9 +91,9 @@ __global__ void __launch_bounds__(PATCHES * WARP)
 
 }  // namespace
 
-void blend_backward_by_splat(const BlendArgs& a, const Picture& picture, const BlendGrads& grads, int first_channel,
-                             Stream stream) {
-    launch(by_splat_kernel, tiles_of(a), PATCHES * WARP, stream, a, picture, grads, first_channel);
+void sum_by_splat(const BlendArgs& a, const BlendState& picture, const PictureGrads& grads, const BlendGrads& out,
+                  int first_channel, Stream stream) {
+    launch(by_splat_kernel, tiles_of(a), PATCHES * WARP, stream, a, picture, grads, out, first_channel);
 }
 
 }  // namespace gsb::cuda

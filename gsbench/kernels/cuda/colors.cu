@@ -47,24 +47,21 @@ __device__ void sum_colors(const ColorArgs& a, const Weights& w, int64_t i, floa
     });
 }
 
-__global__ void color_kernel(ColorArgs a, float* colors) {
+__global__ void color_kernel(ColorArgs a, Colors out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
     float color[3] = {};
     if (a.opacities[i] >= ALPHA_MIN) sum_colors(a, Weights(a, i), i, color);
-    for (int channel = 0; channel < 3; ++channel) colors[i * 3 + channel] = max(color[channel], 0.0f);
+    for (int channel = 0; channel < 3; ++channel) out.colors[i * 3 + channel] = max(color[channel], 0.0f);
 }
 
-// The outputs are zero on entry: those of Gaussians that are not drawn, and of harmonics not in use, stay so.
-__global__ void color_backward_kernel(ColorArgs a, ColorGrads out) {
-    const int64_t i = global_thread();
-    if (i >= a.N || a.opacities[i] < ALPHA_MIN) return;
+// Adds to the gradients of Gaussian i's coefficients, and returns that of its mean.
+__device__ Vec3<float> color_vjp(const ColorArgs& a, const float (&given)[3], const ColorGrads& out, int64_t i,
+                                 float& g_time) {
     const Weights w(a, i);
-    float color[3], g[3], g_Y[MAX_BASIS] = {}, g_time = 0.0f;
+    float color[3], g[3], g_Y[MAX_BASIS] = {};
     sum_colors(a, w, i, color);
-    for (int channel = 0; channel < 3; ++channel) {
-        g[channel] = color[channel] >= 0.0f ? out.colors[i * 3 + channel] : 0.0f;
-    }
+    for (int channel = 0; channel < 3; ++channel) g[channel] = color[channel] >= 0.0f ? given[channel] : 0.0f;
     each_coefficient(a, [&](int k, int basis, int wave) {
         const float* p = coefficient(a, a.sh0, a.shN, i, k);
         float* g_p = coefficient(a, out.sh0, out.shN, i, k);
@@ -72,12 +69,24 @@ __global__ void color_backward_kernel(ColorArgs a, ColorGrads out) {
         float along = 0.0f;
         for (int channel = 0; channel < 3; ++channel) {
             along += p[channel] * g[channel];
-            g_p[channel] = g[channel] * weight;
+            g_p[channel] += g[channel] * weight;
         }
         g_Y[basis] += along * w.cosines[wave];
         g_time += along * w.Y[basis] * w.sines[wave] * (TURN * static_cast<float>(wave));  // by mu_t
     });
-    const Vec3<float> g_mean = w.unit.vjp(harmonics_vjp(w.unit.direction, a.degree, g_Y));
+    return w.unit.vjp(harmonics_vjp(w.unit.direction, a.degree, g_Y));
+}
+
+// The rows of coefficients of a Gaussian that is not drawn, or whose colour has no gradient, are left alone.
+__global__ void color_backward_kernel(ColorArgs a, GivenColors given, ColorGrads out) {
+    const int64_t i = global_thread();
+    if (i >= a.N) return;
+    const float g[3] = {given.colors[i * 3], given.colors[i * 3 + 1], given.colors[i * 3 + 2]};
+    Vec3<float> g_mean{};
+    float g_time = 0.0f;
+    if (a.opacities[i] >= ALPHA_MIN && (g[0] != 0.0f || g[1] != 0.0f || g[2] != 0.0f)) {
+        g_mean = color_vjp(a, g, out, i, g_time);
+    }
     out.means[i * 3] = g_mean.x;
     out.means[i * 3 + 1] = g_mean.y;
     out.means[i * 3 + 2] = g_mean.z;
@@ -86,12 +95,12 @@ __global__ void color_backward_kernel(ColorArgs a, ColorGrads out) {
 
 }  // namespace
 
-void show_colors(const ColorArgs& a, float* colors, Stream stream) {
-    if (a.N > 0) launch(color_kernel, blocks_for(a.N), THREADS, stream, a, colors);
+void show_colors(const ColorArgs& a, const Colors& out, Stream stream) {
+    if (a.N > 0) launch(color_kernel, blocks_for(a.N), THREADS, stream, a, out);
 }
 
-void show_colors_backward(const ColorArgs& a, const ColorGrads& out, Stream stream) {
-    if (a.N > 0) launch(color_backward_kernel, blocks_for(a.N), THREADS, stream, a, out);
+void show_colors_backward(const ColorArgs& a, const GivenColors& given, const ColorGrads& out, Stream stream) {
+    if (a.N > 0) launch(color_backward_kernel, blocks_for(a.N), THREADS, stream, a, given, out);
 }
 
 }  // namespace gsb::cuda

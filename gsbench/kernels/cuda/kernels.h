@@ -1,215 +1,76 @@
-// What the CUDA kernels take: device pointers, row-major and contiguous, and the stream to run on.
+// The CUDA kernels: those of arguments.h, with device pointers, and what only a GPU has. A stream to run on comes last.
 //
 // Every function only enqueues work. Memory is the caller's, outputs and scratch alike, so that it comes from torch's
-// caching allocator. N Gaussians before C cameras give C x N splats; gradients are named g_ and may be null where said.
+// caching allocator. N Gaussians before C cameras give C x N splats. The arguments' `threads` are the CPU's.
 #pragma once
 
 #include <cstddef>
 #include <cstdint>
 
-#include "../math/off_diagonal.h"
-#include "../slices.h"
+#include "../arguments.h"
 
 struct CUstream_st;
 
-namespace gsb::cuda {
+namespace gsb {
 
-using Stream = CUstream_st*;
-
-struct Cameras {
-    int64_t C;
-    const float *viewmats, *Ks;  // [C, 4, 4] [C, 3, 3]
-    int width, height;
-    float near, far, eps2d;
-    bool antialias;
-};
-
-struct Gaussians {
-    int64_t N;
-    const float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
-};
-
-struct GaussianGrads {
-    float *means, *factors, *opacities;
-    float* viewmats;  // [C, 4, 4], zero on entry; null: not wanted
-};
-
-struct Splats {
-    float* means2d;     // [C, N, 2]
-    float* roots;       // [C, N, 4]: p, q, r of math/projection.h and the opacity
-    float* depths;      // [C, N]
-    float* half_sizes;  // [C, N, 2], 0: not drawn
-};
-
-struct SplatGrads {
-    const float *means2d, *roots, *depths;  // null: zero
-};
-
-// Splats to each tile's list. `order` are splats by depth, `ends` the running sum of the tiles they touch.
+// Splats to each tile's list.
 struct BinArgs {
     int64_t N, C;
     const float *means2d, *roots, *depths, *half_sizes;
     int width, height;
 };
+GSB_FIELDS(BinArgs, INPUTS, N, C, means2d, roots, depths, half_sizes, width, height)
 
-struct BlendArgs {
-    int64_t N, C;
-    int D;
-    bool color_per_camera;  // colors are [C, N, D], else [N, D]
-    const float *means2d, *roots, *colors, *background;
-    const int32_t *offsets, *ids;  // [C * tiles + 1] [pairs]
-    int width, height;
+// All arrays are [C * N].
+struct TileCounts {
+    uint32_t *keys, *indices, *sorted_keys;
+    uint32_t* order;  // splats by depth
+    int64_t* ends;    // the running sum of the tiles that they touch, in this order
+    void* scratch;
+    size_t scratch_bytes;
 };
+GSB_FIELDS(TileCounts, OUTPUTS, keys, indices, sorted_keys, order, ends, scratch, scratch_bytes)
 
-struct Picture {
-    float *image, *alpha;  // [C, H, W, D] [C, H, W]
-    float* transmittance;  // [C, H, W] behind the last splat that counts ..
-    int32_t* stop;         // .. whose place in the tile's list this is, plus one
+// Where `pairs` is not the last of `ends`, but the room there is, `tiles` are 0xffffffff on entry, and pairs beyond it
+// are left out.
+struct TileOrder {
+    const uint32_t* order;
+    const int64_t* ends;
+    int64_t pairs;
 };
+GSB_FIELDS(TileOrder, INPUTS, order, ends, pairs)
 
-struct BlendGrads {
-    const float *image, *alpha;  // of the picture; null: zero
-    float* sums;                 // [C, N, 6 + D] scratch, zero on entry: moments and colours
-    float *means2d, *roots;      // [C, N, 2] [C, N, 4]
-    float* colors;               // as the colours
+// The arrays are [pairs], but for `offsets`.
+struct TileLists {
+    uint32_t *tiles, *splats, *sorted_tiles;
+    uint32_t* ids;     // splats of all cameras, each tile's front to back
+    int32_t* offsets;  // [C * tiles + 1] where each tile's list begins
+    void* scratch;
+    size_t scratch_bytes;
 };
+GSB_FIELDS(TileLists, OUTPUTS, tiles, splats, sorted_tiles, ids, offsets, scratch, scratch_bytes)
 
-struct SimilarityArgs {
-    int height, width;
-    const float *image, *target;  // [H, W, 3]
-    float ssim_weight;
-    float* loss;         // [blocks]: its parts, to be added up
-    float* derivatives;  // [3, 3, H, W] scratch; null: no gradient wanted
-    float* grad;         // [H, W, 3]
-};
+}  // namespace gsb
 
-// Gaussians with a triangular factor over (p, d) or (p, t, d), observed from a place and at a time (6DGS, 7DGS).
-struct TriangularArgs {
-    int64_t N;
-    bool conditioned_first;
-    OffDiagonal form;
-    float half;
-    const float *time, *lambda_d, *lambda_t, *center;  // [1] [1] [1] [3]
-    const float *means, *directions, *times;           // [N, 3] [N, 3] [N], null: time is not observed
-    const float *log_diagonal, *shape, *motion, *coupling;  // [N, k + 3] [N, 3] [N, 3 k] [N, k (k - 1) / 2]
-    const float* opacities;                                 // [N] logits
-};
+// `blend_backward` has a pixel a lane, and `blend_backward_by_splat` a splat: the same gradients.
+#define GSB_CUDA_KERNELS(kernel)                                                                   \
+    GSB_KERNELS(kernel)                                                                            \
+    kernel(count_tiles, BinArgs, TileCounts)                                                       \
+    kernel(fill_tiles, BinArgs, TileOrder, TileLists)                                              \
+    kernel(blend_backward_by_splat, BlendArgs, BlendState, PictureGrads, BlendGrads)
 
-struct TriangularGrads {
-    float *means, *directions, *times, *log_diagonal, *shape, *motion, *coupling, *opacities;
-    float* lambdas;  // [2] of direction and time, zero on entry
-};
+namespace gsb::cuda {
 
-// 4D Gaussians with factor M_left M_right diag(exp scales), observed at a time (4DGS).
-struct RotatedArgs {
-    int64_t N;
-    const float *time, *lambda_t;                                      // [1] [1]
-    const float *means, *times, *scales, *left, *right, *opacities;  // [N, 3] [N] [N, 4] [N, 4] [N, 4] [N] logits
-};
+using Stream = CUstream_st*;
 
-struct RotatedGrads {
-    float *means, *times, *scales, *left, *right, *opacities;
-    float* lambda_t;  // [1], zero on entry
-};
+#define GSB_DECLARATION(name, ...) void name(GSB_PARAMETERS(__VA_ARGS__), Stream);
+GSB_CUDA_KERNELS(GSB_DECLARATION)
+#undef GSB_DECLARATION
 
-// 3D Gaussians with the factor R diag(exp scales), which are their own slice (3DGS).
-struct StillArgs {
-    int64_t N;
-    const float *scales, *quats, *opacities;  // [N, 3] [N, 4] [N] logits
-};
+// What `refine` has room for: numbers that the networks read, and numbers that one of them moves.
+constexpr int MAX_FEATURES = 7, MAX_WIDTH = 28;
 
-// Colours by spherical harmonics in the direction from `center`, times `waves` frequencies of time.
-struct ColorArgs {
-    int64_t N;
-    int degree, bases, waves;        // bases: harmonics stored for each frequency
-    const float *sh0, *shN;          // [N, 3] [N, waves * bases - 1, 3]
-    const float *means, *opacities;  // [N, 3] [N]: one below 1/255 is not drawn, and has no colour
-    const float* times;              // [N], null: colours do not change
-    const float *center, *time;      // [3] [1]
-};
-
-struct ColorGrads {
-    const float* colors;
-    float *sh0, *shN, *means, *times;  // zero on entry
-};
-
-// Perceptrons features x 64 x width, one for each of `networks`, on every Gaussian (AGR).
-constexpr int MAX_NETWORKS = 4, MAX_FEATURES = 8, MAX_WIDTH = 28;
-
-// A column of a value [N, stride]: what is read, and where what comes of it goes.
-struct Column {
-    const float* from;
-    float* to;
-    int64_t stride;
-};
-
-struct RefineArgs {
-    int64_t N;
-    int features_width, networks, outputs;  // outputs: the sum of widths
-    int widths[MAX_NETWORKS];
-    Column features[MAX_FEATURES];              // what the networks read; `to` its gradient, which is added to
-    Column moved[MAX_NETWORKS][MAX_WIDTH];      // what each network moves; backward: `from` the outputs' gradient
-    const float *weight_in, *bias_in;           // [networks * 64, features_width] [networks * 64]
-    const float *weight_out, *bias_out;         // [outputs, 64] [outputs]
-};
-
-struct RefineGrads {
-    float* features;                                     // [networks, N, features_width] scratch
-    float *weight_in, *bias_in, *weight_out, *bias_out;  // zero on entry
-};
-
-// Adam on the rows [N, width] of a parameter that are `drawn`.
-struct AdamArgs {
-    int64_t N, width;
-    const bool* drawn;                    // [N]
-    const float* gradients;               // [N, width], as are ..
-    float *parameters, *means, *squares;  // .. the values, and Adam's moments
-    float rate, beta1, beta2, log_beta1, log_beta2, eps;
-    const float* step;  // [1], from 1
-};
-void adam(const AdamArgs&, Stream);
-
-// Bit k of `flags` is set where the k-th array has a value that is not finite, or out of range: means, factors,
-// opacities, colors, viewmats, Ks, background.
-struct Values {
-    int64_t N, C, colors;
-    int D;
-    const float *means, *factors, *opacities, *color, *viewmats, *Ks, *background;
-};
-void flag_values(const Values&, int64_t* flags, Stream);
-
-void project(const Gaussians&, const Cameras&, const Splats&, Stream);
-void project_backward(const Gaussians&, const Cameras&, const SplatGrads&, const GaussianGrads&, Stream);
-
-// keys, indices, sorted_keys, order: [splats]; ends: [splats]
-void count_tiles(const BinArgs&, uint32_t* keys, uint32_t* indices, uint32_t* sorted_keys, uint32_t* order,
-                 int64_t* ends, void* scratch, size_t scratch_bytes, Stream);
-// tiles, splats, sorted_tiles, ids: [pairs]; offsets: [C * tiles + 1]. Where `pairs` is not the last of `ends`, but the
-// room there is, `tiles` are 0xffffffff on entry, and pairs beyond it are left out.
-void fill_tiles(const BinArgs&, const uint32_t* order, const int64_t* ends, int64_t pairs, uint32_t* tiles,
-                uint32_t* splats, uint32_t* sorted_tiles, uint32_t* ids, int32_t* offsets, void* scratch,
-                size_t scratch_bytes, Stream);
-
-void blend(const BlendArgs&, const Picture&, Stream);
-// `by_splat`: with a splat a lane, else with a pixel a lane; the same gradients.
-void blend_backward(const BlendArgs&, const Picture&, const BlendGrads&, bool by_splat, Stream);
-
-void observe_triangular(const TriangularArgs&, const Observation&, Stream);
-void observe_triangular_backward(const TriangularArgs&, const Observation& grads, const TriangularGrads&, Stream);
-
-void observe_rotated(const RotatedArgs&, const Observation&, Stream);
-void observe_rotated_backward(const RotatedArgs&, const Observation& grads, const RotatedGrads&, Stream);
-
-void observe_still(const StillArgs&, const StillSlice&, Stream);
-void observe_still_backward(const StillArgs&, const StillSlice& grads, const StillGrads&, Stream);
-
-void show_colors(const ColorArgs&, float* colors, Stream);
-void show_colors_backward(const ColorArgs&, const ColorGrads&, Stream);
-
-void refine(const RefineArgs&, Stream);
-void refine_backward(const RefineArgs&, const RefineGrads&, Stream);
-
-int similarity_blocks(int height, int width);
-void l1_ssim(const SimilarityArgs&, Stream);
+// Parts that `l1_ssim` leaves of its loss.
+int similarity_parts(int height, int width);
 
 }  // namespace gsb::cuda

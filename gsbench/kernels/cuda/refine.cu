@@ -1,26 +1,53 @@
 // AGR (7DGS, section 4.3): a few perceptrons of two layers move every Gaussian. Weights lie in shared memory and hidden
 // units in registers, so that nothing but the Gaussians' values is read or written; backward computes the hidden units
 // again, 32 Gaussians at a time.
+#include <algorithm>
+#include <numeric>
+#include <stdexcept>
+#include <string>
+
 #include "launch.h"
 
 namespace gsb::cuda {
 namespace {
 
 constexpr int HIDDEN = 64;
+constexpr int INPUTS = MAX_FEATURES + 1;  // a one comes last, whose weight is the bias
+
+// A column of a value [N, stride]: what is read, and where what comes of it goes.
+struct Column {
+    const float* from;
+    float* to;
+    int64_t stride;
+};
+
+// All networks, as the kernels find the columns of the values.
+struct Networks {
+    int64_t N;
+    int features, count, widths[MAX_NETWORKS];
+    Column read[MAX_FEATURES];              // what the networks read
+    Column moved[MAX_NETWORKS][MAX_WIDTH];  // what each network moves; backward: the gradient of what it was moved to
+    const float *weight_in, *bias_in, *weight_out, *bias_out;  // as in RefineArgs
+};
+
+// The features as columns of gradients.
+struct FeatureGrads {
+    Column column[MAX_FEATURES];
+};
 
 // One network's weights as its inner loops read them: everything of a hidden unit side by side.
 struct Network {
-    float in[HIDDEN][MAX_FEATURES];  // the last column is the bias
+    float in[HIDDEN][INPUTS];  // the last column is the bias
     float out[HIDDEN][MAX_WIDTH];
 
     // By all threads of the block; the caller has them wait for it.
-    __device__ void load(const RefineArgs& a, int network, int first_output) {
+    __device__ void load(const Networks& a, int network, int first_output) {
         const int width = a.widths[network];
-        for (int k = static_cast<int>(threadIdx.x); k < HIDDEN * MAX_FEATURES; k += static_cast<int>(blockDim.x)) {
-            const int unit = network * HIDDEN + k / MAX_FEATURES, f = k % MAX_FEATURES;
-            in[k / MAX_FEATURES][f] = f < a.features_width     ? a.weight_in[unit * a.features_width + f]
-                                      : f == MAX_FEATURES - 1 ? a.bias_in[unit]
-                                                               : 0.0f;
+        for (int k = static_cast<int>(threadIdx.x); k < HIDDEN * INPUTS; k += static_cast<int>(blockDim.x)) {
+            const int unit = network * HIDDEN + k / INPUTS, f = k % INPUTS;
+            in[k / INPUTS][f] = f < a.features      ? a.weight_in[unit * a.features + f]
+                                : f == MAX_FEATURES ? a.bias_in[unit]
+                                                    : 0.0f;
         }
         for (int k = static_cast<int>(threadIdx.x); k < HIDDEN * MAX_WIDTH; k += static_cast<int>(blockDim.x)) {
             const int unit = k / MAX_WIDTH, c = k % MAX_WIDTH;
@@ -28,22 +55,22 @@ struct Network {
         }
     }
 
-    __device__ float hidden(int unit, const float (&x)[MAX_FEATURES]) const {
+    __device__ float hidden(int unit, const float (&x)[INPUTS]) const {
         float sum = 0.0f;
-        GSB_UNROLL for (int f = 0; f < MAX_FEATURES; ++f) sum += in[unit][f] * x[f];
+        GSB_UNROLL for (int f = 0; f < INPUTS; ++f) sum += in[unit][f] * x[f];
         return max(sum, 0.0f);
     }
 };
 
 // A Gaussian's features, and a one for the bias.
-__device__ void load_features(const RefineArgs& a, int64_t i, float (&x)[MAX_FEATURES]) {
-    GSB_UNROLL for (int f = 0; f < MAX_FEATURES - 1; ++f) {
-        x[f] = i < a.N && f < a.features_width ? a.features[f].from[i * a.features[f].stride] : 0.0f;
+__device__ void load_features(const Networks& a, int64_t i, float (&x)[INPUTS]) {
+    GSB_UNROLL for (int f = 0; f < MAX_FEATURES; ++f) {
+        x[f] = i < a.N && f < a.features ? a.read[f].from[i * a.read[f].stride] : 0.0f;
     }
-    x[MAX_FEATURES - 1] = 1.0f;
+    x[MAX_FEATURES] = 1.0f;
 }
 
-__device__ int first_output_of(const RefineArgs& a, int network) {
+__device__ int first_output_of(const Networks& a, int network) {
     int first = 0;
     for (int k = 0; k < network; ++k) first += a.widths[k];
     return first;
@@ -53,14 +80,14 @@ constexpr int AT_ONCE = 4;  // Gaussians of a thread: a weight that is read from
 constexpr int MOVERS = 128;  // threads of a block
 
 // A row of blocks a network, the last and widest first.
-__global__ void __launch_bounds__(MOVERS) refine_kernel(const __grid_constant__ RefineArgs a) {
+__global__ void __launch_bounds__(MOVERS) refine_kernel(const __grid_constant__ Networks a) {
     __shared__ Network net;
-    const int network = a.networks - 1 - static_cast<int>(blockIdx.y);
+    const int network = a.count - 1 - static_cast<int>(blockIdx.y);
     const int first = first_output_of(a, network), width = a.widths[network];
     net.load(a, network, first);
     __syncthreads();
     const int64_t begin = static_cast<int64_t>(blockIdx.x) * MOVERS * AT_ONCE + threadIdx.x;
-    float x[AT_ONCE][MAX_FEATURES], sums[AT_ONCE][MAX_WIDTH];
+    float x[AT_ONCE][INPUTS], sums[AT_ONCE][MAX_WIDTH];
     GSB_UNROLL for (int n = 0; n < AT_ONCE; ++n) {
         load_features(a, begin + n * MOVERS, x[n]);
         GSB_UNROLL for (int c = 0; c < MAX_WIDTH; ++c) sums[n][c] = c < width ? a.bias_out[first + c] : 0.0f;
@@ -87,18 +114,18 @@ constexpr int BATCH = 32;             // Gaussians at a time, one a lane of ever
 constexpr int PARTS = 4;              // warps, each with a part of the hidden units
 constexpr int UNITS = HIDDEN / PARTS;
 constexpr int HALVES = BATCH * PARTS / HIDDEN;  // threads that share a hidden unit when weights' gradients are summed
-constexpr int COLUMNS = MAX_WIDTH / HALVES, ROWS = MAX_FEATURES / HALVES;
+constexpr int COLUMNS = MAX_WIDTH / HALVES, ROWS = INPUTS / HALVES;
 static_assert(HALVES == 2);
 
 struct BackwardBatch {
-    float x[BATCH][MAX_FEATURES], g[BATCH][MAX_WIDTH];
+    float x[BATCH][INPUTS], g[BATCH][MAX_WIDTH];
     float h[HIDDEN][BATCH + 1], g_h[HIDDEN][BATCH + 1];  // one more, so that lanes meet in no bank
-    float g_x[PARTS][BATCH][MAX_FEATURES];
+    float g_x[PARTS][BATCH][INPUTS];
 };
 
 // A row of blocks a network; each block sums the weights' gradients over the batches it takes, and adds them at the end.
 __global__ void __launch_bounds__(BATCH * PARTS)
-    refine_backward_kernel(const __grid_constant__ RefineArgs a, RefineGrads out) {
+    refine_backward_kernel(const __grid_constant__ Networks a, RefineGrads out) {
     __shared__ Network net;
     __shared__ BackwardBatch batch;
     const int network = static_cast<int>(blockIdx.y), first = first_output_of(a, network), width = a.widths[network];
@@ -109,14 +136,14 @@ __global__ void __launch_bounds__(BATCH * PARTS)
     for (int64_t begin = static_cast<int64_t>(blockIdx.x) * BATCH; begin < a.N; begin += int64_t{gridDim.x} * BATCH) {
         __syncthreads();  // the weights are there, and the last batch is done with
         const int64_t i = begin + lane;
-        float x[MAX_FEATURES], g[MAX_WIDTH], g_x[MAX_FEATURES] = {};
+        float x[INPUTS], g[MAX_WIDTH], g_x[INPUTS] = {};
         load_features(a, i, x);
         GSB_UNROLL for (int c = 0; c < MAX_WIDTH; ++c) {
             const Column& column = a.moved[network][c];
             g[c] = i < a.N && c < width ? column.from[i * column.stride] : 0.0f;
         }
         if (part == 0) {
-            GSB_UNROLL for (int f = 0; f < MAX_FEATURES; ++f) batch.x[lane][f] = x[f];
+            GSB_UNROLL for (int f = 0; f < INPUTS; ++f) batch.x[lane][f] = x[f];
             GSB_UNROLL for (int c = 0; c < MAX_WIDTH; ++c) batch.g[lane][c] = g[c];
         }
         for (int unit = part * UNITS; unit < (part + 1) * UNITS; ++unit) {
@@ -126,11 +153,11 @@ __global__ void __launch_bounds__(BATCH * PARTS)
                 if (c / 4 * 4 < width) g_h += g[c] * net.out[unit][c];
             }
             g_h = h > 0.0f ? g_h : 0.0f;
-            GSB_UNROLL for (int f = 0; f < MAX_FEATURES; ++f) g_x[f] += g_h * net.in[unit][f];
+            GSB_UNROLL for (int f = 0; f < INPUTS; ++f) g_x[f] += g_h * net.in[unit][f];
             batch.h[unit][lane] = h;
             batch.g_h[unit][lane] = g_h;
         }
-        GSB_UNROLL for (int f = 0; f < MAX_FEATURES; ++f) batch.g_x[part][lane][f] = g_x[f];
+        GSB_UNROLL for (int f = 0; f < INPUTS; ++f) batch.g_x[part][lane][f] = g_x[f];
         __syncthreads();
         for (int n = 0; n < BATCH; ++n) {
             const float h = batch.h[my_unit][n], g_h = batch.g_h[my_unit][n];
@@ -140,11 +167,11 @@ __global__ void __launch_bounds__(BATCH * PARTS)
             GSB_UNROLL for (int f = 0; f < ROWS; ++f) g_in[f] += g_h * batch.x[n][half * ROWS + f];
             if (thread < width) g_bias += batch.g[n][thread];
         }
-        for (int k = thread; k < BATCH * a.features_width; k += BATCH * PARTS) {
-            const int n = k / a.features_width, f = k % a.features_width;
+        for (int k = thread; k < BATCH * a.features; k += BATCH * PARTS) {
+            const int n = k / a.features, f = k % a.features;
             float sum = 0.0f;
             for (int p = 0; p < PARTS; ++p) sum += batch.g_x[p][n][f];
-            if (begin + n < a.N) out.features[(network * a.N + begin + n) * a.features_width + f] = sum;
+            if (begin + n < a.N) out.scratch[(network * a.N + begin + n) * a.features + f] = sum;
         }
     }
     const int unit = network * HIDDEN + my_unit;
@@ -154,42 +181,77 @@ __global__ void __launch_bounds__(BATCH * PARTS)
     }
     GSB_UNROLL for (int f = 0; f < ROWS; ++f) {
         const int row = half * ROWS + f;
-        if (row < a.features_width) atomicAdd(out.weight_in + unit * a.features_width + row, g_in[f]);
-        if (row == MAX_FEATURES - 1) atomicAdd(out.bias_in + unit, g_in[f]);
+        if (row < a.features) atomicAdd(out.weight_in + unit * a.features + row, g_in[f]);
+        if (row == MAX_FEATURES) atomicAdd(out.bias_in + unit, g_in[f]);
     }
     if (thread < width) atomicAdd(out.bias_out + first + thread, g_bias);
 }
 
-// A feature moves through every network, and itself: the gradient of what it was moved to is there already.
-__global__ void feature_kernel(const __grid_constant__ RefineArgs a, const float* by_network) {
-    const int64_t i = global_thread(), step = a.N * a.features_width;
+// A feature moves through every network, and itself.
+__global__ void feature_kernel(const __grid_constant__ Networks a, const __grid_constant__ FeatureGrads grads,
+                               const float* by_network) {
+    const int64_t i = global_thread(), step = a.N * a.features;
     if (i >= a.N) return;
-    GSB_UNROLL for (int f = 0; f < MAX_FEATURES - 1; ++f) {
-        if (f >= a.features_width) continue;
+    GSB_UNROLL for (int f = 0; f < MAX_FEATURES; ++f) {
+        if (f >= a.features) continue;
         float sum = 0.0f;
         GSB_UNROLL for (int network = 0; network < MAX_NETWORKS; ++network) {
-            if (network < a.networks) sum += by_network[network * step + i * a.features_width + f];
+            if (network < a.count) sum += by_network[network * step + i * a.features + f];
         }
-        a.features[f].to[i * a.features[f].stride] += sum;
+        const Column column = grads.column[f];
+        column.to[i * column.stride] = column.from[i * column.stride] + sum;
     }
+}
+
+// Column `c` of arrays [N, value_widths], counted through one array after the other. `to` may be null.
+Column column_of(const RefineArgs& a, const float* const* from, float* const* to, int c) {
+    int array = 0;
+    while (c >= a.value_widths[array]) c -= a.value_widths[array++];
+    return {from[array] + c, to ? to[array] + c : nullptr, a.value_widths[array]};
+}
+
+// `from` and `to` are what the networks move. Each moves the columns that follow those of the network before it.
+Networks networks_of(const RefineArgs& a, const float* const* from, float* const* to) {
+    Networks all{a.N, a.features, a.networks, {}, {}, {}, a.weight_in, a.bias_in, a.weight_out, a.bias_out};
+    const int widest = *std::max_element(a.widths, a.widths + MAX_NETWORKS);
+    if (a.features > MAX_FEATURES || widest > MAX_WIDTH) {
+        throw std::invalid_argument("refine: expected on a GPU at most " + std::to_string(MAX_FEATURES) +
+                                    " features and networks of at most " + std::to_string(MAX_WIDTH) +
+                                    " outputs, got " + std::to_string(a.features) + " and " + std::to_string(widest));
+    }
+    const int columns = std::accumulate(a.value_widths, a.value_widths + MAX_VALUES, 0);
+    if (std::accumulate(a.widths, a.widths + MAX_NETWORKS, 0) != columns) {
+        throw std::invalid_argument("refine: expected networks that move all " + std::to_string(columns) +
+                                    " columns of the values, got other widths");
+    }
+    for (int f = 0; f < a.features; ++f) all.read[f] = column_of(a, a.values, nullptr, f);
+    for (int network = 0, first = 0; network < a.networks; first += a.widths[network++]) {
+        all.widths[network] = a.widths[network];
+        for (int c = 0; c < a.widths[network]; ++c) all.moved[network][c] = column_of(a, from, to, first + c);
+    }
+    return all;
 }
 
 }  // namespace
 
-void refine(const RefineArgs& a, Stream stream) {
+void refine(const RefineArgs& a, const Refined& out, Stream stream) {
+    const Networks networks = networks_of(a, a.values, out.values);
     if (a.N == 0) return;
     const auto blocks = static_cast<unsigned>((a.N + MOVERS * AT_ONCE - 1) / (MOVERS * AT_ONCE));
-    launch(refine_kernel, dim3(blocks, static_cast<unsigned>(a.networks)), MOVERS, stream, a);
+    launch(refine_kernel, dim3(blocks, static_cast<unsigned>(a.networks)), MOVERS, stream, networks);
 }
 
-void refine_backward(const RefineArgs& a, const RefineGrads& out, Stream stream) {
+void refine_backward(const RefineArgs& a, const RefinedGrads& grads, const RefineGrads& out, Stream stream) {
+    const Networks networks = networks_of(a, grads.values, nullptr);
     if (a.N == 0) return;
+    FeatureGrads features{};
+    for (int f = 0; f < a.features; ++f) features.column[f] = column_of(a, grads.values, out.values, f);
     // Each block adds its sums by atomics once: few blocks, but enough to fill the largest GPUs.
     constexpr unsigned MOST_BLOCKS = 512;
     const auto batches = static_cast<unsigned>((a.N + BATCH - 1) / BATCH);
     const dim3 grid(batches < MOST_BLOCKS ? batches : MOST_BLOCKS, static_cast<unsigned>(a.networks));
-    launch(refine_backward_kernel, grid, BATCH * PARTS, stream, a, out);
-    launch(feature_kernel, blocks_for(a.N), THREADS, stream, a, out.features);
+    launch(refine_backward_kernel, grid, BATCH * PARTS, stream, networks, out);
+    launch(feature_kernel, blocks_for(a.N), THREADS, stream, networks, features, out.scratch);
 }
 
 }  // namespace gsb::cuda

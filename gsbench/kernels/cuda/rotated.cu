@@ -6,13 +6,14 @@
 namespace gsb::cuda {
 namespace {
 
+// Times are as long as the clock says: a rotation of space and time needs one unit for both.
 __device__ RotatedParameters<float> parameters(const RotatedArgs& a, int64_t i) {
     RotatedParameters<float> p{};
     load_row(a.means, i, p.mean);
-    p.time = a.times[i];
+    p.time = a.times[i] * *a.clock;
     load_row(a.scales, i, p.scales);
-    load_row(a.left, i, p.left);
-    load_row(a.right, i, p.right);
+    load_row(a.left_quats, i, p.left);
+    load_row(a.right_quats, i, p.right);
     p.opacity = a.opacities[i];
     return p;
 }
@@ -21,26 +22,26 @@ __global__ void observe_kernel(RotatedArgs a, Observation out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
     const RotatedParameters<float> raw = parameters(a, i);
-    store_observed(RotatedGaussian<float>(raw, *a.lambda_t, *a.time).observe(), out, i);
+    store_observed(RotatedGaussian<float>(raw, expf(*a.log_lambda_t), *a.time * *a.clock).observe(), out, i);
 }
 
-__global__ void observe_backward_kernel(RotatedArgs a, Observation grads, RotatedGrads out) {
+__global__ void observe_backward_kernel(RotatedArgs a, ObservationGrads grads, RotatedGrads out) {
     const int64_t i = global_thread();
     RotatedParameters<float> g{};
     if (i < a.N) {
         const RotatedParameters<float> raw = parameters(a, i);
-        RotatedGaussian<float> gaussian(raw, *a.lambda_t, *a.time);
+        RotatedGaussian<float> gaussian(raw, expf(*a.log_lambda_t), *a.time * *a.clock);
         gaussian.observe();
         gaussian.vjp(load_observed(grads, i), g);
         store_row(g.mean, out.means, i);
-        out.times[i] = g.time;
+        out.times[i] = g.time * *a.clock;
         store_row(g.scales, out.scales, i);
-        store_row(g.left, out.left, i);
-        store_row(g.right, out.right, i);
+        store_row(g.left, out.left_quats, i);
+        store_row(g.right, out.right_quats, i);
         out.opacities[i] = g.opacity;
     }
     const float lambda_t = warp_sum(g.lambda_t);
-    if (threadIdx.x % WARP == 0) atomicAdd(out.lambda_t, lambda_t);
+    if (threadIdx.x % WARP == 0) atomicAdd(out.log_lambda_t, lambda_t * expf(*a.log_lambda_t));
 }
 
 }  // namespace
@@ -49,7 +50,8 @@ void observe_rotated(const RotatedArgs& a, const Observation& out, Stream stream
     if (a.N > 0) launch(observe_kernel, small_blocks(a.N), SMALL_BLOCK, stream, a, out);
 }
 
-void observe_rotated_backward(const RotatedArgs& a, const Observation& grads, const RotatedGrads& out, Stream stream) {
+void observe_rotated_backward(const RotatedArgs& a, const ObservationGrads& grads, const RotatedGrads& out,
+                              Stream stream) {
     if (a.N > 0) launch(observe_backward_kernel, small_blocks(a.N), SMALL_BLOCK, stream, a, grads, out);
 }
 

@@ -33,7 +33,7 @@ __device__ inline void store_observed(const Observed<float>& seen, const Observa
     out.opacities[i] = seen.opacity;
 }
 
-__device__ inline Observed<float> load_observed(const Observation& o, int64_t i) {
+__device__ inline Observed<float> load_observed(const ObservationGrads& o, int64_t i) {
     Observed<float> out;
     load_row(o.means, i, out.mean);
     load_matrix(o.factors, i, out.factor);

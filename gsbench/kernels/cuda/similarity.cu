@@ -55,7 +55,7 @@ __device__ float block_sum(float x, int thread) {
     return total;
 }
 
-__global__ void __launch_bounds__(SIDE * SIDE) compare_kernel(SimilarityArgs a, Window window) {
+__global__ void __launch_bounds__(SIDE * SIDE) compare_kernel(SimilarityArgs a, SimilarityLoss out, Window window) {
     constexpr int MOMENTS = 5;
     __shared__ float image[BORDERED][BORDERED], target[BORDERED][BORDERED];
     __shared__ float along_x[MOMENTS][BORDERED][SIDE];
@@ -91,19 +91,19 @@ __global__ void __launch_bounds__(SIDE * SIDE) compare_kernel(SimilarityArgs a, 
         const int row = static_cast<int>(threadIdx.y) + SSIM_RADIUS, column = static_cast<int>(threadIdx.x) + SSIM_RADIUS;
         const float difference = fabsf(image[row][column] - target[row][column]);
         loss = ((1.0f - a.ssim_weight) * difference + a.ssim_weight * (1.0f - s.value)) * scale;
-        if (a.derivatives) {
+        if (out.gradient) {
             const int64_t pixels = static_cast<int64_t>(a.height) * a.width;
-            float* out = a.derivatives + place.channel * pixels + static_cast<int64_t>(place.y) * a.width + place.x;
-            out[0] = s.g_mean;
-            out[COLORS * pixels] = s.g_square;
-            out[2 * COLORS * pixels] = s.g_product;
+            float* at = out.scratch + place.channel * pixels + static_cast<int64_t>(place.y) * a.width + place.x;
+            at[0] = s.g_mean;
+            at[COLORS * pixels] = s.g_square;
+            at[2 * COLORS * pixels] = s.g_product;
         }
     }
     const float total = block_sum(loss, place.thread);
-    if (place.thread == 0) a.loss[(blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x] = total;
+    if (place.thread == 0) out.loss[(blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x] = total;
 }
 
-__global__ void __launch_bounds__(SIDE * SIDE) gradient_kernel(SimilarityArgs a, Window window) {
+__global__ void __launch_bounds__(SIDE * SIDE) gradient_kernel(SimilarityArgs a, SimilarityLoss out, Window window) {
     constexpr int DERIVATIVES = 3;
     __shared__ float planes[DERIVATIVES][BORDERED][BORDERED], along_x[DERIVATIVES][BORDERED][SIDE];
     const Place place;
@@ -111,7 +111,7 @@ __global__ void __launch_bounds__(SIDE * SIDE) gradient_kernel(SimilarityArgs a,
     each_bordered(a, place, [&](int row, int column, int x, int y, bool inside) {
         const int64_t at = place.channel * pixels + static_cast<int64_t>(y) * a.width + x;
         for (int k = 0; k < DERIVATIVES; ++k) {
-            planes[k][row][column] = inside ? a.derivatives[k * COLORS * pixels + at] : 0.0f;
+            planes[k][row][column] = inside ? out.scratch[k * COLORS * pixels + at] : 0.0f;
         }
     });
     __syncthreads();
@@ -133,7 +133,7 @@ __global__ void __launch_bounds__(SIDE * SIDE) gradient_kernel(SimilarityArgs a,
     const int64_t at = (static_cast<int64_t>(place.y) * a.width + place.x) * COLORS + place.channel;
     const float x = a.image[at], y = a.target[at];
     const float sign = x > y ? 1.0f : x < y ? -1.0f : 0.0f;
-    a.grad[at] = scale * ((1.0f - a.ssim_weight) * sign - a.ssim_weight * (g[0] + 2.0f * x * g[1] + y * g[2]));
+    out.gradient[at] = scale * ((1.0f - a.ssim_weight) * sign - a.ssim_weight * (g[0] + 2.0f * x * g[1] + y * g[2]));
 }
 
 dim3 tiles(int height, int width) {
@@ -143,16 +143,16 @@ dim3 tiles(int height, int width) {
 
 }  // namespace
 
-int similarity_blocks(int height, int width) {
+int similarity_parts(int height, int width) {
     const dim3 grid = tiles(height, width);
     return static_cast<int>(grid.x * grid.y * grid.z);
 }
 
-void l1_ssim(const SimilarityArgs& a, Stream stream) {
+void l1_ssim(const SimilarityArgs& a, const SimilarityLoss& out, Stream stream) {
     const Window window = gaussian_window();
     const dim3 grid = tiles(a.height, a.width), block(SIDE, SIDE);
-    launch(compare_kernel, grid, block, stream, a, window);
-    if (a.derivatives) launch(gradient_kernel, grid, block, stream, a, window);
+    launch(compare_kernel, grid, block, stream, a, out, window);
+    if (out.gradient) launch(gradient_kernel, grid, block, stream, a, out, window);
 }
 
 }  // namespace gsb::cuda

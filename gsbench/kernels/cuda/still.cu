@@ -23,7 +23,7 @@ __global__ void still_kernel(StillArgs a, StillSlice out) {
     out.opacities[i] = seen.opacity;
 }
 
-__global__ void still_backward_kernel(StillArgs a, StillSlice grads, StillGrads out) {
+__global__ void still_backward_kernel(StillArgs a, StillSliceGrads grads, StillGrads out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
     const StillParameters<float> raw = parameters(a, i);
@@ -42,7 +42,7 @@ void observe_still(const StillArgs& a, const StillSlice& out, Stream stream) {
     if (a.N > 0) launch(still_kernel, small_blocks(a.N), SMALL_BLOCK, stream, a, out);
 }
 
-void observe_still_backward(const StillArgs& a, const StillSlice& grads, const StillGrads& out, Stream stream) {
+void observe_still_backward(const StillArgs& a, const StillSliceGrads& grads, const StillGrads& out, Stream stream) {
     if (a.N > 0) launch(still_backward_kernel, small_blocks(a.N), SMALL_BLOCK, stream, a, grads, out);
 }
 

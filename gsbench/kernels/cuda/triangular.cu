@@ -1,6 +1,8 @@
 // Slices of Gaussians with triangular factors and their derivative, one a thread; the mathematics is math/triangular.h.
 #include "../math/triangular.h"
 
+#include <stdexcept>
+
 #include "rows.h"
 
 namespace gsb::cuda {
@@ -9,7 +11,7 @@ namespace {
 // CONDITIONED is known to the compiler: where the factor is triangular in the right order, no reflection is compiled in.
 template <bool TIME, bool CONDITIONED>
 __device__ TriangularModel model_of(const TriangularArgs& a) {
-    return {CONDITIONED, a.form, a.half, *a.lambda_d, TIME ? *a.lambda_t : 0.0f,
+    return {CONDITIONED, a.form, a.half, expf(*a.log_lambda_d), TIME ? expf(*a.log_lambda_t) : 0.0f,
             {a.center[0], a.center[1], a.center[2]}, TIME ? *a.time : 0.0f};
 }
 
@@ -38,7 +40,7 @@ __global__ void observe_kernel(TriangularArgs a, Observation out) {
 }
 
 template <bool TIME, bool CONDITIONED>
-__global__ void observe_backward_kernel(TriangularArgs a, Observation grads, TriangularGrads out) {
+__global__ void observe_backward_kernel(TriangularArgs a, ObservationGrads grads, TriangularGrads out) {
     const int64_t i = global_thread();
     TriangularParameters<float, TIME> g{};
     if (i < a.N) {
@@ -58,14 +60,19 @@ __global__ void observe_backward_kernel(TriangularArgs a, Observation grads, Tri
     }
     const float lambda_d = warp_sum(g.lambda_d), lambda_t = warp_sum(g.lambda_t);
     if (threadIdx.x % WARP == 0) {
-        atomicAdd(out.lambdas, lambda_d);
-        atomicAdd(out.lambdas + 1, lambda_t);
+        atomicAdd(out.log_lambda_d, lambda_d * expf(*a.log_lambda_d));
+        if constexpr (TIME) atomicAdd(out.log_lambda_t, lambda_t * expf(*a.log_lambda_t));
     }
 }
 
 // Calls run<TIME, CONDITIONED>() as the arguments say.
 template <class Run>
 void dispatch(const TriangularArgs& a, Run run) {
+    if (a.subtracts) {
+        throw std::invalid_argument(
+            "observe_triangular: expected the square-root scheme on a GPU, got one that subtracts");
+    }
+    if (a.N == 0) return;
     if (a.times) {
         a.conditioned_first ? run.template operator()<true, true>() : run.template operator()<true, false>();
     } else {
@@ -76,15 +83,13 @@ void dispatch(const TriangularArgs& a, Run run) {
 }  // namespace
 
 void observe_triangular(const TriangularArgs& a, const Observation& out, Stream stream) {
-    if (a.N == 0) return;
     dispatch(a, [&]<bool TIME, bool CONDITIONED>() {
         launch(observe_kernel<TIME, CONDITIONED>, small_blocks(a.N), SMALL_BLOCK, stream, a, out);
     });
 }
 
-void observe_triangular_backward(const TriangularArgs& a, const Observation& grads, const TriangularGrads& out,
+void observe_triangular_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out,
                                  Stream stream) {
-    if (a.N == 0) return;
     dispatch(a, [&]<bool TIME, bool CONDITIONED>() {
         launch(observe_backward_kernel<TIME, CONDITIONED>, small_blocks(a.N), SMALL_BLOCK, stream, a, grads, out);
     });

@@ -6,9 +6,6 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-constexpr float ALPHA_MAX = 0.999f;
-constexpr float TRANSMITTANCE_MIN = 1e-4f;
-
 // The falloff of a splat at a pixel: alpha and the two coordinates in which the splat is round.
 template <class T>
 struct Falloff {

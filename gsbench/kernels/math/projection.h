@@ -10,11 +10,11 @@
 #pragma once
 
 #include "scalar.h"
+#include "thresholds.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
 
-constexpr float ALPHA_MIN = 1.0f / 255.0f;
 constexpr float HALF_LOG2_E = 0.721347520f;       // exp(-x/2) = 2^(-HALF_LOG2_E x)
 constexpr float SQRT_HALF_LOG2_E = 0.849321800f;  // so this scales the root
 constexpr float BOUNDS_MARGIN = 0.01f;            // pixels, lest rounding cut off a pixel

@@ -1,4 +1,4 @@
-// Where the mathematics of a slice stops following a number further. gsbench/kernels/thresholds.py reads these lines, so
+// Where the mathematics of a slice stops following a number further, and where blending stops. gsbench/kernels/thresholds.py reads these lines, so
 // that torch's twin of the kernels stops at the same places.
 #pragma once
 
@@ -12,5 +12,10 @@ constexpr float LOG_SIZE_MAX = 16.0f;
 constexpr float EXPONENT_MAX = 80.0f;
 // A 4D Gaussian whose f_temp is not above this is not drawn (4DGS, gaussian_renderer).
 constexpr float TIME_GATE_MIN = 0.05f;
+// An alpha below this is skipped, one above that held (3DGS, forward.cu); a pixel is full where less than
+// TRANSMITTANCE_MIN of the light behind would be left.
+constexpr float ALPHA_MIN = 1.0f / 255.0f;
+constexpr float ALPHA_MAX = 0.999f;
+constexpr float TRANSMITTANCE_MIN = 1e-4f;
 
 }  // namespace gsb

@@ -1,0 +1,74 @@
+"""Who computes: torch by itself, or the kernels on the CPU or on a GPU. It is chosen here and nowhere else."""
+
+import functools
+import warnings
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsbench import kernels
+from gsbench.errors import InputError, did_you_mean
+from gsbench.kernels import cuda
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A backend, handed to models, to the rasterizer, to the loss and to the optimizer, who ask it `serves`."""
+
+    name: str
+    devices: tuple[str, ...]  # whose kernels it uses
+
+    def serves(self, tensor: Tensor) -> bool:
+        """Whether kernels do the work on such a tensor; else torch does."""
+        device = tensor.device.type
+        return tensor.dtype == torch.float32 and device in self.devices and _built(device)
+
+
+REFERENCE = Backend("reference", ())
+CPU = Backend("cpu", ("cpu",))
+CUDA = Backend("cuda", ("cuda",))
+AUTO = Backend("auto", ("cpu", "cuda"))  # what serves a tensor, wherever it is
+BACKENDS = {backend.name: backend for backend in (AUTO, REFERENCE, CPU, CUDA)}
+
+
+def resolve(name: str, device: str = "cpu") -> Backend:
+    """The backend of a name on a kind of device; `auto` becomes the fastest that is installed for it.
+
+    Raises:
+        InputError: no such backend, it is not installed, or it does not work on that device.
+    """
+    if name not in BACKENDS:
+        raise InputError(f"raster backend '{name}' is not known. {did_you_mean(name, BACKENDS)}")
+    if name == "auto":
+        _warn(device)
+        return BACKENDS[device] if device in AUTO.devices and _built(device) else REFERENCE
+    if name == "cpu" and not kernels.available():
+        raise InputError("raster backend 'cpu' is not built in this installation: reinstall with a C++20 compiler, "
+                         "or use raster.backend=reference")  # fmt: skip
+    if name == "cuda" and not cuda.available():
+        why = "no CUDA device was found" if cuda.built() else "it is not built here, see docs/gpu.md"
+        raise InputError(f"raster backend 'cuda': {why}; use raster.backend=auto or reference")
+    if name in AUTO.devices and device in AUTO.devices and name != device:
+        raise InputError(f"raster backend '{name}' does not draw on device '{device}': use device={name}, "
+                         "or raster.backend=auto or reference")  # fmt: skip
+    return BACKENDS[name]
+
+
+def _built(device: str) -> bool:
+    return kernels.available() if device == "cpu" else cuda.available()
+
+
+def _warn(device: str) -> None:
+    """Say what `auto` falls back to."""
+    if cuda.built() and not cuda.available():
+        _warn_once("no CUDA device was found: the CUDA kernels of this installation are idle, the CPU draws")
+    if device == "cuda" and not cuda.built():
+        _warn_once("the CUDA kernels are not built in this installation: the GPU draws by the reference backend, "
+                   "which is slow; see docs/gpu.md")  # fmt: skip
+
+
+@functools.cache
+def _warn_once(why: str) -> None:
+    """Once a process."""
+    warnings.warn(f"raster backend 'auto': {why}", stacklevel=4)

@@ -1,0 +1,305 @@
+// What the kernels take, on the CPU and on a GPU alike: addresses of arrays, row-major and contiguous, and numbers.
+//
+// A structure holds the inputs of an operation, its outputs, the gradients given of its outputs, or those wanted of its
+// inputs. gsbench/kernels/operation.py fills the fields by their names: beside each structure GSB_FIELDS says which of
+// the four it is, and lists them. GSB_KERNELS lists the kernels that both the CPU and a GPU have.
+//
+// N Gaussians come before C cameras. Scalars that a GPU computes are addresses too, so that nothing waits to read them.
+#pragma once
+
+#include <cstdint>
+
+#include "math/off_diagonal.h"
+
+#ifndef GSB_FIELDS  // bindings.h reads them; to everything else they are nothing
+#define GSB_FIELDS(Structure, role, ...)
+#endif
+
+namespace gsb {
+
+// ---- gsbench/kernels/slices.py
+
+// Gaussians with a triangular factor over (p, d) or (p, t, d), observed from a place and at a time (6DGS, 7DGS).
+struct TriangularArgs {
+    int64_t N;
+    bool conditioned_first;
+    OffDiagonal form;
+    bool subtracts;  // by the scheme that forms S, for comparison; on the CPU only
+    float half;
+    const float *means, *directions, *times;  // [N, 3] [N, 3] [N, 1], null: time is not observed
+    const float *log_diagonal, *shape, *motion, *coupling;    // [N, k + 3] [N, 3] [N, 3 k] [N, k (k - 1) / 2]
+    const float *opacities, *center;                          // [N] logits, [3]
+    const float *time, *log_lambda_d, *log_lambda_t;          // [] [] []
+    int threads;
+};
+GSB_FIELDS(TriangularArgs, INPUTS, N, conditioned_first, form, subtracts, half, means, directions, times, log_diagonal,
+           shape, motion, coupling, opacities, center, time, log_lambda_d, log_lambda_t, threads)
+
+struct TriangularGrads {
+    float *means, *directions, *times, *log_diagonal, *shape, *motion, *coupling, *opacities;
+    float *log_lambda_d, *log_lambda_t;  // zero on entry
+};
+GSB_FIELDS(TriangularGrads, GRADS, means, directions, times, log_diagonal, shape, motion, coupling, opacities,
+           log_lambda_d, log_lambda_t)
+
+// Gaussians over (x, y, z, t) with the factor M_left M_right diag(exp scales), observed at a time (4DGS).
+struct RotatedArgs {
+    int64_t N;
+    const float *means, *times, *scales, *left_quats, *right_quats;  // [N, 3] [N, 1] [N, 4] [N, 4] [N, 4]
+    const float *opacities, *clock, *time, *log_lambda_t;            // [N] logits, [] [] []
+    int threads;
+};
+GSB_FIELDS(RotatedArgs, INPUTS, N, means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
+           threads)
+
+struct RotatedGrads {
+    float *means, *times, *scales, *left_quats, *right_quats, *opacities;
+    float* log_lambda_t;  // zero on entry
+};
+GSB_FIELDS(RotatedGrads, GRADS, means, times, scales, left_quats, right_quats, opacities, log_lambda_t)
+
+// The 3D Gaussians that an observation leaves.
+struct Observation {
+    float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
+};
+GSB_FIELDS(Observation, OUTPUTS, means, factors, opacities)
+
+struct ObservationGrads {
+    const float *means, *factors, *opacities;
+};
+GSB_FIELDS(ObservationGrads, GIVEN, means, factors, opacities)
+
+// 3D Gaussians with the factor R diag(exp scales), which are their own slice (3DGS).
+struct StillArgs {
+    int64_t N;
+    const float *scales, *quats, *opacities;  // [N, 3] [N, 4] [N] logits
+    int threads;
+};
+GSB_FIELDS(StillArgs, INPUTS, N, scales, quats, opacities, threads)
+
+struct StillSlice {
+    float *factors, *opacities;  // [N, 3, 3] [N]
+};
+GSB_FIELDS(StillSlice, OUTPUTS, factors, opacities)
+
+struct StillSliceGrads {
+    const float *factors, *opacities;
+};
+GSB_FIELDS(StillSliceGrads, GIVEN, factors, opacities)
+
+struct StillGrads {
+    float *scales, *quats, *opacities;
+};
+GSB_FIELDS(StillGrads, GRADS, scales, quats, opacities)
+
+// ---- gsbench/kernels/colors.py
+
+// Colours by spherical harmonics in the direction from `center`, times `waves` frequencies of time.
+struct ColorArgs {
+    int64_t N;
+    int degree, bases, waves;        // bases: harmonics stored for each frequency
+    const float *sh0, *shN;          // [N, 1, 3] [N, waves * bases - 1, 3]
+    const float *means, *opacities;  // [N, 3] [N]: one below 1/255 is not drawn, and has no colour
+    const float* times;              // [N, 1], null: colours do not change
+    const float *center, *time;      // [3] []
+    int threads;
+};
+GSB_FIELDS(ColorArgs, INPUTS, N, degree, bases, waves, sh0, shN, means, opacities, times, center, time, threads)
+
+struct Colors {
+    float* colors;  // [N, 3]
+};
+GSB_FIELDS(Colors, OUTPUTS, colors)
+
+struct GivenColors {
+    const float* colors;
+};
+GSB_FIELDS(GivenColors, GIVEN, colors)
+
+struct ColorGrads {
+    float *sh0, *shN;  // added to, in the rows that have a gradient
+    float *means, *times;
+};
+GSB_FIELDS(ColorGrads, GRADS, sh0, shN, means, times)
+
+// ---- gsbench/kernels/refine.py
+
+constexpr int MAX_NETWORKS = 4, MAX_VALUES = 12;
+
+// Perceptrons features x 64 x width, one for each of `networks`, on every Gaussian (AGR). They read the values of the
+// first `networks - 1` arrays, each of which one of them moves; the last moves all the others.
+struct RefineArgs {
+    int64_t N;
+    int features, networks, arrays, outputs;  // features: numbers that are read; outputs: the sum of widths
+    int widths[MAX_NETWORKS], value_widths[MAX_VALUES];
+    const float* values[MAX_VALUES];     // [arrays] of [N, value_widths]
+    const float *weight_in, *bias_in;    // [networks * 64, features] [networks * 64]
+    const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
+    int threads;
+};
+GSB_FIELDS(RefineArgs, INPUTS, N, features, networks, arrays, outputs, widths, value_widths, values, weight_in, bias_in,
+           weight_out, bias_out, threads)
+
+struct Refined {
+    float* values[MAX_VALUES];  // [arrays] of [N, value_widths]
+};
+GSB_FIELDS(Refined, OUTPUTS, values)
+
+struct RefinedGrads {
+    const float* values[MAX_VALUES];
+};
+GSB_FIELDS(RefinedGrads, GIVEN, values)
+
+struct RefineGrads {
+    float* values[MAX_VALUES];                           // of the features: [networks - 1] of [N, value_widths]
+    float *weight_in, *bias_in, *weight_out, *bias_out;  // zero on entry
+    float* scratch;                                      // [networks, N, features], on a GPU
+};
+GSB_FIELDS(RefineGrads, GRADS, values, weight_in, bias_in, weight_out, bias_out, scratch)
+
+// ---- gsbench/kernels/raster.py
+
+struct ProjectArgs {
+    int64_t N, C;
+    const float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
+    const float *viewmats, *Ks;                // [C, 4, 4] [C, 3, 3]
+    int width, height;
+    float near, far, eps2d;
+    bool antialias;
+    int threads;
+};
+GSB_FIELDS(ProjectArgs, INPUTS, N, C, means, factors, opacities, viewmats, Ks, width, height, near, far, eps2d,
+           antialias, threads)
+
+struct Splats {
+    float* means2d;     // [C, N, 2]
+    float* roots;       // [C, N, 4]: p, q, r of math/projection.h and the opacity
+    float* depths;      // [C, N]
+    float* half_sizes;  // [C, N, 2], 0: not drawn
+};
+GSB_FIELDS(Splats, OUTPUTS, means2d, roots, depths, half_sizes)
+
+struct SplatGrads {
+    const float *means2d, *roots, *depths;  // depths null: zero
+};
+GSB_FIELDS(SplatGrads, GIVEN, means2d, roots, depths)
+
+struct ProjectGrads {
+    float *means, *factors, *opacities;
+    float* viewmats;  // [C, 4, 4], zero on entry; null: not wanted
+};
+GSB_FIELDS(ProjectGrads, GRADS, means, factors, opacities, viewmats)
+
+struct BlendArgs {
+    int64_t N, C;
+    int D;
+    bool color_per_camera;  // colors are [C, N, D], else [1, N, D]
+    const float *means2d, *roots, *half_sizes, *colors, *background;
+    const int32_t *offsets, *ids;  // [C * tiles + 1] [pairs]: each tile's list of splats, front to back
+    int width, height;
+    int threads;
+};
+GSB_FIELDS(BlendArgs, INPUTS, N, C, D, color_per_camera, means2d, roots, half_sizes, colors, background, offsets, ids,
+           width, height, threads)
+
+struct Picture {
+    float *image, *alpha;         // [C, H, W, D] [C, H, W, 1]
+    float *transmittance, *stop;  // [C, tiles * 256] what is left, and where in its list a pixel ends: each backend's way
+};
+GSB_FIELDS(Picture, OUTPUTS, image, alpha, transmittance, stop)
+
+struct BlendState {
+    const float *transmittance, *stop;
+};
+GSB_FIELDS(BlendState, OUTPUTS, transmittance, stop)
+
+struct PictureGrads {
+    const float *image, *alpha;  // alpha null: zero
+};
+GSB_FIELDS(PictureGrads, GIVEN, image, alpha)
+
+struct BlendGrads {
+    float *means2d, *roots, *colors;  // [C, N, 2] [C, N, 4] as colors
+    float* background;                // [D], zero on entry; null: not wanted
+    float* scratch;                   // [C, N, 6 + D] zero on entry, on a GPU
+};
+GSB_FIELDS(BlendGrads, GRADS, means2d, roots, colors, background, scratch)
+
+// Bit k of `flags` is set where the k-th array has a value that is not finite, or out of range.
+struct ValueArgs {
+    int64_t N, C, all_colors;  // all_colors: how many numbers
+    int D;
+    const float *means, *factors, *opacities, *colors, *viewmats, *Ks, *background;
+    int threads;
+};
+GSB_FIELDS(ValueArgs, INPUTS, N, C, all_colors, D, means, factors, opacities, colors, viewmats, Ks, background, threads)
+
+struct ValueFlags {
+    int64_t* flags;  // [1], zero on entry
+};
+GSB_FIELDS(ValueFlags, OUTPUTS, flags)
+
+// ---- gsbench/kernels/loss.py
+
+struct SimilarityArgs {
+    int height, width;
+    const float *image, *target;  // [H, W, 3]
+    float ssim_weight;
+    int threads;
+};
+GSB_FIELDS(SimilarityArgs, INPUTS, height, width, image, target, ssim_weight, threads)
+
+struct SimilarityLoss {
+    float* loss;      // [parts], to be added up: `similarity_parts` says how many
+    float* gradient;  // [H, W, 3]; null: not wanted
+    float* scratch;   // [3, 3, H, W], on a GPU, for the gradient
+};
+GSB_FIELDS(SimilarityLoss, OUTPUTS, loss, gradient, scratch)
+
+// ---- gsbench/kernels/adam.py
+
+// Adam on the rows [N, width] of a parameter that are `drawn`.
+struct AdamArgs {
+    int64_t N, width;
+    const bool* drawn;       // [N]
+    const float* gradient;   // [N, width]
+    double rate, beta1, beta2, eps;
+    const float* step;       // [], from 1
+    int threads;
+};
+GSB_FIELDS(AdamArgs, INPUTS, N, width, drawn, gradient, rate, beta1, beta2, eps, step, threads)
+
+struct AdamState {
+    float *parameter, *mean, *square;  // [N, width]
+};
+GSB_FIELDS(AdamState, OUTPUTS, parameter, mean, square)
+
+}  // namespace gsb
+
+// kernel(name, the structures it takes)
+#define GSB_KERNELS(kernel)                                                                        \
+    kernel(observe_triangular, TriangularArgs, Observation)                                        \
+    kernel(observe_triangular_backward, TriangularArgs, ObservationGrads, TriangularGrads)         \
+    kernel(observe_rotated, RotatedArgs, Observation)                                              \
+    kernel(observe_rotated_backward, RotatedArgs, ObservationGrads, RotatedGrads)                  \
+    kernel(observe_still, StillArgs, StillSlice)                                                   \
+    kernel(observe_still_backward, StillArgs, StillSliceGrads, StillGrads)                         \
+    kernel(show_colors, ColorArgs, Colors)                                                         \
+    kernel(show_colors_backward, ColorArgs, GivenColors, ColorGrads)                               \
+    kernel(refine, RefineArgs, Refined)                                                            \
+    kernel(refine_backward, RefineArgs, RefinedGrads, RefineGrads)                                 \
+    kernel(project, ProjectArgs, Splats)                                                           \
+    kernel(project_backward, ProjectArgs, SplatGrads, ProjectGrads)                                \
+    kernel(blend, BlendArgs, Picture)                                                              \
+    kernel(blend_backward, BlendArgs, BlendState, PictureGrads, BlendGrads)                        \
+    kernel(flag_values, ValueArgs, ValueFlags)                                                     \
+    kernel(l1_ssim, SimilarityArgs, SimilarityLoss)                                                \
+    kernel(adam, AdamArgs, AdamState)
+
+// const A&, const B&, .. of the structures A, B, ..
+#define GSB_CONST_1(A) const A&
+#define GSB_CONST_2(A, B) const A&, const B&
+#define GSB_CONST_3(A, B, C) const A&, const B&, const C&
+#define GSB_CONST_4(A, B, C, D) const A&, const B&, const C&, const D&
+#define GSB_PICK(_1, _2, _3, _4, picked, ...) picked
+#define GSB_PARAMETERS(...) GSB_PICK(__VA_ARGS__, GSB_CONST_4, GSB_CONST_3, GSB_CONST_2, GSB_CONST_1)(__VA_ARGS__)

@@ -1,0 +1,104 @@
+"""Call the compiled kernels of one kind of device: the fields of their argument structures are filled by name."""
+
+import functools
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsbench import kernels
+from gsbench.errors import InputError
+from gsbench.kernels import cuda
+
+# In front of a field's name, by what its structure holds: see kernels/arguments.h.
+_PREFIX = {"INPUTS": "", "OUTPUTS": "out.", "GIVEN": "given.", "GRADS": "grad."}
+
+Slots = dict[str, Any]  # by prefix and name: a number, an address as an int, or a tuple of either
+
+
+class Library:
+    """The kernels for tensors on the CPU."""
+
+    def __init__(self, extension: ModuleType) -> None:
+        """Take the extension that holds them."""
+        self.extension = extension
+        self._fields = {name: _fields(signature) for name, signature in extension.SIGNATURES.items()}
+
+    def call(self, name: str, slots: Slots, like: Tensor) -> None:
+        """Run a kernel on memory of the same device as `like`; `slots` holds a value for each of its fields."""
+        slots["threads"] = torch.get_num_threads()
+        getattr(self.extension, name)(*[slots[field] for field in self._fields[name]])
+
+    def takes(self, name: str, field: str) -> bool:
+        """Whether a kernel has a field."""
+        return field in self._fields[name]
+
+    @property
+    def needs_scratch(self) -> bool:
+        """Whether kernels are given their scratch memory; those of the CPU get their own."""
+        return False
+
+    def similarity_parts(self, height: int, width: int) -> int:
+        """How many parts `l1_ssim` leaves of its loss."""
+        return 1
+
+
+class CudaLibrary(Library):
+    """The kernels for tensors on a GPU, enqueued on torch's current stream."""
+
+    def call(self, name: str, slots: Slots, like: Tensor) -> None:
+        """Enqueue a kernel on the device of `like`."""
+        slots["threads"] = 1
+        values = [slots[field] for field in self._fields[name]]
+        if not like.is_cuda:  # tests run these kernels on the CPU
+            getattr(self.extension, name)(*values, 0)
+            return
+        with torch.cuda.device_of(like):
+            getattr(self.extension, name)(*values, torch.cuda.current_stream(like.device).cuda_stream)
+
+    @property
+    def needs_scratch(self) -> bool:
+        """On a GPU memory comes from torch's caching allocator, scratch too."""
+        return True
+
+    def similarity_parts(self, height: int, width: int) -> int:
+        """One of each block of threads."""
+        return int(self.extension.similarity_parts(height, width))
+
+
+_LIBRARIES: dict[str, Library] = {}  # by kind of device, as they were asked for
+
+
+def library_of(device: str) -> Library:
+    """The kernels for tensors on a kind of device, `cpu` or `cuda`.
+
+    Raises:
+        InputError: they were not built, or there are none for such a device.
+    """
+    if device not in _LIBRARIES:
+        if device not in ("cpu", "cuda"):
+            raise InputError(f"expected tensors on the CPU or a CUDA device, got them on '{device}'")
+        _LIBRARIES[device] = Library(kernels.native()) if device == "cpu" else CudaLibrary(cuda.cuda())
+    return _LIBRARIES[device]
+
+
+def allocate(what: str, like: Tensor, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Tensor:
+    """An uninitialised tensor on the device of another, for `what`.
+
+    Raises:
+        torch.OutOfMemoryError: in one line, with what it was for, its size and what to lower.
+    """
+    try:
+        return like.new_empty(shape, dtype=dtype)
+    except torch.OutOfMemoryError as error:
+        size = dtype.itemsize * functools.reduce(lambda a, b: a * b, shape, 1)
+        reason = " ".join(str(error).split())
+        raise torch.OutOfMemoryError(
+            f"{what} need {size / 2**20:.1f} MiB on {like.device}: lower the picture's size, the cameras drawn at once "
+            f"or the number of Gaussians ({reason:.160})"
+        ) from None
+
+
+def _fields(signature: tuple[tuple[str, str], ...]) -> list[str]:
+    return [_PREFIX[role] + name for role, names in signature for name in names.replace(",", " ").split()]

@@ -1,0 +1,36 @@
+// What the rasterizer's numbers may be: the ranges that `flag_values` looks at, on the CPU and on a GPU.
+#pragma once
+
+#include <cfloat>
+
+#include "../arguments.h"
+
+namespace gsb {
+
+// `count` numbers, `stride` apart, are to be in [low, high]; else bit `bit` of the flags is set.
+struct Range {
+    const float* values;
+    int64_t count, stride;
+    float low, high;
+    int bit;
+};
+
+constexpr int RANGES = 14;
+
+struct Ranges {
+    Range range[RANGES];
+};
+
+inline Ranges ranges_of(const ValueArgs& a) {
+    const auto finite = [](const float* values, int64_t count, int bit) {
+        return Range{values, count, 1, -FLT_MAX, FLT_MAX, bit};
+    };
+    const auto of_Ks = [&](int entry, float low, float high) { return Range{a.Ks + entry, a.C, 9, low, high, 5}; };
+    return {{finite(a.means, a.N * 3, 0), finite(a.factors, a.N * 9, 1), {a.opacities, a.N, 1, 0.0f, 1.0f, 2},
+             finite(a.colors, a.all_colors, 3), finite(a.viewmats, a.C * 16, 4), finite(a.Ks, a.C * 9, 5),
+             of_Ks(0, FLT_MIN, FLT_MAX), of_Ks(4, FLT_MIN, FLT_MAX),  // focal lengths
+             of_Ks(1, 0.0f, 0.0f), of_Ks(3, 0.0f, 0.0f), of_Ks(6, 0.0f, 0.0f), of_Ks(7, 0.0f, 0.0f),
+             of_Ks(8, 1.0f, 1.0f), finite(a.background, a.D, 6)}};
+}
+
+}  // namespace gsb

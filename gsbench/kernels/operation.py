@@ -1,0 +1,316 @@
+"""Declare an operation of the kernels once; its check, calls, gradient, fake and place on a tape all follow from that.
+
+An operation is a pair of plain functions on tensors, `forward` and `backward`. Called, it is recorded by the tape in
+charge (gsbench.kernels.tape), or else by torch's autograd, for which it is registered as `torch.ops.gsbench.NAME`.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.kernels import tape
+from gsbench.kernels.library import Slots, allocate, library_of
+
+Tensors = list[Tensor]  # an input that is left out is an empty tensor of one dimension
+Shape = tuple[int | str, ...]
+Sizes = dict[str, int]
+
+_SCHEMA = {int: "int", float: "float", bool: "bool"}
+
+
+class Operation:
+    """One operation: its name is that of its kernel, NAME_backward that of the kernel of its gradient."""
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        inputs: dict[str, str],
+        outputs: dict[str, str],
+        numbers: dict[str, type] | None = None,
+        constant: Sequence[str] = (),
+        passive: Sequence[str] = (),
+        optional: Sequence[str] = (),
+        adds: Sequence[str] = (),
+        zeroed: Sequence[str] = (),
+        on_request: Sequence[str] = (),
+        integers: Sequence[str] = (),
+        derive: Callable[[dict[str, Tensor], Slots], Sizes] | None = None,
+        scratch: str | None = None,
+        memory: str = "results",
+    ) -> None:
+        """Declare it.
+
+        Args:
+            name: of the operation and its kernel.
+            inputs: their shapes, as "N 3" or "C height width D": sizes are numbers, or names that mean the same size
+                wherever they stand. A first size that may be left out has a question mark.
+            outputs: the same.
+            numbers: what is no tensor, by type; an int is a size too.
+            constant: inputs by which there is no gradient, and asking for one is an error.
+            passive: inputs and outputs that no gradient goes through, in silence.
+            optional: inputs that may be left out.
+            adds: inputs to whose gradient the kernel adds, so that those of several views need one memory.
+            zeroed: inputs whose gradient is a sum over Gaussians, of which a GPU's blocks each add a part.
+            on_request: inputs whose gradient costs something, and is computed where it is wanted only.
+            integers: inputs of int32; all others are float32.
+            derive: sizes that are no input's own, from the tensors given and the numbers.
+            scratch: the shape of memory that backward needs on a GPU, zero on entry.
+            memory: what the outputs are, for a message that there is not enough of it.
+        """
+        self.name = name
+        self.inputs = {key: _shape(text) for key, text in inputs.items()}
+        self.outputs = tuple(outputs)
+        self.numbers = numbers or {}
+        self.constant = frozenset(constant)
+        self.adds = {i for i, key in enumerate(inputs) if key in adds}
+        self._differentiable = [key not in {*constant, *passive} for key in inputs]
+        self._carries = [key not in passive for key in outputs]
+        self._optional = {i for i, key in enumerate(inputs) if key in optional}
+        self._on_request = {f"grad.{key}" for key in on_request}
+        self._zeroed = {f"grad.{key}" for key in (*adds, *zeroed, *on_request)}
+        self._dtypes = [torch.int32 if key in integers else torch.float32 for key in self.inputs]
+        self._derive = derive
+        self._scratch = _shape(scratch) if scratch is not None else None
+        self._memory = memory
+        # The names of the kernels' fields; None where there is no gradient.
+        self._out = [(f"out.{key}", _shape(text)) for key, text in outputs.items()]
+        self._given = [f"given.{key}" for key in outputs]
+        self._needed = {f"given.{key}" for key in outputs if key not in passive} - _MAY_BE_NULL
+        self._grad = [f"grad.{key}" if own else None for key, own in zip(inputs, self._differentiable, strict=True)]
+        self._last: tuple[list[Any] | None, Slots] = None, {}
+        self.backward_kernel = f"{name}_backward"  # the benchmark of the GPU compares two
+        self._traced = _register(self)
+
+    def __call__(self, *arguments: Any) -> Tensors:
+        """The outputs, of tensors (None: left out) and then numbers, in the order of the declaration.
+
+        Raises:
+            InputError: shapes that do not fit, another type than float32, more than one device, or a gradient wanted
+                that there is not.
+        """
+        tensors, numbers = self.split(arguments)
+        for key, x in zip(self.inputs, tensors, strict=False):
+            if key in self.constant and x.requires_grad:
+                raise InputError(f"{self.name} has no gradient by {key}: detach it")
+        recording = tape.current()
+        if recording is not None:
+            return recording.record(self, tensors, numbers)
+        if torch.compiler.is_compiling() or (torch.is_grad_enabled() and any(x.requires_grad for x in tensors)):
+            outputs: Tensors = self._traced(tensors, *numbers)
+            return outputs
+        return self.forward(tensors, numbers)
+
+    def split(self, arguments: Sequence[Any]) -> tuple[Tensors, tuple[Any, ...]]:
+        """Tensors and numbers of a call."""
+        count = len(self.inputs)
+        like = arguments[0]
+        return [like.new_empty(0) if x is None else x for x in arguments[:count]], tuple(arguments[count:])
+
+    def differentiable(self, tensors: Tensors) -> list[bool]:
+        """By which inputs there is a gradient."""
+        return self._differentiable
+
+    def carries_gradient(self, outputs: Tensors) -> list[bool]:
+        """Through which outputs there is one."""
+        return self._carries
+
+    # ---- the pair
+
+    def forward(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
+        """The outputs; nothing is recorded."""
+        return self.run(tensors, numbers)[0]
+
+    def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
+        """`forward`, and what backward can use again: sizes, numbers, and the inputs' memory in `rows`."""
+        slots = self.match(tensors, numbers).copy()
+        like = tensors[0]
+        rows = slots["rows"] = in_rows(tensors)
+        for key, x in zip(self.inputs, rows, strict=True):
+            slots[key] = x.data_ptr()
+        outputs = []
+        for key, shape in self._out:
+            outputs.append(allocate(self._memory, like, tuple([slots[x] if isinstance(x, str) else x for x in shape])))
+            slots[key] = outputs[-1].data_ptr()
+        library_of(like.device.type).call(self.name, slots, like)
+        return outputs, slots
+
+    def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
+        """The slots that `run` returned, of what autograd has kept."""
+        slots = self.match(tensors, numbers).copy()
+        rows = slots["rows"] = in_rows(tensors)
+        slots.update({key: x.data_ptr() for key, x in zip(self.inputs, rows, strict=True)})
+        slots.update({key: x.data_ptr() for (key, _), x in zip(self._out, outputs, strict=True)})
+        return slots
+
+    def backward(
+        self,
+        tensors: Tensors,
+        slots: Slots,
+        outputs: Tensors,
+        given: Sequence[Tensor | None],
+        wanted: Sequence[bool],
+        sums: dict[int, Tensor] | None = None,
+    ) -> list[Tensor | None]:
+        """The gradients by the inputs, of those by the outputs (None: zero).
+
+        Args:
+            tensors: as `run` had them.
+            slots: what it returned beside the outputs.
+            outputs: which it returned.
+            given: one for each output.
+            wanted: one for each input; only inputs that are `on_request` heed it.
+            sums: by an input's number: memory to which its gradient is added, for inputs of `adds`.
+        """
+        like = tensors[0]
+        library = library_of(like.device.type)
+        kept: list[Tensor | None] = []  # alive until the kernel has run
+        for name, g, x in zip(self._given, given, outputs, strict=True):
+            if g is None and name in self._needed:
+                g = torch.zeros_like(x)
+            kept.append(None if g is None else g if g.is_contiguous() else g.contiguous())
+            slots[name] = address(kept[-1])
+        gradients: list[Tensor | None] = []
+        for i, (key, x) in enumerate(zip(self._grad, tensors, strict=True)):
+            if key is None:
+                gradients.append(None)
+                continue
+            if (key in self._on_request and not wanted[i]) or self._is_left_out(i, x):
+                gradients.append(None)
+                slots[key] = 0
+                continue
+            if sums is not None and i in sums:
+                gradient = sums[i]
+            else:
+                gradient = allocate("gradients", like, x.shape)
+                if key in self._zeroed:
+                    gradient.zero_()
+            gradients.append(gradient)
+            slots[key] = gradient.data_ptr()
+        if self._scratch is not None:
+            if library.needs_scratch:
+                shape = tuple([slots[x] if isinstance(x, str) else x for x in self._scratch])
+                kept.append(allocate("scratch space of gradients", like, shape).zero_())
+                slots["grad.scratch"] = address(kept[-1])
+            else:
+                slots["grad.scratch"] = 0
+        library.call(self.backward_kernel, slots, like)
+        return gradients
+
+    # ---- what follows from the declaration
+
+    def match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
+        """The sizes and numbers of a call; raises InputError unless everything is as declared."""
+        call = [*numbers, *[(x.shape, x.dtype, x.device) for x in tensors]]
+        last, slots = self._last
+        if call != last:  # a training step asks the same a thousand times
+            slots = self._match(tensors, numbers)
+            self._last = call, slots
+        return slots
+
+    def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
+        slots: Slots = dict(zip(self.numbers, numbers, strict=True))
+        there = [not self._is_left_out(i, x) for i, x in enumerate(tensors)]
+        if self._derive is not None:
+            given = {key: x for key, x, own in zip(self.inputs, tensors, there, strict=True) if own}
+            slots.update(self._derive(given, slots))
+        device = tensors[0].device
+        for (key, shape), x, dtype, own in zip(self.inputs.items(), tensors, self._dtypes, there, strict=True):
+            if not own:
+                continue
+            actual, expected = list(x.shape), list(shape)
+            if str(expected[:1]).startswith("['?"):  # a first size that may be left out
+                expected = expected[1:] if len(actual) < len(expected) else [str(expected[0])[1:], *expected[1:]]
+            good = len(actual) == len(expected)
+            for size, found in zip(expected, actual, strict=False):
+                good = good and found == (slots.setdefault(size, found) if isinstance(size, str) else size)
+            if not good:
+                known = [slots.get(size, size) if isinstance(size, str) else size for size in expected]
+                raise InputError(f"{self.name}: expected {key} of shape {known}, got {actual}")
+            if x.dtype != dtype or x.device != device:
+                raise InputError(f"{self.name}: expected {key} as {str(dtype).removeprefix('torch.')} on {device}, as "
+                                 f"{next(iter(self.inputs))} is, got {x.dtype} on {x.device}")  # fmt: skip
+        return slots
+
+    def _is_left_out(self, i: int, x: Tensor) -> bool:
+        """Whether an input stands for none."""
+        return i in self._optional and x.shape == _NOTHING
+
+    def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
+        """Outputs of the right shapes, for torch.compile."""
+        slots = self._match(tensors, numbers)
+        shapes = [[slots[x] if isinstance(x, str) else x for x in shape] for _, shape in self._out]
+        return [tensors[0].new_empty(shape) for shape in shapes]
+
+    def fake_backward(self, tensors: Tensors) -> Tensors:
+        """Gradients of the right shapes."""
+        return [x.new_empty(x.shape) for x in tensors]
+
+
+# Gradients that are seldom given, and whose kernels know that a null is zero.
+_MAY_BE_NULL = frozenset({"given.depths", "given.alpha"})
+_NOTHING = torch.Size([0])
+
+
+def address(x: Tensor | None) -> int:
+    """Of a tensor's first number; 0 for None. The tensor must live until the call that it is passed to returns."""
+    return 0 if x is None else x.data_ptr()
+
+
+def in_rows(tensors: Tensors) -> Tensors:
+    """The same values row by row in memory."""
+    return [x if x.is_contiguous() else x.contiguous() for x in tensors]
+
+
+def _shape(text: str) -> Shape:
+    return tuple(int(size) if size.isdigit() else size for size in text.split())
+
+
+def _apart(results: Tensors, inputs: Tensors) -> Tensors:
+    """Results none of which shares memory with an input or another: torch asks that of what it is told of."""
+    taken, apart = {x.untyped_storage().data_ptr() for x in inputs}, []
+    for x in results:
+        apart.append(x.clone() if x.untyped_storage().data_ptr() in taken else x)
+        taken.add(apart[-1].untyped_storage().data_ptr())
+    return apart
+
+
+def _register(operation: Operation) -> Callable[..., Any]:
+    """The operation as torch.ops.gsbench.NAME, which autograd and torch.compile know."""
+    name, numbers = operation.name, operation.numbers
+    declared = "".join(f", {_SCHEMA[kind]} {key}" for key, kind in numbers.items())
+    schema, count = f"(Tensor[] tensors{declared}) -> Tensor[]", len(numbers)
+
+    def forward(tensors: Tensors, *values: Any) -> Tensors:
+        return operation.forward(tensors, values)
+
+    def backward(tensors: Tensors, *rest: Any) -> Tensors:
+        values, (outputs, given, wanted) = rest[:count], rest[count:]
+        gradients = operation.backward(tensors, operation.prepare(tensors, values, outputs), outputs, given, wanted)
+        return _apart([torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)], given)
+
+    def keep(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
+        ctx.tensors = len(inputs[0])
+        ctx.wanted = [x.requires_grad for x in inputs[0]]
+        ctx.save_for_backward(*inputs[0], *output)
+        ctx.numbers = inputs[1:]
+
+    def gradient(ctx: Any, given: list[Tensor | None]) -> tuple[Any, ...]:
+        tensors, outputs = ctx.saved_tensors[: ctx.tensors], ctx.saved_tensors[ctx.tensors :]
+        dense = [torch.zeros_like(x) if g is None else g for g, x in zip(given, outputs, strict=True)]
+        gradients = backward_op(list(tensors), *ctx.numbers, list(outputs), dense, ctx.wanted)
+        wanted = [g if asked else None for g, asked in zip(gradients, ctx.wanted, strict=True)]
+        return wanted, *(None,) * count
+
+    forward_op = torch.library.custom_op(f"gsbench::{name}", forward, mutates_args=(), schema=schema)
+    backward_op = torch.library.custom_op(
+        f"gsbench::{name}_backward", backward, mutates_args=(),
+        schema=f"(Tensor[] tensors{declared}, Tensor[] outputs, Tensor[] given, bool[] wanted) -> Tensor[]",
+    )  # fmt: skip
+    forward_op.register_fake(lambda tensors, *values: operation.fake(tensors, values))
+    backward_op.register_fake(lambda tensors, *_: operation.fake_backward(tensors))
+    forward_op.register_autograd(gradient, setup_context=keep)
+    return forward_op

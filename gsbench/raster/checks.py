@@ -1,0 +1,69 @@
+"""Refuse what cannot be drawn, before anything is: shapes, types, devices and values."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+
+_last: list[object] = []  # what was found good last: a training asks the same a thousand times
+
+
+def check_arguments(
+    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, background: Tensor | None, near: float, far: float, eps2d: float,
+) -> None:  # fmt: skip
+    """Raise InputError unless everything is as `rasterize` says."""
+    global _last
+    sizes = width, height, near, far, eps2d
+    given = means, factors, opacities, colors, viewmats, Ks, background
+    call: list[object] = [*sizes, *[isinstance(x, Tensor) and (x.shape, x.dtype, x.device) for x in given]]
+    if call == _last:
+        return
+    tensors = {"means": means, "factors": factors, "opacities": opacities, "colors": colors,
+               "viewmats": viewmats, "Ks": Ks}  # fmt: skip
+    if background is not None:
+        tensors["background"] = background
+    for name, tensor in tensors.items():
+        if not isinstance(tensor, Tensor) or tensor.dim() == 0:
+            what = "one of shape []" if isinstance(tensor, Tensor) else type(tensor).__name__
+            raise InputError(f"{name}: expected a tensor of at least one dimension, got {what}")
+    N, C, D = len(means), len(viewmats), colors.shape[-1]
+    shapes = {"means": (N, 3), "factors": (N, 3, 3), "opacities": (N,), "viewmats": (C, 4, 4), "Ks": (C, 3, 3),
+              "colors": (N, D) if colors.dim() == 2 else (C, N, D), "background": (D,)}  # fmt: skip
+    for name, tensor in tensors.items():
+        if tuple(tensor.shape) != shapes[name]:
+            raise InputError(f"{name}: expected shape {list(shapes[name])}, got {list(tensor.shape)}")
+        if tensor.dtype != means.dtype or not tensor.is_floating_point():
+            raise InputError(f"{name}: expected {means.dtype} as means are (a float type), got {tensor.dtype}")
+        if tensor.device != means.device:
+            raise InputError(f"{name}: expected on {means.device} as means are, got {tensor.device}")
+    if D < 1 or C < 1:
+        raise InputError(f"colors, viewmats: expected at least one channel and one camera, got D={D}, C={C}")
+    if not all(isinstance(size, int) and size >= 1 for size in (width, height)):
+        raise InputError(f"expected a picture of at least 1x1 whole pixels, got width={width}, height={height}")
+    if not 0 < near < far or not 0 <= eps2d < math.inf:
+        raise InputError(f"expected 0 < near < far and eps2d >= 0, got near={near}, far={far}, eps2d={eps2d}")
+    _last = call
+
+
+def check_values(
+    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, background: Tensor,
+) -> None:  # fmt: skip
+    """Raise InputError unless every value is finite, opacities are in [0, 1] and focal lengths positive."""
+    tensors = {"means": means, "factors": factors, "opacities": opacities, "colors": colors,
+               "viewmats": viewmats, "Ks": Ks, "background": background}  # fmt: skip
+    for name, tensor in tensors.items():
+        # A sum is one pass; only when it is not finite is each value looked at (a finite sum hides no NaN).
+        if not torch.isfinite(tensor.detach().sum()) and not torch.isfinite(tensor).all():
+            row = int((~torch.isfinite(tensor)).flatten().nonzero()[0])
+            raise InputError(f"{name}: expected finite values, got {tensor.flatten()[row].item()} at flat index {row}")
+    low, high = opacities.detach().aminmax() if len(means) else (0, 0)
+    if low < 0 or high > 1:
+        raise InputError(f"opacities: expected values in [0, 1], got {low} to {high}")
+    if (Ks.detach()[:, [0, 1], [0, 1]] <= 0).any():
+        raise InputError("Ks: expected positive focal lengths at [0, 0] and [1, 1]")
+    rest = Ks.detach()[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
+    if (rest != rest.new_tensor([0.0, 0.0, 0.0, 0.0, 1.0])).any():
+        raise InputError("Ks: expected [fx 0 cx; 0 fy cy; 0 0 1]: skew is not drawn, undistort the images without it")

@@ -1,0 +1,24 @@
+"""What the rasterizer returns."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class RasterInfo:
+    """What the rasterizer knows beside the picture."""
+
+    radii: Tensor  # [C, N] int32, pixels: half the side of the square that holds every pixel drawn; 0: not drawn
+    means2d: Tensor  # [C, N, 2] pixels, in the autograd graph: its gradient drives densification
+    depths: Tensor  # [C, N] camera-space z of the means
+    pairs: int  # (tile, Gaussian) pairs blended
+
+
+@dataclass(frozen=True)
+class RasterOutput:
+    """A picture, how much of it is covered, and `RasterInfo`."""
+
+    image: Tensor  # [C, H, W, D]
+    alpha: Tensor  # [C, H, W, 1]
+    info: RasterInfo

@@ -1,0 +1,126 @@
+"""Compute the gradients of one training step: the views of a batch side by side, each on a tape of its own.
+
+Threads share the views, not the kernels: a batch has few views and each of them many small kernels. Every view's
+gradient is added in the order of the views, so that any number of threads gives the same bits.
+"""
+
+import functools
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from gsbench.errors import InputError, TooLargeError
+from gsbench.kernels.tape import Tape
+from gsbench.measure.speed import Stages
+from gsbench.models import GaussianModel, Query
+from gsbench.models.render import rasterize_slice
+from gsbench.scenes import View
+from gsbench.train.losses import photometric
+from gsbench.train.watch import DivergedError
+
+Sums = dict[int, Tensor]  # gradients by the id of what they are by
+
+
+class Seen(NamedTuple):
+    """What a step leaves of one view."""
+
+    loss: Tensor  # []
+    radii: Tensor  # [1, N] int32, pixels
+    g_means2d: Tensor  # [1, N, 2] of the batch's loss, by pixels
+
+
+class Step:
+    """Sees views and leaves the gradient of their mean loss in the model's parameters."""
+
+    def __init__(
+        self, model: GaussianModel, background: Tensor, ssim_weight: float, antialias: bool, stages: Stages
+    ) -> None:
+        """Train `model` before a background colour [3]; its time goes to `stages`."""
+        self.model = model
+        self.background = background
+        self.ssim_weight = ssim_weight
+        self.antialias = antialias
+        self.stages = stages
+
+    def __call__(self, views: Sequence[View]) -> list[Seen]:
+        """The loss is the mean over `views`.
+
+        Raises:
+            DivergedError: a slice is not finite.
+            TooLargeError: memory would not suffice.
+        """
+        sources = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
+        # Only the kernels' time is worth threads of Python's, and a GPU does one thing after the other anyway.
+        place = self.model.splats["means"]
+        on_cpu = place.device.type == "cpu" and self.model.backend.serves(place)
+        lanes = min(len(views), torch.get_num_threads()) if on_cpu else 1
+        total: Sums = {}
+        if lanes == 1:
+            seen = [self._see(view, sources, total, len(views), self.stages) for view in views]
+        else:
+            seen = self._side_by_side(views, sources, total, lanes)
+        with self.stages("backward"):
+            for parameter in sources:
+                parameter.grad = total.get(id(parameter))
+        return seen
+
+    def _side_by_side(self, views: Sequence[View], sources: list[nn.Parameter], total: Sums, lanes: int) -> list[Seen]:
+        """Deal the views to threads: those of the first lane go into `total`, each other into sums of its own."""
+        started = time.perf_counter()
+        bounds = [len(views) * lane // lanes for lane in range(lanes + 1)]
+        sums = [total if i < bounds[1] else {} for i in range(len(views))]
+        clocks = [Stages() for _ in range(lanes)]
+
+        def run(lane: int) -> list[Seen]:
+            return [self._see(views[i], sources, sums[i], len(views), clocks[lane])
+                    for i in range(bounds[lane], bounds[lane + 1])]  # fmt: skip
+
+        pool = _pool(lanes, max(1, torch.get_num_threads() // lanes))
+        seen = [one for part in pool.map(run, range(lanes)) for one in part]
+        for own in sums[bounds[1] :]:
+            for key, gradient in own.items():
+                if key in total:
+                    total[key] += gradient
+                else:
+                    total[key] = gradient
+        self.stages.share([clock.seconds for clock in clocks], time.perf_counter() - started)
+        return seen
+
+    def _see(self, view: View, sources: list[nn.Parameter], sums: Sums, views: int, stages: Stages) -> Seen:
+        """One view of a batch, whose gradients are added to `sums`."""
+        with Tape() as tape:
+            with stages("slice"):
+                gaussians = self.model.slice(Query.of(view.camera, view.time))
+            with stages("raster"):
+                try:
+                    output = rasterize_slice(
+                        gaussians, view.camera, self.background, self.model.backend, self.antialias
+                    )
+                except TooLargeError:
+                    raise
+                except InputError as error:  # the rasterizer's door is the first to see a slice that is not finite
+                    raise DivergedError(str(error)) from None
+            with stages("loss"):
+                loss = photometric(output.image, view.image[None], self.ssim_weight, self.model.backend)
+        with stages("backward"):
+            means2d = output.info.means2d
+            tape.backward(loss, torch.full_like(loss, 1 / views), [*sources, means2d], sums)
+            g_means2d = sums.pop(id(means2d), None)
+        if g_means2d is None:
+            g_means2d = torch.zeros_like(means2d)
+        return Seen(loss.detach() / views, output.info.radii, g_means2d)
+
+
+@functools.cache
+def _pool(lanes: int, threads: int) -> ThreadPoolExecutor:
+    """So many lanes, whose kernels and torch operations run on `threads` threads each."""
+    before = torch.get_num_threads()
+    pool = ThreadPoolExecutor(lanes, "gsbench-view", lambda: torch.set_num_threads(threads))
+    # A lane is started by each call that finds none idle, and setting its own number sets that of threads to come.
+    list(pool.map(lambda _: time.sleep(0.01), range(lanes)))
+    torch.set_num_threads(before)
+    return pool

@@ -1,0 +1,83 @@
+"""The declaration of operations: what is refused at the door, and that kernels name the same things."""
+
+import importlib
+import pkgutil
+
+import pytest
+import torch
+
+from gsbench import kernels
+from gsbench.errors import InputError
+from gsbench.kernels.library import library_of
+from gsbench.kernels.operation import Operation
+from gsbench.kernels.slices import observe_rotated, observe_still
+
+
+def declared() -> list[Operation]:
+    """Every operation of gsbench.kernels."""
+    modules = [importlib.import_module(f"gsbench.kernels.{m.name}") for m in pkgutil.iter_modules(kernels.__path__)
+               if not m.name.startswith("_") and m.name != "cuda"]  # fmt: skip
+    return [x for module in modules for x in vars(module).values() if isinstance(x, Operation)]
+
+
+@pytest.mark.parametrize("operation", declared(), ids=lambda operation: operation.name)
+def test_declaration_and_kernel_name_the_same(operation: Operation) -> None:
+    """Catches a field that a declaration has and the kernel's structure has not: it would be dropped in silence."""
+    library = library_of("cpu")
+    names = {*operation.inputs, *operation.numbers} - {"with_gradient"}  # which is said by a null
+    for name in names - {"networks"} if operation.inputs else ():
+        assert library.takes(operation.name, name) or library.takes(operation.name, f"out.{name}"), name
+    for name in operation.outputs:
+        assert library.takes(operation.name, f"out.{name}"), name
+    if operation.name == "l1_ssim":
+        return  # its gradient comes with its value
+    for name, own in zip(operation.inputs, operation.differentiable([]) if operation.inputs else (), strict=True):
+        assert library.takes(f"{operation.name}_backward", f"grad.{name}") == own, name
+
+
+def test_every_kernel_is_declared() -> None:
+    """Catches a kernel that no operation calls any more."""
+    called = {operation.name for operation in declared()}
+    others = {"adam", "flag_values", "count_tiles", "fill_tiles"}  # without a gradient
+    assert {name.removesuffix("_backward") for name in kernels.native().SIGNATURES} == called | others
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ((torch.zeros(4, 3), torch.zeros(5, 4), torch.zeros(4)), r"expected quats of shape \[4, 4\], got \[5, 4\]"),
+        ((torch.zeros(4, 3), torch.zeros(4, 4), torch.zeros(4, 1)), r"expected opacities of shape \[4\], got \[4, 1\]"),
+        ((torch.zeros(4, 3), torch.zeros(4, 4).double(), torch.zeros(4)), "expected quats as float32"),
+        ((torch.zeros(4, 3).long(), torch.zeros(4, 4), torch.zeros(4)), "expected scales as float32"),
+    ],
+)
+def test_what_does_not_fit_is_refused(given: tuple[torch.Tensor, ...], said: str) -> None:
+    """Catches arrays that a kernel would read past their end."""
+    with pytest.raises(InputError, match=said):
+        observe_still(*given)
+
+
+def test_columns_are_put_in_rows() -> None:
+    """Catches a kernel that is given the address of a transposed tensor."""
+    g = torch.Generator().manual_seed(0)
+    scales, quats, opacities = (torch.randn(n, 4, generator=g) for n in (3, 4, 1))
+    columns = observe_still(scales.mT, quats.mT, opacities[0])
+    rows = observe_still(scales.mT.contiguous(), quats.mT.contiguous(), opacities[0])
+    assert all(torch.equal(a, b) for a, b in zip(columns, rows, strict=True))
+
+
+def test_no_gradient_is_promised_where_there_is_none() -> None:
+    """Catches a gradient by time that would be zero without a word."""
+    x = torch.zeros(2, 4)
+    with pytest.raises(InputError, match="observe_rotated has no gradient by time"):
+        observe_rotated(x[:, :3], x[:, :1], x, x + 1, x + 1, x[:, 0], torch.ones(()),
+                        torch.zeros((), requires_grad=True), torch.zeros(()))  # fmt: skip
+
+
+def test_the_extension_counts_and_types_its_values() -> None:
+    """Catches a call that shifts every field by one: the last door looks at number and kind."""
+    native = kernels.native()
+    with pytest.raises(TypeError, match="expected 7 values"):
+        native.observe_still(1, 2, 3)
+    with pytest.raises(TypeError):
+        native.observe_still(0, "means", 0, 0, 1, 0, 0)

@@ -1,0 +1,126 @@
+"""A tape's gradients against autograd's: the same bits, where operations are chained and where torch is in between."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchmarks.scene import camera, model
+from gsbench.backends import CPU
+from gsbench.kernels.colors import show_colors
+from gsbench.kernels.loss import l1_ssim
+from gsbench.kernels.slices import observe_still
+from gsbench.kernels.tape import Tape
+from gsbench.measure.speed import Stages
+from gsbench.models import GaussianModel, Query
+from gsbench.models.render import rasterize_slice
+from gsbench.scenes.scene import Camera, View
+from gsbench.train.step import Step
+
+BACKGROUND = torch.tensor([0.1, 0.5, 0.9])
+
+
+def views(count: int, size: int = 40) -> list[View]:
+    """The benchmark's camera at a few distances and times, before random images."""
+    viewmats, Ks = camera(size)
+    g, made = torch.Generator().manual_seed(0), []
+    for i in range(count):
+        viewmat = viewmats[0].clone()
+        viewmat[2, 3] += 0.3 * i
+        made.append(View(str(i), Camera(viewmat, Ks[0], size, size - 3), 0.1 + 0.2 * i,
+                         torch.rand(size - 3, size, 3, generator=g)))  # fmt: skip
+    return made
+
+
+def fitted(name: str, N: int = 300, *, agr: bool = False) -> GaussianModel:
+    """A model all of whose parts learn."""
+    made = model(name, N, agr=agr, backend=CPU)
+    with torch.no_grad():
+        for parameter in made.refinement.parameters() if made.refinement is not None else ():
+            parameter.add_(0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
+    made.set_stage(replace(made.stage, tune_modulation=True))
+    return made
+
+
+def gradients(made: GaussianModel) -> dict[str, Tensor]:
+    found = {name: p.grad for name, p in made.named_parameters() if p.grad is not None}
+    made.zero_grad(set_to_none=True)
+    return found
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize(("name", "agr"), [("3dgs", False), ("4dgs", False), ("6dgs", False), ("7dgs", False),
+                                           ("7dgs", True), ("4dgs", True)])  # fmt: skip
+def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool) -> None:
+    """Catches an operation left out of the chain, a gradient given twice, or to another tensor."""
+    made, batch = fitted(name, agr=agr), views(3)
+    expected: dict[str, Tensor] = {}
+    for view in batch:
+        seen = made.slice(Query.of(view.camera, view.time))
+        output = rasterize_slice(seen, view.camera, BACKGROUND, CPU)
+        output.info.means2d.retain_grad()
+        (l1_ssim(output.image[0], view.image, 0.2) / 3).backward()
+        for key, gradient in gradients(made).items():
+            expected[key] = gradient if key not in expected else expected[key] + gradient
+    torch.set_num_threads(1)
+    seen_by_step = Step(made, BACKGROUND, 0.2, False, Stages())(batch)
+    actual = gradients(made)
+    assert actual.keys() == expected.keys()
+    for key, gradient in expected.items():
+        assert torch.equal(actual[key], gradient), key
+        assert gradient.any(), key
+    assert output.info.means2d.grad is not None
+    assert torch.equal(seen_by_step[-1].g_means2d, output.info.means2d.grad)
+
+
+@pytest.mark.usefixtures("threads", "instruction_set")
+@pytest.mark.parametrize("name", ["4dgs", "7dgs"])
+def test_the_same_bits_for_any_number_of_threads(name: str) -> None:
+    """Catches views whose gradients are added in the order that threads come by."""
+    made, batch = fitted(name, agr=True), views(5)
+    found = []
+    for count in (1, 2, 3, 8):
+        torch.set_num_threads(count)
+        seen = Step(made, BACKGROUND, 0.2, False, Stages())(batch)
+        found.append((gradients(made), torch.stack([one.loss for one in seen]), [one.g_means2d for one in seen]))
+        assert torch.get_num_threads() == count
+    for other in found[1:]:
+        assert all(torch.equal(x, other[0][key]) for key, x in found[0][0].items())
+        assert torch.equal(other[1], found[0][1])
+        assert all(torch.equal(a, b) for a, b in zip(other[2], found[0][2], strict=True))
+
+
+def test_what_torch_does_in_between_is_differentiated_too() -> None:
+    """Catches a gradient lost where a tensor of autograd's graph enters an operation, or an operation's enters one."""
+    g = torch.Generator().manual_seed(3)
+    scales, quats = torch.randn(20, 3, generator=g).requires_grad_(), torch.randn(20, 4, generator=g).requires_grad_()
+    opacities, means = torch.randn(20, generator=g).requires_grad_(), torch.randn(20, 3, generator=g).requires_grad_()
+    sh0, shN = torch.randn(20, 1, 3, generator=g).requires_grad_(), torch.randn(20, 15, 3, generator=g).requires_grad_()
+    leaves = [scales, quats, opacities, means, sh0, shN]
+
+    def loss() -> Tensor:
+        factors, faded = observe_still(2 * scales, quats, opacities)  # torch before an operation
+        moved = means + (factors @ factors.mT).sum(-1) * faded[:, None]  # and after it
+        colors = show_colors(sh0, shN, moved, faded, torch.zeros(3), 3)
+        again = show_colors(sh0, shN, 3 * moved + 1, faded, torch.zeros(3), 3)  # coefficients that are read twice
+        return (colors * again.square()).sum() + means.square().sum()
+
+    expected = torch.autograd.grad(loss(), leaves)
+    with Tape() as tape:
+        value = loss()
+    sums = {id(sh0): torch.ones_like(sh0)}  # another view's
+    tape.backward(value, torch.ones(()), leaves, sums)
+    sums[id(sh0)] -= 1
+    for x, gradient in zip(leaves, expected, strict=True):
+        torch.testing.assert_close(sums[id(x)], gradient, rtol=1e-5, atol=1e-5)
+
+
+def test_nothing_is_noted_where_nothing_is_wanted() -> None:
+    """Catches a tape that keeps every tensor of a rendering."""
+    with Tape() as tape, torch.no_grad():
+        observe_still(torch.zeros(2, 3, requires_grad=True), torch.ones(2, 4), torch.zeros(2))
+    assert not tape._notes
+    with Tape() as tape:
+        observe_still(torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2))
+    assert not tape._notes
