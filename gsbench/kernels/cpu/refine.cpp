@@ -1,10 +1,11 @@
 // AGR (7DGS, section 4.3): four perceptrons of two layers move every Gaussian, a block of Gaussians at a time.
 //
 // Gaussians lie along the vectors, so each layer is a product of a small matrix with a tall one that stays in cache:
-// hidden layers are never written to memory, and backward computes them again.
+// hidden layers are never written to memory, and backward computes them again. Backward packs the Gaussians that have a
+// gradient into blocks: many are not seen in a view.
 #include "buffer.h"
 #include "isa.h"
-#include "rows.h"
+#include "simd.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
@@ -13,46 +14,61 @@ namespace {
 constexpr int BLOCK = 128;             // Gaussians
 constexpr int64_t CHUNK = 32 * BLOCK;  // a task; the weights' gradients are summed by chunks
 constexpr int HIDDEN = 64;
+// Tiles of `product` and `outer`: as many sums as registers hold.
 #if defined(__AVX512F__)
-constexpr int TILE_ROWS = 8, TILE_VECS = 2;  // as many sums as registers hold
+constexpr int TILE_ROWS = 8, TILE_SUMS = 16, OUTER_ROWS = 4;
 #else
-constexpr int TILE_ROWS = 4, TILE_VECS = 1;
+constexpr int TILE_ROWS = 4, TILE_SUMS = 4, OUTER_ROWS = 1;
 #endif
 
-// out = (bias | 0 | out) + W X for R rows of W and V vectors of Gaussians. Rows of X and out are BLOCK apart.
-template <int R, int V>
-GSB_HD inline void product_tile(const float* W, int stride, const float* bias, bool add, const float* X, int inner,
-                                float* out) {
+// out = finish((bias | 0 | out) + W X, place) at `at` and on, for R rows of W and V vectors of Gaussians. Rows of X and
+// out are BLOCK apart.
+template <int R, int V, class Finish>
+GSB_HD inline void product_tile(const float* W, int inner, const float* bias, bool add, const float* X, float* out,
+                                int at, Finish finish) {
     Vec sums[R][V];
     GSB_UNROLL for (int r = 0; r < R; ++r) {
         GSB_UNROLL for (int v = 0; v < V; ++v) {
-            sums[r][v] = add ? Vec::load(out + r * BLOCK + v * LANES) : Vec(bias ? bias[r] : 0.0f);
+            sums[r][v] = add ? Vec::load(out + at + r * BLOCK + v * LANES) : Vec(bias ? bias[r] : 0.0f);
         }
     }
     for (int k = 0; k < inner; ++k) {
         Vec x[V];
         GSB_UNROLL for (int v = 0; v < V; ++v) x[v] = Vec::load(X + k * BLOCK + v * LANES);
         GSB_UNROLL for (int r = 0; r < R; ++r) {
-            const Vec w(W[r * stride + k]);
+            const Vec w(W[r * inner + k]);
             GSB_UNROLL for (int v = 0; v < V; ++v) sums[r][v] += x[v] * w;
         }
     }
     GSB_UNROLL for (int r = 0; r < R; ++r) {
-        GSB_UNROLL for (int v = 0; v < V; ++v) sums[r][v].store(out + r * BLOCK + v * LANES);
+        GSB_UNROLL for (int v = 0; v < V; ++v) {
+            const int place = at + r * BLOCK + v * LANES;
+            finish(sums[r][v], place).store(out + place);
+        }
     }
 }
 
-void product(const float* W, int rows, int inner, const float* bias, bool add, const float* X, float* out) {
-    for (int v = 0; v < BLOCK; v += TILE_VECS * LANES) {
-        const int whole = rows / TILE_ROWS * TILE_ROWS;
-        for (int r = 0; r < whole; r += TILE_ROWS) {
-            product_tile<TILE_ROWS, TILE_VECS>(W + r * inner, inner, bias ? bias + r : nullptr, add, X + v, inner,
-                                               out + r * BLOCK + v);
+// The vectors of Gaussians in a tile of R rows, a power of two.
+constexpr int vectors_beside(int R) {
+    int V = 1;
+    while (2 * V * R <= TILE_SUMS && 2 * V * LANES <= BLOCK) V *= 2;
+    return V;
+}
+
+// Rows of W [rows, inner] from `first` on. Those left over from whole tiles are a tile of their own, of more Gaussians:
+// a sum waits for the one before it, and meanwhile the others go on.
+template <int R = TILE_ROWS, class Finish>
+void product(const float* W, int rows, int inner, const float* bias, bool add, const float* X, float* out,
+             Finish finish, int first = 0) {
+    constexpr int V = vectors_beside(R);
+    for (; first + R <= rows; first += R) {
+        for (int v = 0; v < BLOCK; v += V * LANES) {
+            product_tile<R, V>(W + first * inner, inner, bias ? bias + first : nullptr, add, X + v, out,
+                               first * BLOCK + v, finish);
         }
-        for (int r = whole; r < rows; ++r) {
-            product_tile<1, TILE_VECS>(W + r * inner, inner, bias ? bias + r : nullptr, add, X + v, inner,
-                                       out + r * BLOCK + v);
-        }
+    }
+    if constexpr (R > 1) {
+        if (first < rows) product<R - 1>(W, rows, inner, bias, add, X, out, finish, first);
     }
 }
 
@@ -78,18 +94,16 @@ GSB_HD inline void outer_tile(const float* A, const float* B, int stride, float*
     }
 }
 
-// `columns` is a multiple of four.
-void outer(const float* A, int rows, const float* B, int columns, float* out) {
-    const int whole = rows / 4 * 4;
-    for (int r = 0; r < whole; r += 4) {
+// `columns` is a multiple of four. Rows of out are `stride` apart.
+template <int R = OUTER_ROWS>
+void outer(const float* A, int rows, const float* B, int columns, float* out, int stride, int first = 0) {
+    for (; first + R <= rows; first += R) {
         for (int c = 0; c < columns; c += 4) {
-            outer_tile<4>(A + r * BLOCK, B + c * BLOCK, columns, out + r * columns + c);
+            outer_tile<R>(A + first * BLOCK, B + c * BLOCK, stride, out + first * stride + c);
         }
     }
-    for (int r = whole; r < rows; ++r) {
-        for (int c = 0; c < columns; c += 4) {
-            outer_tile<1>(A + r * BLOCK, B + c * BLOCK, columns, out + r * columns + c);
-        }
+    if constexpr (R > 1) {
+        if (first < rows) outer<R - 1>(A, rows, B, columns, out, stride, first);
     }
 }
 
@@ -107,53 +121,65 @@ void transpose(const float* A, int rows, int columns, float* out) {
     }
 }
 
-// Rows [first, first + BLOCK) of an array [N, width] as `width` rows of the block; zero past the end.
-void load_block(const float* rows, int64_t first, int64_t N, int width, float* out) {
-    for (int v = 0; v < BLOCK; v += LANES) {
-        const int64_t i = first + v;
-        const int n = i >= N ? 0 : lanes_from(i, N);
-        for (int k = 0; k < width; ++k) {
-            (n ? gather(rows + i * width + k, width, n) : Vec(0.0f)).store(out + k * BLOCK + v);
-        }
+// Up to BLOCK Gaussians: those `rows` after `first`.
+struct Block {
+    int64_t first;
+    const int32_t* rows;
+    int count;
+};
+
+// The block's rows of an array [N, width] as `width` rows of BLOCK; zero past the block's end.
+void load_block(const Block& block, const float* array, int width, float* out) {
+    for (int i = 0; i < block.count; ++i) {
+        const float* row = array + (block.first + block.rows[i]) * width;
+        for (int k = 0; k < width; ++k) out[k * BLOCK + i] = row[k];
+    }
+    for (int k = 0; k < width; ++k) {
+        for (int i = block.count; i < BLOCK; ++i) out[k * BLOCK + i] = 0.0f;
     }
 }
 
-// The block's `width` rows, added to those of `base` [N, width] unless that is null.
-void store_block(const float* block, const float* base, int64_t first, int64_t N, int width, float* rows) {
-    for (int v = 0; v < BLOCK && first + v < N; v += LANES) {
-        const int64_t i = first + v;
-        const int n = lanes_from(i, N);
-        for (int k = 0; k < width; ++k) {
-            const Vec x = Vec::load(block + k * BLOCK + v);
-            const int64_t at = i * width + k;
-            scatter(base ? x + gather(base + at, width, n) : x, rows + at, width, n);
-        }
+// What load_block reads, plus the `width` rows at `moved`, to another array. Both go number by number: rows are so short
+// that gathers and scatters take longer.
+void store_block(const Block& block, const float* moved, const float* array, int width, float* out) {
+    for (int i = 0; i < block.count; ++i) {
+        const int64_t at = (block.first + block.rows[i]) * width;
+        for (int k = 0; k < width; ++k) out[at + k] = array[at + k] + moved[k * BLOCK + i];
     }
 }
 
-// The first `arrays` of several as rows of the block, one array below the other.
-void load_blocks(const RefineArgs& a, const float* const* arrays, int count, int64_t first, float* out) {
+// The first `count` of several arrays as rows of the block, one array below the other.
+void load_blocks(const RefineArgs& a, const Block& block, const float* const* arrays, int count, float* out) {
     for (int i = 0; i < count; ++i) {
-        load_block(arrays[i], first, a.N, a.value_widths[i], out);
+        load_block(block, arrays[i], a.value_widths[i], out);
         out += a.value_widths[i] * BLOCK;
     }
 }
 
+// What load_blocks reads, plus `moved`, to other arrays.
+void store_blocks(const RefineArgs& a, const Block& block, const float* moved, const float* const* arrays, int count,
+                  float* const* out) {
+    for (int i = 0; i < count; ++i) {
+        store_block(block, moved, arrays[i], a.value_widths[i], out[i]);
+        moved += a.value_widths[i] * BLOCK;
+    }
+}
+
+constexpr auto as_it_is = [](Vec x, int) { return x; };
+
 void hidden_layer(const RefineArgs& a, int network, const float* X, float* H) {
-    product(a.weight_in + network * HIDDEN * a.features_width, HIDDEN, a.features_width,
-            a.bias_in + network * HIDDEN, false, X, H);
-    for (int k = 0; k < HIDDEN * BLOCK; k += LANES) max(Vec::load(H + k), Vec(0.0f)).store(H + k);
+    product(a.weight_in + network * HIDDEN * a.features, HIDDEN, a.features, a.bias_in + network * HIDDEN,
+            false, X, H, [](Vec x, int) { return max(x, Vec(0.0f)); });
 }
 
 // How many floats the gradients of all weights are, and where each part begins.
 struct WeightLayout {
     int weight_in, bias_in, weight_out, bias_out, size;
 
-    // Columns of weight_in's gradient are padded to a multiple of four.
     explicit WeightLayout(const RefineArgs& a) {
         const int rows = a.networks * HIDDEN;
-        weight_in = 0;
-        bias_in = weight_in + a.features_width * rows;  // kept transposed: [features][rows]
+        weight_in = 0;  // kept transposed: [features][rows]
+        bias_in = weight_in + a.features * rows;
         weight_out = bias_in + rows;
         bias_out = weight_out + a.outputs * HIDDEN;
         size = bias_out + a.outputs;
@@ -164,91 +190,116 @@ struct Scratch {
     float *X, *g_X, *H, *g_H, *G;
 
     static size_t size(const RefineArgs& a) {
-        return static_cast<size_t>(2 * a.features_width + 2 * HIDDEN + a.outputs) * BLOCK;
+        return static_cast<size_t>(2 * a.features + 1 + 2 * HIDDEN + a.outputs) * BLOCK;
     }
     Scratch(const RefineArgs& a, float* memory) {
         X = memory;
-        g_X = X + a.features_width * BLOCK;
-        H = g_X + a.features_width * BLOCK;
+        g_X = X + (a.features + 1) * BLOCK;
+        H = g_X + a.features * BLOCK;
         g_H = H + HIDDEN * BLOCK;
         G = g_H + HIDDEN * BLOCK;
     }
 };
 
-void backward_block(const RefineArgs& a, const WeightLayout& layout, const float* weight_in_T,
-                    const float* weight_out_T, int64_t first, const float* const* grads, float* const* g_features,
-                    float* g_weights, const Scratch& s) {
-    load_blocks(a, a.values, a.networks - 1, first, s.X);
-    load_blocks(a, grads, a.arrays, first, s.G);
+void backward_block(const RefineArgs& a, const Block& block, const WeightLayout& layout, const float* weight_in_T,
+                    const float* weight_out_T, const float* const* grads, float* const* g_features, float* g_weights,
+                    const Scratch& s) {
+    load_blocks(a, block, a.values, a.networks - 1, s.X);
+    // A last feature that is one: what its weights would be is the bias, whose gradient follows weight_in's.
+    for (int v = 0; v < BLOCK; v += LANES) Vec(1.0f).store(s.X + a.features * BLOCK + v);
+    load_blocks(a, block, grads, a.arrays, s.G);
     int output = 0;
     for (int network = 0; network < a.networks; ++network) {
         const int width = a.widths[network];
         const float* G = s.G + output * BLOCK;
         hidden_layer(a, network, s.X, s.H);
-        outer(G, width, s.H, HIDDEN, g_weights + layout.weight_out + output * HIDDEN);
-        product(weight_out_T + output * HIDDEN, HIDDEN, width, nullptr, false, G, s.g_H);
-        for (int k = 0; k < HIDDEN * BLOCK; k += LANES) {
-            select(Vec::load(s.H + k) > Vec(0.0f), Vec::load(s.g_H + k), Vec(0.0f)).store(s.g_H + k);
-        }
-        for (int f = 0; f < a.features_width; ++f) {
-            outer(s.X + f * BLOCK, 1, s.g_H, HIDDEN,
-                  g_weights + layout.weight_in + (f * a.networks + network) * HIDDEN);
-        }
-        add_row_sums(s.g_H, HIDDEN, g_weights + layout.bias_in + network * HIDDEN);
-        product(weight_in_T + network * HIDDEN * a.features_width, a.features_width, HIDDEN, nullptr, network > 0, s.g_H,
-                s.g_X);
+        outer(G, width, s.H, HIDDEN, g_weights + layout.weight_out + output * HIDDEN, HIDDEN);
+        product(weight_out_T + output * HIDDEN, HIDDEN, width, nullptr, false, G, s.g_H,
+                [&](Vec x, int at) { return select(Vec::load(s.H + at) > Vec(0.0f), x, Vec(0.0f)); });
+        outer(s.X, a.features + 1, s.g_H, HIDDEN, g_weights + layout.weight_in + network * HIDDEN,
+              a.networks * HIDDEN);
+        product(weight_in_T + network * HIDDEN * a.features, a.features, HIDDEN, nullptr, network > 0,
+                s.g_H, s.g_X, as_it_is);
         output += width;
     }
     add_row_sums(s.G, a.outputs, g_weights + layout.bias_out);
-    const float* g_X = s.g_X;
-    for (int i = 0; i < a.networks - 1; ++i) {
-        store_block(g_X, grads[i], first, a.N, a.value_widths[i], g_features[i]);
-        g_X += a.value_widths[i] * BLOCK;
+    store_blocks(a, block, s.g_X, grads, a.networks - 1, g_features);
+}
+
+bool has_gradient(const RefineArgs& a, const float* const* grads, int64_t i) {
+    for (int k = 0; k < a.arrays; ++k) {
+        const float* row = grads[k] + i * a.value_widths[k];
+        for (int c = 0; c < a.value_widths[k]; ++c) {
+            if (row[c] != 0.0f) return true;
+        }
     }
+    return false;
+}
+
+// Writes the rows of [first, last) that have a gradient, less `first`, and returns their number; the features' gradient
+// of the others is zero.
+int rows_with_gradient(const RefineArgs& a, const float* const* grads, int64_t first, int64_t last,
+                       float* const* g_features, int32_t* rows) {
+    int count = 0;
+    for (int64_t i = first; i < last; ++i) {
+        if (has_gradient(a, grads, i)) {
+            rows[count++] = static_cast<int32_t>(i - first);
+        } else {
+            for (int k = 0; k < a.networks - 1; ++k) {
+                const int width = a.value_widths[k];
+                for (int c = 0; c < width; ++c) g_features[k][i * width + c] = 0.0f;
+            }
+        }
+    }
+    return count;
 }
 
 }  // namespace
 
-void refine(const RefineArgs& a, float* const* out) {
+void refine(const RefineArgs& a, const Refined& out) {
     const size_t scratch_size = Scratch::size(a);
     Buffer<float> scratch(scratch_size * static_cast<size_t>(a.threads));
+    int32_t rows[BLOCK];
+    for (int i = 0; i < BLOCK; ++i) rows[i] = i;
 #pragma omp parallel for num_threads(a.threads) schedule(dynamic, 8) if (a.N > CHUNK)
     for (int64_t first = 0; first < a.N; first += BLOCK) {
         const Scratch s(a, scratch.data() + scratch_size * static_cast<size_t>(thread_index()));
-        load_blocks(a, a.values, a.networks - 1, first, s.X);
+        const Block block{first, rows, static_cast<int>(a.N - first < BLOCK ? a.N - first : BLOCK)};
+        load_blocks(a, block, a.values, a.networks - 1, s.X);
         int output = 0;
         for (int network = 0; network < a.networks; ++network) {
             hidden_layer(a, network, s.X, s.H);
             product(a.weight_out + output * HIDDEN, a.widths[network], HIDDEN, a.bias_out + output, false, s.H,
-                    s.G + output * BLOCK);
+                    s.G + output * BLOCK, as_it_is);
             output += a.widths[network];
         }
-        const float* G = s.G;
-        for (int i = 0; i < a.arrays; ++i) {
-            store_block(G, a.values[i], first, a.N, a.value_widths[i], out[i]);
-            G += a.value_widths[i] * BLOCK;
-        }
+        store_blocks(a, block, s.G, a.values, a.arrays, out.values);
     }
 }
 
-void refine_backward(const RefineArgs& a, const float* const* grads, const RefineGrads& out) {
+void refine_backward(const RefineArgs& a, const RefinedGrads& grads, const RefineGrads& out) {
     const WeightLayout layout(a);
-    const size_t rows = static_cast<size_t>(a.networks) * HIDDEN, width = static_cast<size_t>(a.features_width);
+    const size_t rows = static_cast<size_t>(a.networks) * HIDDEN, width = static_cast<size_t>(a.features);
     Buffer<float> weight_in_T(rows * width), weight_out_T(static_cast<size_t>(a.outputs) * HIDDEN);
     for (int network = 0, output = 0; network < a.networks; output += a.widths[network++]) {
-        transpose(a.weight_in + network * HIDDEN * a.features_width, HIDDEN, a.features_width,
-                  weight_in_T.data() + network * HIDDEN * a.features_width);
+        transpose(a.weight_in + network * HIDDEN * a.features, HIDDEN, a.features,
+                  weight_in_T.data() + network * HIDDEN * a.features);
         transpose(a.weight_out + output * HIDDEN, a.widths[network], HIDDEN, weight_out_T.data() + output * HIDDEN);
     }
     const int64_t chunks = (a.N + CHUNK - 1) / CHUNK;
     const size_t scratch_size = Scratch::size(a), weights = static_cast<size_t>(layout.size);
-    Buffer<float> scratch(scratch_size * static_cast<size_t>(a.threads)), partial(weights * static_cast<size_t>(chunks));
+    Buffer<float> scratch(scratch_size * static_cast<size_t>(a.threads));
+    Buffer<float> partial(weights * static_cast<size_t>(chunks));
     partial.zero();
 #pragma omp parallel for num_threads(a.threads) schedule(dynamic, 1) if (chunks > 1)
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
         const Scratch s(a, scratch.data() + scratch_size * static_cast<size_t>(thread_index()));
-        for (int64_t first = chunk * CHUNK; first < (chunk + 1) * CHUNK && first < a.N; first += BLOCK) {
-            backward_block(a, layout, weight_in_T.data(), weight_out_T.data(), first, grads, out.features,
+        int32_t packed[CHUNK];
+        const int64_t first = chunk * CHUNK, last = first + CHUNK < a.N ? first + CHUNK : a.N;
+        const int count = rows_with_gradient(a, grads.values, first, last, out.values, packed);
+        for (int i = 0; i < count; i += BLOCK) {
+            const Block block{first, packed + i, count - i < BLOCK ? count - i : BLOCK};
+            backward_block(a, block, layout, weight_in_T.data(), weight_out_T.data(), grads.values, out.values,
                            partial.data() + weights * static_cast<size_t>(chunk), s);
         }
     }
@@ -257,7 +308,7 @@ void refine_backward(const RefineArgs& a, const float* const* grads, const Refin
     for (size_t chunk = 0; chunk < static_cast<size_t>(chunks); ++chunk) {
         for (size_t k = 0; k < weights; ++k) total[k] += partial[chunk * weights + k];
     }
-    transpose(total.data() + layout.weight_in, a.features_width, static_cast<int>(rows), out.weight_in);
+    transpose(total.data() + layout.weight_in, a.features, static_cast<int>(rows), out.weight_in);
     __builtin_memcpy(out.bias_in, total.data() + layout.bias_in, rows * sizeof(float));
     __builtin_memcpy(out.weight_out, total.data() + layout.weight_out,
                      static_cast<size_t>(a.outputs) * HIDDEN * sizeof(float));

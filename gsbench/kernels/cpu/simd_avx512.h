@@ -62,6 +62,13 @@ GSB_HD inline void split(Vec x, Vec& mantissa, Vec& exponent) {
     exponent = _mm512_getexp_ps((x / mantissa).v);
 }
 
+// p[by] .. p[by + 15] of an aligned p, |by| < 16, from aligned loads: one that crosses cache lines counts twice.
+template <int by>
+GSB_HD inline Vec load_beside(const float* p) {
+    const __m512i low = _mm512_load_si512(by < 0 ? p - LANES : p), high = _mm512_load_si512(by < 0 ? p : p + LANES);
+    return _mm512_castsi512_ps(_mm512_alignr_epi32(high, low, by < 0 ? by + LANES : by));
+}
+
 GSB_HD inline __mmask16 first(int n) { return static_cast<__mmask16>((1u << n) - 1); }
 
 // Floats at(0) .. at(15) as one register: the gathers and scatters of AVX-512 take twice as long as moving each float

@@ -204,6 +204,12 @@ GSB_HD inline void transpose(Vec (&x)[LANES]) {
     for (int k = 0; k < LANES; ++k) x[k] = Vec::gather(rows[0] + k, LANES);
 }
 
+// p[by] .. p[by + 15] of an aligned p, |by| < 16.
+template <int by>
+GSB_HD inline Vec load_beside(const float* p) {
+    return Vec::load(p + by);
+}
+
 // The first n floats of p, zero in the other lanes.
 GSB_HD inline Vec load_some(const float* p, int n) { return n == LANES ? Vec::load(p) : gather(p, 1, n); }
 

@@ -1,8 +1,8 @@
 // The training loss (1 - w) L1 + w (1 - SSIM) and its gradient in one pass over the rows of two pictures.
 //
-// A row of pixels is filtered along x when it is read, and along y when the eleven rows about it have been; the
-// derivatives of SSIM go through the same filter once more on their way to the gradient. Only the last eleven rows of
-// each are kept, so everything stays in cache.
+// A row of pixels is filtered along x when it is read, and along y, four rows at a time, when the rows about them have
+// been; the derivatives of SSIM go through the same filter once more on their way to the gradient. Only the last few
+// rows of each are kept, so everything stays in cache.
 #include "../math/similarity.h"
 
 #include "buffer.h"
@@ -15,154 +15,210 @@ namespace {
 
 constexpr int CHANNELS = 3;
 constexpr int MARGIN = 16;  // zeros on either side of a row: SSIM_RADIUS pixels of three channels, in whole vectors
-constexpr int MOMENTS = 5, DERIVATIVES = 3;
-static_assert(MARGIN >= SSIM_RADIUS * CHANNELS && MARGIN % LANES == 0);
+constexpr int MOMENTS = 4;  // of a, b, a^2 + b^2 and a b: SSIM needs no more of the squares than their sum
+constexpr int DERIVATIVES = 3;
+#if defined(__AVX2__)
+constexpr int GROUP = 4;  // rows filtered along y at once: they share most of the rows that they read
+#else
+constexpr int GROUP = 1;  // too few registers to keep those in
+#endif
+constexpr int SPAN = GROUP + SSIM_WINDOW - 1;  // rows that a group reads
+constexpr int KEPT = SPAN + GROUP - 1;         // the last of them may come with others, which the next group reads
+constexpr int PADDED = GROUP * DERIVATIVES > MOMENTS ? GROUP * DERIVATIVES : MOMENTS;
+static_assert(MARGIN == LANES && MARGIN >= SSIM_RADIUS * CHANNELS);
 
 struct Window {
-    float weight[SSIM_WINDOW];
+    float weight[SSIM_RADIUS + 1];  // by the distance from the middle
 
     Window() {
-        double total = 0.0, w[SSIM_WINDOW];
-        for (int i = 0; i < SSIM_WINDOW; ++i) {
-            const double x = i - SSIM_RADIUS;
-            total += w[i] = ::exp(-x * x / (2.0 * SSIM_SIGMA * SSIM_SIGMA));
+        double total = 0.0, w[SSIM_RADIUS + 1];
+        for (int i = 0; i <= SSIM_RADIUS; ++i) {
+            w[i] = ::exp(-i * i / (2.0 * SSIM_SIGMA * SSIM_SIGMA));
+            total += i ? 2.0 * w[i] : w[i];
         }
-        for (int i = 0; i < SSIM_WINDOW; ++i) weight[i] = static_cast<float>(w[i] / total);
+        for (int i = 0; i <= SSIM_RADIUS; ++i) weight[i] = static_cast<float>(w[i] / total);
     }
 };
 
-// The last eleven rows of `planes` filtered quantities.
+// The last rows of `planes` filtered quantities, and a row of zeros for all rows outside of the picture.
 struct Ring {
-    int planes, stride;
+    int planes, stride, height, kept;
     Buffer<float> rows;
 
-    Ring(int planes, int stride)
-        : planes(planes), stride(stride), rows(static_cast<size_t>(SSIM_WINDOW) * planes * stride) {}
-
-    float* row(int y, int plane) {
-        return rows.data() + static_cast<size_t>((y % SSIM_WINDOW) * planes + plane) * stride;
+    Ring(int planes, int stride, int height)
+        : planes(planes), stride(stride), height(height), kept(height < KEPT ? height : KEPT),
+          rows(static_cast<size_t>(kept + 1) * planes * stride) {
+        __builtin_memset(at(kept), 0, static_cast<size_t>(planes) * stride * sizeof(float));
     }
+
+    float* at(int slot) { return rows.data() + static_cast<size_t>(slot) * planes * stride; }
+    float* row(int y) { return at(y >= 0 && y < height ? y % kept : kept); }
 };
+
+// The first n lanes; zero in the others.
+GSB_HD inline Vec first_of(Vec x, int n) {
+    if (n == LANES) return x;
+    alignas(64) float lanes[LANES] = {};
+    store_first(x, lanes, n);
+    return Vec::load(lanes);
+}
 
 // A horizontal strip of the picture, rows [begin, end), with memory of its own.
 struct Strip {
     const SimilarityArgs& args;
+    float* gradient;  // null: not wanted
     const Window& window;
     int begin, end, width, stride;  // width: floats of a row
     Ring moments, derivatives;
     Buffer<float> padded;  // rows before the filter along x; what is outside of the picture stays zero
 
-    Strip(const SimilarityArgs& a, const Window& window, int begin, int end)
-        : args(a), window(window), begin(begin), end(end), width(a.width * CHANNELS),
-          stride((width + LANES - 1) / LANES * LANES), moments(MOMENTS, stride), derivatives(DERIVATIVES, stride),
-          padded(static_cast<size_t>(MOMENTS) * (stride + 2 * MARGIN)) {
+    Strip(const SimilarityArgs& a, float* gradient, const Window& window, int begin, int end)
+        : args(a), gradient(gradient), window(window), begin(begin), end(end), width(a.width * CHANNELS),
+          stride((width + LANES - 1) / LANES * LANES), moments(MOMENTS, stride, a.height),
+          derivatives(gradient ? DERIVATIVES : 0, stride, a.height),
+          padded(static_cast<size_t>(PADDED) * (stride + 2 * MARGIN)) {
         padded.zero();
     }
 
     float* padded_row(int plane) { return padded.data() + static_cast<size_t>(plane) * (stride + 2 * MARGIN) + MARGIN; }
 
-    // Planes of padded_row, filtered along x, to row y of a ring.
-    template <int PLANES>
-    void filter_along_x(Ring& ring, int y) {
-        for (int x = 0; x < stride; x += LANES) {
-            Vec sums[PLANES];
-            for (auto& sum : sums) sum = Vec(0.0f);
-            for (int tap = 0; tap < SSIM_WINDOW; ++tap) {
-                const int at = x + (tap - SSIM_RADIUS) * CHANNELS;
-                for (int k = 0; k < PLANES; ++k) sums[k] += Vec::load(padded_row(k) + at) * window.weight[tap];
-            }
-            for (int k = 0; k < PLANES; ++k) sums[k].store(ring.row(y, k) + x);
+    // What the pixels up to D away add to `sum`, the farthest first.
+    template <int D = SSIM_RADIUS>
+    GSB_HD Vec filtered_along_x(const float* p, Vec sum = Vec(0.0f)) const {
+        if constexpr (D == 0) {
+            return sum + Vec::load(p) * window.weight[0];
+        } else {
+            constexpr int to = D * CHANNELS;
+            // The farthest two are loaded across cache lines: a processor does that while it shifts the others.
+            const Vec pair =
+                D == SSIM_RADIUS ? Vec::load(p - to) + Vec::load(p + to) : load_beside<-to>(p) + load_beside<to>(p);
+            return filtered_along_x<D - 1>(p, sum + pair * window.weight[D]);
         }
     }
 
-    // The value at x of row y of a ring's planes, filtered along y.
+    // padded_row(first) and those that follow, filtered along x, to row y of a ring.
+    void filter_along_x(int first, Ring& ring, int y) {
+        for (int k = 0; k < ring.planes; ++k) {
+            const float* in = padded_row(first + k);
+            float* out = ring.row(y) + static_cast<size_t>(k) * stride;
+            for (int x = 0; x < stride; x += LANES) filtered_along_x(in + x).store(out + x);
+        }
+    }
+
+    // The rows that rows y .. y + GROUP - 1 of a ring are filtered from. Where fewer than GROUP are wanted, the last of
+    // them may hold anything.
+    struct Rows {
+        const float* row[SPAN];
+
+        Rows(Ring& ring, int y) {
+            for (int i = 0; i < SPAN; ++i) row[i] = ring.row(y + i - SSIM_RADIUS);
+        }
+    };
+
+    // Values at x of a group's planes, filtered along y.
     template <int PLANES>
-    void filter_along_y(Ring& ring, int y, int x, Vec (&sums)[PLANES]) {
-        for (auto& sum : sums) sum = Vec(0.0f);
-        const int first = y < SSIM_RADIUS ? -y : -SSIM_RADIUS;
-        const int last = args.height - 1 - y < SSIM_RADIUS ? args.height - 1 - y : SSIM_RADIUS;
-        for (int dy = first; dy <= last; ++dy) {
-            const float weight = window.weight[dy + SSIM_RADIUS];
-            for (int k = 0; k < PLANES; ++k) sums[k] += Vec::load(ring.row(y + dy, k) + x) * weight;
+    GSB_HD void filter_along_y(const Rows& rows, int x, Vec (&out)[GROUP][PLANES]) const {
+        for (int k = 0; k < PLANES; ++k) {
+            const auto at = [&](int i) { return Vec::load(rows.row[i] + k * stride + x); };
+            GSB_UNROLL for (int j = 0; j < GROUP; ++j) {
+                const int middle = j + SSIM_RADIUS;
+                Vec sum(0.0f);
+                GSB_UNROLL for (int d = SSIM_RADIUS; d > 0; --d) {
+                    sum += (at(middle - d) + at(middle + d)) * window.weight[d];
+                }
+                out[j][k] = sum + at(middle) * window.weight[0];
+            }
         }
     }
 
     void read_row(int y) {
-        const float *a = args.image + static_cast<int64_t>(y) * width, *b = args.target + static_cast<int64_t>(y) * width;
+        const int64_t row = static_cast<int64_t>(y) * width;
+        const float *a = args.image + row, *b = args.target + row;
         for (int x = 0; x < width; x += LANES) {
             const int n = width - x < LANES ? width - x : LANES;
             const Vec va = load_first(a + x, n), vb = load_first(b + x, n);
-            const Vec values[MOMENTS] = {va, vb, va * va, vb * vb, va * vb};
+            const Vec values[MOMENTS] = {va, vb, va * va + vb * vb, va * vb};
             for (int k = 0; k < MOMENTS; ++k) values[k].store(padded_row(k) + x);
         }
-        filter_along_x<MOMENTS>(moments, y);
+        filter_along_x(0, moments, y);
     }
 
-    // SSIM of row y, summed; its derivatives, filtered along x.
-    float compare_row(int y) {
-        Vec total(0.0f);
+    // SSIM of `count` rows from y on, each row's sum to row_sums[row][0]; its derivatives, filtered along x.
+    void compare_rows(int y, int count, float* row_sums) {
+        const Rows rows(moments, y);
+        Vec totals[GROUP];
+        for (auto& total : totals) total = Vec(0.0f);
         for (int x = 0; x < stride; x += LANES) {
-            Vec m[MOMENTS];
-            filter_along_y(moments, y, x, m);
-            const Similarity<Vec> s(m[0], m[1], m[2], m[3], m[4]);
+            Vec m[GROUP][MOMENTS];
+            filter_along_y(rows, x, m);
             const int n = width - x < LANES ? width - x : LANES;
-            alignas(64) float lanes[LANES] = {};
-            store_first(s.value, lanes, n);
-            total += Vec::load(lanes);
-            store_first(s.g_mean, padded_row(0) + x, n);
-            store_first(s.g_square, padded_row(1) + x, n);
-            store_first(s.g_product, padded_row(2) + x, n);
+            for (int j = 0; j < count; ++j) {
+                const Similarity<Vec> s(m[j][0], m[j][1], m[j][2], Vec(0.0f), m[j][3]);
+                totals[j] += first_of(s.value, n);
+                if (!gradient) continue;
+                const Vec values[DERIVATIVES] = {s.g_mean, s.g_square, s.g_product};
+                for (int k = 0; k < DERIVATIVES; ++k) first_of(values[k], n).store(padded_row(j * DERIVATIVES + k) + x);
+            }
         }
-        if (args.grad) filter_along_x<DERIVATIVES>(derivatives, y);
-        return sum(total);
+        for (int j = 0; j < count; ++j) {
+            if (gradient) filter_along_x(j * DERIVATIVES, derivatives, y + j);
+            if (y + j >= begin && y + j < end) row_sums[(y + j) * 2] = sum(totals[j]);
+        }
     }
 
-    // The gradient of row y; returns the row's sum of |a - b|.
-    float finish_row(int y) {
-        const int64_t row = static_cast<int64_t>(y) * width;
+    // The gradient of `count` rows from y on; each row's sum of |a - b| to row_sums[row][1].
+    void finish_rows(int y, int count, float* row_sums) {
         const float pixels = static_cast<float>(args.height) * static_cast<float>(width);
         const Vec l1((1.0f - args.ssim_weight) / pixels), ssim(-args.ssim_weight / pixels), zero(0.0f);
-        Vec total(0.0f);
+        const Rows rows(derivatives, y);
+        Vec totals[GROUP];
+        for (auto& total : totals) total = zero;
         for (int x = 0; x < width; x += LANES) {
             const int n = width - x < LANES ? width - x : LANES;
-            const Vec a = load_first(args.image + row + x, n), b = load_first(args.target + row + x, n);
-            const Vec difference = a - b;
-            total += max(difference, -difference);
-            if (!args.grad) continue;
-            Vec g[DERIVATIVES];
-            filter_along_y(derivatives, y, x, g);
-            const Vec sign = select(difference > zero, l1, select(difference < zero, -l1, zero));
-            store_first(sign + ssim * (g[0] + a * g[1] * 2.0f + b * g[2]), args.grad + row + x, n);
+            Vec g[GROUP][DERIVATIVES];
+            if (gradient) filter_along_y(rows, x, g);
+            for (int j = 0; j < count; ++j) {
+                const int64_t at = static_cast<int64_t>(y + j) * width + x;
+                const Vec a = load_first(args.image + at, n), b = load_first(args.target + at, n), difference = a - b;
+                totals[j] += max(difference, -difference);
+                if (!gradient) continue;
+                const Vec sign = select(difference > zero, l1, select(difference < zero, -l1, zero));
+                store_first(sign + ssim * (g[j][0] + a * g[j][1] * 2.0f + b * g[j][2]), gradient + at, n);
+            }
         }
-        return sum(total);
+        for (int j = 0; j < count; ++j) row_sums[(y + j) * 2 + 1] = sum(totals[j]);
     }
 
     // row_sums [height][2]: of SSIM and of |a - b|.
     void run(float* row_sums) {
-        const int reach = args.grad ? SSIM_RADIUS : 0;
+        const int reach = gradient ? SSIM_RADIUS : 0;
         const auto within = [&](int y) { return y < 0 ? 0 : y > args.height ? args.height : y; };
+        const auto at_most = [](int n) { return n < GROUP ? n : GROUP; };
+        const int last = within(end + reach);
         int read = within(begin - reach - SSIM_RADIUS), compared = within(begin - reach);
-        for (int y = begin; y < end; ++y) {
-            for (; compared < within(y + reach + 1); ++compared) {
-                // Rows are read into the ring only as far as this row's window; older ones may go by then.
-                for (; read < within(compared + SSIM_RADIUS + 1); ++read) read_row(read);
-                const float similarity = compare_row(compared);
-                if (compared >= begin && compared < end) row_sums[compared * 2] = similarity;
+        for (int y = begin; y < end; y += GROUP) {
+            const int count = at_most(end - y);
+            while (compared < within(y + count + reach)) {
+                // Rows are read into the ring only as far as this group's window; older ones may go by then.
+                const int group = at_most(last - compared);
+                for (; read < within(compared + group + SSIM_RADIUS); ++read) read_row(read);
+                compare_rows(compared, group, row_sums);
+                compared += group;
             }
-            row_sums[y * 2 + 1] = finish_row(y);
+            finish_rows(y, count, row_sums);
         }
     }
 };
 
 }  // namespace
 
-double l1_ssim(const SimilarityArgs& a) {
+void l1_ssim(const SimilarityArgs& a, const SimilarityLoss& out) {
     const Window window;
     Buffer<float> row_sums(static_cast<size_t>(a.height) * 2);
     const int strips = a.threads < a.height ? a.threads : a.height;
 #pragma omp parallel for num_threads(a.threads) schedule(static, 1)
     for (int i = 0; i < strips; ++i) {
-        Strip strip(a, window, static_cast<int>(static_cast<int64_t>(a.height) * i / strips),
+        Strip strip(a, out.gradient, window, static_cast<int>(static_cast<int64_t>(a.height) * i / strips),
                     static_cast<int>(static_cast<int64_t>(a.height) * (i + 1) / strips));
         strip.run(row_sums.data());
     }
@@ -172,7 +228,8 @@ double l1_ssim(const SimilarityArgs& a) {
         difference += row_sums[static_cast<size_t>(y) * 2 + 1];
     }
     const double pixels = static_cast<double>(a.height) * a.width * CHANNELS;
-    return (1.0 - a.ssim_weight) * difference / pixels + a.ssim_weight * (1.0 - similarity / pixels);
+    const double weight = a.ssim_weight;
+    *out.loss = static_cast<float>((1.0 - weight) * difference / pixels + weight * (1.0 - similarity / pixels));
 }
 
 }  // namespace GSB_ISA
