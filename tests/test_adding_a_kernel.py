@@ -1,0 +1,82 @@
+"""The worked example of docs/adding_a_kernel.md, built and run as a reader would."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tiny_run import ROOT, environment
+
+CHECK = """
+import sys
+sys.meta_path[:] = [finder for finder in sys.meta_path if 'Redirecting' not in type(finder).__name__]
+import torch
+from gsbench.kernels.balls import observe_ball
+from gsbench.kernels.tape import Tape
+g = torch.Generator().manual_seed(0)
+raw = [torch.randn(shape, generator=g).requires_grad_() for shape in ((37, 1), (37,))]
+weights = torch.randn(37, 3, 3, generator=g), torch.randn(37, generator=g)
+exact = [x.detach().double().requires_grad_() for x in raw]
+expected = exact[0].exp()[:, :, None] * torch.eye(3, dtype=torch.float64), torch.sigmoid(exact[1])
+for seen, wanted in zip(observe_ball(*raw), expected, strict=True):
+    torch.testing.assert_close(seen.double(), wanted, rtol=1e-5, atol=1e-6)
+def loss(seen): return sum((x * w).sum() for x, w in zip(seen, weights, strict=True))
+want = torch.autograd.grad(loss(expected), exact)
+got = torch.autograd.grad(loss(observe_ball(*raw)), raw)
+with Tape() as tape: value = loss(observe_ball(*raw))
+sums = {}
+tape.backward(value, torch.ones(()), raw, sums)
+for x, a, b in zip(raw, got, want, strict=True):
+    torch.testing.assert_close(a.double(), b, rtol=1e-4, atol=1e-6)
+    assert torch.equal(sums[id(x)], a)
+"""
+
+
+def blocks() -> list[tuple[str, str | None, str]]:
+    """The example's files: path, the line that the text goes before (None: a new file), the text."""
+    page = (ROOT / "docs" / "adding_a_kernel.md").read_text()
+    found = re.findall(r"^`(gsbench/[\w/]+\.\w+)`(?:, before `(.*?)`)?:\n\n```\w+\n(.*?)^```", page,
+                       flags=re.MULTILINE | re.DOTALL)  # fmt: skip
+    return [(path, before or None, text) for path, before, text in found]
+
+
+def test_it_touches_fewer_than_eight_files() -> None:
+    """Catches seams that cost more again: a kernel for a new slice once touched 22 files."""
+    assert len({path for path, _, _ in blocks()}) == 5
+    assert len(blocks()) == 6
+
+
+@pytest.mark.skipif(not all(map(shutil.which, ("cmake", "ninja", "c++"))), reason="needs cmake, ninja and a compiler")
+def test_the_worked_example_builds_and_differentiates(tmp_path: Path) -> None:
+    """Catches documentation that no longer builds, on the CPU and by the shim for CUDA, or a wrong gradient of it."""
+    project, build = tmp_path / "project", tmp_path / "build"
+    left_out = shutil.ignore_patterns("__pycache__", "sample", "*.so")
+    shutil.copytree(ROOT / "gsbench", project / "gsbench", ignore=left_out)
+    (project / "gsbench/scenes/sample").mkdir()
+    shutil.copy(ROOT / "CMakeLists.txt", project)
+    (project / "tests/kernels").mkdir(parents=True)
+    for path in (ROOT / "tests/kernels").glob("cuda_shim.*"):
+        shutil.copy(path, project / "tests/kernels")
+    for path, before, text in blocks():
+        target = project / path
+        if before is None:
+            assert not target.exists()
+            target.write_text(text)
+            continue
+        whole = target.read_text()
+        assert whole.count(before) == 1
+        target.write_text(whole.replace(before, text + before))
+    # Unoptimised, and for one instruction set: what is tested is that it compiles and is right.
+    options = ["-G", "Ninja", "-DCUDA=shim", "-DGSB_OPTIMISATION=-O0", f"-DPython_EXECUTABLE={sys.executable}"]
+    if "x86" in os.uname().machine:
+        options.append("-DGSB_LEVELS=v2")
+    for command in (["cmake", "-S", str(project), "-B", str(build), *options], ["cmake", "--build", str(build)]):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    shutil.copy(next(build.glob("_native*.so")), project / "gsbench/kernels")
+    done = subprocess.run([sys.executable, "-c", CHECK], capture_output=True, text=True, cwd=project, check=False,
+                          env={**environment(), "PYTHONPATH": os.fspath(project)})  # fmt: skip
+    assert done.returncode == 0, done.stderr
