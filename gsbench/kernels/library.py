@@ -26,9 +26,19 @@ class Library:
         self._fields = {name: _fields(signature) for name, signature in extension.SIGNATURES.items()}
 
     def call(self, name: str, slots: Slots, like: Tensor) -> None:
-        """Run a kernel on memory of the same device as `like`; `slots` holds a value for each of its fields."""
+        """Run a kernel on memory of the same device as `like`; `slots` holds a value for each of its fields.
+
+        Raises:
+            InputError: the kernel has no room for such sizes, or none of such an option.
+        """
         slots["threads"] = torch.get_num_threads()
-        getattr(self.extension, name)(*[slots[field] for field in self._fields[name]])
+        self._run(name, *[slots[field] for field in self._fields[name]])
+
+    def _run(self, name: str, *values: Any) -> None:
+        try:
+            getattr(self.extension, name)(*values)
+        except ValueError as error:
+            raise InputError(str(error)) from None
 
     def takes(self, name: str, field: str) -> bool:
         """Whether a kernel has a field."""
@@ -52,10 +62,10 @@ class CudaLibrary(Library):
         slots["threads"] = 1
         values = [slots[field] for field in self._fields[name]]
         if not like.is_cuda:  # tests run these kernels on the CPU
-            getattr(self.extension, name)(*values, 0)
+            self._run(name, *values, 0)
             return
         with torch.cuda.device_of(like):
-            getattr(self.extension, name)(*values, torch.cuda.current_stream(like.device).cuda_stream)
+            self._run(name, *values, torch.cuda.current_stream(like.device).cuda_stream)
 
     @property
     def needs_scratch(self) -> bool:

@@ -82,7 +82,7 @@ class Operation:
         self._needed = {f"given.{key}" for key in outputs if key not in passive} - _MAY_BE_NULL
         self._grad = [f"grad.{key}" if own else None for key, own in zip(inputs, self._differentiable, strict=True)]
         self._last: tuple[list[Any] | None, Slots] = None, {}
-        self.backward_kernel = f"{name}_backward"  # the benchmark of the GPU compares two
+        self.backward_kernel = f"{name}_backward"  # of the same arguments as any other that is put here
         self._traced = _register(self)
 
     def __call__(self, *arguments: Any) -> Tensors:

@@ -1,5 +1,7 @@
 """The rasterizer's operations: project Gaussians to splats, list each tile's splats, blend them into images."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -100,6 +102,19 @@ def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewpo
     means2d, roots, _, half_sizes = splats
     image, alpha, *_ = _blend(means2d, roots, half_sizes, colors, background, *bins, viewport.width, viewport.height)
     return image, alpha
+
+
+@contextmanager
+def backward_by_splat() -> Iterator[None]:
+    """On a GPU, differentiate what is blended by the kernel with a splat a lane, not with a pixel a lane.
+
+    The gradients are the same; docs/gpu.md says why it is the latter that runs.
+    """
+    before, _blend.backward_kernel = _blend.backward_kernel, "blend_backward_by_splat"
+    try:
+        yield
+    finally:
+        _blend.backward_kernel = before
 
 
 def flag_values(*values: Tensor) -> Tensor:

@@ -13,7 +13,4 @@ NB_MODULE(GSB_MODULE, m) {
     GSB_CUDA_KERNELS(GSB_DEFINE)
     m.def("scratch_bytes", &cuda::scratch_bytes, "Bytes that sorting and summing n items need.");
     m.def("similarity_parts", &cuda::similarity_parts, "Parts that l1_ssim leaves of its loss.");
-    m.attr("MAX_NETWORKS") = MAX_NETWORKS;
-    m.attr("MAX_FEATURES") = cuda::MAX_FEATURES;
-    m.attr("MAX_WIDTH") = cuda::MAX_WIDTH;
 }
