@@ -1,5 +1,6 @@
 """The scene that speed is measured on, and the models that are sliced: a recipe, the same numbers everywhere."""
 
+import math
 from typing import Any
 
 import torch
@@ -8,6 +9,7 @@ from torch import Tensor
 from gsbench.models import GaussianModel, build
 from gsbench.models.base import Stage
 from gsbench.models.factors import KINDS
+from gsbench.models.triangular import TriangularModel
 from gsbench.scenes.scene import Points
 
 SIGMA = 0.0083  # median standard deviation along an axis: a mean 3-sigma radius of 5 pixels at 400 x 400
@@ -34,8 +36,14 @@ def camera(size: int) -> tuple[Tensor, Tensor]:
     return viewmat[None], K[None]
 
 
-def model(name: str, N: int, *, agr: bool = False, seed: int = 0, **options: Any) -> GaussianModel:
-    """A model of N Gaussians at the size of `gaussians`, with correlations and colours that are not zero."""
+def model(
+    name: str, N: int, *, agr: bool = False, seed: int = 0, sigma: float = SIGMA, **options: Any
+) -> GaussianModel:
+    """A model of N Gaussians, whose slices are as large as the Gaussians of `gaussians` whatever N.
+
+    Standard deviations of a slice along its axes in space are log-normal with the median `sigma` and SPREAD. Correlations
+    and colours are not zero.
+    """
     g = torch.Generator().manual_seed(seed)
     lambdas = {"6dgs": {"lambda_d": 0.05}, "7dgs": {"lambda_d": 0.05, "lambda_t": 0.05}}
     made = build(name, agr=agr, sh_degree=3, **lambdas.get(name, {}) | options)
@@ -46,5 +54,8 @@ def model(name: str, N: int, *, agr: bool = False, seed: int = 0, **options: Any
                 parameter.add_(0.02 * torch.randn(parameter.shape, generator=g))
             if key == "opacities":
                 parameter.copy_(torch.randn(N, generator=g))
+        logs = made.splats[made.geometry[0]]  # [N, 3 or more], of which those in space are set
+        space = made.rows["p"] if isinstance(made, TriangularModel) else [0, 1, 2]
+        logs[:, space] = math.log(sigma) + SPREAD * torch.randn(N, 3, generator=g)
     made.set_stage(Stage(3, refine=agr, tune_modulation=False))
     return made

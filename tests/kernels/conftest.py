@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from gsbench import kernels
-from gsbench.kernels import cuda
+from gsbench.kernels import cuda, library
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -67,8 +67,10 @@ def shim(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
 
 @pytest.fixture
 def cuda_device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Where the CUDA kernels run: `cuda`, or `cpu` with the kernels replaced by those of the shim."""
+    """Where the CUDA kernels run: `cuda`, or `cpu`, whose kernels are those of the shim meanwhile, built or not."""
     if cuda.available():
         return "cuda"
-    monkeypatch.setattr(cuda, "_cuda", request.getfixturevalue("shim"))
+    shim = request.getfixturevalue("shim")
+    monkeypatch.setattr(kernels, "_native", shim)
+    monkeypatch.setitem(library._LIBRARIES, "cpu", library.CudaLibrary(shim))
     return "cpu"

@@ -1,40 +1,25 @@
 """The CUDA kernels against the reference, on a GPU or by the shim: pictures, gradients, the loss, bad input."""
 
 import re
-import sys
-from pathlib import Path
+from collections.abc import Iterator
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
 import torch
+from raster.cases import camera, case, gaussians, names
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.cuda import raster
-from gsbench.kernels.cuda.adam import adam
-from gsbench.kernels.cuda.loss import l1_ssim
-from gsbench.kernels.cuda.raster import View
-from gsbench.raster import RasterOutput, rasterize
-from gsbench.raster.cuda import splat
+from gsbench.kernels.adam import adam
+from gsbench.kernels.loss import l1_ssim
+from gsbench.kernels.raster import backward_by_splat
+from gsbench.raster import rasterize
 from gsbench.stability.brute import paint
 from gsbench.train.losses import photometric
 from gsbench.train.optim import adam_reference
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "raster"))
-from cases import camera, case, gaussians, names
-
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background")
-
-
-def draw(arguments: dict[str, Any], device: str) -> RasterOutput:
-    """`rasterize(.., backend="cuda")`; on the CPU past its door, which asks for a GPU."""
-    if device == "cuda":
-        return rasterize(**arguments, backend="cuda")
-    a = {"near": 0.01, "far": 1e10, "eps2d": 0.3, "antialias": False} | arguments
-    colors = a["colors"] if a["colors"].dim() == 3 else a["colors"].expand(len(a["viewmats"]), *a["colors"].shape)
-    background = a.get("background", colors.new_zeros(colors.shape[-1]))
-    view = View(a["width"], a["height"], a["near"], a["far"], a["eps2d"], a["antialias"])
-    return splat(a["means"], a["factors"], a["opacities"], colors, a["viewmats"], a["Ks"], background, view)
 
 
 def decided(arguments: dict[str, Any]) -> Tensor:
@@ -47,7 +32,7 @@ def decided(arguments: dict[str, Any]) -> Tensor:
 def test_picture_is_the_reference(name: str, cuda_device: str) -> None:
     """Catches any wrong rule of the picture, a bound, tile or patch that loses a Gaussian, and a wrong order."""
     expected = rasterize(**case(name), backend="reference")
-    output = draw(case(name, torch.float32, cuda_device), cuda_device)
+    output = rasterize(**case(name, torch.float32, cuda_device), backend=cuda_device)
     sure = decided(case(name))
     assert sure.double().mean() > 0.8
     for got, want in ((output.image, expected.image), (output.alpha, expected.alpha)):
@@ -58,10 +43,10 @@ def test_picture_is_the_reference(name: str, cuda_device: str) -> None:
     assert (output.info.pairs == 0) == (expected.info.pairs == 0)
 
 
-def gradients(arguments: dict[str, Any], output_of: Any, weight: Tensor) -> dict[str, Tensor]:
+def gradients(arguments: dict[str, Any], backend: str, weight: Tensor) -> dict[str, Tensor]:
     """Of a loss that feels every channel and the cover of the pixels with a weight, by every input."""
     inputs = {k: arguments[k].clone().requires_grad_() for k in DIFFERENTIABLE if k in arguments}
-    output = output_of(arguments | inputs)
+    output = rasterize(**arguments | inputs, backend=backend)
     output.info.means2d.retain_grad()
     weight = weight.to(output.image)[..., None]
     waves = torch.arange(output.image.numel()).mul(0.05).sin().view_as(output.image).to(output.image)
@@ -81,9 +66,10 @@ def assert_gradients_close(got: dict[str, Tensor], want: dict[str, Tensor]) -> N
 
 
 @pytest.fixture(params=[False, True], ids=["by_pixel", "by_splat"])
-def by_splat(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def by_splat(request: pytest.FixtureRequest) -> Iterator[None]:
     """Runs the test with each of backward's kernels."""
-    monkeypatch.setattr(raster, "BACKWARD_BY_SPLAT", request.param)
+    with backward_by_splat() if request.param else nullcontext():
+        yield
 
 
 @pytest.mark.usefixtures("by_splat")
@@ -92,9 +78,7 @@ def test_gradients_are_those_of_the_reference(name: str, cuda_device: str) -> No
     """Catches a wrong or missing derivative of any input, and sums that miss a patch, a lane or a camera."""
     exact, single = case(name), case(name, torch.float32, cuda_device)
     sure = decided(exact)
-    want = gradients(exact, lambda a: rasterize(**a, backend="reference"), sure)
-    got = gradients(single, lambda a: draw(a, cuda_device), sure)
-    assert_gradients_close(got, want)
+    assert_gradients_close(gradients(single, cuda_device, sure), gradients(exact, "reference", sure))
 
 
 @pytest.mark.usefixtures("by_splat")
@@ -106,14 +90,13 @@ def test_many_tiles_and_rounds(cuda_device: str) -> None:
     exact["opacities"] = exact["opacities"] * 0.3  # deep: many splats a pixel
     exact = {k: v.double() if isinstance(v, Tensor) else v for k, v in exact.items()}
     single = {k: v.to(cuda_device, torch.float32) if isinstance(v, Tensor) else v for k, v in exact.items()}
-    want, got = rasterize(**exact, backend="reference"), draw(single, cuda_device)
+    want, got = rasterize(**exact, backend="reference"), rasterize(**single, backend=cuda_device)
     error = (got.image.cpu().double() - want.image).abs().amax(-1)
     # A decision that rounding flips changes a pixel by up to 1/255: a handful of the millions made.
     assert error.quantile(0.999) < 1e-4
     assert error.max() < 1 / 255
     weight = (error < 1e-4).double()
-    assert_gradients_close(gradients(single, lambda a: draw(a, cuda_device), weight),
-                           gradients(exact, lambda a: rasterize(**a, backend="reference"), weight))  # fmt: skip
+    assert_gradients_close(gradients(single, cuda_device, weight), gradients(exact, "reference", weight))
 
 
 @pytest.mark.usefixtures("by_splat")
@@ -127,9 +110,9 @@ def test_order_of_threads_does_not_matter(name: str, cuda_device: str, monkeypat
     for reversed_ in (False, True):
         if reversed_:
             monkeypatch.setenv("GSBENCH_SHIM_REVERSED", "1")
-        output = draw(arguments, cuda_device)
+        output = rasterize(**arguments, backend=cuda_device)
         every = torch.ones(output.alpha.shape[:-1])
-        grads = gradients(arguments, lambda a: draw(a, cuda_device), every)
+        grads = gradients(arguments, cuda_device, every)
         loss = l1_ssim(image, target, 0.2)
         (g_image,) = torch.autograd.grad(loss, image)
         found.append([output.image, output.alpha, loss, g_image, *grads.values()])
@@ -149,7 +132,7 @@ def test_bad_values_are_named(name: str, value: float, said: str, cuda_device: s
     arguments = case("three_cameras", torch.float32, cuda_device)
     arguments[name].view(-1)[0] = value
     with pytest.raises(InputError, match=said):
-        draw(arguments, cuda_device)
+        rasterize(**arguments, backend=cuda_device)
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (16, 16), (37, 50), (5, 70)])
@@ -191,7 +174,7 @@ def test_out_of_memory_names_the_buffer_and_the_process_lives_on(
     cuda_device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches torch's own words, which say neither what the memory was for nor what to lower, and a broken state."""
-    arguments, empty = case("random", torch.float32, cuda_device), torch.empty
+    arguments, new_empty = case("random", torch.float32, cuda_device), Tensor.new_empty
     every = torch.ones(1, arguments["height"], arguments["width"])
     asked = 0
 
@@ -199,16 +182,16 @@ def test_out_of_memory_names_the_buffer_and_the_process_lives_on(
         nonlocal asked
         asked = 0
 
-        def limited(*args: Any, **kwargs: Any) -> Tensor:
+        def limited(like: Tensor, *args: Any, **kwargs: Any) -> Tensor:
             nonlocal asked
             asked += 1
             if asked == refused:
                 raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate")
-            return empty(*args, **kwargs)
+            return new_empty(like, *args, **kwargs)
 
         with monkeypatch.context() as patch:
-            patch.setattr(torch, "empty", limited)
-            return gradients(arguments, lambda a: draw(a, cuda_device), every)
+            patch.setattr(Tensor, "new_empty", limited)
+            return gradients(arguments, cuda_device, every)
 
     run(refused=0)  # what happens once a process is done with
     expected, buffers = run(refused=0), set()
@@ -218,5 +201,6 @@ def test_out_of_memory_names_the_buffer_and_the_process_lives_on(
         said = re.fullmatch("(.+) need [0-9.]+ MiB on .+: lower the picture's size.+", str(error.value))
         assert said, str(error.value)
         buffers.add(said[1])
-    assert {"projected Gaussians", "lists of each tile's Gaussians", "pictures", "sums over pixels"} <= buffers
+    assert buffers >= {"projected Gaussians", "lists of each tile's Gaussians", "images", "gradients",
+                       "scratch space of gradients"}  # fmt: skip
     assert_gradients_close(run(refused=0), expected)

@@ -1,103 +1,69 @@
-"""Slices, colours and refinement by the CUDA kernels, on a GPU or by the shim, against the models written in torch."""
+"""Slices, colours, refinement and training steps by the CUDA kernels, on a GPU or by the shim, against torch's."""
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 import pytest
+import test_tape
 import torch
 from test_observe import VARIANTS, assert_same, color_inputs, gradients, model_and_raw, rotated, still
 from torch import Tensor
 
+from gsbench.backends import AUTO, REFERENCE, Backend
 from gsbench.errors import InputError
-from gsbench.kernels import colors, refine, slices
-from gsbench.kernels.cuda import observe as on_cuda
-from gsbench.models import Query
+from gsbench.kernels import colors, refine
+from gsbench.measure.speed import Stages
+from gsbench.models import GaussianModel, Query
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
-from gsbench.models.factors import OFF_DIAGONALS
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.refinement import Refinement
+from gsbench.train.step import Step
 
-OPERATIONS = {
-    slices._observe: on_cuda.observe,
-    slices._observe_backward: on_cuda.observe_backward,
-    slices._rotated: on_cuda.rotated,
-    slices._rotated_backward: on_cuda.rotated_backward,
-    slices._still: on_cuda.still,
-    slices._still_backward: on_cuda.still_backward,
-    colors._show: on_cuda.show,
-    colors._show_backward: on_cuda.show_backward,
-    refine._refine: on_cuda.refine,
-    refine._refine_backward: on_cuda.refine_backward,
-}
 Move = Callable[[Tensor], Tensor]
 
 
 @pytest.fixture
-def move(cuda_device: str) -> Iterator[Move]:
-    """Takes tensors to where the kernels run; for the shim, the operations call these on the CPU meanwhile."""
-    with ExitStack() as stack:
-        for operation, function in OPERATIONS.items() if cuda_device == "cpu" else ():
-            operation.register_kernel("cpu")(function)
-            operation._disabled_kernel.discard("cpu")  # `set_kernel_enabled` cannot leave it disabled
-            stack.callback(operation._disabled_kernel.add, "cpu")
-        yield lambda x: x.detach().to(cuda_device, torch.float32).requires_grad_(x.requires_grad)
+def move(cuda_device: str) -> Move:
+    """Takes tensors to where the kernels run."""
+    return lambda x: x.detach().to(cuda_device, torch.float32).requires_grad_(x.requires_grad)
 
 
 def back(tensors: list[Tensor]) -> list[Tensor]:
     return [x.cpu() for x in tensors]
 
 
+def assert_slices_agree(exact: GaussianModel, raw: dict[str, Tensor], move: Move) -> None:
+    """The kernels' slice, and its gradients by all parameters, against those of a model in float64, which is torch's."""
+    center, time = torch.tensor([0.3, -0.2, -3.0]), torch.tensor(0.4)
+    expected = list(exact.observe(raw, Query(center.double(), time.double())))
+    lambdas = list(exact.log_modulation.parameters())
+    single = {name: move(x) for name, x in raw.items()}
+    model = deepcopy(exact).to(single["opacities"])
+    model.condition = None  # nothing is left to torch
+    actual = list(model.observe(single, Query(move(center), move(time))))
+    assert_same(back(actual), expected)
+    inputs = [*single.values(), *model.log_modulation.parameters()]
+    assert_same(back(gradients(actual, inputs)), gradients(expected, [*raw.values(), *lambdas]))
+
+
 @pytest.mark.parametrize(("timed", "options"), VARIANTS)
 def test_slice(timed: bool, options: dict[str, Any], move: Move) -> None:
     """Catches a wrong row order, reflection, gate or derivative of any parameter."""
-    center = torch.tensor([0.3, -0.2, -3.0])
-    exact, raw = model_and_raw(timed, options, torch.float64)
-    seen = exact.condition(raw, Query(center.double(), torch.tensor(0.4, dtype=torch.float64)))
-    expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
-    model, _ = model_and_raw(timed, options, torch.float32)
-    single = {name: move(value) for name, value in raw.items()}
-    lambdas = {name: move(value) for name, value in model.log_modulation.items()}
-    actual = list(slices.observe_triangular(
-        single["means"], single["directions"], single.get("times"), single["log_diagonal"], single["shape"],
-        single["motion"], single["coupling"], single["opacities"], move(center), move(torch.tensor(0.4)),
-        lambdas["direction"].exp(), lambdas["time"].exp() if timed else None,
-        conditioned_first=options.get("factor_order") != "paper", form=OFF_DIAGONALS.index(model.triangle.form),
-        directional_half=model.directional_half,
-    ))  # fmt: skip
-    assert_same(back(actual), expected)
-    wanted = gradients(expected, [*raw.values(), *exact.log_modulation.values()])
-    weights = torch.Generator().manual_seed(2)
-    given = [move(torch.randn(x.shape, generator=weights)) for x in actual]
-    assert_same(back(list(torch.autograd.grad(actual, [*single.values(), *lambdas.values()], given))), wanted)
+    assert_slices_agree(*model_and_raw(timed, options, torch.float64), move)
 
 
 def test_rotated_slice(move: Move) -> None:
     """Catches a wrong sign of a quaternion's matrix, row order, gate or derivative of any parameter."""
-    exact, raw = rotated(torch.float64)
-    seen = exact.condition(raw, Query(torch.zeros(3, dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64)))
-    expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
-    single = [move(x) for x in raw.values()]
-    log_lambda = move(exact.log_modulation["time"])
-    actual = list(slices.observe_rotated(*single, move(torch.tensor(0.4)), log_lambda.exp()))
-    assert_same(back(actual), expected)
-    g = torch.Generator().manual_seed(2)
-    given = [move(torch.randn(x.shape, generator=g)) for x in actual]
-    assert_same(back(list(torch.autograd.grad(actual, [*single, log_lambda], given))),
-                gradients(expected, [*raw.values(), exact.log_modulation["time"]]))  # fmt: skip
+    assert_slices_agree(*rotated(torch.float64), move)
 
 
 def test_still_slice(move: Move) -> None:
     """Catches a wrong sign of a rotation's entry, a size that does not stop, or a derivative."""
     raw = still(torch.float64)
-    expected = [Gaussians3DModel.factors(raw), torch.sigmoid(raw["opacities"])]
-    single = [move(x) for x in raw.values()]
-    actual = list(slices.observe_still(*single))
-    assert_same(back(actual), expected)
-    g = torch.Generator().manual_seed(2)
-    given = [move(torch.randn(x.shape, generator=g)) for x in actual]
-    assert_same(back(list(torch.autograd.grad(actual, single, given))), gradients(expected, list(raw.values())))
+    raw = {"means": torch.zeros(len(raw["opacities"]), 3, dtype=torch.float64, requires_grad=True), **raw}
+    assert_slices_agree(Gaussians3DModel(), raw, move)
 
 
 @pytest.mark.parametrize("waves", [1, 3])
@@ -129,34 +95,46 @@ def test_colors(degree: int, waves: int, move: Move) -> None:
 def test_refinement(N: int, widths: list[int], move: Move) -> None:
     """Catches a batch's edge that is lost, a network that reads another's weights, and any wrong gradient."""
     g = torch.Generator().manual_seed(N)
-    exact = Refinement(widths, g).double()
+    exact = Refinement(widths, g, units=0.5 + torch.rand(sum(widths), generator=g)).double()
     with torch.no_grad():
         for parameter in exact.parameters():
             parameter.add_(0.2 * torch.randn(parameter.shape, generator=g))
     parts = [*widths[:-1], 2, widths[-1] - 2]  # the last network moves two arrays
     values = [torch.randn(N, c, generator=g, dtype=torch.float64).requires_grad_() for c in parts]
     expected = exact(values, torch.tensor(0.37, dtype=torch.float64))
-    weights = [torch.randn(x.shape, generator=g) for x in expected]
-
-    single = {name: move(p) for name, p in exact.named_parameters()}
-    inputs, at_time = [move(x) for x in values], move(exact.at_time(torch.tensor(0.37, dtype=torch.float64)))
-    outs = [[single[f"{kind}_out.{i}"] for i in range(len(widths))] for kind in ("weights", "biases")]
-    actual = refine.refine(inputs, single["weight_in"][:, : exact.features], at_time, *outs)
+    single = deepcopy(exact).to(move(values[0]))
+    inputs = [move(x) for x in values]
+    actual = single(inputs, move(torch.tensor(0.37)), by_kernel=True)
     assert_same(back(actual), expected)
-    wanted = torch.autograd.grad(expected, [*values, *exact.parameters()], [w.double() for w in weights])
-    got = torch.autograd.grad(actual, [*inputs, at_time, single["weight_in"], *outs[0], *outs[1]],
-                              [move(w) for w in weights])  # fmt: skip
-    n, used = len(values), slice(None, exact.features)
-    by_name = dict(zip((name for name, _ in exact.named_parameters()), wanted[n:], strict=True))
-    assert_same(back([*got[:n], got[n], got[n + 1][:, used], *got[n + 2 :]]),
-                [*wanted[:n], by_name["bias_in"], by_name["weight_in"][:, used],
-                 *(by_name[f"weights_out.{i}"] for i in range(len(widths))),
-                 *(by_name[f"biases_out.{i}"] for i in range(len(widths)))])  # fmt: skip
+    assert_same(back(gradients(actual, [*inputs, *single.parameters()])),
+                gradients(expected, [*values, *exact.parameters()]))  # fmt: skip
 
 
 def test_networks_too_large_are_refused(move: Move) -> None:
     """Catches a network that would not fit the kernel's arrays, and would be read past their end."""
-    one = move(torch.ones(1))
+    one, units = move(torch.ones(1)), move(torch.ones(32))
     with pytest.raises(InputError, match="at most 28 outputs"):
         refine.refine([move(torch.ones(4, 3)), move(torch.ones(4, 29))], move(torch.ones(128, 3)), one.expand(128),
-                      [move(torch.ones(3, 64)), move(torch.ones(29, 64))], [one.expand(3), one.expand(29)])  # fmt: skip
+                      [move(torch.ones(3, 64)), move(torch.ones(29, 64))], [one.expand(3), one.expand(29)], units,
+                      move(torch.empty(0)))  # fmt: skip
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize(("name", "agr"), [("7dgs", True), ("4dgs", False)])
+def test_a_training_step_s_gradients_are_the_reference_s(name: str, agr: bool, cuda_device: str) -> None:
+    """Catches what no kernel shows alone: a gradient that is lost, or taken twice, on its way from the loss through
+    blending, projection, colours and slices to the parameters, or in the sum over views."""
+    torch.set_num_threads(1)  # the shim runs in one
+
+    def step(backend: Backend, device: str) -> dict[str, Tensor]:
+        made = test_tape.fitted(name, agr=agr).to(device)
+        made.backend = backend
+        background = torch.tensor([0.1, 0.5, 0.9], device=device)
+        Step(made, background, 0.2, False, Stages(device))([view.to(device) for view in test_tape.views(2)])
+        return test_tape.gradients(made)
+
+    got, want = step(AUTO, cuda_device), step(REFERENCE, "cpu")
+    assert got.keys() == want.keys()
+    for key, expected in want.items():
+        assert expected.any(), key
+        assert (got[key].cpu() - expected).norm() <= 1e-3 * expected.norm(), key

@@ -1,26 +1,25 @@
 """Replayed renders against launched ones: on a GPU as a CUDA graph, by the shim as a call that is made again."""
 
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from gsbench.raster.cuda import splat_within
 from torch import Tensor
 
 from benchmarks.scene import camera as benchmark_camera
 from benchmarks.scene import model
+from gsbench.backends import CUDA, REFERENCE
 from gsbench.errors import InputError
-from gsbench.models import Query, replay
+from gsbench.kernels.raster import Viewport
+from gsbench.models import GaussianModel, Query, replay
 from gsbench.models.render import render
 from gsbench.models.replay import Replay
 from gsbench.raster import EPS2D, FAR, NEAR
+from gsbench.raster.native import draw_within
 from gsbench.scenes.scene import Camera
 
-pytestmark = pytest.mark.filterwarnings("ignore:raster backend 'auto'")  # the shim is built, and there is no GPU
 BACKGROUND = (0.1, 0.5, 0.9)
-CONFIG: Any = SimpleNamespace(backend="auto", antialias=False)  # the schema needs hydra, which not every GPU has
 
 
 def camera(device: str, distance: float = 4.0, size: int = 40) -> Camera:
@@ -45,20 +44,24 @@ def device(cuda_device: str, monkeypatch: pytest.MonkeyPatch) -> str:
     """Where replays run."""
     if cuda_device == "cpu":
         monkeypatch.setattr(replay, "capture", called_again)
-        monkeypatch.setattr(replay, "choose_backend", lambda *_: "cuda")
+        monkeypatch.setattr(replay, "resolve", lambda *_: CUDA)
     return cuda_device
 
 
-def both(device: str, name: str, agr: bool = False) -> tuple[Any, Replay, Callable[[Camera, float], Tensor]]:
+def large(name: str, device: str, agr: bool = False) -> GaussianModel:
+    """A model whose Gaussians cover each other in a small picture."""
+    return model(name, 300, agr=agr, sigma=0.2).to(device)
+
+
+def both(device: str, name: str, agr: bool = False) -> tuple[GaussianModel, Replay, Callable[[Camera, float], Tensor]]:
     """A model, its replay, and its launched render."""
-    fitted = model(name, 300, agr=agr).to(device)
-    background, config = torch.tensor(BACKGROUND, device=device), CONFIG
+    fitted, background = large(name, device, agr), torch.tensor(BACKGROUND, device=device)
 
     def launched(camera: Camera, time: float) -> Tensor:
         with torch.no_grad():
-            return render(fitted, camera, time, background, config)
+            return render(fitted, camera, time, background)
 
-    return fitted, Replay(fitted, background, config), launched
+    return fitted, Replay(fitted, background), launched
 
 
 @pytest.mark.parametrize(("name", "agr"), [("3dgs", False), ("4dgs", False), ("6dgs", True), ("7dgs", True)])
@@ -99,13 +102,13 @@ def test_a_bad_value_is_named(device: str) -> None:
 @pytest.mark.parametrize("N", [0, 300])
 def test_too_little_room_is_told(N: int, room: int, device: str) -> None:
     """Catches a pair written past the end of the lists; with too few of them the count alone is right."""
-    seen, fitted = camera(device), model("4dgs", 300).to(device)
+    seen, fitted = camera(device), large("4dgs", device)
     with torch.no_grad():
         means, factors, opacities, colors = fitted.slice(Query.at(seen.center, 0.4))
-        image, needed = splat_within(
+        image, needed = draw_within(
             means[:N], factors[:N], opacities[:N], colors[None, :N], seen.viewmat[None], seen.K[None],
             torch.tensor(BACKGROUND, device=device),
-            replay.View(seen.width, seen.height, NEAR, FAR, EPS2D, antialias=False), room,
+            Viewport(seen.width, seen.height, NEAR, FAR, EPS2D, antialias=False), room,
         )  # fmt: skip
     assert needed.tolist()[-1] == 0
     assert image.isfinite().all()
@@ -116,4 +119,4 @@ def test_too_little_room_is_told(N: int, room: int, device: str) -> None:
 def test_only_the_cuda_backend_is_replayed() -> None:
     """Catches a graph asked for where nothing records one."""
     with pytest.raises(InputError, match=r"expected raster\.backend=cuda, got 'reference'"):
-        Replay(model("3dgs", 5), torch.zeros(3), SimpleNamespace(backend="reference"))
+        Replay(model("3dgs", 5, backend=REFERENCE), torch.zeros(3))

@@ -34,8 +34,8 @@ def views(count: int, size: int = 40) -> list[View]:
 
 
 def fitted(name: str, N: int = 300, *, agr: bool = False) -> GaussianModel:
-    """A model all of whose parts learn."""
-    made = model(name, N, agr=agr, backend=CPU)
+    """A model all of whose parts learn, and whose Gaussians cover each other."""
+    made = model(name, N, agr=agr, sigma=0.2, backend=CPU)
     with torch.no_grad():
         for parameter in made.refinement.parameters() if made.refinement is not None else ():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
