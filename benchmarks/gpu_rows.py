@@ -2,19 +2,19 @@
 
 import itertools
 from collections.abc import Iterator
-from types import SimpleNamespace
-from typing import Any
+from contextlib import nullcontext
 
 import torch
 from torch import Tensor
 
 from benchmarks.compare import Call, Case, Cost, Place, Row, attempted, compared
 from benchmarks.gsplat_way import gsplat_image
-from benchmarks.rows import useful_alphas
+from benchmarks.rows import training_step, useful_alphas
 from benchmarks.scene import camera, gaussians, model
-from gsbench.kernels.cuda import raster as cuda_raster
+from gsbench.backends import AUTO, REFERENCE
 from gsbench.kernels.loss import l1_ssim
-from gsbench.models import GaussianModel
+from gsbench.kernels.raster import backward_by_splat
+from gsbench.models import GaussianModel, Query
 from gsbench.models.factors import rotation
 from gsbench.models.render import render
 from gsbench.models.replay import Replay
@@ -77,11 +77,8 @@ def backward_cost(place: Place, N: int, size: int, by_splat: bool) -> Cost:
     inputs = [x.requires_grad_() for x in place.put(gaussians(N))]
     image = rasterize(*inputs, *place.put(camera(size)), size, size).image
     upstream = torch.ones_like(image)
-    before, cuda_raster.BACKWARD_BY_SPLAT = cuda_raster.BACKWARD_BY_SPLAT, by_splat
-    try:
+    with backward_by_splat() if by_splat else nullcontext():
         return place.cost(lambda: torch.autograd.grad(image, inputs, upstream, retain_graph=True))
-    finally:
-        cuda_raster.BACKWARD_BY_SPLAT = before
 
 
 def frame_rows(place: Place) -> Iterator[Row]:
@@ -101,18 +98,18 @@ def frame_case(place: Place, case: str, name: str, agr: bool, N: int, size: int)
 def two_ways(place: Place, fitted: GaussianModel, size: int) -> tuple[Call, Call]:
     """A model's picture by our kernels, and by slicing in torch and drawing by gsplat."""
     viewmats, Ks = place.put(camera(size))
-    center = -(viewmats[0, :3, :3].T @ viewmats[0, :3, 3])
+    seen_from, background = Camera(viewmats[0], Ks[0], size, size), torch.zeros(3, device=place.device)
 
     def ours() -> Tensor:
-        fitted.backend = "auto"
-        return rasterize(*fitted.slice(center, TIME), viewmats, Ks, size, size).image
+        fitted.backend = AUTO
+        return render(fitted, seen_from, TIME, background)
 
     def theirs() -> Tensor:
-        fitted.backend = "reference"
-        seen = fitted.slice(center, TIME)
+        fitted.backend = REFERENCE
+        seen = fitted.slice(Query.of(seen_from, TIME))
         covars = seen.factors @ seen.factors.mT
         return gsplat_image(seen.means, None, None, seen.opacities, seen.colors, covars=covars, viewmats=viewmats,
-                            Ks=Ks, size=size)  # fmt: skip
+                            Ks=Ks, size=size)[0]  # fmt: skip
 
     return ours, theirs
 
@@ -128,15 +125,18 @@ def replay_rows(place: Place) -> Iterator[Row]:
 def replay_row(place: Place, case: str, name: str, agr: bool, N: int, size: int) -> Row:
     fitted, background = model(name, N, agr=agr).to(place.device), torch.zeros(3, device=place.device)
     viewmats, Ks = place.put(camera(size))
-    seen, config = Camera(viewmats[0], Ks[0], size, size), SimpleNamespace(backend="auto", antialias=False)
-    replay = Replay(fitted, background, config)
+    seen = Camera(viewmats[0], Ks[0], size, size)
+    replay = Replay(fitted, background)
     with torch.no_grad():
-        launched = place.cost(lambda: render(fitted, seen, TIME, background, config))
+        launched = place.cost(lambda: render(fitted, seen, TIME, background))
     return compared("replay", case, "forward", place.cost(lambda: replay(seen, TIME)), launched)
 
 
 def step_rows(place: Place) -> Iterator[Row]:
-    """A step of training on one view: frame, L1 + SSIM (ours fused, theirs torch), gradients, Adam (fused in both)."""
+    """A step of training on one view: frame, L1 + SSIM, gradients, Adam (fused in both).
+
+    Ours is the trainer's, by kernels on a tape; theirs is autograd's, with the loss in torch.
+    """
     N, sizes = (500, (48,)) if not place.on_gpu else (100_000, (400, 800))
     for agr, size in itertools.product((False, True), sizes):
         case = f"7dgs {'with' if agr else 'without'} AGR, {N} / {size}x{size}"
@@ -144,25 +144,22 @@ def step_rows(place: Place) -> Iterator[Row]:
 
 
 def step_row(place: Place, case: str, agr: bool, N: int, size: int) -> Row:
-    ours, theirs = steps(place, agr, N, size)
-    return compared("step", case, "all", place.cost(ours), place.cost(theirs) if place.gsplat else None)
+    ours = training_step(model("7dgs", N, agr=agr).to(place.device), size, 1)
+    theirs = place.cost(their_step(place, agr, N, size)) if place.gsplat else None
+    return compared("step", case, "all", place.cost(ours), theirs)
 
 
-def steps(place: Place, agr: bool, N: int, size: int) -> list[Call]:
-    found: list[Call] = []
-    target = torch.rand(1, size, size, 3, device=place.device)
-    for k, loss in enumerate((l1_ssim, lambda a, b, w: photometric(a, b, w, "reference"))):
-        fitted = model("7dgs", N, agr=agr).to(place.device)
-        picture = two_ways(place, fitted, size)[k]
-        adam = torch.optim.Adam(fitted.parameters(), lr=1e-5, eps=1e-15, fused=True)
+def their_step(place: Place, agr: bool, N: int, size: int) -> Call:
+    fitted, target = model("7dgs", N, agr=agr).to(place.device), torch.rand(size, size, 3, device=place.device)
+    _, picture = two_ways(place, fitted, size)
+    adam = torch.optim.Adam(fitted.parameters(), lr=1e-9, eps=1e-15, fused=True)
 
-        def step(picture: Call = picture, loss: Any = loss, adam: torch.optim.Adam = adam) -> None:
-            loss(picture()[0], target[0], 0.2).backward()
-            adam.step()
-            adam.zero_grad(set_to_none=True)
+    def step() -> None:
+        photometric(picture(), target, 0.2, REFERENCE).backward()
+        adam.step()
+        adam.zero_grad(set_to_none=True)
 
-        found.append(step)
-    return found
+    return step
 
 
 def loss_rows(place: Place) -> Iterator[Row]:
@@ -171,5 +168,5 @@ def loss_rows(place: Place) -> Iterator[Row]:
         image, target = (torch.rand(size, size, 3, device=place.device) for _ in range(2))
         image.requires_grad_()
         ours = place.cost(lambda a=image, b=target: torch.autograd.grad(l1_ssim(a, b, 0.2), a))
-        theirs = place.cost(lambda a=image, b=target: torch.autograd.grad(photometric(a, b, 0.2, "reference"), a))
+        theirs = place.cost(lambda a=image, b=target: torch.autograd.grad(photometric(a, b, 0.2, REFERENCE), a))
         yield compared("loss", f"{size}x{size}, theirs is torch", "both", ours, theirs)

@@ -1,15 +1,18 @@
 """Every CUDA kernel, forward and backward, on small cases: what compute-sanitizer looks at."""
 
+from contextlib import nullcontext
+
 import torch
 
 from benchmarks.scene import camera, gaussians, model
-from gsbench.kernels.cuda import raster
-from gsbench.kernels.cuda.adam import adam
+from gsbench.kernels.adam import adam
 from gsbench.kernels.loss import l1_ssim
+from gsbench.kernels.raster import Viewport, backward_by_splat
+from gsbench.models import Query
 from gsbench.raster import EPS2D, FAR, NEAR, rasterize
-from gsbench.raster.cuda import splat_within
+from gsbench.raster.native import draw_within
 
-VIEW = raster.View(70, 50, NEAR, FAR, EPS2D, antialias=False)
+VIEWPORT = Viewport(70, 50, NEAR, FAR, EPS2D, antialias=False)
 MODELS = (("3dgs", {}), ("4dgs", {}), ("6dgs", {}), ("7dgs", {}), ("7dgs", {"factor_order": "paper"}))
 
 
@@ -19,15 +22,16 @@ def main() -> None:
         means, factors, opacities, _ = (x.cuda().requires_grad_() for x in gaussians(1_000))
         colors = torch.rand(1_000, D, device="cuda").requires_grad_()
         arguments = means, factors * 4, opacities, colors, viewmats.requires_grad_(), Ks
-        for raster.BACKWARD_BY_SPLAT in (True, False):
+        for way in (backward_by_splat(), nullcontext()):
             output = rasterize(*arguments, 70, 50, backend="cuda")
-            (output.image.square().sum() + output.alpha.sum()).backward(retain_graph=True)
+            with way:
+                (output.image.square().sum() + output.alpha.sum()).backward(retain_graph=True)
         for room in (100, 100_000):  # too few pairs, too many
             with torch.no_grad():
-                splat_within(*arguments[:3], colors[None], *arguments[4:], colors.new_zeros(D), VIEW, room)
+                draw_within(*arguments[:3], colors[None], *arguments[4:], colors.new_zeros(D), VIEWPORT, room)
     center = torch.tensor([0.0, 0.0, -4.0], device="cuda")
     for name, options in MODELS:
-        seen = model(name, 500, agr=True, **options).cuda().slice(center, 0.4)
+        seen = model(name, 500, agr=True, **options).cuda().slice(Query.at(center, 0.4))
         sum(x.square().sum() for x in seen).backward()
     image = torch.rand(37, 50, 3, device="cuda").requires_grad_()
     l1_ssim(image, torch.rand(37, 50, 3, device="cuda"), 0.2).backward()

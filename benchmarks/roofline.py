@@ -24,6 +24,6 @@ def limits() -> Limits:
     kernels, rounds = native(), 1_000_000
     a, b, c = (torch.rand(1 << 24) for _ in range(3))
     flops = measure(lambda: kernels.roofline_flops(rounds)).p10
-    triad = measure(lambda: kernels.roofline_triad(a, b, c)).p10
+    triad = measure(lambda: kernels.roofline_triad(a.data_ptr(), b.data_ptr(), c.data_ptr(), len(a))).p10
     alphas = measure(lambda: kernels.roofline_alphas(rounds)).p10
     return Limits(20 * LANES * rounds / flops / 1e6, 12 * len(a) / triad / 1e6, LANES * rounds / alphas / 1e6)

@@ -136,11 +136,13 @@ def step() -> Iterator[Row]:
 
 
 def training_step(fitted: GaussianModel, size: int, views: int) -> Callable[[], None]:
-    """The gradients of a batch, and Adam at a rate that moves nothing."""
+    """The gradients of a batch, where the model is, and Adam at a rate that moves nothing."""
     viewmats, Ks = camera(size)
     target = torch.rand(size, size, 3, generator=torch.Generator().manual_seed(0))
-    batch = [View(str(i), Camera(viewmats[0], Ks[0], size, size), 0.4, target) for i in range(views)]
-    gradients = Step(fitted, torch.zeros(3), 0.2, False, Stages())
+    device = fitted.splats["means"].device.type
+    view = View("0", Camera(viewmats[0], Ks[0], size, size), 0.4, target).to(device)
+    batch = [view] * views
+    gradients = Step(fitted, torch.zeros(3, device=device), 0.2, False, Stages(device))
     adam = torch.optim.Adam([p for p in fitted.parameters() if p.requires_grad], lr=1e-9, fused=True)
 
     def call() -> None:

@@ -41,7 +41,7 @@ def model(
 ) -> GaussianModel:
     """A model of N Gaussians, whose slices are as large as the Gaussians of `gaussians` whatever N.
 
-    Standard deviations of a slice along its axes in space are log-normal with the median `sigma` and SPREAD. Correlations
+    The standard deviations of a slice along its axes are log-normal, of median `sigma` and spread SPREAD. Correlations
     and colours are not zero.
     """
     g = torch.Generator().manual_seed(seed)

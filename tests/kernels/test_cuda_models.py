@@ -35,7 +35,7 @@ def back(tensors: list[Tensor]) -> list[Tensor]:
 
 
 def assert_slices_agree(exact: GaussianModel, raw: dict[str, Tensor], move: Move) -> None:
-    """The kernels' slice, and its gradients by all parameters, against those of a model in float64, which is torch's."""
+    """The kernels' slice, and its gradients by all parameters, against those of torch in float64."""
     center, time = torch.tensor([0.3, -0.2, -3.0]), torch.tensor(0.4)
     expected = list(exact.observe(raw, Query(center.double(), time.double())))
     lambdas = list(exact.log_modulation.parameters())
