@@ -269,9 +269,9 @@ def _shape(text: str) -> Shape:
     return tuple(int(size) if size.isdigit() else size for size in text.split())
 
 
-def _apart(results: Tensors, inputs: Tensors) -> Tensors:
+def _apart(results: Tensors, inputs: Sequence[Tensor | None]) -> Tensors:
     """Results none of which shares memory with an input or another: torch asks that of what it is told of."""
-    taken, apart = {x.untyped_storage().data_ptr() for x in inputs}, []
+    taken, apart = {x.untyped_storage().data_ptr() for x in inputs if x is not None}, []
     for x in results:
         apart.append(x.clone() if x.untyped_storage().data_ptr() in taken else x)
         taken.add(apart[-1].untyped_storage().data_ptr())
@@ -300,15 +300,14 @@ def _register(operation: Operation) -> Callable[..., Any]:
 
     def gradient(ctx: Any, given: list[Tensor | None]) -> tuple[Any, ...]:
         tensors, outputs = ctx.saved_tensors[: ctx.tensors], ctx.saved_tensors[ctx.tensors :]
-        dense = [torch.zeros_like(x) if g is None else g for g, x in zip(given, outputs, strict=True)]
-        gradients = backward_op(list(tensors), *ctx.numbers, list(outputs), dense, ctx.wanted)
+        gradients = backward_op(list(tensors), *ctx.numbers, list(outputs), given, ctx.wanted)
         wanted = [g if asked else None for g, asked in zip(gradients, ctx.wanted, strict=True)]
         return wanted, *(None,) * count
 
     forward_op = torch.library.custom_op(f"gsbench::{name}", forward, mutates_args=(), schema=schema)
     backward_op = torch.library.custom_op(
         f"gsbench::{name}_backward", backward, mutates_args=(),
-        schema=f"(Tensor[] tensors{declared}, Tensor[] outputs, Tensor[] given, bool[] wanted) -> Tensor[]",
+        schema=f"(Tensor[] tensors{declared}, Tensor[] outputs, Tensor?[] given, bool[] wanted) -> Tensor[]",
     )  # fmt: skip
     forward_op.register_fake(lambda tensors, *values: operation.fake(tensors, values))
     backward_op.register_fake(lambda tensors, *_: operation.fake_backward(tensors))

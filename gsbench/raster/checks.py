@@ -16,7 +16,7 @@ def check_arguments(
 ) -> None:  # fmt: skip
     """Raise InputError unless everything is as `rasterize` says."""
     global _last
-    sizes = width, height, near, far, eps2d
+    sizes = width, type(width), height, type(height), near, far, eps2d
     given = means, factors, opacities, colors, viewmats, Ks, background
     call: list[object] = [*sizes, *[isinstance(x, Tensor) and (x.shape, x.dtype, x.device) for x in given]]
     if call == _last:
