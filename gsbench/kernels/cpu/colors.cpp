@@ -80,6 +80,7 @@ public:
 private:
     GSB_HD void fill() {
         const int n = left < LANES ? left : LANES;
+        for (int i = 0; i < count; ++i) __builtin_prefetch(p + offsets[i] + 2 * LANES);  // far apart, so nothing else would
         for (int i = 0; i < LANES; ++i) block[i] = i < count ? load_some(p + offsets[i], n) : Vec(0.0f);
         transpose(block);
         p += n;
