@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from benchmarks.scene import camera, gaussians, model
+from gsbench import kernels
 from gsbench.backends import BACKENDS, CPU, REFERENCE
 from gsbench.kernels.loss import l1_ssim
 from gsbench.measure.speed import Stages
@@ -153,4 +154,24 @@ def training_step(fitted: GaussianModel, size: int, views: int) -> Callable[[], 
     return call
 
 
-SECTIONS = {"raster": raster, "observe": observing, "loss": loss, "step": step}
+def instruction_sets() -> Iterator[Row]:
+    """The same calls by each instruction set that this machine has: a higher one is not to be slower."""
+    query, g = Query.at(torch.tensor([0.0, 0.0, -4.0]), 0.4), torch.Generator().manual_seed(0)
+    image, target = (torch.rand(400, 400, 3, generator=g) for _ in range(2))
+    image.requires_grad_()
+    inputs, (viewmats, Ks) = [x.requires_grad_() for x in gaussians(10_000)], camera(400)
+    calls: dict[str, Callable[[], Any]] = {
+        f"{name} 50k slice and colours": lambda made=made: sum(x.sum() for x in made.slice(query)).backward()
+        for name, made in ((name, model(name, 50_000, agr=name == "7dgs")) for name in ("3dgs", "4dgs", "6dgs", "7dgs"))
+    }
+    calls["raster 10k / 400x400"] = lambda: rasterize(*inputs, viewmats, Ks, 400, 400).image.sum().backward()
+    calls["loss 400x400"] = lambda: l1_ssim(image, target, 0.2).backward()
+    best = kernels.native().active()
+    for name, call in calls.items():
+        for level in kernels.native().instruction_sets():
+            kernels.use_instruction_set(level)
+            yield Row("instruction sets", f"{name} forward + backward, {level}", call)
+        kernels.use_instruction_set(best)
+
+
+SECTIONS = {"raster": raster, "observe": observing, "loss": loss, "step": step, "isa": instruction_sets}
