@@ -10,7 +10,7 @@ from benchmarks.scene import camera, gaussians, model
 from gsbench import kernels
 from gsbench.backends import BACKENDS, CPU, REFERENCE
 from gsbench.kernels.loss import l1_ssim
-from gsbench.measure.speed import Stages
+from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.raster import rasterize
 from gsbench.scenes import Camera, View
@@ -143,7 +143,7 @@ def training_step(fitted: GaussianModel, size: int, views: int) -> Callable[[], 
     device = fitted.splats["means"].device.type
     view = View("0", Camera(viewmats[0], Ks[0], size, size), 0.4, target).to(device)
     batch = [view] * views
-    gradients = Step(fitted, torch.zeros(3, device=device), 0.2, False, Stages(device))
+    gradients = Step(fitted, torch.zeros(3, device=device), 0.2, False, StageClock(device))
     adam = torch.optim.Adam([p for p in fitted.parameters() if p.requires_grad], lr=1e-9, fused=True)
 
     def call() -> None:

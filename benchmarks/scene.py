@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsbench.models import GaussianModel, build
-from gsbench.models.base import Stage
+from gsbench.models.base import Phase
 from gsbench.models.factors import KINDS
 from gsbench.models.triangular import TriangularModel
 from gsbench.scenes.scene import Points
@@ -57,5 +57,5 @@ def model(
         logs = made.splats[made.geometry[0]]  # [N, 3 or more], of which those in space are set
         space = made.rows["p"] if isinstance(made, TriangularModel) else [0, 1, 2]
         logs[:, space] = math.log(sigma) + SPREAD * torch.randn(N, 3, generator=g)
-    made.set_stage(Stage(3, refine=agr, tune_modulation=False))
+    made.set_phase(Phase(3, refine=agr, tune_modulation=False))
     return made

@@ -1,4 +1,4 @@
-"""The command line: compose a config, hand each scene of it to experiment.run. Needs no torch until a run starts."""
+"""Compose a config from the command line and do a run for each of its scenes, without torch until the first starts."""
 
 import os
 import sys
@@ -32,11 +32,11 @@ def entry(composed: DictConfig) -> None:
                          f"{composed.data.dataset} ({', '.join(composed.data.scenes)}), each with "
                          f"transforms_{{train,val,test}}.json and the images they name. "
                          f"Published at: {composed.data.published}")  # fmt: skip
-    from gsbench import experiment  # imports torch
+    from gsbench.run.run import run  # imports torch
 
     for one in _one_scene_each(composed):
         try:
-            record = experiment.run(one)
+            record = run(one)
             problem = None if record.status == "ok" else f"{record.status}: {record.reason}"
         except InputError as error:
             problem = str(error)

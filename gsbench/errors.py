@@ -18,3 +18,8 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, choices, n=1, cutoff=0.4)
     guess = f"Did you mean '{close[0]}'? " if close else ""
     return f"{guess}Valid: {', '.join(choices)}."
+
+
+def one_line(error: BaseException) -> str:
+    """The first line of an error's message, or its type where it has no message."""
+    return (str(error) or type(error).__name__).splitlines()[0]

@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from gsbench.config import CONF, Config, register_schema
-from gsbench.experiment import build
+from gsbench.run import build
 from gsbench.scenes.points import random_points
 from gsbench.train.optim import Optimizer, rate_at
 

@@ -73,7 +73,7 @@ def time_renders(
     return RenderTimes(p10=deciles[0], p50=deciles[4], p90=deciles[8])
 
 
-class Stages:
+class StageClock:
     """Seconds by stage of training: ``with stages("slice"): ...`` adds to that stage's sum.
 
     On a GPU both ends are events in its queue of work, so that nothing is waited for before the sums are asked for, and

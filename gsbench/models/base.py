@@ -42,7 +42,7 @@ class Conditioned(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Stage:
+class Phase:
     """How much of a model is switched on at some point of the training."""
 
     sh_degree: int
@@ -84,7 +84,7 @@ class GaussianModel(nn.Module, ABC):
         self.sh_degree = sh_degree
         self.backend = backend
         self.extent = 1.0  # of the scene, world units
-        self.stage = Stage(sh_degree, agr, False)
+        self.phase = Phase(sh_degree, agr, False)
 
     # ---- what a subclass gives
 
@@ -119,7 +119,7 @@ class GaussianModel(nn.Module, ABC):
 
     def show(self, raw: Raw, directions: Tensor, query: Query) -> Tensor:
         """Colours [N, 3] in unit directions [N, 3]."""
-        return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), directions, self.stage.sh_degree)
+        return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), directions, self.phase.sh_degree)
 
     # ---- what every model does
 
@@ -147,7 +147,7 @@ class GaussianModel(nn.Module, ABC):
             unit = size_of(points)
             units = torch.cat([torch.full((n,), unit if name in LENGTHS else 1.0) for name, n in widths.items()])
             self.refinement = Refinement(outputs, generator, self.agr_octaves, units)
-        self.set_stage(self.stage)
+        self.set_phase(self.phase)
 
     def slice(self, query: Query) -> Gaussians3D:
         """Observe the model from a place at a time: 3D Gaussians for the rasterizer.
@@ -169,13 +169,13 @@ class GaussianModel(nn.Module, ABC):
     def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
         """Colours of a slice; the kernel leaves out what `opacities` say cannot be drawn."""
         if type(self).show is GaussianModel.show and self.backend.serves(means):
-            return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, self.stage.sh_degree)
+            return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, self.phase.sh_degree)
         return self.show(raw, unit(means - query.center), query)
 
     def refined(self, query: Query) -> Raw:
         """Raw parameters after AGR: raw + phi(f) (7DGS eq. 15), on log-diagonals before the exp."""
         raw: Raw = dict(self.splats.items())
-        if self.refinement is None or not self.stage.refine or query.time is None:
+        if self.refinement is None or not self.phase.refine or query.time is None:
             return raw
         names = (*self.centers, *self.geometry)
         by_kernel = self.backend.serves(raw["means"])
@@ -196,13 +196,13 @@ class GaussianModel(nn.Module, ABC):
         """lambda_t or lambda_d of `log_modulation`, positive by exp, []."""
         return self.log_modulation[name].exp()
 
-    def set_stage(self, stage: Stage) -> None:
+    def set_phase(self, phase: Phase) -> None:
         """Switch parts on or off; what is off neither acts nor learns."""
-        self.stage = stage
+        self.phase = phase
         for parameter in self.log_modulation.parameters():
-            parameter.requires_grad_(stage.tune_modulation)
+            parameter.requires_grad_(phase.tune_modulation)
         if self.refinement is not None:
-            self.refinement.requires_grad_(stage.refine)
+            self.refinement.requires_grad_(phase.refine)
 
     def groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by the name their learning rate goes by."""

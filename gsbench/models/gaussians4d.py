@@ -104,7 +104,7 @@ class Gaussians4DModel(GaussianModel):
         if self.time_degree >= MAX_WAVES or not self.backend.serves(means):
             return super().paint(raw, means, opacities, query)
         assert query.time is not None
-        sh0, degree, waves = raw["sh0"].flatten(1, 2), self.stage.sh_degree, self.time_degree + 1
+        sh0, degree, waves = raw["sh0"].flatten(1, 2), self.phase.sh_degree, self.time_degree + 1
         return show_colors(sh0, raw["shN"], means, opacities, query.center, degree, raw["times"], query.time, waves)
 
     def initial_colors(self, dc: Tensor) -> Raw:
@@ -117,7 +117,7 @@ class Gaussians4DModel(GaussianModel):
         """4DSH."""
         assert query.time is not None
         coefficients = torch.cat([raw["sh0"].flatten(1, 2), raw["shN"]], 1).unflatten(1, (self.time_degree + 1, -1))
-        return sh_time_colors(coefficients, directions, self.stage.sh_degree, query.time - raw["times"][:, 0])
+        return sh_time_colors(coefficients, directions, self.phase.sh_degree, query.time - raw["times"][:, 0])
 
     def scales(self) -> Tensor:
         """Largest of the three spatial scales, as 4DGS' density control has it."""

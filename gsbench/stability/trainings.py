@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from gsbench.errors import InputError
-from gsbench.experiment import build
 from gsbench.models import GaussianModel
+from gsbench.run import build
 from gsbench.scenes.scene import Camera, Points, Scene, View
 from gsbench.stability.cases import Case, Cell, device_of
 from gsbench.stability.training_cases import Training

@@ -15,7 +15,7 @@ from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.measure.curve import Curve
 from gsbench.measure.quality import psnr
-from gsbench.measure.speed import Stages
+from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel
 from gsbench.models.render import render
 from gsbench.scenes import Scene, View
@@ -58,7 +58,7 @@ class Trainer:
         self.optimizer = Optimizer(model, config.model, train, scene.extent, config.optim)
         self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity, len(scene.train))
         self.floor = Floor(model, [view.camera for view in scene.train])
-        self.stages = Stages(config.device)
+        self.stages = StageClock(config.device)
         self.gradients = Step(model, self.background, train.ssim_weight, config.raster.antialias, self.stages)
         self.watch = Watch(config.device)
         if config.device.startswith("cuda"):  # there a bad step is found later, and must not be applied meanwhile
@@ -98,7 +98,7 @@ class Trainer:
     def _descend(self) -> None:
         """One step: the loss is the mean over a batch of views."""
         step, train, stages = self.step, self.config.train, self.stages
-        self.model.set_stage(self.schedule.stage(step))
+        self.model.set_phase(self.schedule.phase(step))
         views = [self.scene.train[i] for i in batch(step, len(self.scene.train), train.batch_size, self.config.seed)]
         try:
             seen = self.gradients(views)
@@ -121,7 +121,7 @@ class Trainer:
 
     def _measure(self) -> None:
         """Add a point to the curve; its cost is in no stage, so in no training time."""
-        self.model.set_stage(self.schedule.stage(self.step))
+        self.model.set_phase(self.schedule.phase(self.step))
         val = self.psnr(self.scene.val) if self.scene.val else math.nan
         self.curve.add(self.step + 1, sum(self.stages.seconds.values()), val)
         leak = self.config.protocol.best_on_test
@@ -167,4 +167,4 @@ class Trainer:
         self.stages.load_state_dict(state["stages"])
         self.curve.load_state_dict(state["curve"])
         self.best = Best(**state["best"])
-        self.model.set_stage(self.schedule.stage(max(0, self.step - 1)))
+        self.model.set_phase(self.schedule.phase(max(0, self.step - 1)))

@@ -3,7 +3,7 @@
 import torch
 
 from gsbench.config import TrainConfig
-from gsbench.models import Stage
+from gsbench.models import Phase
 
 # What an interval waits for takes a number of steps, not a part of the run. So `densify.every` does not scale, and
 # resets are never closer than Adam, at its rate of 0.05, needs to raise opacities again.
@@ -28,9 +28,9 @@ class Schedule:
         """A step of the recipe in this run; at least 1."""
         return max(1, round(step * self.config.iterations / self.config.recipe_iterations))
 
-    def stage(self, step: int) -> Stage:
+    def phase(self, step: int) -> Phase:
         """What of the model is on at a step, counted from 0."""
-        return Stage(
+        return Phase(
             sh_degree=min(self.sh_degree, step // self.scaled(self.config.sh_every)),
             refine=self.agr and step >= self.scaled(self.config.refine_from),
             tune_modulation=step >= self.scaled(self.config.modulation_from),

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from gsbench.errors import InputError, TooLargeError
 from gsbench.kernels.tape import Tape
-from gsbench.measure.speed import Stages
+from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes import View
@@ -37,7 +37,7 @@ class Step:
     """Sees views and leaves the gradient of their mean loss in the model's parameters."""
 
     def __init__(
-        self, model: GaussianModel, background: Tensor, ssim_weight: float, antialias: bool, stages: Stages
+        self, model: GaussianModel, background: Tensor, ssim_weight: float, antialias: bool, stages: StageClock
     ) -> None:
         """Train `model` before a background colour [3]; its time goes to `stages`."""
         self.model = model
@@ -73,7 +73,7 @@ class Step:
         started = time.perf_counter()
         bounds = [len(views) * lane // lanes for lane in range(lanes + 1)]
         sums = [total if i < bounds[1] else {} for i in range(len(views))]
-        clocks = [Stages() for _ in range(lanes)]
+        clocks = [StageClock() for _ in range(lanes)]
 
         def run(lane: int) -> list[Seen]:
             return [self._see(views[i], sources, sums[i], len(views), clocks[lane])
@@ -90,7 +90,7 @@ class Step:
         self.stages.share([clock.seconds for clock in clocks], time.perf_counter() - started)
         return seen
 
-    def _see(self, view: View, sources: list[nn.Parameter], sums: Sums, views: int, stages: Stages) -> Seen:
+    def _see(self, view: View, sources: list[nn.Parameter], sums: Sums, views: int, stages: StageClock) -> Seen:
         """One view of a batch, whose gradients are added to `sums`."""
         with Tape() as tape:
             with stages("slice"):

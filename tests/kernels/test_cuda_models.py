@@ -13,7 +13,7 @@ from torch import Tensor
 from gsbench.backends import AUTO, REFERENCE, Backend
 from gsbench.errors import InputError
 from gsbench.kernels import colors, refine
-from gsbench.measure.speed import Stages
+from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.base import unit
@@ -130,7 +130,7 @@ def test_a_training_step_s_gradients_are_the_reference_s(name: str, agr: bool, c
         made = test_tape.fitted(name, agr=agr).to(device)
         made.backend = backend
         background = torch.tensor([0.1, 0.5, 0.9], device=device)
-        Step(made, background, 0.2, False, Stages(device))([view.to(device) for view in test_tape.views(2)])
+        Step(made, background, 0.2, False, StageClock(device))([view.to(device) for view in test_tape.views(2)])
         return test_tape.gradients(made)
 
     got, want = step(AUTO, cuda_device), step(REFERENCE, "cpu")

@@ -12,7 +12,7 @@ from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.slices import observe_still
 from gsbench.kernels.tape import Tape
-from gsbench.measure.speed import Stages
+from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes.scene import Camera, View
@@ -39,7 +39,7 @@ def fitted(name: str, N: int = 300, *, agr: bool = False) -> GaussianModel:
     with torch.no_grad():
         for parameter in made.refinement.parameters() if made.refinement is not None else ():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
-    made.set_stage(replace(made.stage, tune_modulation=True))
+    made.set_phase(replace(made.phase, tune_modulation=True))
     return made
 
 
@@ -64,7 +64,7 @@ def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool) -> None:
         for key, gradient in gradients(made).items():
             expected[key] = gradient if key not in expected else expected[key] + gradient
     torch.set_num_threads(1)
-    seen_by_step = Step(made, BACKGROUND, 0.2, False, Stages())(batch)
+    seen_by_step = Step(made, BACKGROUND, 0.2, False, StageClock())(batch)
     actual = gradients(made)
     assert actual.keys() == expected.keys()
     for key, gradient in expected.items():
@@ -82,7 +82,7 @@ def test_the_same_bits_for_any_number_of_threads(name: str) -> None:
     found = []
     for count in (1, 2, 3, 8):
         torch.set_num_threads(count)
-        seen = Step(made, BACKGROUND, 0.2, False, Stages())(batch)
+        seen = Step(made, BACKGROUND, 0.2, False, StageClock())(batch)
         found.append((gradients(made), torch.stack([one.loss for one in seen]), [one.g_means2d for one in seen]))
         assert torch.get_num_threads() == count
     for other in found[1:]:

@@ -42,14 +42,14 @@ def test_stages_add_up_and_survive_a_resume(monkeypatch):
     """Would catch a resumed run whose stages start at zero, and a stage whose time is lost when its body raises."""
     now = iter(range(100))
     monkeypatch.setattr(time, "perf_counter", lambda: float(next(now)))
-    stages = speed.Stages()
+    stages = speed.StageClock()
     for name in ("slice", "raster", "slice"):
         with stages(name):
             pass
     with pytest.raises(KeyError), stages("loss"):
         raise KeyError
     assert stages.seconds == {"slice": 2.0, "raster": 1.0, "loss": 1.0}
-    resumed = speed.Stages()
+    resumed = speed.StageClock()
     resumed.load_state_dict(stages.state_dict())
     with resumed("slice"):
         pass
@@ -82,7 +82,7 @@ def test_stages_wait_for_no_device_until_they_are_read(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "Event", Event)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda _: None)
-    stages = speed.Stages("cuda")
+    stages = speed.StageClock("cuda")
     for name in ("slice", "raster", "slice"):
         with stages(name):
             pass
@@ -97,7 +97,7 @@ def test_stages_wait_for_no_device_until_they_are_read(monkeypatch):
 
 def test_stages_do_not_nest():
     """Would catch seconds counted twice, so that stage_s adds up to more than train_s."""
-    stages = speed.Stages()
+    stages = speed.StageClock()
     with pytest.raises(InputError, match="'b' was opened inside 'a'"), stages("a"), stages("b"):
         pass
     with stages("b"):  # and the refusal does not leave "a" open
@@ -121,7 +121,7 @@ def test_peak_memory_sees_an_allocation_and_can_start_anew():
 def test_on_a_gpu_the_stage_that_caused_the_work_pays_for_it():
     """Would catch a missing synchronisation: queueing 200 large products takes far less time than doing them."""
     a = torch.rand(4096, 4096, device="cuda")
-    stages = speed.Stages("cuda")
+    stages = speed.StageClock("cuda")
     speed.reset_peak_memory("cuda")
     with stages("warm"):
         a @ a

@@ -9,7 +9,7 @@ from small import CAMERA, EXTENT, MODELS, VARIANTS, N, fresh, joint, lively, raw
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models import GaussianModel, Query, Stage
+from gsbench.models import GaussianModel, Phase, Query
 from gsbench.models.base import CHILDREN, SHRINK
 
 TRIANGULAR = [v for v in VARIANTS if v.startswith(("6dgs", "7dgs")) and "row_scaled" not in v]
@@ -19,7 +19,7 @@ IN_TIME = [v for v in TRIANGULAR if v.startswith("7dgs")]
 def quiet(variant: str, **options: Any) -> GaussianModel:
     """A lively model whose AGR does not act: rows are what is looked at."""
     model = lively(variant, **options)
-    model.set_stage(Stage(3, False, False))
+    model.set_phase(Phase(3, False, False))
     return model
 
 

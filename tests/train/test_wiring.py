@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from gsbench.backends import AUTO, REFERENCE
-from gsbench.experiment import build
 from gsbench.measure.curve import Point
 from gsbench.models import Query
+from gsbench.run import build
 from gsbench.scenes.scene import Scene
 from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.loop import Trainer
@@ -160,7 +160,7 @@ def test_a_model_shows_the_same_by_kernels_and_in_torch(name: str, degree: int, 
         assert model.refinement is not None
         for weight in model.refinement.weights_out:
             weight.normal_(0, 0.02, generator=random)
-    model.set_stage(replace(model.stage, sh_degree=degree, refine=True))
+    model.set_phase(replace(model.phase, sh_degree=degree, refine=True))
     shown = []
     for backend in (AUTO, REFERENCE):
         model.backend = backend
