@@ -12,9 +12,9 @@ from gsbench.backends import AUTO, Backend
 from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.models.appearance import sh_colors
-from gsbench.models.query import Query
+from gsbench.models.query import Query, unit
 from gsbench.models.refinement import OCTAVES, Refinement
-from gsbench.scenes.points import SH_C0, nearest_distances
+from gsbench.scenes.points import SH_C0, nearest_distances, size_of
 from gsbench.scenes.scene import Points
 
 Raw = dict[str, Tensor]  # raw parameters by name, N rows each
@@ -144,8 +144,8 @@ class GaussianModel(nn.Module, ABC):
         if self.agr:
             widths = {name: raw[name].shape[-1] for name in (*self.centers, *self.geometry)}
             outputs = [*(widths[name] for name in self.centers), sum(widths[name] for name in self.geometry)]
-            unit = size_of(points)
-            units = torch.cat([torch.full((n,), unit if name in LENGTHS else 1.0) for name, n in widths.items()])
+            size = size_of(points)
+            units = torch.cat([torch.full((n,), size if name in LENGTHS else 1.0) for name, n in widths.items()])
             self.refinement = Refinement(outputs, generator, self.agr_octaves, units)
         self.set_phase(self.phase)
 
@@ -252,19 +252,3 @@ class GaussianModel(nn.Module, ABC):
         for name, parameter in self.splats.items():
             parameter.data = torch.empty_like(state[f"splats.{name}"], device=parameter.device)
         self.load_state_dict(state)
-
-
-def size_of(points: Points) -> float:
-    """How large a scene is, world units: the standard deviation of its points along an axis; 1 of a single point.
-
-    Cameras that stand far off do not change it, unlike the extent.
-    """
-    size = float(points.means.std(0).mean()) if len(points.means) > 1 else 0.0
-    return size if 0 < size < math.inf else 1.0
-
-
-def unit(vectors: Tensor) -> Tensor:
-    """Vectors [N, 3] at length 1; a vector too short to have a direction becomes zero, and so does its gradient."""
-    square = vectors.square().sum(-1, keepdim=True)
-    defined = square > 1e-20
-    return torch.where(defined, vectors * torch.where(defined, square, 1.0).rsqrt(), 0.0)

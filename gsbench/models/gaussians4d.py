@@ -11,11 +11,12 @@ from gsbench.kernels.colors import MAX_WAVES, show_colors
 from gsbench.kernels.slices import observe_rotated
 from gsbench.kernels.thresholds import TIME_GATE_MIN
 from gsbench.models.appearance import sh_time_colors
-from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, size_of
+from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
 from gsbench.models.factors import rotation4d, sizes
 from gsbench.models.query import Query
 from gsbench.models.registry import register
 from gsbench.models.slicing import check_scheme, mahalanobis, slice_gaussians
+from gsbench.scenes.points import size_of
 from gsbench.scenes.scene import Points
 
 

@@ -10,9 +10,9 @@ from torch import Tensor
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.slices import observe_triangular
 from gsbench.kernels.thresholds import EXPONENT_MAX
-from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw, unit
+from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle
-from gsbench.models.query import Query
+from gsbench.models.query import Query, unit
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.scene import Points
 

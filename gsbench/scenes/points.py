@@ -77,6 +77,15 @@ def nearest_distances(
     return torch.from_numpy(np.sqrt(squared.clip(min=_MIN_SQUARED_DISTANCE))).to(means)
 
 
+def size_of(points: Points) -> float:
+    """How large a scene is, world units: the standard deviation of its points along an axis; 1 of a single point.
+
+    Cameras that stand far off do not change it, unlike the extent.
+    """
+    size = float(points.means.std(0).mean()) if len(points.means) > 1 else 0.0
+    return size if 0 < size < math.inf else 1.0
+
+
 def _columns(vertices: NDArray[np.void], names: tuple[str, str, str], path: str | Path) -> NDArray[np.float64]:
     """Return three properties as [P, 3] float64, finite in single precision."""
     for name in names:

@@ -16,8 +16,8 @@ from gsbench.kernels import colors, refine
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.appearance import sh_colors, sh_time_colors
-from gsbench.models.base import unit
 from gsbench.models.gaussians3d import Gaussians3DModel
+from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement
 from gsbench.train.step import Step
 

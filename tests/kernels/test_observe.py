@@ -13,12 +13,12 @@ from gsbench.kernels.refine import refine
 from gsbench.kernels.slices import observe_rotated, observe_still, observe_triangular
 from gsbench.models import Query
 from gsbench.models.appearance import sh_colors, sh_time_colors
-from gsbench.models.base import unit
 from gsbench.models.factors import OFF_DIAGONALS
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.gaussians6d import Gaussians6DModel
 from gsbench.models.gaussians7d import Gaussians7DModel
+from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement
 from gsbench.models.triangular import TriangularModel
 

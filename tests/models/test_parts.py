@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from gsbench.errors import InputError
 from gsbench.models.appearance import sh_basis, sh_colors, sh_time_colors
-from gsbench.models.base import unit
 from gsbench.models.factors import OFF_DIAGONALS, Triangle, rotation, rotation4d
+from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement, encode_time
 
 PROPERTY = settings(max_examples=25, deadline=None)
