@@ -25,7 +25,7 @@ $(VENV)/installed: pyproject.toml constraints.txt $(NATIVE)
 		{ echo "gsbench needs Python 3.11, 3.12 or 3.13; $(PYTHON) is $$($(PYTHON) --version). Try make PYTHON=python3.12"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		--config-settings cmake.define.CUDA=$(CUDA) --editable '.[dev]'
+		--config-settings cmake.define.CUDA=$(CUDA) --editable '.[dev,stability]'
 	touch $@
 
 table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR on the embedded scenes; print and write the table

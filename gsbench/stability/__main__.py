@@ -1,21 +1,29 @@
-"""``python -m gsbench.stability``: audit hard cases, write the page; exit with 1 where a default breaks its bound."""
+"""Audit hard cases and write the page (``python -m gsbench.stability``): exit with 1 if a default breaks its bound."""
 
 import argparse
+import importlib.util
 import os
 import sys
 from pathlib import Path
 
 from gsbench.errors import InputError
 
+EXTRA = ("matplotlib", "mpmath")  # the packages of gsbench[stability]
+
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the audit, or look at a checkpoint; see `--help`."""
+    """Run the audit or measure a checkpoint, see `--help`; return the exit code, 2 where neither can be done."""
     parser = argparse.ArgumentParser(prog="python -m gsbench.stability", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/stability"), help="folder of the results")
     parser.add_argument("--long", action="store_true", help="train for 2,000 steps at 30 times the learning rates")
     parser.add_argument("--checkpoint", type=Path, metavar="FILE",
                         help="no audit: the condition numbers in a trained model")  # fmt: skip
     options = parser.parse_args(arguments)
+    missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
+    if missing:
+        print(f"gsbench.stability: error: expected {' and '.join(missing)}: install with "
+              "pip install 'gsbench[stability]'", file=sys.stderr)  # fmt: skip
+        return 2
     os.environ.setdefault("MPLBACKEND", "Agg")
     if options.checkpoint:
         return show_spectrum(options.checkpoint, options.out)
@@ -30,7 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def show_spectrum(checkpoint: Path, folder: Path) -> int:
-    """Print and draw the condition numbers in a checkpoint; 2 where it is none."""
+    """Print and plot the condition numbers in a checkpoint; return 2 where the file is not a checkpoint."""
     from gsbench.stability import spectrum
 
     try:

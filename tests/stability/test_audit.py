@@ -121,6 +121,26 @@ def test_experiment_is_the_audit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert seen == [["--out", str(tmp_path / "stability")]]
 
 
+@pytest.mark.parametrize("missing", [["mpmath"], ["matplotlib", "mpmath"]])
+def test_without_the_extra_a_line_says_what_to_install(
+    missing: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a stack trace from the middle of the audit, by either command, where gsbench came without the extra."""
+    from gsbench import __main__ as gsbench
+
+    for name in missing:
+        monkeypatch.setitem(sys.modules, name, None)
+    line = f"expected {' and '.join(missing)}: install with pip install 'gsbench[stability]'\n"
+    assert command.main(["--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == f"gsbench.stability: error: {line}"
+    monkeypatch.setattr(sys, "argv", ["gsbench", "+exp=stability", f"results={tmp_path}"])
+    with pytest.raises(SystemExit) as end:
+        gsbench.main()
+    assert end.value.code == 1
+    assert capsys.readouterr().err == f"gsbench.stability: error: {line}"
+    assert not list(tmp_path.iterdir())
+
+
 def test_missing_numbers_are_not_good_ones() -> None:
     """Catches a NaN error that passes a comparison, and an infinite one hidden by a percentile."""
     assert not cell("square_root", math.nan).holds
