@@ -13,15 +13,15 @@ from omegaconf.errors import OmegaConfBaseException
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError, did_you_mean
 
-_failures: list[str] = []  # one line for each run that did not end well; Hydra's own sweeps go on past them
+_failures: list[str] = []  # one line for each run that did not end well; a Hydra sweep goes on after it
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def entry(composed: DictConfig) -> None:
-    """Run every scene that the config names; one that fails does not stop the others."""
+    """Do a run for every scene that the config names; a run that fails does not stop the others."""
     if OmegaConf.is_missing(composed, "experiment"):
         raise InputError(f"no experiment was chosen: add +exp=NAME. Valid: {', '.join(_group('exp'))}.")
-    if composed.experiment == "stability":  # the one experiment that is no run of a model on a scene
+    if composed.experiment == "stability":  # the only experiment that trains no model on a scene
         from gsbench.stability.__main__ import main as audit
 
         if audit(["--out", str(Path(composed.results) / "stability")]):
@@ -46,9 +46,9 @@ def entry(composed: DictConfig) -> None:
 
 
 def main() -> None:
-    """Entry point of `python -m gsbench` and `gsbench`: errors are lines, not stack traces."""
+    """Run the commands `python -m gsbench` and `gsbench`; print an error as one line instead of a stack trace."""
     register_schema()
-    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises, so that this function can say it shorter
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and they are explained in one line below
     try:
         entry()
     except InputError as error:
@@ -59,7 +59,7 @@ def main() -> None:
 
 
 def _one_scene_each(composed: DictConfig) -> list[DictConfig]:
-    """The config itself, or for scene=all one config for each scene of the data set, composed as if it was named."""
+    """Return the config, or for scene=all one config for each scene, composed as if that scene was named."""
     if composed.scene.name != "all":
         return [composed]
     overrides = [o for o in HydraConfig.get().overrides.task if not o.startswith("scene=")]
@@ -75,7 +75,7 @@ def _group(name: str) -> list[str]:
 
 
 def _explain(error: Exception) -> str:
-    """Hydra's and OmegaConf's errors in one line that names the key and the nearest valid one."""
+    """Explain an error of Hydra or OmegaConf in one line that names the key and the nearest valid one."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return f"{group} '{name}' is not known. {did_you_mean(name, error.options)}"

@@ -1,4 +1,4 @@
-"""Who computes: torch by itself, or the kernels on the CPU or on a GPU. It is chosen here and nowhere else."""
+"""Choose the backend that computes: torch alone, the kernels on the CPU, or the kernels on a GPU."""
 
 import functools
 import warnings
@@ -14,13 +14,13 @@ from gsbench.kernels import cuda
 
 @dataclass(frozen=True)
 class Backend:
-    """A backend, handed to models, to the rasterizer, to the loss and to the optimizer, who ask it `serves`."""
+    """A backend. Models, the rasterizer, the loss and the optimizer are given one, and ask it whether it `serves`."""
 
     name: str
-    devices: tuple[str, ...]  # whose kernels it uses
+    devices: tuple[str, ...]  # the kinds of device on which it uses kernels
 
     def serves(self, tensor: Tensor) -> bool:
-        """Whether kernels do the work on such a tensor; else torch does."""
+        """Tell whether kernels do the work on such a tensor; otherwise torch does."""
         device = tensor.device.type
         return tensor.dtype == torch.float32 and device in self.devices and _built(device)
 
@@ -28,15 +28,15 @@ class Backend:
 REFERENCE = Backend("reference", ())
 CPU = Backend("cpu", ("cpu",))
 CUDA = Backend("cuda", ("cuda",))
-AUTO = Backend("auto", ("cpu", "cuda"))  # what serves a tensor, wherever it is
+AUTO = Backend("auto", ("cpu", "cuda"))  # uses the kernels of whichever device a tensor is on
 BACKENDS = {backend.name: backend for backend in (AUTO, REFERENCE, CPU, CUDA)}
 
 
 def resolve(name: str, device: str = "cpu") -> Backend:
-    """The backend of a name on a kind of device; `auto` becomes the fastest that is installed for it.
+    """Find a backend by its name for a kind of device; `auto` becomes the fastest one that is installed for it.
 
     Raises:
-        InputError: no such backend, it is not installed, or it does not work on that device.
+        InputError: the backend does not exist, is not installed, or does not work on that device.
     """
     if name not in BACKENDS:
         raise InputError(f"raster backend '{name}' is not known. {did_you_mean(name, BACKENDS)}")
@@ -50,7 +50,7 @@ def resolve(name: str, device: str = "cpu") -> Backend:
         why = "no CUDA device was found" if cuda.built() else "it is not built here, see docs/gpu.md"
         raise InputError(f"raster backend 'cuda': {why}; use raster.backend=auto or reference")
     if name in AUTO.devices and device in AUTO.devices and name != device:
-        raise InputError(f"raster backend '{name}' does not draw on device '{device}': use device={name}, "
+        raise InputError(f"raster backend '{name}' does not render on device '{device}': use device={name}, "
                          "or raster.backend=auto or reference")  # fmt: skip
     return BACKENDS[name]
 
@@ -60,15 +60,15 @@ def _built(device: str) -> bool:
 
 
 def _warn(device: str) -> None:
-    """Say what `auto` falls back to."""
+    """Warn where `auto` falls back to a slower backend."""
     if cuda.built() and not cuda.available():
-        _warn_once("no CUDA device was found: the CUDA kernels of this installation are idle, the CPU draws")
+        _warn_once("no CUDA device was found: the CUDA kernels of this installation are idle, the CPU renders")
     if device == "cuda" and not cuda.built():
-        _warn_once("the CUDA kernels are not built in this installation: the GPU draws by the reference backend, "
+        _warn_once("the CUDA kernels are not built in this installation: the GPU renders by the reference backend, "
                    "which is slow; see docs/gpu.md")  # fmt: skip
 
 
 @functools.cache
 def _warn_once(why: str) -> None:
-    """Once a process."""
+    """Warn, but only once in a process."""
     warnings.warn(f"raster backend 'auto': {why}", stacklevel=4)

@@ -1,6 +1,6 @@
-"""The schema of conf/: what every key is, of which type, with which default. A typo in a YAML fails, naming the key.
+"""Declare the schema of conf/: the type and the default of every key. A typo in a YAML fails and names the key.
 
-Needs no torch, so that `--help` and a wrong key answer at once.
+This module needs no torch, so that `--help` and the message about a wrong key appear at once.
 """
 
 from dataclasses import dataclass, field
@@ -16,14 +16,14 @@ CONF = HERE / "conf" if (HERE / "conf").is_dir() else HERE.parent / "conf"  # in
 
 @dataclass
 class DataConfig:
-    """A data set: where it lies and how it is looked at. An experiment sets these."""
+    """A data set: where its files are and how they are read. An experiment sets these."""
 
-    dataset: str = MISSING  # what tables call it
-    paper_dataset: str | None = None  # whose rows of the paper's tables stand beside it
-    root: str = MISSING  # folder that holds a folder for each scene; pkg://module for data inside a package
-    published: str = ""  # where to get it, for the error message when it is missing
-    scenes: list[str] = field(default_factory=list)  # what scene=all means
-    background: str = "black"  # or white: what images are composited over and renders stand before
+    dataset: str = MISSING  # its name in tables
+    paper_dataset: str | None = None  # the data set of the paper whose rows are shown beside it
+    root: str = MISSING  # the folder that holds a folder for each scene; pkg://module for data inside a package
+    published: str = ""  # where to get the data, for the error message when it is missing
+    scenes: list[str] = field(default_factory=list)  # the scenes of scene=all
+    background: str = "black"  # or white: the colour behind the images and the renders
     modulation: float = 0.5  # the initial lambda_t and lambda_d of 7DGS here (7DGS, implementation details)
     initial_points: int = 100_000  # drawn at random where the data set gives none ..
     initial_half_width: float = 1.3  # .. in the cube [-w, w]^3
@@ -34,7 +34,7 @@ class SceneConfig:
     """One scene of the data set."""
 
     name: str = MISSING
-    downscale: int = 1  # integer factor by which images are made smaller, area filter
+    downscale: int = 1  # integer factor by which images are made smaller, by an area filter
     eval_split: str = "test"  # or val, where the test split is wrong (D-NeRF lego)
 
 
@@ -44,56 +44,56 @@ class LearningRate:
 
     start: float = MISSING
     end: float | None = None  # None: constant
-    per_extent: bool = False  # times the scene's extent
-    per_run: bool = False  # times sqrt(recipe_iterations / iterations): a shorter run goes as far in fewer steps
+    per_extent: bool = False  # multiplied by the scene's extent
+    per_run: bool = False  # multiplied by sqrt(recipe_iterations / iterations), since a shorter run has fewer steps
 
 
 @dataclass
 class ModelConfig:
-    """A model: what every model has, and the options of this one's constructor."""
+    """A model: the keys that every model has, and the options of this model's constructor."""
 
     name: str = MISSING
     published_with_agr: bool = False  # whether AGR is part of the method as its authors describe it
     agr: bool = "${.published_with_agr}"  # type: ignore[assignment]  # an interpolation, typed when resolved
-    agr_octaves: int = 4  # K of AGR's time encoding; the paper's 10 learn every frame by heart: docs/tuning.md
+    agr_octaves: int = 4  # K of AGR's time encoding; the paper's 10 memorise every frame: docs/tuning.md
     sh_degree: int = 3
-    min_opacity: float = 0.005  # pruned below
-    lr: dict[str, LearningRate] = field(default_factory=dict)  # by parameter
+    min_opacity: float = 0.005  # a Gaussian below it is pruned
+    lr: dict[str, LearningRate] = field(default_factory=dict)  # by parameter group
     options: dict[str, Any] = field(default_factory=dict)  # keyword arguments of the model's class
 
 
 @dataclass
 class DensifyConfig:
-    """Adaptive density control (3DGS, section 5.2). Steps but `every` are those of a run of `recipe_iterations`."""
+    """Adaptive density control (3DGS, section 5.2). All steps but `every` are those of a run of `recipe_iterations`."""
 
     start: int = 500
     stop: int = 15_000
-    every: int = 100  # steps of any run: what was cloned needs them to part before it is judged again
+    every: int = 100  # steps of a run of any length: clones need them to move apart before the next decision
     reset_every: int = 3_000  # opacity reset
-    grad_threshold: float = 2e-4  # mean gradient of a 2D mean, in units of half the picture
-    clone_below: float = 0.01  # clone where the largest scale is below this part of the extent, split above
-    prune_above: float = 0.1  # prune where it is above this part, after the first opacity reset
+    grad_threshold: float = 2e-4  # mean gradient of a 2D mean, in units of half the image
+    clone_below: float = 0.01  # clone if the largest scale is below this part of the extent, else split
+    prune_above: float = 0.1  # prune if it is above this part, after the first opacity reset
 
 
 @dataclass
 class TrainConfig:
-    """The recipe. Steps are stated for a run of `recipe_iterations` and scale with the run's length."""
+    """The recipe. Steps are stated for a run of `recipe_iterations` and are scaled to the length of the run."""
 
     iterations: int = 30_000
     recipe_iterations: int = 30_000
-    batch_size: int = 4  # views a step
+    batch_size: int = 4  # views in a step
     ssim_weight: float = 0.2  # loss = (1 - w) L1 + w (1 - SSIM)
-    sh_every: int = 1_000  # one degree of spherical harmonics more
-    refine_from: int = 3_000  # AGR acts and learns
-    modulation_from: int = 15_000  # lambda_t and lambda_d learn
+    sh_every: int = 1_000  # steps after which the spherical harmonics gain a degree
+    refine_from: int = 3_000  # the step from which AGR acts and learns
+    modulation_from: int = 15_000  # the step from which lambda_t and lambda_d learn
     densify: DensifyConfig = field(default_factory=DensifyConfig)
-    curve_points: int = 20  # measurements on the val split along the run
+    curve_points: int = 20  # measurements on the val split during the run
     checkpoint_minutes: float = 2.0  # a killed run loses at most this much
 
 
 @dataclass
 class RasterConfig:
-    """How pictures are drawn."""
+    """How images are rendered."""
 
     backend: str = "auto"
     antialias: bool = False
@@ -104,25 +104,25 @@ class ProtocolConfig:
     """How results are measured; written into every record."""
 
     name: str = MISSING
-    quantise: bool = False  # measure 8-bit pictures
-    best_on_test: bool = False  # also the best test PSNR seen in training, as published code reports: it leaks
+    quantise: bool = False  # round renders to 8 bits before they are measured
+    best_on_test: bool = False  # also record the best test PSNR during training, as published code does: it leaks
     lpips_alex: str | None = None  # trunk weights; None: $TORCH_HOME/hub/checkpoints
     lpips_vgg: str | None = None
-    renders: int = 30  # timed, at least
-    pictures: int = 3  # test views saved as render | ground truth | error
+    renders: int = 30  # how many renders are timed, at least
+    pictures: int = 3  # test views in pictures.png, as render | ground truth | error
 
 
 @dataclass
 class Config:
-    """One run, or one run for each scene of the data set."""
+    """A run, or for scene=all a run for each scene of the data set."""
 
     experiment: str = MISSING  # the name of the +exp= file, a folder in results/
     seed: int = 0
     device: str = "cpu"
     agr: bool = "${model.agr}"  # type: ignore[assignment]
-    optim: str = "adam"  # or sparse_adam: what no view of a batch drew does not move
+    optim: str = "adam"  # or sparse_adam: a Gaussian that no view of the batch sees does not move
     results: str = "results"
-    resume: bool = True  # go on from a checkpoint and keep finished runs of the same config; false: start over
+    resume: bool = True  # continue from a checkpoint and keep finished runs of the same config; false: start over
     model: ModelConfig = field(default_factory=ModelConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     data: DataConfig = field(default_factory=DataConfig)

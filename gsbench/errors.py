@@ -1,15 +1,15 @@
-"""What a user can get wrong: one exception that says what was expected, what came, and what to do."""
+"""Report faults in the input: an error message says what was expected, what was given, and what to do."""
 
 import difflib
 from collections.abc import Iterable
 
 
 class InputError(ValueError):
-    """A fault in what was given (config, data set, tensor), told in one line and shown without a stack trace."""
+    """The config, the data set or a tensor has a fault; the message is one line and is shown without a stack trace."""
 
 
 class TooLargeError(InputError, MemoryError):
-    """A request that memory would not suffice for, refused before it was made."""
+    """A request needs more memory than there is; it is refused before anything is allocated."""
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
@@ -21,5 +21,5 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """The first line of an error's message, or its type where it has no message."""
+    """Return the first line of an error's message, or its type where it has no message."""
     return (str(error) or type(error).__name__).splitlines()[0]

@@ -1,1 +1,1 @@
-"""What came out of a run: quality, speed, the curve, and the record that keeps them; imports none of them."""
+"""Measure a run: the quality of its images, its speed, its curve, and the record that keeps them."""

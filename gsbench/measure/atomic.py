@@ -1,4 +1,4 @@
-"""A file appears whole or not at all: what a killed run leaves behind can always be read."""
+"""Write files atomically, so that every file which a killed run leaves behind can be read."""
 
 import os
 import secrets
@@ -8,7 +8,7 @@ from pathlib import Path
 def write_atomically(path: Path, data: bytes) -> None:
     """Write `data` to `path` through a temporary name in the same folder, flushed to the disk before it is renamed.
 
-    The folder is made where it is missing. Whoever reads `path` sees the old file or the new one, never a part.
+    The folder is made where it is missing. A reader of `path` sees the old file or the new one, never a part.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")

@@ -1,4 +1,4 @@
-"""The curve of a run: accuracy on validation over iterations and seconds, and the time to reach an accuracy."""
+"""Keep the curve of a run: PSNR on the val split over iterations and seconds, and the time to reach a PSNR."""
 
 import math
 from dataclasses import dataclass, field
@@ -17,12 +17,12 @@ class Point(NamedTuple):
 
 @dataclass
 class Curve:
-    """The points of one run, in order; its state lives in the checkpoint, so that a resumed run continues it."""
+    """The points of one run in order. The checkpoint holds them, so that a resumed run continues the curve."""
 
     points: list[Point] = field(default_factory=list)
 
     def add(self, iteration: int, seconds: float, psnr_val: float) -> None:
-        """Append a point; raises InputError where iteration or seconds go backwards (a resume gone wrong)."""
+        """Append a point; raises InputError where iteration or seconds go backwards (after a faulty resume)."""
         if self.points and (iteration <= self.points[-1].iteration or seconds < self.points[-1].seconds):
             raise InputError(
                 f"curve: expected a point after {self.points[-1].iteration} iterations, {self.points[-1].seconds} s; "
@@ -37,16 +37,16 @@ class Curve:
 
     @property
     def best(self) -> Point | None:
-        """The earliest of the points with the highest PSNR; None where there is none."""
+        """The earliest of the points with the highest PSNR; None if no PSNR is finite."""
         finite = [(p.psnr_val, p) for p in self.points if p.psnr_val is not None]
         return max(finite, key=lambda pair: pair[0])[1] if finite else None
 
     def seconds_to(self, psnr: float) -> float | None:
-        """Training seconds at the first evaluation that reached `psnr` dB, not interpolated; None if none did."""
+        """Return the training seconds at the first point that reached `psnr` dB, not interpolated; None if none did."""
         return next((p.seconds for p in self.points if p.psnr_val is not None and p.psnr_val >= psnr), None)
 
     def state_dict(self) -> list[tuple[int, float, float | None]]:
-        """The points as plain tuples, which a checkpoint read with weights_only=True accepts."""
+        """Return the points as plain tuples, which a checkpoint can hold (weights_only=True)."""
         return [(p.iteration, p.seconds, p.psnr_val) for p in self.points]
 
     def load_state_dict(self, state: list[tuple[int, float, float | None]]) -> None:

@@ -1,8 +1,8 @@
-"""LPIPS: the distance of two images in the features of a trained network (Zhang et al. 2018), version 0.1.
+"""Compute LPIPS 0.1, the distance of two images in the features of a trained network (Zhang et al. 2018).
 
-Computed as the lpips package does, and bit-equal to it on the same trunk, without importing it: it imports torchvision,
-whose wheel fails on CPU builds of torch, and it checks no weights. Its linear weights are read from its wheel; the
-trunk's come from a file that is checked by its SHA-256.
+Results are bit-equal to those of the lpips package on the same trunk. The package is not imported, because it imports
+torchvision, whose wheel fails on CPU builds of torch, and does not check weights. Its linear weights are read from its
+wheel; the weights of the trunk come from a file that is checked by its SHA-256.
 """
 
 import hashlib
@@ -22,11 +22,11 @@ from gsbench.errors import InputError, did_you_mean
 
 
 class BackboneMissing(Exception):  # noqa: N818  # not an error: the column stays empty, and this is its reason
-    """The weights of a backbone are not on this machine; str() is the reason for the empty column."""
+    """The weights of a backbone are not on this machine; the message is the reason for the empty column."""
 
 
 def _alexnet() -> nn.Sequential:
-    """The features of torchvision's AlexNet, up to the last ReLU."""
+    """Build the features of torchvision's AlexNet, up to the last ReLU."""
     relu, pool = nn.ReLU(), nn.MaxPool2d(3, 2)
     return nn.Sequential(
         *(nn.Conv2d(3, 64, 11, 4, 2), relu, pool),
@@ -38,7 +38,7 @@ def _alexnet() -> nn.Sequential:
 
 
 def _vgg16() -> nn.Sequential:
-    """The features of torchvision's VGG16, up to the last ReLU."""
+    """Build the features of torchvision's VGG16, up to the last ReLU."""
     layers: list[nn.Module] = []
     last = 3
     for channels, count in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
@@ -51,18 +51,18 @@ def _vgg16() -> nn.Sequential:
 
 @dataclass(frozen=True)
 class Backbone:
-    """A trunk: its layers, which of their outputs are compared, and how its weights are known."""
+    """A trunk: its layers, the outputs that are compared, and the SHA-256 of its weights."""
 
     trunk: Callable[[], nn.Sequential]
     taps: tuple[int, ...]  # the ReLUs whose outputs are compared
-    least_side: int  # pixels; a smaller image vanishes in the pools
-    file: str  # what torchvision calls its weights; the name ends in the first 8 hex digits of their SHA-256
+    least_side: int  # pixels; the pooling layers reduce a smaller image to nothing
+    file: str  # torchvision's name of the weights, which ends in the first 8 hex digits of their SHA-256
     linear_sha256: str  # of lpips' own weights v0.1
     other_sha256: tuple[str, ...] = ()  # further files with the same weights
 
     @property
     def trunk_sha256(self) -> tuple[str, ...]:
-        """Beginnings of the SHA-256 of the files accepted as trunk weights."""
+        """The first digits of the SHA-256 of the files accepted as trunk weights."""
         return (Path(self.file).stem.rsplit("-", 1)[1], *self.other_sha256)
 
 
@@ -103,7 +103,7 @@ class Perceptual(nn.Module):
         self.requires_grad_(False)
 
     def features(self, images: Tensor) -> list[Tensor]:  # [B, 3, H, W] in [-1, 1]
-        """The compared features, each of unit length at every pixel."""
+        """Compute the compared features, each of unit length at every pixel."""
         tapped = []
         x = (images - self.shift) / self.scale
         for i, layer in enumerate(self.trunk):
@@ -113,7 +113,7 @@ class Perceptual(nn.Module):
         return tapped
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:  # [B, 3, H, W] in [-1, 1], each
-        """The distances [B]: Zhang et al. 2018, eq. 1."""
+        """Compute the distances [B] (Zhang et al. 2018, eq. 1)."""
         distance = torch.zeros(len(a), 1, 1, 1, device=a.device)
         for fa, fb, weight in zip(self.features(a), self.features(b), self.linear, strict=True):
             distance = distance + F.conv2d((fa - fb) ** 2, weight).mean((2, 3), keepdim=True)
@@ -122,11 +122,13 @@ class Perceptual(nn.Module):
 
 @cache
 def load(backbone: str = "alex", weights: Path | None = None, device: str = "cpu") -> Perceptual:
-    """The network, loaded once per process and device.
+    """Load the network, once per process and device.
 
     The trunk's weights come from the file `weights`, else from torchvision's file in ``$TORCH_HOME/hub/checkpoints``.
-    Raises BackboneMissing where neither is there, InputError for a file that is named and missing or is not the weights
-    it should be (never used in silence). Call it before a long run: both are worth knowing at the start.
+
+    Raises:
+        BackboneMissing: neither file is on this machine.
+        InputError: the file `weights` is missing, or the file holds other weights.
     """
     if backbone not in BACKBONES:
         raise InputError(f"lpips: unknown backbone '{backbone}'. {did_you_mean(backbone, BACKBONES)}")
@@ -152,7 +154,7 @@ def load(backbone: str = "alex", weights: Path | None = None, device: str = "cpu
 
 
 def _read_weights(path: Path, accepted: tuple[str, ...]) -> dict[str, Tensor]:
-    """The tensors of a .pth or .npz file whose SHA-256 begins with one of `accepted`; raises InputError otherwise."""
+    """Read the tensors of a .pth or .npz file; raises InputError unless its SHA-256 begins with one of `accepted`."""
     data = path.read_bytes()
     sha256 = hashlib.sha256(data).hexdigest()
     if not sha256.startswith(accepted):

@@ -1,4 +1,4 @@
-"""Where a run's numbers come from: the commit, the versions, the machine, the config, the time."""
+"""Describe the provenance of a run: its commit, versions, machine, config and time."""
 
 import hashlib
 import json
@@ -15,10 +15,13 @@ PACKAGES = ("gsbench", "torch", "numpy", "scikit-image", "lpips", "opencv-contri
 
 
 def provenance(*, config: dict[str, Any], data_hash: str, threads: int, device: str | None = None) -> Provenance:
-    """The provenance of a run that is finishing now.
+    """Describe the provenance of a run that ends now; this imports none of the packages whose versions it notes.
 
-    `config` is the whole resolved config as plain JSON, `data_hash` the scene's fingerprint, `device` the GPU's name;
-    None stands for the processor, by its name. Imports none of the packages whose versions it notes.
+    Args:
+        config: the whole resolved config, plain JSON.
+        data_hash: the fingerprint of the scene.
+        threads: of torch.
+        device: the name of the GPU; None stands for the processor, which is then named.
     """
     return Provenance(
         git_commit=git_commit(),
@@ -33,13 +36,13 @@ def provenance(*, config: dict[str, Any], data_hash: str, threads: int, device: 
 
 
 def config_hash(config: dict[str, Any]) -> str:
-    """sha256 of a resolved config as plain JSON, whatever the order of its keys."""
+    """Compute the SHA-256 of a resolved config in plain JSON; the order of its keys does not matter."""
     canonical = json.dumps(config, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:
-    """The versions of python and of the installed packages that the numbers depend on."""
+    """Return the versions of python and of the installed packages that the numbers depend on."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -50,9 +53,9 @@ def versions() -> dict[str, str]:
 
 
 def git_commit() -> str | None:
-    """The commit of the checkout this file belongs to, "-dirty" added where tracked files differ from it.
+    """Return the commit of the checkout that this file belongs to, with "-dirty" if tracked files differ from it.
 
-    None where git does not track this file: a wheel installed inside somebody's repository is not of their commit.
+    None if git does not track this file, as in a wheel that is installed inside another repository.
     """
     here = Path(__file__)
     if _git(here.parent, "ls-files", "--error-unmatch", here.name) is None:
@@ -61,7 +64,7 @@ def git_commit() -> str | None:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """What git says, or None where it is not installed, fails or hangs."""
+    """Run git and return its output; None if git is not installed, fails or hangs."""
     try:
         done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True, timeout=10)
     except (OSError, subprocess.SubprocessError):
@@ -70,7 +73,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def processor_name() -> str:
-    """The processor as its maker calls it, e.g. "AMD EPYC 9B14"."""
+    """Return the processor's name, such as "AMD EPYC 9B14"."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text().splitlines():

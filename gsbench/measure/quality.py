@@ -1,7 +1,7 @@
-"""How good a picture is: PSNR, SSIM and LPIPS by one protocol, and all of them over the views of a split.
+"""Measure the quality of images by one protocol: PSNR, SSIM and LPIPS, and their means over the views of a split.
 
-Images are [H, W, 3] tensors of floats, meant in [0, 1] and clamped to it. Pixels that are NaN make the result NaN.
-Where published code disagrees on a definition, the choice made here is stated in its function.
+Images are [H, W, 3] tensors of floats and are clamped to [0, 1]. A pixel that is NaN makes the result NaN. Where
+published code differs in a definition, the function states which one is used.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -22,29 +22,29 @@ from gsbench.measure.record import ViewScore
 
 T = TypeVar("T")
 
-SSIM_LEAST_SIDE = 11  # pixels: the window of a Gaussian of sigma 1.5, cut at 3.5 sigma
+SSIM_LEAST_SIDE = 11  # pixels: the width of a Gaussian window of sigma 1.5, cut at 3.5 sigma
 
 
 def evenly(items: Sequence[T], count: int) -> list[T]:
-    """At most `count` of them, evenly spaced from the first on: the fixed subset of views that a split is judged by."""
+    """Choose at most `count` items, evenly spaced from the first on: a fixed subset of the views of a split."""
     count = min(count, len(items))
     return [items[i * len(items) // count] for i in range(count)]
 
 
 def psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
-    """Peak signal-to-noise ratio in dB, its mean squared error joint over H x W x 3; infinite for equal images."""
+    """Compute the PSNR in dB from the mean squared error over H x W x 3; it is infinite for equal images."""
     return _decibels(_squared_error(a, b).mean())
 
 
 def psnr_channel_mean(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
-    """The mean of the three channels' PSNR in dB, as some codes report it: never below `psnr` (Jensen)."""
+    """Compute the mean of the channels' PSNR in dB, as some codes report it; it is never below `psnr` (Jensen)."""
     return fmean(_decibels(error) for error in _squared_error(a, b).mean((0, 1)))
 
 
 def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
-    """Structural similarity by scikit-image with the settings of Wang et al. 2004, in float64, mean over channels.
+    """Compute SSIM by scikit-image with the settings of Wang et al. 2004, in float64, as the mean over channels.
 
-    Without data_range scikit-image takes 2 for floats, without use_sample_covariance=False it differs from the paper.
+    data_range is given because scikit-image assumes 2 for floats; use_sample_covariance=False is as in the paper.
     """
     a, b = _images(a, b, SSIM_LEAST_SIDE, "ssim")
     similarity = structural_similarity(
@@ -61,9 +61,9 @@ def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
 
 @torch.no_grad()
 def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = None) -> float:  # [H, W, 3], each
-    """LPIPS 0.1 on the "alex" or "vgg" backbone, inputs scaled to [-1, 1], on the images' device.
+    """Compute LPIPS 0.1 with the "alex" or "vgg" backbone, inputs scaled to [-1, 1], on the images' device.
 
-    `weights` and what is raised (BackboneMissing, InputError): see gsbench.measure.perceptual.load.
+    `gsbench.measure.perceptual.load` explains `weights`, and the BackboneMissing and InputError that it raises.
     """
     network = perceptual.load(backbone, weights, str(a.device))
     a, b = (2 * x.float() - 1 for x in _images(a, b, BACKBONES[backbone].least_side, "lpips"))
@@ -71,13 +71,13 @@ def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = N
 
 
 def quantise(image: Tensor) -> Tensor:  # [..., 3]
-    """The image as an 8-bit PNG would hold it, back in [0, 1]."""
+    """Round an image to the values that an 8-bit PNG can hold, in [0, 1]."""
     return (image.clamp(0, 1) * 255).round() / 255
 
 
 @dataclass(frozen=True)
 class Quality:
-    """The quality over the views of a split, in the record's own terms."""
+    """The quality over the views of a split, by the names of the record."""
 
     metrics: dict[str, float | None]  # means over the views
     missing: dict[str, str]  # why a metric is None
@@ -85,18 +85,22 @@ class Quality:
 
 
 def evaluate(
-    pictures: Iterable[tuple[str, Tensor, Tensor]],  # name, render [H, W, 3], truth [H, W, 3]
+    images: Iterable[tuple[str, Tensor, Tensor]],  # name, render [H, W, 3], truth [H, W, 3]
     *,
     background: tuple[float, float, float],
     quantised: bool = False,
     weights: dict[str, Path] | None = None,
 ) -> Quality:
-    """Every metric on every picture, and their means.
+    """Compute every metric of every image, and their means.
 
-    `background` is the colour the truth was composited over: an image of nothing else scores `psnr_background_only`.
-    `quantised` sends renders through 8 bits first. `weights` names the trunk file by backbone. A missing backbone or a
-    picture too small for a metric leaves that metric None with the reason; see gsbench.measure.perceptual.load for the
-    weights that raise InputError.
+    A metric is None, with the reason, where its backbone is missing or an image is too small for it.
+
+    Args:
+        images: of the views of a split, renders beside ground truth.
+        background: the colour that the truth was composited over; an image of only this colour scores
+            `psnr_background_only`.
+        quantised: whether renders are rounded to 8 bits first.
+        weights: trunk files by backbone; see `gsbench.measure.perceptual.load`, and the InputError that it raises.
     """
     measures: dict[str, Callable[[Tensor, Tensor], float]] = {
         "psnr": psnr,
@@ -111,7 +115,7 @@ def evaluate(
     scores: dict[str, list[float]] = {metric: [] for metric in measures}
     missing: dict[str, str] = {}
     per_view = []
-    for name, render, truth in pictures:
+    for name, render, truth in images:
         side = min(truth.shape[:2])
         shown = quantise(render) if quantised else render
         here: dict[str, float] = {}
@@ -125,16 +129,16 @@ def evaluate(
                 missing[metric] = str(reason)
         for metric, value in here.items():
             scores[metric].append(value)
-        del here["psnr_background_only"]  # of the split, not of the model's view
+        del here["psnr_background_only"]  # a property of the split and not of the render
         per_view.append(ViewScore(name, **here))
     if not per_view:
-        raise InputError("evaluate: expected at least one picture, got none")
+        raise InputError("evaluate: expected at least one image, got none")
     metrics = {metric: None if metric in missing else fmean(values) for metric, values in scores.items()}
     return Quality(metrics, missing, per_view)
 
 
 def _images(a: Tensor, b: Tensor, least_side: int, what: str) -> tuple[Tensor, Tensor]:
-    """Both images clamped to [0, 1] in float64; raises InputError where they are not two images of one size."""
+    """Clamp both images to [0, 1] in float64; raises InputError unless they are two images of one size."""
     for image in (a, b):
         if image.ndim != 3 or image.shape[2] != 3 or not image.is_floating_point():
             raise InputError(
@@ -156,5 +160,5 @@ def _squared_error(a: Tensor, b: Tensor) -> Tensor:  # [H, W, 3]
 
 
 def _decibels(mean_squared_error: Tensor) -> float:
-    """-10 log10 of it, the peak being 1."""
+    """Convert a mean squared error to PSNR in dB, for a peak of 1."""
     return float(-10 * mean_squared_error.log10())

@@ -1,7 +1,7 @@
-"""The schema of record.json, one file a run: written atomically, validated when read, usable without torch.
+"""Declare the schema of record.json, the record of one run, write it atomically and validate it when it is read.
 
-A record says what was run (model, scene, seed, effects), under which protocol, what came out (metrics, cost, curve) and
-where the numbers come from (provenance). A number that is missing is null and says why in `missing`.
+A record says what was run (model, scene, seed, effects), by which protocol, with which results (metrics, cost, curve)
+and where the numbers come from (provenance). A missing number is null, and `missing` says why. Needs no torch.
 """
 
 import dataclasses
@@ -24,19 +24,19 @@ STATUSES = ("ok", "failed", "diverged")
 METRICS = (
     "psnr",  # dB, joint over H x W x 3, final iteration, mean over the views of the evaluated split
     "psnr_train",  # dB, on as many training views as are evaluated, evenly spaced: the gap to `psnr` is overfitting
-    "psnr_channel_mean",  # dB, mean of the three channels' PSNR
+    "psnr_channel_mean",  # dB, the mean of the three channels' PSNR
     "ssim",
     "lpips_alex",
     "lpips_vgg",
     "psnr_best_on_val",  # dB, at the iteration that was best on validation
-    "psnr_best_on_test",  # dB, the best seen on test during training: it LEAKS, and is only for comparing with papers
-    "psnr_background_only",  # dB of an image of nothing but background: what a model that learned nothing gets
+    "psnr_best_on_test",  # dB, the best on test during training: it LEAKS, and is only for comparison with papers
+    "psnr_background_only",  # dB of an image of the background alone, which is what a model that learned nothing gets
 )
 
 
 @dataclass(frozen=True)
 class Effects:
-    """Which effects the model simulates."""
+    """The effects that the model simulates."""
 
     time: bool
     direction: bool
@@ -57,10 +57,10 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Cost:
-    """What the run cost."""
+    """The cost of the run."""
 
     train_s: float  # seconds of the whole training loop less evaluation
-    stage_s: dict[str, float]  # its split by stage
+    stage_s: dict[str, float]  # the same by stage
     render_ms: RenderTimes
     fps: float  # 1000 / render_ms.p50: gsbench.measure.speed.time_renders
     num_gaussians: int
@@ -70,7 +70,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where the numbers come from: gsbench.measure.provenance.provenance() fills it."""
+    """Where the numbers come from; `gsbench.measure.provenance.provenance` fills it in."""
 
     git_commit: str | None  # "-dirty" at the end where tracked files were changed; None outside a git checkout
     versions: dict[str, str]  # python and the packages that the numbers depend on
@@ -84,7 +84,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Record:
-    """One run. `metrics` has keys of METRICS; every null among them has its reason in `missing`."""
+    """One run. The keys of `metrics` are among METRICS; `missing` gives the reason for every null."""
 
     status: str  # "ok", "failed" or "diverged"
     reason: str | None  # why it is not ok
@@ -107,8 +107,10 @@ class Record:
 def write(record: Record, path: Path) -> None:
     """Write `record` to `path` atomically as strict JSON.
 
-    A metric that is not finite becomes null with its reason. Raises InputError, naming the field, for anything `read`
-    would refuse, so that no record is written that cannot be read.
+    A metric that is not finite becomes null with its reason.
+
+    Raises:
+        InputError: `read` would refuse this record; the message names the field.
     """
     try:
         plain = json.loads(json.dumps(dataclasses.asdict(_without_non_finite(record))))
@@ -119,7 +121,7 @@ def write(record: Record, path: Path) -> None:
 
 
 def read(path: Path) -> Record:
-    """Read and validate the record at `path`; raises InputError naming the file and the field."""
+    """Read and validate the record at `path`; raises InputError that names the file and the field."""
     try:
         plain = json.loads(path.read_bytes().decode(), object_pairs_hook=_unique_keys)
         return _validated(plain, path)
@@ -127,12 +129,12 @@ def read(path: Path) -> Record:
         raise InputError(f"{path}: expected a record, could not read it: {error.strerror}") from None
     except InputError:
         raise
-    except (ValueError, RecursionError) as error:  # also bad UTF-8, and integers of thousands of digits
+    except (ValueError, RecursionError) as error:  # also bad UTF-8 and integers of thousands of digits
         raise InputError(f"{path}: expected a record in JSON: {error}; delete it and run again") from None
 
 
 def _validated(plain: Any, path: Path) -> Record:
-    """`plain` JSON as a record; raises InputError naming `path` and the field."""
+    """Convert plain JSON to a record; raises InputError that names `path` and the field."""
     version = plain.get("version") if isinstance(plain, dict) else VERSION
     if type(version) is not int or version != VERSION:  # first: another version has other keys
         raise InputError(f"{path}: version: expected {VERSION}, got {ascii(version)[:80]}; run again with this gsbench")
@@ -142,12 +144,23 @@ def _validated(plain: Any, path: Path) -> Record:
 
 
 def find(root: Path) -> list[Path]:
-    """The paths of all records under `root`, sorted."""
+    """List the paths of all records under `root`, sorted."""
     return sorted(root.rglob(FILE_NAME))
 
 
 def run_path(root: Path, experiment: str, scene: str, model: str, seed: int) -> Path:
-    """The folder of one run, ``root/<experiment>/<scene>/<model>/seed<k>``; raises InputError for an unsafe name."""
+    """Return the folder of a run, ``root/<experiment>/<scene>/<model>/seed<k>``.
+
+    Args:
+        root: the folder of all results.
+        experiment: its name.
+        scene: its name.
+        model: the label of the run, the model's name with _agr or _noagr where it is not as published.
+        seed: not negative.
+
+    Raises:
+        InputError: a name could leave its folder, or the seed is negative.
+    """
     for what, name in (("experiment", experiment), ("scene", scene), ("model", model)):
         _check_name(name, what)
     if seed < 0:
@@ -156,13 +169,13 @@ def run_path(root: Path, experiment: str, scene: str, model: str, seed: int) -> 
 
 
 def _check_name(name: str, where: str) -> None:
-    """A name becomes a folder, so it must not be able to leave its parent."""
+    """Refuse a name that, as that of a folder, could leave its parent."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.+-]*", name):
         raise InputError(f"{where}: expected a name of letters, digits and _ . + -, got {name!r:.80}")
 
 
 def _check(record: Record, file: str) -> None:
-    """What the types alone do not say; raises InputError naming `file` and the field."""
+    """Check what the types do not express; raises InputError that names `file` and the field."""
     if record.status not in STATUSES:
         raise InputError(f"{file}: status: got {record.status!r:.80}. {did_you_mean(record.status, STATUSES)}")
     for what, name in (("experiment", record.experiment), ("scene", record.scene), ("model", record.model)):
@@ -190,7 +203,7 @@ def _check(record: Record, file: str) -> None:
 
 
 def _without_non_finite(record: Record) -> Record:
-    """The same record with metrics, view scores and curve points that are not finite set to None, with the reason."""
+    """Set the metrics, view scores and curve points that are not finite to None, with the reason."""
     metrics, missing = record.metrics, dict(record.missing)
     if metrics is not None:
         bad = {name: value for name, value in metrics.items() if value is not None and not math.isfinite(value)}
@@ -207,7 +220,7 @@ def _finite(value: Any) -> Any:
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """JSON leaves it open which of two equal keys counts; a record must not."""
+    """Refuse an object with two equal keys: JSON does not define which of them counts."""
     unique = dict(pairs)
     if len(unique) < len(pairs):
         raise ValueError("a key appears twice in one object")

@@ -1,4 +1,4 @@
-"""Plain JSON into typed dataclasses, strictly: no unknown key, no conversion, no NaN; faults name file and field."""
+"""Parse plain JSON into typed dataclasses, strictly: no unknown key, no conversion, no NaN."""
 
 import dataclasses
 import math
@@ -12,17 +12,20 @@ T = TypeVar("T")
 
 
 def parse(kind: type[T], value: object, file: str) -> T:
-    """Return `value`, as json.loads gives it, as an instance of the dataclass `kind`.
+    """Parse `value`, as json.loads gives it, into an instance of the dataclass `kind`.
 
-    Understood are dataclasses, named tuples, list[X], dict[str, X], X | None, bool, int, float (an int counts as one),
-    str, and Any (any plain JSON). Raises InputError ``<file>: <field>: expected ..., got ...``.
+    Fields may be dataclasses, named tuples, list[X], dict[str, X], X | None, bool, int, float (which accepts an int),
+    str, and Any (any plain JSON).
+
+    Raises:
+        InputError: ``<file>: <field>: expected ..., got ...``.
     """
     parsed: T = _parse(kind, value, file, "")
     return parsed
 
 
 def _parse(kind: Any, value: Any, file: str, field: str) -> Any:
-    """`value` as a `kind`; `field` is its place in the file, as in ``cost.render_ms.p50`` or ``curve[3]``."""
+    """Parse `value` as a `kind`; `field` is its place in the file, such as ``cost.render_ms.p50`` or ``curve[3]``."""
     if dataclasses.is_dataclass(kind):
         return _parse_fields(kind, value, file, field)
     if hasattr(kind, "_fields"):  # a named tuple, written as a list
@@ -47,12 +50,12 @@ def _parse(kind: Any, value: Any, file: str, field: str) -> Any:
 
 @cache
 def _kinds(kind: Any) -> dict[str, Any]:
-    """The types of the fields, in their order."""
+    """Return the types of the fields, in their order."""
     return get_type_hints(kind)
 
 
 def _parse_fields(kind: Any, value: Any, file: str, field: str) -> Any:
-    """An object as the dataclass `kind`: every field present, and nothing else."""
+    """Parse an object as the dataclass `kind`: it must have every field and no other key."""
     if type(value) is not dict:
         raise _fault(file, field, "an object", value)
     kinds = _kinds(kind)
@@ -67,7 +70,7 @@ def _parse_fields(kind: Any, value: Any, file: str, field: str) -> Any:
 
 
 def _parse_any(value: Any, file: str, field: str) -> Any:
-    """Plain JSON of any shape, its numbers finite."""
+    """Parse plain JSON of any shape; its numbers must be finite."""
     if value is None or type(value) is bool:
         return value
     for container in (dict[str, Any], list[Any]):
@@ -77,10 +80,10 @@ def _parse_any(value: Any, file: str, field: str) -> Any:
 
 
 def _parse_scalar(kind: Any, value: Any, file: str, field: str) -> Any:
-    """A bool, int, float or str, each only as itself, but for an int where a float is expected."""
+    """Parse a bool, int, float or str without conversion, except that an int is accepted as a float."""
     if kind is str and type(value) is str:
         return _text(value, file, field)
-    if kind is int and type(value) is int and abs(value) < 2**63:  # beyond it, tables hold no integers
+    if kind is int and type(value) is int and abs(value) < 2**63:  # tables cannot hold larger integers
         return value
     if kind is float and type(value) in (int, float):
         try:
@@ -96,7 +99,7 @@ def _parse_scalar(kind: Any, value: Any, file: str, field: str) -> Any:
 
 
 def _text(value: str, file: str, field: str) -> str:
-    """A string that can be written and printed: JSON's escapes also spell halves of characters."""
+    """Parse a string that can be encoded: JSON's escapes can also spell lone surrogates."""
     try:
         value.encode()
     except UnicodeEncodeError:

@@ -1,6 +1,6 @@
-"""How long things take: the definition of FPS, seconds per stage of training, peak memory.
+"""Measure speed and memory: FPS, seconds by stage of training, peak bytes.
 
-torch is imported only where a GPU is asked for, so that the record, and a table of records, need none.
+torch is imported only for a GPU, so that records and tables of records do not need it.
 """
 
 import ctypes
@@ -38,7 +38,7 @@ def nothing_to_wait_for() -> None:
 
 
 def synchroniser(device: str) -> Callable[[], None]:
-    """What waits for `device` ("cpu", "cuda", "cuda:1") to finish the work it was given."""
+    """Return a function that waits until `device` ("cpu", "cuda", "cuda:1") has finished its work."""
     if not device.startswith("cuda"):
         return nothing_to_wait_for
     import torch
@@ -54,9 +54,17 @@ def time_renders(
 ) -> RenderTimes:
     """Time `render(i)`, i = 0..count-1, after `warmup` untimed calls.
 
-    FPS in gsbench is 1000 / the median of these milliseconds. `render(i)` is the whole way from the model to an image
-    on the device, slicing and refinement (AGR) included and nothing cached between calls; the device is waited for
-    before and after every one. Raises InputError for fewer than 30 renders, whose percentiles would mean little.
+    FPS in gsbench is 1000 / the median of these milliseconds. A call renders an image on the device from the model,
+    with slicing and AGR, and caches nothing for the next call; it is timed from an idle device to an idle device.
+
+    Args:
+        render: renders frame i.
+        count: of timed calls.
+        warmup: of untimed calls before them.
+        synchronise: waits for the device.
+
+    Raises:
+        InputError: fewer than 30 renders, whose percentiles would mean little.
     """
     if count < LEAST_RENDERS:
         raise InputError(f"time_renders: expected count >= {LEAST_RENDERS}, got {count}")
@@ -74,10 +82,10 @@ def time_renders(
 
 
 class StageClock:
-    """Seconds by stage of training: ``with stages("slice"): ...`` adds to that stage's sum.
+    """Sums the seconds of each stage of training: ``with stages("slice"): ...`` adds to the sum of that stage.
 
-    On a GPU both ends are events in its queue of work, so that nothing is waited for before the sums are asked for, and
-    work is charged to the stage that caused it.
+    On a GPU both ends of a stage are events in its queue of work. So nothing waits for it before the sums are read, and
+    work counts for the stage that caused it.
     """
 
     def __init__(self, device: str = "cpu") -> None:
@@ -88,7 +96,7 @@ class StageClock:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Time what runs inside; raises InputError inside another stage, whose seconds would count twice."""
+        """Time the block inside; raises InputError inside another stage, because its seconds would count twice."""
         if self._current is not None:
             raise InputError(f"stages: '{name}' was opened inside '{self._current}'; close that one first")
         self._current = name
@@ -102,7 +110,7 @@ class StageClock:
                 self._add_one()
 
     def share(self, lanes: list[dict[str, float]], wall: float) -> None:
-        """Add `wall` seconds in which lanes ran side by side, by the share each stage had of all lanes' time."""
+        """Add `wall` seconds in which lanes ran side by side, divided among stages as the lanes' own seconds are."""
         total = sum(sum(seconds.values()) for seconds in lanes) or 1.0
         for seconds in lanes:
             for name, own in seconds.items():
@@ -110,7 +118,7 @@ class StageClock:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """The sums so far; waits for the device."""
+        """The sums so far; reading them waits for the device."""
         while self._ended:
             self._add_one()
         return self._seconds
@@ -120,7 +128,7 @@ class StageClock:
         self._seconds[name] = self._seconds.get(name, 0.0) + self._clock.seconds(start, end)
 
     def state_dict(self) -> dict[str, float]:
-        """The sums so far, for the checkpoint."""
+        """Return the sums so far, for the checkpoint."""
         return dict(self.seconds)
 
     def load_state_dict(self, state: dict[str, float]) -> None:
@@ -130,7 +138,7 @@ class StageClock:
 
 
 class _Clock(Protocol):
-    """Marks moments; `mark`s are its own."""
+    """A clock that marks moments and tells the seconds between two of its marks."""
 
     def mark(self) -> Any: ...
     def has_passed(self, mark: Any) -> bool: ...
@@ -149,7 +157,7 @@ class _HostClock:
 
 
 class _DeviceClock:
-    """Moments at which a GPU has done what it was given so far."""
+    """Marks the moments at which a GPU has finished the work that was enqueued so far."""
 
     def __init__(self, device: str) -> None:
         self.device = device
@@ -170,24 +178,24 @@ class _DeviceClock:
 
 
 def reset_peak_memory(device: str = "cpu") -> None:
-    """Start a new peak, so that a run does not report that of an earlier one in the same process (multirun)."""
+    """Start a new peak, so that a run does not report the peak of an earlier run in the same process (multirun)."""
     if device.startswith("cuda"):
         import torch
 
         torch.cuda.reset_peak_memory_stats(device)
     elif (clear := Path("/proc/self/clear_refs")).exists():
-        with suppress(AttributeError):  # another libc than glibc
-            ctypes.CDLL(None).malloc_trim(0)  # what the native kernels keep for the next step is not the next run's
+        with suppress(AttributeError):  # a libc that is not glibc
+            ctypes.CDLL(None).malloc_trim(0)  # memory kept by the kernels is not of the next run
         clear.write_text("5")  # proc(5): resets VmHWM, which ru_maxrss reports
 
 
 def peak_memory(device: str = "cpu") -> int:
-    """Peak bytes: on a GPU what torch allocated there, else the process' resident memory, libraries included."""
+    """Return the peak bytes: on a GPU those that torch allocated, else the process' resident memory with libraries."""
     if device.startswith("cuda"):
         import torch
 
         return int(torch.cuda.max_memory_allocated(device))
-    import resource  # not on Windows, where reading records should still work
+    import resource  # not available on Windows, where records can still be read
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # getrusage(2): kilobytes on Linux

@@ -1,4 +1,4 @@
-"""What is fitted: Gaussians of any dimension. A slice is the only thing a model must provide."""
+"""Model scenes by Gaussians of three to seven dimensions; every model provides its 3D slice at a query."""
 
 from gsbench.models.base import GaussianModel, Gaussians3D, Phase
 from gsbench.models.query import Query

@@ -1,4 +1,4 @@
-"""What colour a Gaussian shows: spherical harmonics of the direction (3DGS), times a Fourier series of time (4DGS)."""
+"""Compute colours: spherical harmonics of the direction (3DGS), times a Fourier series of time (4DGS)."""
 
 import math
 
@@ -15,7 +15,7 @@ _C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Real spherical harmonics up to `degree` (at most 3) of unit directions, [N, 3] -> [N, (degree + 1)^2]."""
+    """Compute real spherical harmonics up to `degree` (at most 3) of unit directions, [N, 3] -> [N, (degree + 1)^2]."""
     x, y, z = directions.unbind(-1)
     basis = [torch.full_like(x, SH_C0)]
     if degree > 0:
@@ -33,14 +33,14 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def sh_colors(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """Colours max(0, sum beta_lm Y_lm + 0.5), [N, K, 3] and [N, 3] -> [N, 3] (3DGS; 7DGS eq. 2)."""
+    """Compute colours max(0, sum beta_lm Y_lm + 0.5), [N, K, 3] and [N, 3] -> [N, 3] (3DGS; 7DGS eq. 2)."""
     basis = sh_basis(directions, degree)
     used = coefficients[:, : basis.shape[-1]]
     return ((basis[..., None] * used).sum(1) + 0.5).clamp(min=0)
 
 
 def sh_time_colors(coefficients: Tensor, directions: Tensor, degree: int, time_offset: Tensor) -> Tensor:
-    """Colours of 4DSH: Y_lm(d) cos(2 pi n (t - mu_t) / T), T = 1 (4DGS, eq. 12).
+    """Compute colours by 4DSH: Y_lm(d) cos(2 pi n (t - mu_t) / T), T = 1 (4DGS, eq. 12).
 
     Args:
         coefficients: [N, M, K, 3], one set of K spherical harmonics for each frequency n = 0 .. M-1.

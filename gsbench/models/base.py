@@ -1,4 +1,4 @@
-"""Hold N Gaussians with raw parameters, which `slice` observes and density control edits row by row."""
+"""Define the base of all models: N Gaussians with raw parameters, their slice, and edits of their rows."""
 
 import math
 from abc import ABC, abstractmethod
@@ -19,13 +19,13 @@ from gsbench.scenes.scene import Points
 
 Raw = dict[str, Tensor]  # raw parameters by name, N rows each
 CHILDREN = 2  # a split leaves two Gaussians ..
-SHRINK = 0.8 * CHILDREN  # .. each 1.6 times smaller (3DGS, gaussian_model.py)
+SHRINK = 0.8 * CHILDREN  # .. that are 1.6 times smaller (3DGS, gaussian_model.py)
 INITIAL_OPACITY = 0.1
-LENGTHS = ("means", "motion")  # raw parameters in world units; sizes are logarithms, to which a unit adds a constant
+LENGTHS = ("means", "motion")  # raw parameters in world units; sizes are logarithms, which another unit only shifts
 
 
 class Gaussians3D(NamedTuple):
-    """What the rasterizer draws: one slice of a model."""
+    """One slice of a model: the 3D Gaussians that the rasterizer renders."""
 
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
@@ -38,12 +38,12 @@ class Conditioned(NamedTuple):
 
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
-    gate: Tensor  # [N] f_temp f_dir in [0, 1]: how much of the opacity is left
+    gate: Tensor  # [N] f_temp f_dir in [0, 1], a factor of the opacity
 
 
 @dataclass(frozen=True)
 class Phase:
-    """How much of a model is switched on at some point of the training."""
+    """The parts of a model that are switched on at some step of the training."""
 
     sh_degree: int
     refine: bool  # AGR moves the parameters and learns
@@ -51,25 +51,25 @@ class Phase:
 
 
 class GaussianModel(nn.Module, ABC):
-    """N Gaussians. A subclass gives its raw geometry, how that is sliced, and how a Gaussian is split; no more."""
+    """N Gaussians. A subclass provides its raw geometry, how that is sliced, and how a Gaussian is split."""
 
     observes: ClassVar[tuple[str, ...]] = ()  # of "time", "direction"
-    centers: ClassVar[tuple[str, ...]] = ("means",)  # raw parameters that are means: AGR reads and moves these ..
-    geometry: ClassVar[tuple[str, ...]]  # .. and moves these, which make the factor
+    centers: ClassVar[tuple[str, ...]] = ("means",)  # the raw parameters that are means: AGR reads and moves them ..
+    geometry: ClassVar[tuple[str, ...]]  # .. and moves these, which form the factor
 
     def __init__(
         self, *, agr: bool = False, agr_octaves: int = OCTAVES, sh_degree: int = 3, backend: Backend = AUTO
     ) -> None:
-        """Make a model without Gaussians; `initialise` gives it some, `load_state` others.
+        """Make a model without Gaussians; `initialise` or `load_state` adds them.
 
         Args:
-            agr: whether the adaptive Gaussian refinement moves the Gaussians.
+            agr: whether AGR, the adaptive Gaussian refinement, moves the Gaussians.
             agr_octaves: K of AGR's time encoding.
             sh_degree: of the spherical harmonics, 0 to 3.
-            backend: who slices, colours and refines.
+            backend: computes the slices, the colours and AGR.
 
         Raises:
-            InputError: an option out of its range.
+            InputError: an option is out of its range.
         """
         super().__init__()
         if sh_degree not in range(4):
@@ -86,39 +86,39 @@ class GaussianModel(nn.Module, ABC):
         self.extent = 1.0  # of the scene, world units
         self.phase = Phase(sh_degree, agr, False)
 
-    # ---- what a subclass gives
+    # ---- what a subclass provides
 
     @abstractmethod
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Raw parameters named in `centers` and `geometry`, less `means`; `distances` [N] are those to neighbours."""
+        """Initialise the parameters of `centers` and `geometry` except `means`, from distances to neighbours [N]."""
 
     @abstractmethod
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Slice Gaussians with raw parameters `raw` at what this model observes."""
+        """Slice Gaussians with raw parameters `raw` at a query."""
 
     @abstractmethod
     def scales(self) -> Tensor:
-        """Each Gaussian's largest standard deviation in space, [N], world units."""
+        """Return the largest standard deviation of each Gaussian in space, [N], world units."""
 
     @abstractmethod
     def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Raw geometry of the children of parents, of which `raw` holds CHILDREN copies in a row."""
+        """Return the raw geometry of children; `raw` holds CHILDREN copies of each parent, one after the other."""
 
     def hold_sizes(self, least: Tensor) -> None:
-        """Raise raw sizes in space to at least `least` [N], world units; none here, where they are not known."""
+        """Raise raw sizes in space to at least `least` [N], world units; a model without such sizes does nothing."""
         return
 
     def long_in_time(self) -> Tensor:
-        """Which Gaussians are split, rather than cloned, for their extent in time, [N] bool (7DGS, section 4.4)."""
+        """Tell which Gaussians are split because of their extent in time, [N] bool (7DGS, section 4.4)."""
         return torch.zeros(len(self), dtype=torch.bool, device=self.splats["means"].device)
 
     def initial_colors(self, dc: Tensor) -> Raw:
-        """Raw appearance that shows the colour dc [N, 3] (of degree 0) at every direction and time."""
+        """Return the raw appearance that has the colour dc [N, 3] (degree 0) in every direction and at every time."""
         rest = dc.new_zeros(len(dc), (self.sh_degree + 1) ** 2 - 1, 3)
         return {"sh0": dc[:, None], "shN": rest}
 
     def show(self, raw: Raw, directions: Tensor, query: Query) -> Tensor:
-        """Colours [N, 3] in unit directions [N, 3]."""
+        """Compute the colours [N, 3] in unit directions [N, 3]."""
         return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), directions, self.phase.sh_degree)
 
     # ---- what every model does
@@ -128,12 +128,12 @@ class GaussianModel(nn.Module, ABC):
 
     @torch.no_grad()
     def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
-        """Start from points: isotropic in space at the distance of three neighbours, opacity 0.1 (3DGS, section 5.1).
+        """Start at points: isotropic in space, as large as the distance to three neighbours, opacity 0.1 (3DGS, 5.1).
 
         Args:
-            points: where Gaussians start, in which colours.
+            points: the means and colours of the Gaussians.
             extent: of the scene, world units; density control and learning rates are relative to it.
-            generator: what is random is drawn from it.
+            generator: the source of all random numbers.
         """
         self.extent = extent
         distances = nearest_distances(points.means)
@@ -150,10 +150,10 @@ class GaussianModel(nn.Module, ABC):
         self.set_phase(self.phase)
 
     def slice(self, query: Query) -> Gaussians3D:
-        """Observe the model from a place at a time: 3D Gaussians for the rasterizer.
+        """Slice the model at a query: return 3D Gaussians for the rasterizer.
 
         Raises:
-            InputError: the model needs a time and got none.
+            InputError: the model observes time and the query has none.
         """
         if query.time is None and ("time" in self.observes or self.agr):
             raise InputError(f"{type(self).__name__}: expected a time in [0, 1], got none: this model observes time")
@@ -162,18 +162,18 @@ class GaussianModel(nn.Module, ABC):
         return Gaussians3D(means, factors, opacities, self.paint(raw, means, opacities, query))
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
-        """Means, factors and opacities of a slice; models with a kernel for it call that instead."""
+        """Compute the means, factors and opacities of a slice; models that have a kernel for it call the kernel."""
         means, factors, gate = self.condition(raw, query)
         return means, factors, torch.sigmoid(raw["opacities"]) * gate
 
     def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
-        """Colours of a slice; the kernel leaves out what `opacities` say cannot be drawn."""
+        """Compute the colours of a slice; the kernel skips Gaussians that are culled by their opacity."""
         if type(self).show is GaussianModel.show and self.backend.serves(means):
             return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, self.phase.sh_degree)
         return self.show(raw, unit(means - query.center), query)
 
     def refined(self, query: Query) -> Raw:
-        """Raw parameters after AGR: raw + phi(f) (7DGS eq. 15), on log-diagonals before the exp."""
+        """Apply AGR to the raw parameters: raw + phi(f) (7DGS eq. 15), to log-diagonals before the exp."""
         raw: Raw = dict(self.splats.items())
         if self.refinement is None or not self.phase.refine or query.time is None:
             return raw
@@ -183,7 +183,7 @@ class GaussianModel(nn.Module, ABC):
         return raw | dict(zip(names, moved, strict=True))
 
     def modulate(self, name: str, value: float) -> None:
-        """Give the model lambda_t (`time`) or lambda_d (`direction`), at `value` to begin with.
+        """Give the model lambda_t (`time`) or lambda_d (`direction`), initially `value`.
 
         Raises:
             InputError: `value` is not a positive number.
@@ -193,11 +193,11 @@ class GaussianModel(nn.Module, ABC):
         self.log_modulation[name] = nn.Parameter(torch.tensor(math.log(value)))
 
     def modulation(self, name: str) -> Tensor:
-        """lambda_t or lambda_d of `log_modulation`, positive by exp, []."""
+        """Return lambda_t or lambda_d, [], positive as the exp of `log_modulation`."""
         return self.log_modulation[name].exp()
 
     def set_phase(self, phase: Phase) -> None:
-        """Switch parts on or off; what is off neither acts nor learns."""
+        """Switch parts of the model on or off; a part that is off neither acts nor learns."""
         self.phase = phase
         for parameter in self.log_modulation.parameters():
             parameter.requires_grad_(phase.tune_modulation)
@@ -205,7 +205,7 @@ class GaussianModel(nn.Module, ABC):
             self.refinement.requires_grad_(phase.refine)
 
     def groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by the name their learning rate goes by."""
+        """Return the parameters by group; a group has a name and a learning rate."""
         groups = {name: [parameter] for name, parameter in self.splats.items()}
         if self.refinement is not None:
             groups["refinement"] = list(self.refinement.parameters())
@@ -213,18 +213,18 @@ class GaussianModel(nn.Module, ABC):
             groups["modulation"] = list(self.log_modulation.parameters())
         return groups
 
-    # ---- density control: rows are kept, copied and split here, whatever they mean
+    # ---- density control: keep, copy and split rows
 
     @torch.no_grad()
     def select(self, rows: Tensor) -> None:
-        """Keep the given rows, in the given order, repeated where repeated. Parameters stay the same objects."""
+        """Keep the given rows in the given order; a row may be repeated. Parameters stay the same objects."""
         for parameter in self.splats.values():
             parameter.data = parameter.data[rows]
             parameter.grad = None
 
     @torch.no_grad()
     def split(self, rows: Tensor, generator: torch.Generator) -> None:
-        """Turn rows [M], CHILDREN copies of each parent in a row, into its children."""
+        """Turn rows [M], CHILDREN copies of each parent one after the other, into its children."""
         raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.geometry)}
         for name, value in self.divide(raw, generator).items():
             self.splats[name].data[rows] = value
@@ -235,10 +235,10 @@ class GaussianModel(nn.Module, ABC):
         self.splats["opacities"].data.clamp_(max=math.log(ceiling / (1 - ceiling)))
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over a `state_dict` of any number of Gaussians.
+        """Load a `state_dict` with any number of Gaussians.
 
         Raises:
-            InputError: the state is not this model's.
+            InputError: the state is that of another model.
         """
         means = state.get("splats.means")
         N = len(means) if isinstance(means, Tensor) and means.dim() else 0

@@ -1,4 +1,4 @@
-"""Parameters to factors F of a covariance S = F F^T, and back: triangular (6DGS, 7DGS), rotated (3DGS, 4DGS)."""
+"""Compute factors F of covariances S = F F^T from raw parameters: triangular (6DGS, 7DGS) or rotated (3DGS, 4DGS)."""
 
 import torch
 import torch.nn.functional as F
@@ -9,21 +9,21 @@ from gsbench.kernels.thresholds import LOG_SIZE_MAX
 from gsbench.models.slicing import triangularise
 
 OFF_DIAGONALS = ("relative", "raw", "row_scaled")  # forms of `Triangle`; math/off_diagonal.h has them in this order
-KINDS = ("shape", "motion", "coupling")  # of entries below the diagonal
+KINDS = ("shape", "motion", "coupling")  # kinds of entries below the diagonal
 
 
 def sizes(logs: Tensor) -> Tensor:
-    """exp of log sizes of any shape, each held to +-LOG_SIZE_MAX; the gradient of one that is held is zero."""
+    """Compute exp of log sizes of any shape, clamped to +-LOG_SIZE_MAX; a clamped one has a gradient of zero."""
     return logs.clamp(-LOG_SIZE_MAX, LOG_SIZE_MAX).exp()
 
 
 class Triangle:
-    """Which entries of a triangular factor over p, t and d are shape, motion and coupling, and what these are.
+    """The layout of a triangular factor over p, t and d: which of its entries are shape, motion and coupling.
 
-    Below the diagonal of L there are three kinds of entries, each with its unit and so with its learning rate:
-    `shape` in the rows and columns of p is how a slice is skewed, relative to the Gaussian's own size; `motion` in the
-    rows of p and the columns of t and d is how far it moves for one standard deviation of t or d, in world units (over
-    (p, t, d): of t and d for one of p); `coupling` is what is left, among t and d.
+    Below the diagonal of L there are three kinds of entries. Each has its own unit and so its own learning rate.
+    `shape`, in the rows and columns of p, is the skew of a slice relative to the Gaussian's size. `motion`, in the rows
+    of p and the columns of t and d, is how far a slice moves for one standard deviation of t or d, in world units; in a
+    factor over (p, t, d) it is how far t and d move for one of p. `coupling` is the rest, among t and d.
     """
 
     def __init__(self, letters: str, form: str = "relative") -> None:
@@ -31,12 +31,12 @@ class Triangle:
 
         Args:
             letters: the variable of each row: "p", "t" or "d".
-            form: `relative`: an entry of shape is stated in units of its row's diagonal, so that it means the same for
-                a Gaussian of any size; `raw`: every entry is itself, as the 7DGS paper has it; `row_scaled`: every
-                entry is (2 sigmoid(x) - 1) times its row's diagonal, as the authors' later code has it.
+            form: `relative`: entries of shape are in units of their row's diagonal, so that they mean the same for a
+                Gaussian of any size; `raw`: a parameter is the entry itself, as in the 7DGS paper; `row_scaled`: an
+                entry is (2 sigmoid(x) - 1) times its row's diagonal, as in the authors' later code.
 
         Raises:
-            InputError: an unknown form.
+            InputError: the form is unknown.
         """
         if form not in OFF_DIAGONALS:
             raise InputError(f"off_diagonal '{form}' is not known. {did_you_mean(form, OFF_DIAGONALS)}")
@@ -46,7 +46,7 @@ class Triangle:
         for place, (i, j) in enumerate(below):
             in_space = (letters[i] + letters[j]).count("p")
             places[("coupling", "motion", "shape")[in_space]].append(place)
-        self.places = places  # by kind, where its entries stand among all
+        self.places = places  # by kind, the places of its entries among all
         self.rows = [i for i, _ in below]
         order = [place for kind in KINDS for place in places[kind]]
         self.columns = sorted(range(len(order)), key=order.__getitem__)  # of (shape, motion, coupling), for each place
@@ -54,7 +54,7 @@ class Triangle:
         self.is_relative = torch.tensor([place in relative for place in range(len(below))])
 
     def factor(self, log_diagonal: Tensor, kinds: dict[str, Tensor]) -> Tensor:
-        """Lower triangular L whose diagonal is positive by exp (7DGS, section 4.1).
+        """Compute the lower triangular L, whose diagonal is positive by exp (7DGS, section 4.1).
 
         Args:
             log_diagonal: [N, n] logarithms of the diagonal.
@@ -70,10 +70,9 @@ class Triangle:
         return torch.stack([F.pad(torch.cat(row, -1), (0, n - 1 - i)) for i, row in enumerate(rows)], 1)
 
     def parameters(self, factor: Tensor) -> dict[str, Tensor]:
-        """Undo `factor`: log_diagonal, shape, motion and coupling of any square factor [N, n, n] of S.
+        """Invert `factor`: compute log_diagonal, shape, motion and coupling of any square factor [N, n, n] of S.
 
-        In the form `row_scaled`, entries that it cannot reach (as large as their diagonal or larger) are cut to 99.9 %
-        of it.
+        The form `row_scaled` cannot express entries as large as their row's diagonal; they are cut to 99.9 % of it.
         """
         n = factor.shape[-1]
         L, _ = triangularise(factor, n)
@@ -87,16 +86,16 @@ class Triangle:
         return {"log_diagonal": diagonal.log()} | self.split(x)
 
     def split(self, below: Tensor) -> dict[str, Tensor]:
-        """Parameters below the diagonal, [N, n (n - 1) / 2] row by row, by their kind."""
+        """Sort the parameters below the diagonal, [N, n (n - 1) / 2] row by row, by their kind."""
         return {kind: below[:, self.places[kind]] for kind in KINDS}
 
     def join(self, kinds: dict[str, Tensor]) -> Tensor:
-        """Undo `split`."""
+        """Invert `split`."""
         return torch.cat([kinds[kind] for kind in KINDS], -1)[:, self.columns]
 
 
 def rotation(quaternions: Tensor) -> Tensor:
-    """Rotation matrices of quaternions wxyz of any length but zero, [N, 4] -> [N, 3, 3]."""
+    """Compute the rotation matrices of quaternions wxyz of any length but zero, [N, 4] -> [N, 3, 3]."""
     w, x, y, z = F.normalize(quaternions, dim=-1).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -107,7 +106,7 @@ def rotation(quaternions: Tensor) -> Tensor:
 
 
 def rotation4d(left: Tensor, right: Tensor) -> Tensor:
-    """The 4D rotation M_left(l) M_right(r) of two quaternions, [N, 4] and [N, 4] -> [N, 4, 4] (4DGS, eq. 7)."""
+    """Compute the 4D rotation M_left(l) M_right(r) of two quaternions, [N, 4] and [N, 4] -> [N, 4, 4] (4DGS, eq. 7)."""
     a, b, c, d = F.normalize(left, dim=-1).unbind(-1)
     p, q, r, s = F.normalize(right, dim=-1).unbind(-1)
     M_left = torch.stack([a, -b, -c, -d, b, a, -d, c, c, d, a, -b, d, -c, b, a], -1).unflatten(-1, (4, 4))

@@ -1,4 +1,4 @@
-"""3DGS: nothing is observed, the slice is the Gaussian itself (Kerbl et al. 2023)."""
+"""Model a static scene by 3DGS, whose slice is the Gaussian itself (Kerbl et al. 2023)."""
 
 import math
 from typing import Any
@@ -21,40 +21,40 @@ class Gaussians3DModel(GaussianModel):
     geometry = ("scales", "quats")
 
     def __init__(self, **options: Any) -> None:
-        """Options as `GaussianModel`."""
+        """Make an empty model, with the options of `GaussianModel`."""
         super().__init__(**options)
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Spheres."""
+        """Start with spheres."""
         quats = torch.zeros(len(distances), 4)
         quats[:, 0] = 1
         return {"scales": distances.log()[:, None].repeat(1, 3), "quats": quats}
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """The Gaussian as it is."""
+        """Return the Gaussian itself."""
         return Conditioned(raw["means"], self.factors(raw), torch.ones_like(raw["opacities"]))
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
-        """By the native kernel, where it serves."""
+        """Slice by the kernel where the backend has one."""
         if not self.backend.serves(raw["means"]):
             return super().observe(raw, query)
         return raw["means"], *observe_still(raw["scales"], raw["quats"], raw["opacities"])
 
     def scales(self) -> Tensor:
-        """Largest of the three scales."""
+        """Return the largest of the three scales."""
         return self.splats["scales"].detach().amax(-1).exp()
 
     def hold_sizes(self, least: Tensor) -> None:
-        """All three scales."""
+        """Raise all three scales."""
         self.splats["scales"].data.clamp_(min=least.log()[:, None])
 
     def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Children drawn from the parent's own distribution, 1.6 times smaller (3DGS, section 5.2)."""
+        """Sample children from the parent's distribution, 1.6 times smaller (3DGS, section 5.2)."""
         z = torch.randn(raw["means"].shape, generator=generator).to(raw["means"])
         means = raw["means"] + (self.factors(raw) @ z[..., None])[..., 0]
         return {"means": means, "scales": raw["scales"] - math.log(SHRINK)}
 
     @staticmethod
     def factors(raw: Raw) -> Tensor:
-        """R S, [N, 3, 3]."""
+        """Compute the factors R S, [N, 3, 3]."""
         return rotation(raw["quats"]) * sizes(raw["scales"])[:, None, :]

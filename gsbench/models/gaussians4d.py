@@ -1,4 +1,4 @@
-"""4DGS: Gaussians in space and time, and colours that change with time (Yang et al. 2023)."""
+"""Model a moving scene by 4DGS: Gaussians in space and time, whose colours change with time (Yang et al. 2023)."""
 
 import math
 from typing import Any
@@ -24,8 +24,9 @@ from gsbench.scenes.scene import Points
 class Gaussians4DModel(GaussianModel):
     """Means and times, four log scales and two quaternions: F = M_left(l) M_right(r) S over (x, y, z, t).
 
-    A rotation of space and time needs one unit for both: it sees the clip as long as the scene is large (`clock`), so
-    that a scene in metres and the same in centimetres are one. The fourth scale is such a length; `times` are not.
+    A rotation of space and time needs one unit for both. With `clock` the clip is as long as the scene is large, so
+    that a scene in metres and the same scene in centimetres train alike. The fourth scale is in that unit; `times` are
+    in clips.
     """
 
     clock: Tensor  # [] world units a clip
@@ -40,13 +41,13 @@ class Gaussians4DModel(GaussianModel):
         """Make an empty model.
 
         Args:
-            time_degree: frequencies of the colour's Fourier series beside the constant one; 0: colours do not change.
+            time_degree: frequencies of the colour's Fourier series besides the constant one; 0: constant colours.
             scheme: of `slice_gaussians`.
             lambda_t: sensitivity of the temporal opacity.
             options: as `GaussianModel`.
 
         Raises:
-            InputError: an option out of its range.
+            InputError: an option is out of its range.
         """
         super().__init__(**options)
         if not isinstance(time_degree, int) or time_degree < 0:
@@ -58,7 +59,7 @@ class Gaussians4DModel(GaussianModel):
         self.register_buffer("clock", torch.ones(()))
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Spheres in space, times uniform over the clip and a tenth of it beyond, time scale sqrt(T / 5)."""
+        """Start with spheres, times uniform from -0.1 to 1.1 clips, and a time scale of sqrt(T / 5)."""
         N = len(distances)
         self.clock.fill_(size_of(points))
         duration = self.clock.log() + 0.5 * math.log(1 / 5)
@@ -73,8 +74,8 @@ class Gaussians4DModel(GaussianModel):
         time = query.time
         assert time is not None
         factor, delta = _leading_first(self.factors(raw)), time - raw["times"]
-        # A Gaussian that is not drawn at this time stays at mu_p, as if it were seen at its own: else the huge numbers
-        # of one that is thin in time would reach a gradient as 0 x inf.
+        # A Gaussian that is culled at this time is sliced at its own time and so stays at mu_p. Otherwise the huge
+        # numbers of a Gaussian that is thin in time would reach its gradient as 0 x inf.
         with torch.no_grad():
             seen = self._gate(factor, delta) > TIME_GATE_MIN
         mean = torch.cat([raw["means"], raw["times"]], -1)
@@ -84,7 +85,7 @@ class Gaussians4DModel(GaussianModel):
         return Conditioned(means, factors, torch.where(seen, gate, 0.0))
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
-        """The square-root scheme by the native kernel, where it serves."""
+        """Slice by the kernel where the backend has one, in the square-root scheme."""
         if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
             return super().observe(raw, query)
         assert query.time is not None
@@ -101,7 +102,7 @@ class Gaussians4DModel(GaussianModel):
         )
 
     def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
-        """4DSH by the native kernel, where it serves."""
+        """Compute 4DSH by the kernel where the backend has one."""
         if self.time_degree >= MAX_WAVES or not self.backend.serves(means):
             return super().paint(raw, means, opacities, query)
         assert query.time is not None
@@ -109,27 +110,27 @@ class Gaussians4DModel(GaussianModel):
         return show_colors(sh0, raw["shN"], means, opacities, query.center, degree, raw["times"], query.time, waves)
 
     def initial_colors(self, dc: Tensor) -> Raw:
-        """4DSH coefficients [N, time_degree + 1, K, 3]: only the constant one is not zero."""
+        """Return 4DSH coefficients [N, time_degree + 1, K, 3], of which only the constant one is not zero."""
         K = (self.sh_degree + 1) ** 2
         waves = dc.new_zeros(len(dc), self.time_degree + 1, K, 3)
         return {"sh0": dc[:, None, None], "shN": waves.flatten(1, 2)[:, 1:]}
 
     def show(self, raw: Raw, directions: Tensor, query: Query) -> Tensor:
-        """4DSH."""
+        """Compute 4DSH in torch."""
         assert query.time is not None
         coefficients = torch.cat([raw["sh0"].flatten(1, 2), raw["shN"]], 1).unflatten(1, (self.time_degree + 1, -1))
         return sh_time_colors(coefficients, directions, self.phase.sh_degree, query.time - raw["times"][:, 0])
 
     def scales(self) -> Tensor:
-        """Largest of the three spatial scales, as 4DGS' density control has it."""
+        """Return the largest of the three spatial scales, as density control in 4DGS does."""
         return self.splats["scales"].detach()[:, :3].amax(-1).exp()
 
     def hold_sizes(self, least: Tensor) -> None:
-        """The three spatial scales."""
+        """Raise the three spatial scales."""
         self.splats["scales"].data[:, :3].clamp_(min=least.log()[:, None])
 
     def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Children drawn from the parent's distribution in space and time, all scales 1.6 times smaller."""
+        """Sample children from the parent's distribution in space and time, with all scales 1.6 times smaller."""
         z = torch.randn(len(raw["means"]), 4, generator=generator).to(raw["means"])
         offset = (self.factors(raw) @ z[..., None])[..., 0]
         return {
@@ -139,20 +140,20 @@ class Gaussians4DModel(GaussianModel):
         }
 
     def _gate(self, factor: Tensor, delta: Tensor) -> Tensor:
-        """f_temp of factors [N, 4, 4], delta [N, 1] away in time, [N]."""
+        """Compute f_temp [N] of factors [N, 4, 4] at a distance delta [N, 1] in time."""
         return torch.exp(-0.5 * self.modulation("time") * mahalanobis(factor[:, 3:], delta))
 
     def factors(self, raw: Raw) -> Tensor:
-        """R S with rows (x, y, z, t), t in clips, [N, 4, 4]."""
+        """Compute the factors R S with rows (x, y, z, t), t in clips, [N, 4, 4]."""
         factor = rotation4d(raw["left_quats"], raw["right_quats"]) * sizes(raw["scales"])[:, None, :]
         return torch.cat([factor[:, :3], factor[:, 3:] / self.clock], 1)
 
 
 def _leading_first(factor: Tensor) -> Tensor:
-    """Swap the columns of [N, 4, 4] so that the one that is largest in the row of t is the first; F F^T stays.
+    """Swap columns of [N, 4, 4] so that the first one is the largest in the row of t; F F^T does not change.
 
-    Columns differ by factors of 10^7 where a Gaussian is long in time, and a reflection is accurate in each of them,
-    not only in the largest, if it starts so (Powell and Reid 1969; Cox and Higham 1998).
+    In a Gaussian that is long in time, columns differ by factors of 10^7. With this order a reflection is accurate in
+    every column and not only in the largest (Powell and Reid 1969; Cox and Higham 1998).
     """
     largest = factor[:, 3].detach().abs().argmax(-1, keepdim=True)
     columns = torch.arange(4, device=factor.device).repeat(len(factor), 1)

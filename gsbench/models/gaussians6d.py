@@ -1,4 +1,4 @@
-"""6DGS: Gaussians over position and direction, for effects that depend on the view (Gao et al. 2024)."""
+"""Model view-dependent effects by 6DGS: Gaussians over position and direction (Gao et al. 2024)."""
 
 from gsbench.models.registry import register
 from gsbench.models.triangular import TriangularModel
@@ -6,7 +6,7 @@ from gsbench.models.triangular import TriangularModel
 
 @register("6dgs")
 class Gaussians6DModel(TriangularModel):
-    """Observes d; q = {d}."""
+    """Gaussians conditioned on q = {d}."""
 
     observes = ("direction",)
     centers = ("means", "directions")

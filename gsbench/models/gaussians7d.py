@@ -1,4 +1,4 @@
-"""7DGS: Gaussians over position, time and direction (Gao et al. 2025)."""
+"""Model moving, view-dependent scenes by 7DGS: Gaussians over position, time and direction (Gao et al. 2025)."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from gsbench.models.triangular import TriangularModel
 
 @register("7dgs")
 class Gaussians7DModel(TriangularModel):
-    """Observes t and d; q = {t, d}."""
+    """Gaussians conditioned on q = {t, d}."""
 
     observes = ("time", "direction")
     centers = ("means", "times", "directions")
@@ -24,12 +24,12 @@ class Gaussians7DModel(TriangularModel):
             options: as `TriangularModel`.
 
         Raises:
-            InputError: an option out of its range.
+            InputError: an option is out of its range.
         """
         super().__init__(**options)
         self.modulate("time", lambda_t)
 
     @torch.no_grad()
     def long_in_time(self) -> Tensor:
-        """|S_pt| > 0.05 extent and sqrt(S_t) > 0.25 T (7DGS, section 4.4)."""
+        """Test |S_pt| > 0.05 extent and sqrt(S_t) > 0.25 T (7DGS, section 4.4)."""
         return self.moves_long(self.factors(dict(self.splats.items())))

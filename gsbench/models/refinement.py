@@ -1,4 +1,4 @@
-"""AGR, the adaptive Gaussian refinement: small networks that move a Gaussian's raw parameters with time (7DGS, 4.3)."""
+"""Move the raw parameters of Gaussians with time by AGR, the adaptive Gaussian refinement (7DGS, section 4.3)."""
 
 import functools
 import math
@@ -21,15 +21,15 @@ def encode_time(time: Tensor, octaves: int = OCTAVES) -> Tensor:
 
 @functools.cache
 def _frequencies(octaves: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """2^k pi, [K]: made once, as on a GPU every operation of a few numbers costs as much as one of thousands."""
+    """Return 2^k pi, [K], cached: on a GPU an operation on a few numbers costs as much as one on thousands."""
     return math.pi * 2.0 ** torch.arange(octaves, device=device, dtype=dtype)
 
 
 class Refinement(nn.Module):
-    """Perceptrons f x 64 x c that read the means and gamma(t) = f, one to move each mean and one to move the rest.
+    """Perceptrons f x 64 x c, one for each mean and one for the rest, that read f = (means, gamma(t)).
 
-    7DGS eq. 14 and 15. The output layers start at zero, so that switching the refinement on changes nothing. f does not
-    depend on the view.
+    See 7DGS eq. 14 and 15. The output layers start at zero, so that switching AGR on changes nothing. f does not depend
+    on the view.
     """
 
     units: Tensor  # [sum of outputs]
@@ -40,11 +40,11 @@ class Refinement(nn.Module):
         """Make the networks, their output layers zero.
 
         Args:
-            outputs: the width of each network; the last is of what is no mean.
-            generator: the first layers are drawn from it.
-            octaves: K of gamma(t). Many octaves on few frames tell every frame apart, and learn each by heart.
-            units: [sum of outputs] what the networks measure each number in, so that they see a scene of any size
-                alike; ones by default.
+            outputs: the width of each network; the last one moves what is not a mean.
+            generator: samples the first layers.
+            octaves: K of gamma(t). With many octaves and few frames the networks memorise each frame.
+            units: [sum of outputs] in which the networks see each number, so that the size of the scene does not
+                matter; ones by default.
         """
         super().__init__()
         self.features = sum(outputs[:-1])
@@ -61,15 +61,15 @@ class Refinement(nn.Module):
         self.biases_out = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in outputs])
 
     def forward(self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False) -> list[Tensor]:
-        """Raw parameters [N, c] at one time [], moved: those that are read, then the others.
+        """Move raw parameters [N, c], those that are read and then the others, to a time [].
 
-        `by_kernel` (float32), no hidden layer is written to memory.
+        The kernel (float32) writes no hidden layer to memory.
         """
         if by_kernel:
             gamma = encode_time(time, self.octaves)
             return refine(values, self.weight_in, self.bias_in, list(self.weights_out), list(self.biases_out),
                           self.units, gamma)  # fmt: skip
-        # The units are those of the layers' rows and columns: no Gaussian's number is scaled.
+        # The units scale rows and columns of the layers instead of the parameters of every Gaussian.
         weight_in, bias_in = self.weight_in[:, : self.features] / self.units[: self.features], self.at_time(time)
         units = self.units.split([len(w) for w in self.weights_out])
         weights_out = [w * unit[:, None] for w, unit in zip(self.weights_out, units, strict=True)]
@@ -81,5 +81,5 @@ class Refinement(nn.Module):
         return [x + residual for x, residual in zip(values, residuals, strict=True)]
 
     def at_time(self, time: Tensor) -> Tensor:
-        """What gamma(t), the same for all Gaussians, adds to every hidden unit: one vector, not 2 K more columns."""
+        """Compute what gamma(t) adds to the hidden units; all Gaussians share it, so it is one vector."""
         return F.linear(encode_time(time, self.octaves), self.weight_in[:, self.features :], self.bias_in)

@@ -1,4 +1,4 @@
-"""Find a model by its name: `register` enters a class, `build` makes a model of it."""
+"""Register models by name and build them."""
 
 import importlib
 import inspect
@@ -14,7 +14,7 @@ M = TypeVar("M", bound=type[GaussianModel])
 
 
 def register(name: str) -> Callable[[M], M]:
-    """Class decorator: `build` finds the model by this name."""
+    """Decorate a class so that `build` finds it by this name."""
 
     def enter(model: M) -> M:
         _REGISTRY[name] = model
@@ -24,12 +24,12 @@ def register(name: str) -> Callable[[M], M]:
 
 
 def build(name: str, **options: Any) -> GaussianModel:
-    """Make the model registered as `name`, without Gaussians yet.
+    """Build the model registered as `name`, without Gaussians yet.
 
-    Every module of `gsbench.models` is imported first, so that a new model is one new file in that folder.
+    This imports every module of `gsbench.models`, so that a new model is one new file in that folder.
 
     Raises:
-        InputError: no such model, an option it does not have, or one that it needs and did not get.
+        InputError: the model is unknown, does not have an option, or needs an option that is missing.
     """
     package = importlib.import_module("gsbench.models")
     for module in pkgutil.iter_modules(package.__path__):
@@ -37,7 +37,7 @@ def build(name: str, **options: Any) -> GaussianModel:
     if name not in _REGISTRY:
         raise InputError(f"model '{name}' is not known. {did_you_mean(name, _REGISTRY)}")
     model = _REGISTRY[name]
-    # A constructor passes on what it does not name itself: its options are those of all classes it stands on.
+    # A constructor passes unknown options on to its base, so the options are those of all base classes.
     signatures = [inspect.signature(cls.__init__) for cls in model.__mro__ if issubclass(cls, GaussianModel)]
     known = {p.name: p.default for s in signatures for p in s.parameters.values() if p.kind is p.KEYWORD_ONLY}
     for option in options:

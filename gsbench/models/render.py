@@ -1,4 +1,4 @@
-"""Render one image of a model: slice it, rasterize the slice."""
+"""Render an image of a model: slice it at a query and rasterize the slice."""
 
 from torch import Tensor
 
@@ -12,7 +12,15 @@ from gsbench.scenes.scene import Camera
 def rasterize_slice(
     gaussians: Gaussians3D, camera: Camera, background: Tensor, backend: Backend, antialias: bool = False
 ) -> RasterOutput:
-    """Rasterize one slice for one camera, before a background colour [3]."""
+    """Rasterize one slice for one camera.
+
+    Args:
+        gaussians: the slice.
+        camera: sees it.
+        background: colour [3].
+        backend: of the rasterizer.
+        antialias: see `gsbench.raster.rasterize`.
+    """
     return rasterize(
         *gaussians,
         camera.viewmat[None],
@@ -28,6 +36,14 @@ def rasterize_slice(
 def render(
     model: GaussianModel, camera: Camera, time: float | None, background: Tensor, antialias: bool = False
 ) -> Tensor:
-    """The image [H, W, 3] of a model from a camera at a time, by the model's own backend."""
+    """Render the image [H, W, 3] of a model by the model's own backend.
+
+    Args:
+        model: initialised.
+        camera: sees it.
+        time: in [0, 1]; None where the scene has no time.
+        background: colour [3].
+        antialias: see `gsbench.raster.rasterize`.
+    """
     seen = model.slice(Query.of(camera, time))
     return rasterize_slice(seen, camera, background, model.backend, antialias).image[0]

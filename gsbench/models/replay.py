@@ -1,4 +1,4 @@
-"""Renders of a model as a CUDA graph: what a picture launches is recorded once, and replayed for cameras and times."""
+"""Record the renders of a model as a CUDA graph, and replay it for other cameras and times."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
@@ -16,34 +16,34 @@ from gsbench.raster import EPS2D, FAR, NEAR
 from gsbench.raster.native import draw_within
 from gsbench.scenes.scene import Camera
 
-MARGIN = 1.25  # room for pairs, over what the picture at hand needs
+MARGIN = 1.25  # room for intersections, as a multiple of what the first image needs
 T = TypeVar("T")
 
 
 class _Recording(NamedTuple):
-    """A picture of one size. What it reads is written before each replay."""
+    """A recorded render of one image size. Its camera and time are overwritten before each replay."""
 
     camera: Camera
     time: Tensor | None  # []
     play: Callable[[], None]
     image: Tensor  # [H, W, 3]
-    needed: Tensor  # [2] int64: pairs of a tile and a Gaussian, and whether a value was out of range
-    room: int  # for pairs
+    needed: Tensor  # [2] int64: intersections, and whether a value was out of range
+    room: int  # for intersections
 
 
 class Replay:
-    """`render` of a model on a GPU, without launching and, but at a picture's end, without waiting.
+    """`render` of a model on a GPU that launches no kernels by itself and waits only at the end of an image.
 
-    The numbers of Gaussians and of pixels are fixed when a picture is recorded, at the first call for its size; that of
-    pairs to sort, which `render` waits for in the middle of a picture, is held below a bound that was enough for the
-    picture at hand and is looked at when a picture is done. One beyond it is recorded again with more room.
+    The first call for an image size records a graph, which fixes the numbers of Gaussians and of pixels. `render` waits
+    for the number of intersections in the middle of an image. A graph has room for a fixed number instead, MARGIN times
+    that of the first image, and the number is checked at the end; a larger one records the graph again.
     """
 
     def __init__(self, model: GaussianModel, background: Tensor, antialias: bool = False) -> None:
-        """Render `model`, whose parameters may change in value but not in number, before a background colour [3].
+        """Render `model`, whose parameters may change in value but not in number, with a background colour [3].
 
         Raises:
-            InputError: pictures of this model are not drawn by the CUDA backend.
+            InputError: this model is not rendered by the CUDA backend.
         """
         backend = resolve(model.backend.name, model.splats["means"].device.type)
         if backend.name != "cuda":
@@ -56,11 +56,11 @@ class Replay:
 
     @torch.no_grad()
     def __call__(self, camera: Camera, time: float | None) -> Tensor:  # [H, W, 3]
-        """The picture of a model from a camera at a time; the next call overwrites it.
+        """Render the model for a camera at a time; the next call overwrites the image.
 
         Raises:
-            InputError: the model needs a time and got none, or a value is out of range.
-            RuntimeError: CUDA cannot record what this model does.
+            InputError: the model observes time and there is none, or a value is out of range.
+            RuntimeError: CUDA cannot record this model.
         """
         size = camera.width, camera.height, time is None
         if size not in self._recordings:
@@ -71,7 +71,7 @@ class Replay:
         if recording.time is not None and time is not None:
             recording.time.fill_(time)
         recording.play()
-        *pairs, flags = recording.needed.tolist()  # waits for the picture
+        *pairs, flags = recording.needed.tolist()  # waits for the image
         if flags or any(n > recording.room for n in pairs):
             del self._recordings[size]
             return self(camera, time)
@@ -96,8 +96,8 @@ class Replay:
 
 
 def capture(call: Callable[[], T]) -> tuple[Callable[[], None], T]:
-    """Record what a call enqueues on the current GPU: what replays it, and its results, which a replay overwrites."""
-    call()  # loads what is loaded once a process, which cannot be recorded
+    """Record the work of a call on the current GPU; return its replay and its results, which a replay overwrites."""
+    call()  # the first call loads modules, which cannot be recorded
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
         results = call()

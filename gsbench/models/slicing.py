@@ -1,14 +1,14 @@
-"""The slicing equation: a joint Gaussian over (p, q), observed at q, is a 3D Gaussian over p (7DGS, section 4.2).
+"""Slice joint Gaussians over (p, q) at an observed q into conditional 3D Gaussians over p (7DGS, section 4.2).
 
     K = S_pq S_qq^-1        mean = mu_p + K (q - mu_q)        cov = S_pp - K S_pq^T
 
-A Gaussian is given by a factor F of S = F F^T. Its rows are ordered (p, q); its columns are any. Forming S squares the
-condition number, so the default scheme never does: it turns the rows of F by reflections until
+A Gaussian is given by a factor F of S = F F^T, whose rows are ordered (p, q). Forming S squares the condition number,
+so the default scheme never forms it. It turns the rows of F by reflections until
 F = [T_pq T_pp; T_qq 0] with T_qq lower triangular (square-root Kalman filters: Kailath, Sayed, Hassibi, chapter 12),
 
     K = T_pq T_qq^-1        cov = T_pp T_pp^T
 
-and hands T_pp itself to the rasterizer: semi-definite by construction, nothing subtracted.
+and passes T_pp itself to the rasterizer. This covariance is semi-definite by construction; nothing is subtracted.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ SCHEMES = ("square_root", "schur", "cholesky")
 
 
 class Slice(NamedTuple):
-    """What is left of a joint Gaussian once q is observed."""
+    """The conditional Gaussian that is left of a joint one when q is observed."""
 
     mean: Tensor  # [N, 3]
     factor: Tensor  # [N, 3, 3] F of cov = F F^T
@@ -48,13 +48,13 @@ def slice_gaussians(
 
     Args:
         mean: (mu_p, mu_q).
-        factor: any square F with S = F F^T, rows ordered (p, q).
-        query: the observed q, one for all or one each.
+        factor: a square F with S = F F^T, rows ordered (p, q).
+        query: the observed q, the same for all Gaussians or one for each.
         scheme: `square_root` works on F; `schur` inverts S_qq and subtracts, as published code does; `cholesky` solves
             with a Cholesky factor of S_qq and subtracts. The last two are for comparison: they lose half the digits.
 
     Raises:
-        InputError: shapes that do not fit, or an unknown scheme.
+        InputError: shapes do not fit, or the scheme is unknown.
     """
     N, n = mean.shape if mean.dim() == 2 else (0, 0)
     if n < 3 or factor.shape != (N, n, n) or query.shape not in ((N, n - 3), (n - 3,)):
@@ -69,7 +69,7 @@ def slice_gaussians(
 
 
 def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
-    """K and S_pp - K S_pq^T, [N, 3, k] and [N, 3, 3], by a scheme that forms S; the difference may be indefinite."""
+    """Compute K [N, 3, k] and S_pp - K S_pq^T [N, 3, 3] by a scheme that forms S; the result may be indefinite."""
     S = factor @ factor.mT
     S_pp, S_pq, S_qq = S[:, :3, :3], S[:, :3, 3:], S[:, 3:, 3:]
     if scheme == "schur":
@@ -86,7 +86,7 @@ def check_scheme(scheme: str) -> None:
 
 
 def slice_reduced(mean: Tensor, reduced: Reduced, query: Tensor) -> Slice:
-    """`slice_gaussians` for a factor that is [T_qq 0; T_pq T_pp] already: mean = mu_p + T_pq (T_qq^-1 (q - mu_q))."""
+    """Slice factors that are already [T_qq 0; T_pq T_pp]: mean = mu_p + T_pq (T_qq^-1 (q - mu_q))."""
     white = whiten(reduced.T_qq, query - mean[:, 3:])
     moved = mean[:, :3] + (reduced.T_pq * white[:, None]).sum(-1)
     return Slice(moved, reduced.T_pp, gain_of(reduced.T_pq, reduced.T_qq))
@@ -100,7 +100,7 @@ def reduce(factor: Tensor) -> Reduced:
 
 
 def mahalanobis(rows: Tensor, delta: Tensor) -> Tensor:
-    """delta^T (R R^T)^-1 delta for some rows R of a factor, [N, m, n] and [N, m] -> [N], with nothing inverted.
+    """Compute delta^T (R R^T)^-1 delta of rows R of a factor without an inverse, [N, m, n] and [N, m] -> [N].
 
     This is the exponent of f_temp and f_dir (7DGS eq. 11 and 12): R R^T is the marginal block S_t or S_d.
     """
@@ -109,7 +109,7 @@ def mahalanobis(rows: Tensor, delta: Tensor) -> Tensor:
 
 
 def whiten(T: Tensor, delta: Tensor) -> Tensor:
-    """T^-1 delta for lower triangular T, [N, m, m] and [N, m] -> [N, m], by forward substitution.
+    """Compute T^-1 delta for lower triangular T, [N, m, m] and [N, m] -> [N, m], by forward substitution.
 
     The squares of its first i entries add up to the Mahalanobis distance of the first i variables alone.
     """
@@ -125,8 +125,8 @@ def whiten(T: Tensor, delta: Tensor) -> Tensor:
 def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
     """Reflect [N, r, n] rows from the right until the first k are lower triangular: [N, r, k] and the rest [N, r, n-k].
 
-    R H H^T R^T = R R^T, so no covariance changes. Householder, with the sign that avoids cancellation (Golub and
-    Van Loan, section 5.1).
+    R H H^T R^T = R R^T, so no covariance changes. These are Householder reflections, with the sign that avoids
+    cancellation (Golub and Van Loan, section 5.1).
     """
     rest, columns = rows, []
     for i in range(k):
@@ -136,9 +136,9 @@ def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
         signed = torch.where(x[:, :1] < 0, -length, length)
         v = torch.cat([x[:, :1] + signed, x[:, 1:]], -1)
         vv = (v * v).sum(-1, keepdim=True)
-        step = v * (2 / torch.where(vv > 0, vv, 1.0))  # zero for a row of zeros, which stays as it is
+        step = v * (2 / torch.where(vv > 0, vv, 1.0))  # zero for a row of zeros, which does not change
         rest = rest - (rest * v[:, None]).sum(-1, keepdim=True) * step[:, None]
-        # Row i is now (-+|x|, 0, ..): written as such, so that T is triangular to the last bit.
+        # Row i is now (-+|x|, 0, ..). It is written as such, so that T is exactly triangular.
         columns.append(torch.cat([torch.zeros_like(rest[:, :i, 0]), -signed, rest[:, i + 1 :, 0]], -1))
         rest = rest[..., 1:]
     T = torch.stack(columns, -1) if columns else rows[..., :0]
@@ -146,7 +146,7 @@ def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 def gain_of(T_pq: Tensor, T_qq: Tensor) -> Tensor:
-    """K = T_pq T_qq^-1, [N, 3, k] and [N, k, k] lower triangular: back substitution, unrolled over the few columns."""
+    """Compute K = T_pq T_qq^-1 by back substitution, [N, 3, k] and [N, k, k] lower triangular -> [N, 3, k]."""
     k = T_qq.shape[-1]
     solved: list[Tensor] = []  # columns k-1, k-2, ..
     for j in reversed(range(k)):
@@ -158,7 +158,7 @@ def gain_of(T_pq: Tensor, T_qq: Tensor) -> Tensor:
 
 
 def _cholesky3(S: Tensor) -> Tensor:
-    """A lower triangular factor of [N, 3, 3], negative pivots cut to zero: what is indefinite in S is lost."""
+    """Compute a lower triangular factor of S [N, 3, 3]; negative pivots, where S is indefinite, become zero."""
 
     def root(x: Tensor) -> Tensor:
         return torch.where(x > 0, torch.where(x > 0, x, 1.0).sqrt(), 0.0)

@@ -1,4 +1,4 @@
-"""What 6DGS and 7DGS share: Gaussians over position, direction and maybe time, by one triangular factor."""
+"""Slice 6D and 7D Gaussians by their triangular factor, for 6DGS and 7DGS."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ from gsbench.models.query import Query, unit
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.scene import Points
 
-# Where position, time and direction stand among the rows of the triangular factor.
+# The order of position, time and direction among the rows of the triangular factor.
 FACTOR_ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
 WIDTH = {"p": 3, "t": 1, "d": 3}
 TIME_CORRELATION = 0.05  # split in time where |S_pt| is above this part of the scene's extent ..
@@ -24,10 +24,10 @@ TIME_SCALE = 0.25  # .. and sqrt(S_t) above this part of the clip (7DGS, section
 
 
 class TriangularModel(GaussianModel):
-    """Means of p, d and t and one lower triangular factor of their covariance.
+    """Gaussians with means of p, d and t, and one lower triangular factor of their covariance.
 
-    Rows of a factor are ordered (p, d, t) wherever slicing sees them: with d before t, the leading block of the
-    reduced factor is the marginal one of d.
+    For slicing, the rows of a factor are ordered (p, d, t): with d before t, the leading block of the reduced factor is
+    the marginal of d.
     """
 
     geometry = ("log_diagonal", *KINDS)
@@ -48,12 +48,12 @@ class TriangularModel(GaussianModel):
             lambda_d: initial sensitivity of f_dir.
             factor_order: `paper`, the factor triangular over (p, t, d), or `conditioned_first`, over (d, t, p).
             scheme: of `slice_gaussians`.
-            off_diagonal: what the parameters below the diagonal are, the `form` of `Triangle`.
+            off_diagonal: the `form` of `Triangle`, which says what the parameters below the diagonal mean.
             directional_half: whether f_dir has the 1/2 of 7DGS eq. 12, which 6DGS lacks.
             options: as `GaussianModel`.
 
         Raises:
-            InputError: an option out of its range.
+            InputError: an option is out of its range.
         """
         super().__init__(**options)
         if factor_order not in FACTOR_ORDERS:
@@ -70,7 +70,7 @@ class TriangularModel(GaussianModel):
         self.is_reduced = factor_order == "conditioned_first" and scheme == "square_root"
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Spheres; directions uniform on the unit sphere, of scale 1; time scale sqrt(T / 10); no correlation."""
+        """Start with spheres, directions uniform on the unit sphere of scale 1, and a time scale of sqrt(T / 10)."""
         N = len(distances)
         log_diagonal = torch.zeros(N, sum(map(len, self.rows.values())))
         log_diagonal[:, self.rows["p"]] = distances.log()[:, None]
@@ -92,8 +92,8 @@ class TriangularModel(GaussianModel):
             at = torch.cat([at, query.time.expand(len(at), 1)], -1)
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
         delta = at - mean[:, 3:]
-        # A Gaussian so far from the query that nothing is left of it is left out of what follows, lest its huge
-        # numbers reach a gradient as 0 x inf: it stays at mu_p, gated to zero, as if it were a unit one at the query.
+        # A Gaussian so far from the query that its opacity is zero is replaced by a unit Gaussian at the query, and its
+        # gate is zero. Otherwise its huge numbers would reach a gradient as 0 x inf.
         with torch.no_grad():
             seen = self._exponent(reduced.T_qq, delta, whiten(reduced.T_qq, delta)) < EXPONENT_MAX
         delta = torch.where(seen[:, None], delta, 0.0)
@@ -107,7 +107,7 @@ class TriangularModel(GaussianModel):
         return Conditioned(means, factors, gate)
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
-        """By the native kernel where there is one: for the square-root scheme, and on the CPU for `cholesky`."""
+        """Slice by the kernel where there is one: in the square-root scheme, and on the CPU also for `cholesky`."""
         has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
         if not has_kernel or not self.backend.serves(raw["means"]):
             return super().observe(raw, query)
@@ -131,20 +131,20 @@ class TriangularModel(GaussianModel):
         )
 
     def scales(self) -> Tensor:
-        """Largest standard deviation of the sliced Gaussian, which is the same at every t and d."""
+        """Return the largest standard deviation of the slice, which is the same at every t and d."""
         T_pp = reduce(self.factors(dict(self.splats.items())).detach()).T_pp
         return torch.linalg.matrix_norm(T_pp, ord=2)
 
     def hold_sizes(self, least: Tensor) -> None:
-        """The diagonal of L_pp."""
+        """Raise the diagonal of L_pp."""
         space = self.rows["p"]
         self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=least.log()[:, None])
 
     def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Children along the parent's path where it is long in time, else drawn from its slice; K is theirs too.
+        """Sample children along the parent's path where it is long in time, else from its slice.
 
-        In the reduced factor [T_qq 0; K T_qq T_pp] a child's shape is T_pp / 1.6 (space) or T_qq with its last row,
-        that of t, divided by 1.6 (time). K stays: a child moves as its parent did.
+        In the reduced factor [T_qq 0; K T_qq T_pp] a child's shape is T_pp / 1.6 (space), or T_qq with its last row,
+        that of t, divided by 1.6 (time). K does not change: a child moves as its parent did.
         """
         factor = self.factors(raw)
         T_qq, T_pq, T_pp = reduce(factor)
@@ -154,8 +154,8 @@ class TriangularModel(GaussianModel):
         children = {"means": raw["means"] + torch.where(in_time, 0, (T_pp @ z[..., None])[..., 0])}
         T_pp = torch.where(in_time[..., None], T_pp, T_pp / SHRINK)
         if "time" in self.observes:
-            # z standard deviations along t, though no more than z clips: a child seen at any (t, d) is where its parent
-            # was, for K (q - mu_q) loses K_t dt and mu_p gains it.
+            # A child is z standard deviations along t from its parent, at most z clips. At any (t, d) it is where its
+            # parent was, since K (q - mu_q) loses K_t dt and mu_p gains it.
             sigma = factor[:, 6].norm(dim=-1, keepdim=True).clamp(max=1)
             dt = torch.where(in_time, z[:, :1] * sigma, 0)
             children["means"] = children["means"] + gain[..., -1] * dt
@@ -167,12 +167,12 @@ class TriangularModel(GaussianModel):
         return children | self.triangle.parameters(factor)
 
     def factors(self, raw: Raw) -> Tensor:
-        """The triangular factor with its rows sorted to (p, d, t), [N, n, n]."""
+        """Compute the triangular factor with its rows sorted to (p, d, t), [N, n, n]."""
         L = self.triangle.factor(raw["log_diagonal"], raw)
         return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
 
     def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
-        """-ln(f_dir f_temp) = 1/2 (lambda_d |white_d|^2 + lambda_t (t - mu_t)^2 / S_t), [N] (7DGS eq. 11 and 12)."""
+        """Compute (lambda_d |white_d|^2 + lambda_t (t - mu_t)^2 / S_t) / 2 = -ln(f_dir f_temp), [N] (eq. 11 and 12)."""
         half = 0.5 if self.directional_half else 1.0
         exponent = half * self.modulation("direction") * white[:, :3].square().sum(-1)
         if "time" in self.observes:
@@ -181,17 +181,17 @@ class TriangularModel(GaussianModel):
         return exponent
 
     def _blocks(self, factor: Tensor) -> Reduced:
-        """The factor of `conditioned_first` as what it is: reduced already, its first columns those of q."""
+        """Cut a factor of `conditioned_first` into its blocks; it is already reduced, with the columns of q first."""
         k = factor.shape[-1] - 3
         return Reduced(factor[:, 3:, :k], factor[:, :3, :k], factor[:, :3, k:])
 
     def _own_order(self) -> list[int]:
-        """For each row of the triangular factor, its place in (p, d, t)."""
+        """Return the place in (p, d, t) of each row of the triangular factor."""
         sorted_rows = self.rows["p"] + self.rows["d"] + self.rows["t"]
         return sorted(range(len(sorted_rows)), key=sorted_rows.__getitem__)
 
     def moves_long(self, factor: Tensor) -> Tensor:
-        """Whether Gaussians move with time and are long in it, [N, n, n] -> [N] bool (7DGS, section 4.4)."""
+        """Tell whether Gaussians move with time and are long in it, [N, n, n] -> [N] bool (7DGS, section 4.4)."""
         if "time" not in self.observes:
             return torch.zeros(len(factor), dtype=torch.bool, device=factor.device)
         S_pt = (factor[:, :3] @ factor[:, 6:].mT)[..., 0]

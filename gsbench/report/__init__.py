@@ -1,1 +1,1 @@
-"""From records to tables and pictures. Reads records only and works without torch."""
+"""Make tables and image strips from records, without torch."""

@@ -1,4 +1,4 @@
-"""``python -m gsbench.report RESULTS_DIR``: print the table of the records in a folder and write it there."""
+"""Print the table of the records in a folder, and write it there (``python -m gsbench.report RESULTS_DIR``)."""
 
 import argparse
 import sys
@@ -9,7 +9,7 @@ from gsbench.report import layout, tables
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the tables, write ``table.md`` and ``table.csv``; return 2 where there is nothing to show."""
+    """Print the tables, write ``table.md`` and ``table.csv``; return 2 if there is no record."""
     parser = argparse.ArgumentParser(prog="python -m gsbench.report", description=__doc__)
     parser.add_argument("results", type=Path, metavar="RESULTS_DIR", help="a folder with records, at any depth")
     parser.add_argument("--train", action="store_true", help="also PSNR on training views: the gap is overfitting")

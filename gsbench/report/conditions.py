@@ -1,4 +1,4 @@
-"""Under which conditions the rows of a table hold, and a warning where they differ in what should be equal."""
+"""State the conditions under which the rows of a table were measured, and warn where they differ."""
 
 from collections.abc import Callable
 from functools import partial
@@ -17,19 +17,19 @@ Get = Callable[[Record], str]
 
 
 def printable(text: object) -> str:
-    """Text from a record on one line, without the control characters that a terminal would obey."""
+    """Put text from a record on one line, without control characters that a terminal would obey."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(str(text).split()))
 
 
 def conditions(records: list[Record]) -> list[str]:
-    """Footnotes on protocol, data, machine, commit, versions and seeds; the warnings come first."""
+    """List footnotes on protocol, data, machine, commit, versions and seeds; warnings come first."""
     names = sorted({name for r in records for name in r.protocol} - {"paper_dataset"})
     protocol: dict[str, Get] = {name: partial(_protocol, name=name) for name in names}
     protocol["iterations"] = _iterations
     data: dict[str, Get] = {printable(records[0].dataset): lambda r: r.provenance.data_hash[:8]}
     notes = []
     for title, facts in (("protocol", protocol), ("data", data)):
-        # both may go with the scene (lego is measured on val), but not differ within one
+        # both may differ between scenes (lego is measured on val), but not within a scene
         notes.append(f"{title}: " + "; ".join(f"{name} {_by_scene(records, get)}" for name, get in facts.items()))
         notes += [_differ(name, records, get) for name, get in facts.items() if not _goes_with_scene(records, get)]
     if any(r.scene == "lego" and r.protocol.get("eval_split") == "val" for r in records):
@@ -74,12 +74,12 @@ def _seeds(records: list[Record]) -> str:
 
 
 def _goes_with_scene(records: list[Record], get: Get) -> bool:
-    """Whether every scene has one value."""
+    """Tell whether every scene has a single value."""
     return len({(r.scene, get(r)) for r in records}) == len({r.scene for r in records})
 
 
 def _by_scene(records: list[Record], get: Get) -> str:
-    """The value that all runs have, else each value with its scenes."""
+    """Show the value that all runs share, or each value with its scenes."""
     scenes: dict[str, set[str]] = {}
     for record in records:
         scenes.setdefault(get(record), set()).add(record.scene)
@@ -89,7 +89,7 @@ def _by_scene(records: list[Record], get: Get) -> str:
 
 
 def _differ(what: str, records: list[Record], get: Get) -> str:
-    """A warning that runs which stand side by side differ, with the runs of each value."""
+    """Warn that the compared runs differ, and list the runs of each value."""
     runs: dict[str, list[str]] = {}
     for record in records:
         runs.setdefault(get(record), []).append(f"{record.scene}/{record.model}/seed{record.seed}")

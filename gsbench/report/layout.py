@@ -1,4 +1,4 @@
-"""What a table is, and its two forms: Markdown to keep, plain text for a terminal."""
+"""Lay out tables, as Markdown for files and as plain text for a terminal."""
 
 import math
 import re
@@ -19,7 +19,7 @@ class Column:
     paper: str = ""  # the field of PaperRow that is the same quantity
 
     def show(self, mean: float, std: float = math.nan) -> str:
-        """``mean``, ``mean ± std`` where there is a spread, a dash where there is nothing."""
+        """Format ``mean``, or ``mean ± std`` if there is a spread, or a dash if there is no number."""
         if math.isnan(mean):
             return EMPTY
         digits = self.digits if self.digits is not None else 1 if mean >= 10 else 2
@@ -28,12 +28,12 @@ class Column:
 
 @dataclass(frozen=True)
 class Row:
-    """One line: a model's mean over its seeds, a run that did not finish, or the paper's."""
+    """One line: a model's mean over its seeds, a run that did not finish, or the numbers of the paper."""
 
     label: str
     cells: dict[str, str]  # by Column.key
     seeds: str = ""  # how many
-    best: bool = False  # whether its first column is the best measured
+    best: bool = False  # whether its first column is the best that was measured
 
 
 @dataclass(frozen=True)
@@ -42,22 +42,22 @@ class Section:
 
     title: str
     rows: list[Row]
-    notes: list[str] = field(default_factory=list)  # why a row is not ok, what the average leaves out
+    notes: list[str] = field(default_factory=list)  # reasons why a row is not ok or is left out of the average
 
 
 @dataclass(frozen=True)
 class Table:
-    """One experiment on one data set."""
+    """The table of one experiment on one data set."""
 
     title: str
     columns: list[Column]
     sections: list[Section]
-    marks: list[str]  # what (1), (2), ... in the cells stand for
+    marks: list[str]  # the meaning of (1), (2), ... in the cells
     footnotes: list[str]  # the conditions under which the numbers hold
 
 
 def markdown(tables: list[Table]) -> str:
-    """The tables as Markdown: a heading and a table for every scene, the best PSNR bold, footnotes at the end."""
+    """Format tables as Markdown: a heading and a table for every scene, the best PSNR bold, footnotes at the end."""
     lines: list[str] = []
     for table in tables:
         lines += [f"# {_escape(table.title)}", ""]
@@ -76,7 +76,7 @@ def markdown(tables: list[Table]) -> str:
 
 
 def terminal(tables: list[Table], width: int = 120) -> str:
-    """The tables as plain text within `width` columns, the best PSNR starred; columns that do not fit are left out."""
+    """Format tables as text of at most `width` columns, the best PSNR starred; columns that do not fit are left out."""
     lines: list[str] = []
     for table in tables:
         texts = [[_texts(row, table.columns, star="*") for row in section.rows] for section in table.sections]
@@ -102,7 +102,7 @@ def terminal(tables: list[Table], width: int = 120) -> str:
 
 
 def _aligned(texts: list[str], widths: list[int]) -> str:
-    """As many of `texts` as there are `widths`, the first to the left and the others to the right."""
+    """Align as many of `texts` as there are `widths`, the first to the left and the others to the right."""
     first, *rest = texts[: len(widths)]
     return "  ".join(["  " + first.ljust(widths[0]), *map(str.rjust, rest, widths[1:])]).rstrip()
 
@@ -112,7 +112,7 @@ def _titles(table: Table) -> list[str]:
 
 
 def _texts(row: Row, columns: list[Column], star: str = "") -> list[str]:
-    """The texts of a row from left to right, the best PSNR with a `star`."""
+    """Return the texts of a row from left to right, with a `star` at the best PSNR."""
     first, *rest = (row.cells.get(c.key, "") for c in columns)
     return [row.label, first + star * row.best, *rest, row.seeds]
 
@@ -126,5 +126,5 @@ def _wrapped(text: str, width: int) -> list[str]:
 
 
 def _escape(text: str) -> str:
-    """Text as Markdown that shows it as it is."""
+    """Escape text so that Markdown shows it unchanged."""
     return re.sub(r"([\\`*<|\[\]])", r"\\\1", text)

@@ -1,4 +1,4 @@
-"""The 7DGS paper's own numbers, its Tables 1 and 2 as data, so that they stand beside what is measured here.
+"""Provide the numbers of the 7DGS paper, its Tables 1 and 2, for comparison with measurements.
 
 Source: Gao et al., "7DGS: Unified Spatial-Temporal-Angular Gaussian Splatting", ICCV 2025. A cell that the paper leaves
 empty is None. Its averages are rows of the scene "avg".
@@ -10,14 +10,14 @@ from functools import cache
 from importlib import resources
 
 AVERAGE = "avg"
-MODELS = {"4dgs": False, "7dgs": True, "7dgs_noagr": False}  # what Table 1 compares, and whether it refines (AGR)
+MODELS = {"4dgs": False, "7dgs": True, "7dgs_noagr": False}  # the models of Table 1, and whether they have AGR
 
 
 @dataclass(frozen=True)
 class PaperRow:
     """One row of Table 1: a model on a scene."""
 
-    psnr: float  # dB, the best on test seen during training
+    psnr: float  # dB, the best on test during training
     ssim: float
     lpips: float  # the paper does not say on which backbone
     train_min: float | None  # minutes on one V100
@@ -37,13 +37,13 @@ class MethodRow:
 
 
 def paper_row(dataset: str, scene: str, model: str) -> PaperRow | None:
-    """The row of Table 1, e.g. ``paper_row("D-NeRF", "trex", "7dgs")``; None where the paper has none."""
+    """Return a row of Table 1, such as ``paper_row("D-NeRF", "trex", "7dgs")``; None if the paper has no such row."""
     return table1().get((dataset, scene, model))
 
 
 @cache
 def table1() -> dict[tuple[str, str, str], PaperRow]:
-    """Table 1 by data set ("7DGS-PBR", "D-NeRF", "Technicolor"), scene (or "avg") and model."""
+    """Return Table 1 by data set ("7DGS-PBR", "D-NeRF", "Technicolor"), scene (or "avg") and model."""
     return {
         (row["dataset"], row["scene"], row["model"]): PaperRow(
             psnr=float(row["psnr_db"]),
@@ -59,7 +59,7 @@ def table1() -> dict[tuple[str, str, str], PaperRow]:
 
 @cache
 def table2() -> dict[str, list[MethodRow]]:
-    """Table 2 by data set ("D-NeRF", "Technicolor"), in the paper's order."""
+    """Return Table 2 by data set ("D-NeRF", "Technicolor"), in the paper's order."""
     table: dict[str, list[MethodRow]] = {}
     for row in _read("paper_table2.csv"):
         reproduced = row["reproduced_by_paper"] == "yes"
@@ -75,5 +75,5 @@ def _number(cell: str) -> float | None:
 
 
 def _read(name: str) -> list[dict[str, str]]:
-    """The rows of a table that lies beside this file."""
+    """Read the rows of a CSV file beside this module."""
     return list(csv.DictReader((resources.files(__package__) / name).read_text().splitlines()))

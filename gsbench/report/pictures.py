@@ -1,4 +1,4 @@
-"""Pictures to look at: render | ground truth | error, side by side, a row a view."""
+"""Make image strips for people: a row of render | ground truth | error for each view."""
 
 from pathlib import Path
 
@@ -9,20 +9,23 @@ import numpy.typing as npt
 from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 
-ERROR_SCALE = 0.2  # the error that is drawn brightest; fixed, so that two strips can be compared
-LEAST_WIDTH = 240  # pixels a column; a smaller image is enlarged by a whole factor, without smoothing
+ERROR_SCALE = 0.2  # the error shown brightest; fixed, so that strips can be compared
+LEAST_WIDTH = 240  # pixels of a column; a smaller image is enlarged by an integer factor, without smoothing
 HEADER = 44  # pixels
-GAP = 4  # pixels, grey: the background is often white
+GAP = 4  # pixels; grey, because the background is often white
 GREY = 200
 
 Pixels = npt.NDArray[np.uint8]
 
 
 def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
-    """One picture of (render, truth) pairs, each [H, W, 3] in [0, 1] of one size: uint8 [H', W', 3] RGB.
+    """Put (render, truth) pairs, each [H, W, 3] in [0, 1] of one size, into a strip: uint8 [H', W', 3] RGB.
 
-    The third column is the absolute error, mean over RGB, from black (none) to bright yellow (0.2 or more); the header
-    says so and shows the scale. Raises InputError where sizes differ.
+    The third column is the absolute error, the mean over RGB, from black (none) to bright yellow (0.2 or more). The
+    header names the columns and shows this scale.
+
+    Raises:
+        InputError: there is no pair, or sizes differ.
     """
     if not rows:
         raise InputError("strip: expected at least one pair (render, truth), got none")
@@ -49,14 +52,14 @@ def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB
 
 
 def _bytes(image: npt.NDArray[np.float32]) -> Pixels:
-    """[0, 1] to 8 bits; NaN, which a model that diverged renders, as magenta."""
+    """Convert [0, 1] to 8 bits; NaN, which a diverged model renders, becomes magenta."""
     shown = (np.clip(np.nan_to_num(image), 0, 1) * 255).round().astype(np.uint8)
     shown[np.isnan(image).any(-1)] = (255, 0, 255)
     return shown
 
 
 def _error(render: npt.NDArray[np.float32], truth: npt.NDArray[np.float32]) -> Pixels:
-    """The absolute error through the colour map, magenta where it is NaN."""
+    """Map the absolute error to colours, NaN to magenta."""
     error = np.abs(np.clip(render, 0, 1) - np.clip(truth, 0, 1)).mean(-1)
     shown = _colours(np.nan_to_num(error) / ERROR_SCALE)
     shown[np.isnan(error)] = (255, 0, 255)
@@ -64,20 +67,20 @@ def _error(render: npt.NDArray[np.float32], truth: npt.NDArray[np.float32]) -> P
 
 
 def _colours(values: npt.NDArray[np.floating]) -> Pixels:  # [H, W]
-    """Values in [0, 1] and above through OpenCV's inferno, [H, W, 3] RGB."""
+    """Map values from [0, 1], clamped, to OpenCV's inferno colours, [H, W, 3] RGB."""
     levels = (np.clip(values, 0, 1) * 255).round().astype(np.uint8)
     return np.asarray(cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _beside(images: list[Pixels], factor: int) -> Pixels:
-    """The images from left to right, enlarged, a gap between them."""
+    """Put enlarged images side by side, with gaps between them."""
     large = [image.repeat(factor, 0).repeat(factor, 1) for image in images]
     gap = np.full((large[0].shape[0], GAP, 3), GREY, np.uint8)
     return np.concatenate([large[0], gap, large[1], gap, large[2]], 1)
 
 
 def _header(width: int) -> Pixels:
-    """What the columns, `width` pixels each, are, and the scale of the error from 0 to ERROR_SCALE."""
+    """Write the titles of the columns, each `width` pixels wide, and the scale of the error."""
     header = np.full((HEADER, 3 * width + 2 * GAP, 3), 255, np.uint8)
     titles = ("render", "ground truth", "absolute error, mean of RGB")
     for column, title in enumerate(titles):

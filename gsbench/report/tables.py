@@ -1,4 +1,4 @@
-"""Records into tables: one row a model, grouped by scene, the paper's own row beside it, nothing dropped."""
+"""Make tables from records: a row for each model and scene, with the row of the paper below it."""
 
 import math
 from pathlib import Path
@@ -15,7 +15,7 @@ from gsbench.report import layout, paper
 from gsbench.report.conditions import conditions, printable
 from gsbench.report.layout import EMPTY, Column, Row, Section, Table
 
-LEAKS = "psnr_best_on_test (leaks)"  # never shown without the word
+LEAKS = "psnr_best_on_test (leaks)"  # its title always says that it leaks
 COLUMNS = (  # their keys are columns of `tidy`
     Column("psnr", "PSNR", 2, "psnr"),
     Column("ssim", "SSIM", 3, "ssim"),
@@ -42,7 +42,7 @@ PAPER_LPIPS = (
 
 
 def load(root: Path) -> list[Record]:
-    """All records under `root`; raises InputError where there is none, one is damaged, or one run appears twice."""
+    """All records under `root`; raises InputError if there is none, one is damaged, or a run appears twice."""
     if not root.is_dir():
         raise InputError(f"{root}: expected a folder of results, found none")
     seen: dict[tuple[str, str, str, str, int], Path] = {}
@@ -60,12 +60,12 @@ def load(root: Path) -> list[Record]:
 
 
 def tidy(records: list[Record]) -> pd.DataFrame:
-    """One row a run, one column a quantity; what a run does not have is empty."""
+    """Make a data frame with a row for each run and a column for each quantity; missing numbers are empty."""
     return pd.DataFrame([_quantities(record) for record in records])
 
 
 def _quantities(r: Record) -> dict[str, Any]:
-    """Everything a record says about its run, flat."""
+    """Flatten a record to quantities by name."""
     flat: dict[str, Any] = {name: getattr(r, name) for name in ("experiment", "dataset", "scene", "model", "seed")}
     flat |= {"status": r.status, "reason": r.reason}
     flat |= {LEAKS if name == "psnr_best_on_test" else name: (r.metrics or {}).get(name) for name in METRICS}
@@ -81,7 +81,7 @@ def _quantities(r: Record) -> dict[str, Any]:
 
 
 def build(records: list[Record], *, train: bool = False) -> list[Table]:
-    """A table for every experiment and data set among `records`, sorted by name; `train` adds `psnr_train`."""
+    """Make a table for every experiment and data set in `records`, sorted by name; `train` adds `psnr_train`."""
     groups: dict[tuple[str, str], list[Record]] = {}
     for record in sorted(records, key=lambda r: (r.experiment, r.dataset, r.scene, r.model, r.seed)):
         groups.setdefault((record.experiment, record.dataset), []).append(record)
@@ -89,7 +89,7 @@ def build(records: list[Record], *, train: bool = False) -> list[Table]:
 
 
 class _Builder:
-    """Makes the table of one experiment on one data set; collects what the marks in its cells refer to."""
+    """Makes the table of one experiment on one data set, and collects the footnotes of its cells."""
 
     def __init__(self, records: list[Record], train: bool) -> None:
         self.records = records
@@ -102,14 +102,14 @@ class _Builder:
         for q in flat:
             if q["status"] == "ok":
                 finished.setdefault((q["scene"], q["model"]), []).append(q)
-        self.values = {  # by scene and model, then column: one value a seed, NaN where a run lacks it
+        self.values = {  # by scene and model, then column: a value for each seed, NaN where it is missing
             run: {c.key: [math.nan if q[c.key] is None else float(q[c.key]) for q in seeds] for c in self.columns}
             for run, seeds in finished.items()
         }
         self.marks: list[str] = []
 
     def table(self) -> Table:
-        """The table: a section for every scene, and their average where there are several."""
+        """Make the table: a section for every scene, and their average if there are several."""
         first = self.records[0]
         sections = [self._scene(scene) for scene in self.scenes]
         if len(sections) > 1:
@@ -118,19 +118,19 @@ class _Builder:
         return Table(title, self.columns, sections, self.marks, [*conditions(self.records), *self._no_vgg()])
 
     def _no_vgg(self) -> list[str]:
-        """Why there is no column for LPIPS-VGG, where there is none."""
+        """Say why there is no column for LPIPS-VGG, if there is none."""
         shown = any(c.key == "lpips_vgg" for c in self.columns)
         why = {printable(r.missing["lpips_vgg"]) for r in self.records if "lpips_vgg" in r.missing}
         return [f"LPIPS-VGG has no column: {'; '.join(sorted(why))}."] if why and not shown else []
 
     def _mark(self, text: str) -> str:
-        """The mark of a footnote, the same for the same text."""
+        """Return the mark of a footnote; equal texts share a mark."""
         if text not in self.marks:
             self.marks.append(text)
         return f"({self.marks.index(text) + 1})"
 
     def _scene(self, scene: str) -> Section:
-        """A row for every model with a run that finished, one for every run that did not, and the paper's."""
+        """Make a row for every model with a finished run, for every other run, and for the paper."""
         rows: list[Row] = []
         notes = []
         leader = _leader([self.values[scene, model] for model in self.models if (scene, model) in self.values])
@@ -150,7 +150,7 @@ class _Builder:
         return Section(scene, rows, notes)
 
     def _cell(self, column: Column, finished: list[Record]) -> str:
-        """Mean and spread over the seeds; empty, with the reason, where any of them lacks the number."""
+        """Show the mean and the spread over the seeds, or the reason why a seed lacks the number."""
         values = self.values[finished[0].scene, finished[0].model][column.key]
         if not math.isnan(fmean(values)):
             return column.show(fmean(values), stdev(values) if len(values) > 1 else math.nan)
@@ -159,7 +159,7 @@ class _Builder:
         return f"{EMPTY} " + self._mark(printable(f"{column.title} is empty: {'; '.join(sorted(why))}"))
 
     def _average(self) -> Section:
-        """Means over the scenes that every model has finished, so that all rows average the same scenes."""
+        """Average over the scenes that every model has finished, so that all rows average the same scenes."""
         models = [model for model in self.models if any((scene, model) in self.values for scene in self.scenes)]
         covered = [s for s in self.scenes if models and all((s, model) in self.values for model in models)]
         notes = [f"{model} finished on no scene and is left out" for model in self.models if model not in models]
@@ -181,10 +181,10 @@ class _Builder:
         return Section(f"{title}: {', '.join(covered)}", rows, notes)
 
     def _paper_row(self, scenes: list[str], model: str) -> list[Row]:
-        """The paper's row for `model`, averaged over `scenes`; none where the paper lacks one of them."""
+        """Make the paper's row for `model`, averaged over `scenes`; none if the paper lacks one of them."""
         runs = [r for r in self.records if r.model == model and r.scene in scenes]
         if any(r.effects.refinement != paper.MODELS.get(model) for r in runs):
-            return []  # the same name, but not the paper's model
+            return []  # the model has the same name as one of the paper but differs in AGR
         datasets = {r.scene: str(r.protocol.get("paper_dataset")) for r in runs}
         found = [paper.paper_row(datasets[scene], scene, model) for scene in scenes]
         rows = [row for row in found if row is not None]
@@ -202,18 +202,18 @@ class _Builder:
 
 
 def _shown_psnr(values: dict[str, list[float]]) -> str:
-    """The mean PSNR as its column shows it."""
+    """Format the mean PSNR as its column does."""
     return COLUMNS[0].show(fmean(values[COLUMNS[0].key]))
 
 
 def _leader(rows: list[dict[str, list[float]]]) -> str | None:
-    """The highest mean PSNR as shown, so that rows which look equal lead together; None where no row has one."""
+    """Format the highest mean PSNR, so that rows which look equal lead together; None if no row has one."""
     means = [mean for mean in (fmean(values[COLUMNS[0].key]) for values in rows) if not math.isnan(mean)]
     return COLUMNS[0].show(max(means)) if means else None
 
 
 def write(records: list[Record], folder: Path, *, train: bool = False) -> list[Table]:
-    """Write ``table.md`` and ``table.csv`` into `folder`, each atomically, return the tables; `train` as in `build`."""
+    """Write ``table.md`` and ``table.csv`` to `folder` atomically and return the tables; `train` is as in `build`."""
     tables = build(records, train=train)
     write_atomically(folder / "table.md", layout.markdown(tables).encode())
     write_atomically(folder / "table.csv", tidy(records).to_csv(index=False).encode())

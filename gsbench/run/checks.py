@@ -69,7 +69,7 @@ def scene_folder(config: Config) -> Path:
 
 
 def data_root(root: str) -> Path:
-    """The folder that data.root names: a path, or pkg://module for data that comes with a package."""
+    """Return the folder that data.root names: a path, or pkg://module for data inside a package."""
     if not root.startswith("pkg://"):
         return Path(root).expanduser()
     return Path(str(importlib.resources.files(root.removeprefix("pkg://"))))
@@ -82,7 +82,7 @@ def check_times(model: GaussianModel, scene: Scene, name: str) -> None:
 
 
 def evaluated_views(scene: Scene, split: str) -> list[View]:
-    """The views that a run is measured on; raises InputError where the split has none."""
+    """Return the views that a run is measured on; raises InputError if the split has none."""
     views = scene.val if split == "val" else scene.test
     if not views:
         raise InputError(f"{scene.name}: expected views in the split '{split}', there are none")

@@ -1,4 +1,4 @@
-"""Scenes from files: `load(path)` finds the layout by what lies in the folder."""
+"""Load scenes from files: `load(path)` detects the layout of a data set by a file in its folder."""
 
 import importlib
 import math
@@ -13,11 +13,11 @@ __all__ = ["Camera", "Points", "Scene", "View", "load", "scene_extent"]
 
 @dataclass(frozen=True)
 class _Layout:
-    """One kind of data set on disk: the file it is known by and what reads it."""
+    """One layout of data sets: the file that identifies it and the module that reads it."""
 
     marker: str
-    expected: str  # the files of the layout and where such data is published, for the message when nothing is found
-    reader: str  # module of this package with load(root, *, downscale, background); drawing a model needs none
+    expected: str  # the files of the layout and where such data is published, for the error message
+    reader: str  # module of this package with load(root, *, downscale, background); imported when it is needed
 
 
 _LAYOUTS = (
@@ -36,13 +36,13 @@ def load(
     downscale: int = 1,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Scene:
-    """Load the scene in the folder `path`; its layout is found by what lies there.
+    """Load the scene in the folder `path` and detect its layout.
 
     Images are composited over `background` (RGB in [0, 1]) once and averaged over downscale x downscale blocks, which
     must tile them exactly. Everything is float32 on the CPU, in OpenCV axes.
 
     Raises:
-        InputError: no known layout at `path`, or a fault in the data, named by file and field.
+        InputError: there is no known layout at `path`, or the data has a fault; the message names file and field.
     """
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
         raise InputError(f"downscale: expected a whole number of at least 1, got {downscale!r}")

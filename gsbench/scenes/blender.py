@@ -1,4 +1,4 @@
-"""The Blender layout of NeRF-synthetic, D-NeRF and 7DGS-PBR: transforms_{train,val,test}.json beside PNG images."""
+"""Load the Blender layout of NeRF-synthetic, D-NeRF and 7DGS-PBR: transforms_{train,val,test}.json and PNG images."""
 
 import json
 import math
@@ -24,15 +24,15 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # as instant-ngp and nerfstu
 
 @dataclass(frozen=True)
 class _Intrinsics:
-    """A pinhole in pixels of the full image; what the file leaves out follows from the image's size."""
+    """A pinhole camera in pixels of the full image; missing numbers follow from the size of the image."""
 
     angle_x: float | None  # horizontal field of view in radians; None where the focal length is given
     focal: tuple[float, float] | None
     principal: tuple[float | None, float | None]
-    size: tuple[float | None, float | None]  # width, height the file claims
+    size: tuple[float | None, float | None]  # width and height that the file states
 
     def matrix(self, width: int, height: int, downscale: int) -> Tensor:  # [3, 3] float32
-        """K of the downscaled image. Pixel centres sit at +0.5, so scaling an image scales all of K's first rows."""
+        """Compute K of the downscaled image. Pixel centres are at +0.5, so the first rows of K scale with it."""
         if self.focal is not None:
             fx, fy = self.focal
         else:
@@ -46,7 +46,7 @@ class _Intrinsics:
 
 @dataclass(frozen=True)
 class _Frame:
-    """One entry of `frames`, checked; its image not yet read."""
+    """One checked entry of `frames`, whose image is not read yet."""
 
     path: Path
     name: str  # relative to the scene's folder: "train/r_000.png"
@@ -57,7 +57,7 @@ class _Frame:
 
 @dataclass(frozen=True)
 class _Split:
-    """One transforms_<split>.json, checked."""
+    """One checked transforms_<split>.json."""
 
     source: Path
     intrinsics: _Intrinsics
@@ -68,13 +68,13 @@ class _Split:
 def load(root: Path, *, downscale: int, background: tuple[float, float, float]) -> Scene:
     """Load a scene in the Blender layout; see `gsbench.scenes.load` for the arguments.
 
-    The JSON gives `camera_angle_x`, or `fl_x` with optional `fl_y`, `cx`, `cy`, `w`, `h` in pixels of the full image,
+    The JSON has `camera_angle_x`, or `fl_x` with optional `fl_y`, `cx`, `cy`, `w`, `h` in pixels of the full image,
     and `frames` of `file_path` (relative, ".png" may be left out), `time` in [0, 1] (all frames or none) and
     `transform_matrix`, camera to world in OpenGL axes. Without transforms_val.json there are no validation views.
     Initial points are never taken from the folder: a points3d.ply there was drawn at random by 3DGS.
 
     Raises:
-        InputError: anything that is missing, damaged or contradicts itself, by file and field.
+        InputError: something is missing, damaged or contradictory; the message names file and field.
     """
     root = root.resolve()
     splits = {"train": _read_split(root, "train"), "test": _read_split(root, "test")}
@@ -161,7 +161,7 @@ def _viewmat(
     matrix: object,  # [4, 4] nested lists: camera to world, OpenGL axes (x right, y up, z backward)
     where: str,
 ) -> Tensor:  # [4, 4] float32: world to camera, OpenCV axes (x right, y down, z forward)
-    """Invert a rigid camera-to-world matrix as [R^T | -R^T c] after turning its y and z axes round."""
+    """Invert a rigid camera-to-world matrix as [R^T | -R^T c], with its y and z axes flipped."""
     rows = matrix if isinstance(matrix, list) else []
     if len(rows) != 4 or not all(isinstance(row, list) and len(row) == 4 for row in rows):
         raise InputError(f"{where}: expected 4 rows of 4 numbers, got {_brief(matrix)}")
@@ -184,7 +184,7 @@ def _viewmat(
 
 
 def _check_times(splits: dict[str, _Split]) -> None:
-    """Refuse a data set in which some frames carry a time and some do not."""
+    """Refuse a data set in which only some frames have a time."""
     first = splits["train"].frames[0].time
     for split in splits.values():
         for index, frame in enumerate(split.frames):
@@ -201,8 +201,8 @@ def _read_views(
 ) -> tuple[dict[str, list[View]], dict[str, str]]:
     """Read all images on threads, in order; return the views by split and the images' digests by name.
 
-    Threads and never forks: reading and decoding release the interpreter, and a fork after OpenMP ran hangs. Only the
-    final float images are kept.
+    Threads suffice because reading and decoding release the interpreter's lock; a fork after OpenMP ran would hang.
+    Only the final float images are kept.
     """
 
     def read(frame: _Frame) -> tuple[tuple[int, int], Tensor, str]:
@@ -230,7 +230,7 @@ def _read_views(
 
 
 def _check_size(size: tuple[int, int], expected: tuple[int, int], split: _Split, frame: _Frame) -> None:
-    """Refuse an image whose size is not the first image's, or not the one its JSON claims."""
+    """Refuse an image whose size differs from that of the first image or from the size in its JSON."""
     if size != expected:
         raise InputError(
             f"{frame.where}: expected {expected[0]}x{expected[1]} as the first training image, got {size[0]}x{size[1]}"
@@ -255,7 +255,7 @@ def _number(value: object, where: str) -> float:
 
 
 def _brief(value: object) -> str:
-    """Show a JSON value in a message, cut to what a line bears."""
+    """Shorten a JSON value for a message."""
     if isinstance(value, list | dict):
         return f"a {type(value).__name__} of {len(value)}"
     text = json.dumps(value)

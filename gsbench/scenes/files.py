@@ -1,4 +1,4 @@
-"""A data set's files as untrusted input: found inside the scene's folder or refused, read whole, fingerprinted."""
+"""Read the files of a data set as untrusted input: only inside the scene's folder, and with a fingerprint."""
 
 import hashlib
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ def find_inside(
     name: str,  # a path relative to `root`, as the data set writes it
     where: str,  # the file and field that hold `name`, for the message
 ) -> Path:
-    """Return the resolved path of `name`, which may leave `root` neither by "..", nor absolutely, nor by a link."""
+    """Return the resolved path of `name`; refuse one that leaves `root` by "..", as an absolute path or by a link."""
     if not name.isprintable():  # a NUL byte, a lone surrogate, a line break that would break the message
         raise InputError(f"{where}: expected a path inside {root}, got {name!r}, which is not printable: rename it")
     try:
@@ -32,7 +32,7 @@ def read_file(
 ) -> bytes:
     """Return the bytes of the regular file `path`."""
     try:
-        if not path.is_file():  # a pipe would be waited on for ever
+        if not path.is_file():  # reading a pipe could wait for ever
             raise InputError(f"{where}: expected a file, found none: is the data set complete?")
         return path.read_bytes()
     except OSError as error:
@@ -49,8 +49,8 @@ def fingerprint(
 ) -> str:
     """Return one sha256 for a set of files: that of the lines `sha256sum` prints for them, sorted by name.
 
-    Names are relative, so the same data has the same fingerprint wherever it lies, and inside a scene's folder
-    anyone can check it: ``LC_ALL=C; sha256sum $(printf '%s\\n' transforms_*.json */*.png | sort) | sha256sum``.
+    Names are relative, so the same data has the same fingerprint in any folder. To check it inside the folder of a
+    scene: ``LC_ALL=C; sha256sum $(printf '%s\\n' transforms_*.json */*.png | sort) | sha256sum``.
     """
     lines = "".join(f"{digests[name]}  {name}\n" for name in sorted(digests))
     return digest(lines.encode("utf-8", "surrogateescape"))

@@ -1,4 +1,4 @@
-"""Photographs from PNG: checked, decoded by OpenCV, composited once over the background, area-filtered to size."""
+"""Read images from PNG: check the file, decode it by OpenCV, composite it over the background, filter it to size."""
 
 import struct
 import zlib
@@ -22,7 +22,7 @@ _MAX_PIXELS = 2**26  # a few kilobytes of PNG can claim gigabytes of pixels; 819
 
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV's own log off stderr: what it would say about a broken file, an InputError says in one line."""
+    """Keep OpenCV's own log off stderr; an InputError describes a broken file in one line."""
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
@@ -40,7 +40,7 @@ def decode_png(
     file and leave the rest black.
 
     Raises:
-        InputError: not a PNG, truncated, damaged, of zero size, or neither RGB nor RGBA.
+        InputError: the file is not a PNG, truncated, damaged, of zero size, or neither RGB nor RGBA.
     """
     width, height = _check_structure(data, where)
     if width == 0 or height == 0:
@@ -90,7 +90,7 @@ def composite(
 
 
 def _check_structure(data: bytes, where: str) -> tuple[int, int]:
-    """Walk the chunks from IHDR to IEND, lengths and checksums (PNG specification, section 5); return width, height."""
+    """Check length and checksum of all chunks, IHDR to IEND (PNG specification, section 5); return width and height."""
     if not data.startswith(_SIGNATURE):
         raise InputError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
     size = (0, 0)

@@ -1,4 +1,4 @@
-"""PLY files read as untrusted input: the vertices of an ascii or little-endian file, as a structured array."""
+"""Read the vertices of an ascii or little-endian PLY file, as untrusted input, into a structured array."""
 
 import re
 from pathlib import Path
@@ -24,13 +24,13 @@ _HEADER_END = re.compile(rb"\nend_header[ \t]*\r?\n")
 
 
 def read_vertices(path: Path) -> NDArray[np.void]:
-    """Return the vertex element of a PLY file as a structured array [P], one field a property.
+    """Return the vertex element of a PLY file as a structured array [P] with a field for each property.
 
     The vertex element must come first and hold scalars only, as in every point cloud of COLMAP and 3DGS; what follows
-    it is not read. The count is held against the file's size before anything of that size is made.
+    it is not read. The count is compared with the size of the file before memory is allocated for it.
 
     Raises:
-        InputError: not such a PLY, or fewer bytes or values than its header promises.
+        InputError: the file is not such a PLY, or has fewer bytes or values than its header states.
     """
     data = files.read_file(path, str(path))
     end = _HEADER_END.search(data, 0, _HEADER_LIMIT)
@@ -77,7 +77,7 @@ def _read_header(lines: list[str], path: Path) -> tuple[str, int, np.dtype[np.vo
 
 
 def _read_ascii(body: bytes, count: int, dtype: np.dtype[np.void], path: Path) -> NDArray[np.void]:
-    """Parse `count` rows of numbers; a value its property's type cannot hold is refused, not wrapped."""
+    """Parse `count` rows of numbers; refuse a value that the type of its property cannot hold."""
     names = dtype.names or ()
     values = body.split()[: count * len(names)]
     if len(values) < count * len(names):

@@ -1,4 +1,4 @@
-"""Initial points: drawn at random or given by a PLY, and how far apart they lie."""
+"""Provide initial points, at random or from a PLY, and measure their distances and their extent."""
 
 import math
 from pathlib import Path
@@ -19,7 +19,7 @@ _MIN_SQUARED_DISTANCE = 1e-7  # 3DGS, create_from_pcd: clamp_min(distCUDA2, 1e-7
 
 
 def random_points(count: int, half_width: float, generator: torch.Generator) -> Points:
-    """Draw `count` points uniformly in the cube [-half_width, half_width]^3, of nearly one grey.
+    """Draw `count` points uniformly in the cube [-half_width, half_width]^3, all of nearly the same grey.
 
     Colours are 0.5 + SH_C0 u / 255 with u uniform in [0, 1), as 3DGS and 4DGS draw them (readNerfSyntheticInfo:
     SH2RGB(random / 255)). Everything is float32 on the generator's device.
@@ -35,11 +35,11 @@ def random_points(count: int, half_width: float, generator: torch.Generator) -> 
 def read_ply(path: str | Path) -> Points:
     """Read points from an ascii or binary little-endian PLY: `x y z` and `red green blue`, else 3DGS' `f_dc_0..2`.
 
-    Integer colours are divided by their type's largest value, float colours are taken as they are; a colour beyond
-    [0, 1] is refused, except from `f_dc`, which reaches there by nature and is clamped.
+    Integer colours are divided by their type's largest value, float colours are used unchanged; a colour outside
+    [0, 1] is refused, except one from `f_dc`, where it is usual and is clamped.
 
     Raises:
-        InputError: not such a PLY, truncated, without positions or colours, or with a value that is not finite.
+        InputError: the file is not such a PLY, is truncated, lacks positions or colours, or is not finite.
     """
     vertices = read_vertices(Path(path))
     means = _columns(vertices, ("x", "y", "z"), path)
@@ -65,22 +65,22 @@ def nearest_distances(
     This is the initial scale of 3DGS, sqrt(clamp_min(distCUDA2, 1e-7)); distCUDA2 is the mean SQUARED distance.
 
     Raises:
-        InputError: not more than `k` points, or a point that is not finite.
+        InputError: there are at most `k` points, or a point is not finite.
     """
     if means.shape[0] <= k:
         raise InputError(f"points: expected more than {k} to measure their spacing, got {means.shape[0]}")
     positions = means.detach().cpu().double().numpy()
     if not np.isfinite(positions).all():
         raise InputError("points: expected finite positions, some are not")
-    distances, _ = cKDTree(positions).query(positions, k=k + 1)  # the nearest is the point itself, or one on top of it
+    distances, _ = cKDTree(positions).query(positions, k=k + 1)  # the nearest is the point itself or a duplicate
     squared = np.square(distances[:, 1:]).mean(axis=1)
     return torch.from_numpy(np.sqrt(squared.clip(min=_MIN_SQUARED_DISTANCE))).to(means)
 
 
 def size_of(points: Points) -> float:
-    """How large a scene is, world units: the standard deviation of its points along an axis; 1 of a single point.
+    """Return the size of a scene, world units: the mean standard deviation of points along an axis; 1 for one point.
 
-    Cameras that stand far off do not change it, unlike the extent.
+    Unlike the extent, it does not depend on the cameras.
     """
     size = float(points.means.std(0).mean()) if len(points.means) > 1 else 0.0
     return size if 0 < size < math.inf else 1.0

@@ -1,4 +1,4 @@
-"""What is seen: a camera, a view (camera, time, image), a scene (views by split, background, extent)."""
+"""Define cameras, views (a camera, a time and an image) and scenes (views by split, background, extent)."""
 
 from dataclasses import dataclass, replace
 
@@ -21,21 +21,21 @@ class Camera:
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def to(self, device: str) -> "Camera":
-        """The same camera with its tensors on `device`."""
+        """Return the same camera with its tensors on `device`."""
         return Camera(self.viewmat.to(device), self.K.to(device), self.width, self.height)
 
 
 @dataclass(frozen=True)
 class View:
-    """One photograph: where from, when, and what was seen."""
+    """An image with the camera and the time at which it was taken."""
 
-    name: str  # as the data set calls it: "train/r_000"
+    name: str  # in the data set, such as "train/r_000"
     camera: Camera
     time: float | None  # in [0, 1]; None where the data set has no time
     image: Tensor  # [H, W, 3] float32 in [0, 1], composited over the scene's background
 
     def to(self, device: str) -> "View":
-        """The same view with its tensors on `device`."""
+        """Return the same view with its tensors on `device`."""
         return replace(self, camera=self.camera.to(device), image=self.image.to(device))
 
 
@@ -58,15 +58,15 @@ class Scene:
     background: tuple[float, float, float]  # the colour every image was composited over
     extent: float  # 1.1 x the radius of the training cameras around their mean (3DGS, getNerfppNorm)
     points: Points | None  # None: the data set gives none
-    fingerprint: str  # sha256 over the files read, so that a record says which data it saw
+    fingerprint: str  # SHA-256 of the files, so that a record identifies its data
 
     @property
     def has_time(self) -> bool:
-        """Whether every training view carries a time."""
+        """Whether every training view has a time."""
         return all(view.time is not None for view in self.train)
 
     def to(self, device: str) -> "Scene":
-        """The same scene with its views on `device`."""
+        """Return the same scene with its views on `device`."""
         train, val, test = ([view.to(device) for view in views] for views in (self.train, self.val, self.test))
         return replace(self, train=train, val=val, test=test)
 
@@ -74,7 +74,7 @@ class Scene:
 def scene_extent(
     viewmats: Tensor,  # [C, 4, 4] the training cameras
 ) -> float:
-    """Return 1.1 x the largest distance of a camera from the cameras' mean, in world units; 0 if all share one place.
+    """Return 1.1 x the largest distance of a camera from the cameras' mean, in world units; 0 if all are at one place.
 
     Source: 3DGS, `getNerfppNorm` in scene/dataset_readers.py. Learning rates of positions and the size at which a
     Gaussian splits are multiples of it.

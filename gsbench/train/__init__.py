@@ -1,1 +1,1 @@
-"""How a model is fitted to a scene."""
+"""Train a model on a scene: gradients, optimizer, density control, schedule, checkpoints."""

@@ -1,4 +1,4 @@
-"""A training run on disk: written whole or not at all, read as untrusted input."""
+"""Save the state of a training to a checkpoint, atomically, and read it back as untrusted input."""
 
 import io
 import pickle
@@ -15,17 +15,17 @@ FILE_NAME = "checkpoint.pt"
 
 
 def save(path: Path, config_hash: str, data_hash: str, state: dict[str, Any]) -> None:
-    """Write the state of a run of this config on this data."""
+    """Write the state of a run, with the hashes of its config and its data."""
     buffer = io.BytesIO()
     torch.save({"version": VERSION, "config": config_hash, "data": data_hash, "state": state}, buffer)
     write_atomically(path, buffer.getvalue())
 
 
 def load(path: Path, config_hash: str, data_hash: str, device: str) -> dict[str, Any] | None:
-    """Read the state at `path`; None where there is none, or it is of another config, other data or another version.
+    """Read the state at `path`; None where there is no file, or its config, data or version differs.
 
     Raises:
-        InputError: the file is there and is no checkpoint.
+        InputError: the file exists and is not a checkpoint.
     """
     if not path.exists():
         return None
@@ -34,10 +34,10 @@ def load(path: Path, config_hash: str, data_hash: str, device: str) -> dict[str,
 
 
 def read(path: Path, device: str = "cpu") -> tuple[tuple[int, str, str], dict[str, Any]]:
-    """Read version, config hash and data hash, and the state, of the checkpoint at `path`, whatever it is of.
+    """Read (version, config hash, data hash) and the state of the checkpoint at `path`, without comparing them.
 
     Raises:
-        InputError: it is no checkpoint.
+        InputError: the file is not a checkpoint.
     """
     try:
         content = torch.load(path, map_location=device, weights_only=True)

@@ -1,4 +1,4 @@
-"""Adaptive density control: clone where small, split where large, prune what is faint or unseen (3DGS, section 5.2)."""
+"""Control the density of Gaussians: clone small ones, split large ones, prune faint and unseen ones (3DGS, 5.2)."""
 
 import torch
 from torch import Tensor
@@ -10,46 +10,62 @@ from gsbench.train.optim import Optimizer
 
 
 class DensityControl:
-    """Collects the gradients of 2D means and, when asked, edits the model and the optimizer's moments alike."""
+    """Adaptive density control: collects gradients of 2D means, then edits the model and the optimizer's moments."""
 
     def __init__(
         self, model: GaussianModel, optimizer: Optimizer, config: DensifyConfig, min_opacity: float, views: int
     ) -> None:
-        """Control the density of `model` over epochs of `views`, pruning below `min_opacity`."""
+        """Start with nothing collected.
+
+        Args:
+            model: initialised.
+            optimizer: of the model; its moments follow the Gaussians.
+            config: thresholds.
+            min_opacity: a Gaussian below it is pruned.
+            views: the number of training views, an epoch.
+        """
         self.model = model
         self.optimizer = optimizer
         self.config = config
         self.min_opacity = min_opacity
-        self.patience = 2 * views - 1  # so many views in a row hold a whole epoch, wherever they begin
+        self.patience = 2 * views - 1  # this many views in a row contain a whole epoch, wherever they begin
         self.unseen = torch.zeros(len(model), dtype=torch.int32, device=model.splats["means"].device)
         self.forget()
 
     def forget(self) -> None:
-        """Start collecting anew."""
+        """Drop the collected gradients."""
         like = self.model.splats["opacities"].detach()
         self.gradient = torch.zeros_like(like)  # [N] sum over views of |gradient of the 2D mean|
-        self.seen = torch.zeros_like(like)  # [N] number of views that drew the Gaussian
+        self.seen = torch.zeros_like(like)  # [N] number of views in which the Gaussian was visible
 
     @torch.no_grad()
     def observe(
         self,
         radii: Tensor,  # [C, N]
-        g_means2d: Tensor,  # [C, N, 2] by pixels
+        g_means2d: Tensor,  # [C, N, 2] per pixel
         width: int,
         height: int,
         views: int,
     ) -> None:
-        """Add one view's gradients, of a loss that is a mean over `views`, in units of half the image (NDC)."""
-        x, y = g_means2d.unbind(-1)  # scaled apart: a tensor of both sizes would be waited for on a GPU
+        """Add the gradients of one view, in units of half the image (NDC).
+
+        Args:
+            radii: of the splats in pixels; 0 where the Gaussian was culled.
+            g_means2d: gradient of the loss, a mean over `views`, by the 2D means.
+            width: of the image, pixels.
+            height: of the image, pixels.
+            views: in the batch.
+        """
+        x, y = g_means2d.unbind(-1)  # scaled separately: making a tensor of the two sizes would wait for the GPU
         self.gradient += torch.hypot(x * (views * width / 2), y * (views * height / 2)).sum(0)
         drawn = (radii > 0).sum(0)
         self.seen += drawn
-        # [N] views since the last that drew the Gaussian
+        # [N] views since the Gaussian was last visible
         self.unseen = torch.where(drawn > 0, 0, self.unseen + len(radii))
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator, prune_large: bool) -> None:
-        """Clone, split and prune; children's randomness is drawn from `generator`."""
+        """Clone, split and prune Gaussians; the children of a split are sampled with `generator`."""
         model, config = self.model, self.config
         scales = model.scales()
         wanted = self.gradient / self.seen.clamp(min=1) > config.grad_threshold
@@ -63,7 +79,7 @@ class DensityControl:
         children = torch.arange(len(model) - len(parents), len(model), device=parents.device)
         model.split(children, generator)
 
-        # What no view draws has no gradient: nothing could bring it back, and it costs as much as any other.
+        # A Gaussian that no view sees gets no gradient, so it would never come back, and it costs as much as any other.
         keep = (torch.sigmoid(model.splats["opacities"]) >= self.min_opacity) & (self.unseen < self.patience)
         if prune_large:
             keep &= model.scales() <= config.prune_above * model.extent
@@ -71,16 +87,16 @@ class DensityControl:
         self.forget()
 
     def reset_opacities(self) -> None:
-        """Lower opacities to twice what is pruned, so that only what is needed grows back before the next pruning."""
+        """Lower opacities to twice the pruning threshold; needed Gaussians grow back before the next pruning."""
         self.model.reset_opacities(2 * self.min_opacity)
         self.optimizer.forget(self.model.splats["opacities"])
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What was collected."""
+        """Return the collected gradients and counts, for the checkpoint."""
         return {"gradient": self.gradient, "seen": self.seen, "unseen": self.unseen}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state_dict`."""
+        """Continue from the `state_dict` of a checkpoint."""
         self.gradient, self.seen, self.unseen = state["gradient"], state["seen"], state["unseen"]
 
     def _select(self, rows: Tensor, fresh: int) -> None:

@@ -1,4 +1,4 @@
-"""Why a training diverged: the first Gaussian whose gradient is not finite, and the hard case it resembles."""
+"""Explain why a training diverged: find the first Gaussian whose gradient is not finite, and a hard case like it."""
 
 import math
 
@@ -8,14 +8,14 @@ from torch import Tensor
 from gsbench.kernels.thresholds import LOG_SIZE_MAX
 from gsbench.models import GaussianModel
 
-THIN = -10.0  # log of a size in time: e^-10 of the clip is less than a frame of any
+THIN = -10.0  # log of a size in time: e^-10 of the clip is less than a frame of any scene
 NEEDLE = math.log(1e5)
-FAR = 1e3  # times the scene's extent
-LOUD = 1e3  # coefficients of a colour
+FAR = 1e3  # in units of the scene's extent
+LOUD = 1e3  # size of a colour coefficient
 
 
 def explain(model: GaussianModel) -> str:
-    """One line about the gradients that `backward` left on a model, to follow the report that one is not finite."""
+    """Describe in one line which gradients of a model are not finite; the line follows the report that one is not."""
     for name, parameter in model.splats.items():
         if parameter.grad is None:
             continue
@@ -25,15 +25,15 @@ def explain(model: GaussianModel) -> str:
             case = resembles(model, index)
             like = f"it resembles the stability case '{case}'" if case else "it resembles no stability case"
             return f"the first is Gaussian {index} of {len(parameter)} in '{name}' ({int(bad.sum())} in all): {like}"
-    return "no Gaussian's gradient is: look at the refinement's networks or at lambda"
+    return "no Gaussian's gradient is: look at AGR's networks or at lambda"
 
 
 @torch.no_grad()
 def resembles(model: GaussianModel, index: int) -> str | None:
-    """The case of `gsbench.stability` that a Gaussian's raw parameters come nearest to, None if they look ordinary."""
+    """Name the case of `gsbench.stability` that a Gaussian's raw parameters resemble; None if they look ordinary."""
     raw = {name: parameter[index].flatten() for name, parameter in model.splats.items()}
     if not all(value.isfinite().all() for value in raw.values()):
-        return "learning_rates_times_30"  # the step before went too far
+        return "learning_rates_times_30"  # the previous step was too long
     sizes = raw["log_diagonal"] if "log_diagonal" in raw else raw["scales"]
     in_time = _log_size_in_time(model, sizes)
     lambdas = [float(value) for value in model.log_modulation.parameters()]
@@ -54,10 +54,10 @@ def resembles(model: GaussianModel, index: int) -> str | None:
 
 
 def _log_size_in_time(model: GaussianModel, sizes: Tensor) -> float | None:
-    """The log size that belongs to time, None for a model that does not observe it."""
+    """Return the log size in time; None for a model that does not observe time."""
     if "time" not in model.observes:
         return None
-    rows = getattr(model, "rows", None)  # of the triangular models
+    rows = getattr(model, "rows", None)  # of triangular models
     if rows:
         return float(sizes[rows["t"][0]])
     clock: Tensor = model.clock  # type: ignore[assignment]  # of 4DGS

@@ -1,4 +1,4 @@
-"""Hold Gaussians to what the training cameras can see: no size falls below a small part of a pixel."""
+"""Keep Gaussians from shrinking below what the training cameras resolve, a small part of a pixel."""
 
 import torch
 from torch import Tensor
@@ -6,17 +6,17 @@ from torch import Tensor
 from gsbench.models import GaussianModel
 from gsbench.scenes import Camera
 
-# The rasterizer adds 0.3 px^2 to every projected covariance (eps2d), so that a standard deviation of 0.05 px changes it
-# by less than 1 %; what is thinner still has the same image, and only random-walks (Mip-Splatting, Yu et al. 2024,
-# section 4.1, bounds sizes by the same sampling rate, from above in frequency).
+# The rasterizer adds 0.3 px^2 to every projected covariance (eps2d); a standard deviation of 0.05 px changes that by
+# less than 1 %. A thinner Gaussian has the same image, so its size would follow a random walk. Mip-Splatting (Yu et al.
+# 2024, section 4.1) bounds sizes by the same sampling rate.
 LEAST_PIXELS = 0.05
 
 
 class Floor:
-    """The least size of each Gaussian in space: LEAST_PIXELS where the training camera that sees it largest stands."""
+    """The least size of each Gaussian in space: LEAST_PIXELS in the training camera in which it is largest."""
 
     def __init__(self, model: GaussianModel, cameras: list[Camera]) -> None:
-        """Hold `model`, initialised and on its device, to what `cameras` can see."""
+        """Measure the floor of `model`, which is initialised and on its device, for the training `cameras`."""
         self.model = model
         self.centers = torch.stack([camera.center for camera in cameras])  # [C, 3]
         self.focal = torch.stack([camera.K[[0, 1], [0, 1]].amax() for camera in cameras])  # [C] pixels
@@ -24,22 +24,22 @@ class Floor:
 
     @torch.no_grad()
     def update(self) -> None:
-        """Measure anew, after Gaussians were moved, added or removed."""
+        """Measure the floor again, after Gaussians were moved, added or removed."""
         means = self.model.splats["means"]
-        pixel = means.new_full((len(means),), torch.inf)  # [N] its width at the Gaussian's distance, world units
+        pixel = means.new_full((len(means),), torch.inf)  # [N] width of a pixel at the Gaussian's distance, world units
         for center, focal in zip(self.centers, self.focal, strict=True):
             pixel = torch.minimum(pixel, (means - center).norm(dim=-1) / focal)
         self.least = LEAST_PIXELS * pixel
 
     @torch.no_grad()
     def hold(self) -> None:
-        """Raise the sizes that a step took below the floor."""
+        """Raise sizes that are below the floor."""
         self.model.hold_sizes(self.least)
 
     def state_dict(self) -> Tensor:
-        """What was measured last."""
+        """Return the floor, for the checkpoint."""
         return self.least
 
     def load_state_dict(self, state: Tensor) -> None:
-        """Go on from `state_dict`."""
+        """Continue from the `state_dict` of a checkpoint."""
         self.least = state

@@ -1,4 +1,4 @@
-"""The training loop: see a batch of views, descend, control the density, look at the val split now and then."""
+"""Train a model in a loop: descend on a batch of views, control the density, measure on the val split."""
 
 import math
 import sys
@@ -29,7 +29,7 @@ from gsbench.train.watch import DivergedError, Watch
 
 @dataclass
 class Best:
-    """PSNR on the evaluated split at chosen moments of the training, dB."""
+    """PSNR on the evaluated split at the best moments of the training, dB."""
 
     val: float = -math.inf  # the best on val so far ..
     eval_at_best_val: float | None = None  # .. and what the evaluated split had then
@@ -37,13 +37,19 @@ class Best:
 
 
 class Trainer:
-    """One model, one scene, one run. `step` counts finished steps; the state is exact between two of them."""
+    """The training of one run. `step` counts finished steps; between two steps the state is complete."""
 
     def __init__(self, model: GaussianModel, scene: Scene, views: list[View], config: Config) -> None:
-        """Fit `model`, already initialised and on `config.device`, to `scene.train`; `views` is the evaluated split.
+        """Prepare the training.
+
+        Args:
+            model: initialised and on `config.device`.
+            scene: gives the training and the val views.
+            views: the evaluated split.
+            config: the recipe.
 
         Raises:
-            InputError: an image has a value that is not finite.
+            InputError: a training image has a value that is not finite.
         """
         for view in scene.train:
             if not view.image.isfinite().all():
@@ -61,7 +67,7 @@ class Trainer:
         self.stages = StageClock(config.device)
         self.gradients = Step(model, self.background, train.ssim_weight, config.raster.antialias, self.stages)
         self.watch = Watch(config.device)
-        if config.device.startswith("cuda"):  # there a bad step is found later, and must not be applied meanwhile
+        if config.device.startswith("cuda"):  # a bad step is found some steps later, and must not be applied until then
             self.optimizer.adam.found_inf = self.watch.skip  # type: ignore[attr-defined]
         self.curve = Curve()
         self.best = Best()
@@ -71,11 +77,11 @@ class Trainer:
         """Train to the end, calling `save(state)` every `checkpoint_minutes` and once at the end.
 
         Raises:
-            DivergedError: with the step and the parameter; the last saved state is from before it.
+            DivergedError: a loss or gradient was not finite; the last saved state is from before that step.
         """
         train = self.config.train
         saved = time.monotonic()
-        every = 0.2 if sys.stderr.isatty() else 20.0  # seconds between updates: a log file is no terminal
+        every = 0.2 if sys.stderr.isatty() else 20.0  # seconds between updates, fewer where stderr is a log file
         with tqdm(
             total=train.iterations, initial=self.step, desc=label, unit="it", mininterval=every, maxinterval=every
         ) as bar:
@@ -96,7 +102,7 @@ class Trainer:
         save(self.state_dict())
 
     def _descend(self) -> None:
-        """One step: the loss is the mean over a batch of views."""
+        """Do one step: the loss is the mean over a batch of views."""
         step, train, stages = self.step, self.config.train, self.stages
         self.model.set_phase(self.schedule.phase(step))
         views = [self.scene.train[i] for i in batch(step, len(self.scene.train), train.batch_size, self.config.seed)]
@@ -120,7 +126,7 @@ class Trainer:
                 self.floor.update()
 
     def _measure(self) -> None:
-        """Add a point to the curve; its cost is in no stage, so in no training time."""
+        """Add a point to the curve; its seconds belong to no stage and so do not count as training time."""
         self.model.set_phase(self.schedule.phase(self.step))
         val = self.psnr(self.scene.val) if self.scene.val else math.nan
         self.curve.add(self.step + 1, sum(self.stages.seconds.values()), val)
@@ -135,16 +141,20 @@ class Trainer:
 
     @torch.no_grad()
     def psnr(self, views: list[View]) -> float:
-        """Mean PSNR over views, dB."""
+        """Measure the mean PSNR over views, dB."""
         return sum(psnr(self.render(view), view.image) for view in views) / len(views)
 
     @torch.no_grad()
     def render(self, view: View) -> Tensor:
-        """The model's picture of a view, [H, W, 3]."""
+        """Render the image of a view, [H, W, 3]."""
         return render(self.model, view.camera, view.time, self.background, self.config.raster.antialias)
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next step depends on, and all that was measured so far; raises DivergedError as `run`."""
+        """Return everything that the next step depends on, and everything measured so far, for the checkpoint.
+
+        Raises:
+            DivergedError: as `run`.
+        """
         self.watch.look()
         return {
             "step": self.step,
@@ -158,7 +168,7 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state_dict` to the bits an unbroken run would have."""
+        """Continue from a `state_dict`: results are bit-equal to those of an uninterrupted run."""
         self.step = state["step"]
         self.model.load_state(state["model"])
         self.optimizer.adam.load_state_dict(state["optimizer"])

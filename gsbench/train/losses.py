@@ -1,4 +1,4 @@
-"""What is minimised: (1 - w) L1 + w (1 - SSIM) (3DGS eq. 7)."""
+"""Compute the training loss (1 - w) L1 + w (1 - SSIM) of an image (3DGS eq. 7)."""
 
 import functools
 
@@ -14,7 +14,7 @@ SIGMA = 1.5
 
 
 def photometric(image: Tensor, target: Tensor, ssim_weight: float, backend: Backend = AUTO) -> Tensor:
-    """The training loss of one image, two of [H, W, 3] or [1, H, W, 3] in [0, 1] -> []."""
+    """Compute the training loss [] of an image and its target, both [H, W, 3] or [1, H, W, 3] in [0, 1]."""
     if backend.serves(image):
         return l1_ssim(image, target, ssim_weight)
     loss = F.l1_loss(image, target)
@@ -24,9 +24,10 @@ def photometric(image: Tensor, target: Tensor, ssim_weight: float, backend: Back
 
 
 def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
-    """Mean SSIM in an 11 x 11 Gaussian window, zero padded, as 3DGS trains with; results are measured by
-    `gsbench.measure.quality.ssim` instead (Wang et al. 2004).
-    """  # fmt: skip
+    """Compute the mean SSIM in a zero-padded 11 x 11 Gaussian window, as 3DGS does for its loss.
+
+    Results are measured by `gsbench.measure.quality.ssim` instead (Wang et al. 2004).
+    """
     a, b = (x.reshape(x.shape[-3:]).permute(2, 0, 1) for x in (a, b))
     moments = _blur(torch.cat([a, b, a * a, b * b, a * b]))
     mean_a, mean_b, aa, bb, ab = moments.split(len(a))
@@ -37,9 +38,9 @@ def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _blur(planes: Tensor) -> Tensor:  # [P, H, W]
-    """Blur by the Gaussian window, zero padded: separable, so a banded matrix from the left and one from the right.
+    """Blur by the zero-padded Gaussian window. It is separable: a product with a banded matrix from either side.
 
-    Small pictures are blurred, and differentiated, many times faster so than by torch's convolutions on the CPU.
+    For small images on the CPU this, and its gradient, is many times faster than torch's convolutions.
     """
     height, width = planes.shape[-2:]
     return _band(height, planes.device, planes.dtype) @ planes @ _band(width, planes.device, planes.dtype)

@@ -1,4 +1,4 @@
-"""Adam with a learning rate a parameter, whose moments follow the Gaussians when density control moves rows."""
+"""Optimize by Adam, with a learning rate for each parameter group and moments that follow the Gaussians."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.adam import adam
 from gsbench.models import GaussianModel
 
-if TYPE_CHECKING:  # the configuration needs hydra, which a machine that checks kernels may not have
+if TYPE_CHECKING:  # config.py needs hydra, which a machine that checks kernels may lack
     from gsbench.config import LearningRate, ModelConfig, TrainConfig
 
 OPTIMIZERS = ("adam", "sparse_adam")
@@ -21,14 +21,14 @@ OPTIMIZERS = ("adam", "sparse_adam")
 class Optimizer:
     """torch.optim.Adam over a model's parameter groups (eps 1e-15, as 3DGS).
 
-    `adam` moves what no view of a batch drew by the momentum it has left; `sparse_adam` leaves it, and its moments,
-    alone (Mallick et al. 2024, Taming 3DGS). Where everything is drawn the two are the same.
+    `adam` moves Gaussians that no view of the batch sees by their remaining momentum. `sparse_adam` leaves them and
+    their moments unchanged (Mallick et al. 2024, Taming 3DGS). Where all Gaussians are visible the two are the same.
     """
 
     def __init__(
         self, model: GaussianModel, config: ModelConfig, train: TrainConfig, extent: float, kind: str = "adam"
     ) -> None:
-        """One group for each name of `model.groups()`.
+        """Make a parameter group for each name of `model.groups()`.
 
         Args:
             model: initialised.
@@ -38,7 +38,7 @@ class Optimizer:
             kind: one of OPTIMIZERS.
 
         Raises:
-            InputError: a parameter without a learning rate, or a rate for a parameter no variant of the model has.
+            InputError: a parameter has no learning rate, or a rate is for a parameter that no variant of the model has.
         """
         groups = model.groups()
         for name in groups:
@@ -61,13 +61,13 @@ class Optimizer:
         step: int,
         drawn: Tensor,  # [N] bool
     ) -> None:
-        """Update what has a gradient, at the rates of this step, and drop the gradients.
+        """Update the parameters that have a gradient, at the rates of this step, and drop the gradients.
 
-        `drawn`: which Gaussians some view of the batch drew; the others have no gradient. Where `adam.found_inf` [] is
-        set to 1, nothing is updated.
+        `drawn` marks the Gaussians that some view of the batch sees; the others have no gradient. Where
+        `adam.found_inf` [] is 1, nothing is updated.
         """
         skip: Tensor | None = getattr(self.adam, "found_inf", None)
-        if skip is not None:  # as a mask: to look at it would be to wait for the GPU
+        if skip is not None:  # used as a mask: reading its value would wait for the GPU
             drawn = drawn & (skip == 0)
         counts = 1 if skip is None else 1 - skip
         for group in self.adam.param_groups:
@@ -78,7 +78,7 @@ class Optimizer:
         self.adam.zero_grad(set_to_none=True)
 
     def _step_rows(self, group: dict[str, Any], drawn: Tensor, counts: int | Tensor) -> None:
-        """Update the rows `drawn`; `counts` is 0 where this is no step."""
+        """Update the rows `drawn`; `counts` is 0 where the step is skipped."""
         (parameter,) = group["params"]
         if parameter.grad is None:
             return
@@ -95,7 +95,7 @@ class Optimizer:
         parameter.grad = None
 
     def follow(self, model: GaussianModel, rows: Tensor, fresh: Tensor) -> None:
-        """Move Adam's moments as `model.select(rows)` moved the Gaussians; those `fresh` start from zero."""
+        """Move Adam's moments as `model.select(rows)` moved the Gaussians; those of `fresh` rows become zero."""
         for parameter in model.splats.values():
             state = self.adam.state.get(parameter, {})
             for name in ("exp_avg", "exp_avg_sq"):
@@ -105,18 +105,18 @@ class Optimizer:
                     state[name] = moments
 
     def forget(self, parameter: Tensor) -> None:
-        """Zero the moments of a parameter that was set by hand (3DGS does after an opacity reset)."""
+        """Zero the moments of a parameter that was set directly, as 3DGS does after an opacity reset."""
         for name in ("exp_avg", "exp_avg_sq"):
             if parameter in self.adam.state:
                 self.adam.state[parameter][name].zero_()
 
 
 def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) -> float:
-    """The learning rate of a step counted from 0: log-linear from start to end over the run (3DGS).
+    """Compute the learning rate of a step counted from 0: log-linear from start to end over the run (3DGS).
 
-    Where it is `per_run`, times sqrt(recipe_iterations / iterations). Adam's steps are as long as its rate, whatever
-    the gradient; their sum over a run, where gradients keep their sign, goes with the run's length, and where they are
-    noise, with its square root. The root was better than nothing for every model (docs/tuning.md).
+    A `per_run` rate is multiplied by sqrt(recipe_iterations / iterations). The length of an Adam step is its rate,
+    whatever the size of the gradient. The steps of a run add up in proportion to its length where gradients keep their
+    sign, and to its square root where they are noise. The root improved every model (docs/tuning.md).
     """
     scale = extent if rate.per_extent else 1.0
     if rate.per_run:
@@ -131,7 +131,7 @@ def adam_reference(
     parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, drawn: Tensor, rate: float, betas: list[float],
     eps: float, step: Tensor,
 ) -> None:  # fmt: skip
-    """`gsbench.kernels.adam.adam` in torch."""
+    """Compute `gsbench.kernels.adam.adam` in torch; see there for the arguments."""
     rows = drawn.nonzero()[:, 0]
     g = gradient[rows]
     m = mean[rows].lerp(g, 1 - betas[0])

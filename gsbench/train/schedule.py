@@ -1,12 +1,12 @@
-"""When things happen: the one rule that makes a run of any length the same recipe, and the order views are seen in."""
+"""Schedule a training: scale the steps of the recipe to a run of any length, and order the views."""
 
 import torch
 
 from gsbench.config import TrainConfig
 from gsbench.models import Phase
 
-# What an interval waits for takes a number of steps, not a part of the run. So `densify.every` does not scale, and
-# resets are never closer than Adam, at its rate of 0.05, needs to raise opacities again.
+# Some intervals are a number of steps in a run of any length: clones need `densify.every` steps to move apart, so it is
+# not scaled, and Adam needs this many between two resets to raise opacities again at its rate of 0.05.
 STEPS_BETWEEN_RESETS = 300
 
 
@@ -14,7 +14,7 @@ class Schedule:
     """Steps of a `recipe_iterations` run, scaled to this one: step x iterations / recipe_iterations, rounded."""
 
     def __init__(self, config: TrainConfig, sh_degree: int, agr: bool) -> None:
-        """Scale `config` to its own length, for a model of that full degree, with or without AGR."""
+        """Scale the steps of `config` to its own length, for a model of degree `sh_degree`, with or without AGR."""
         self.config = config
         self.sh_degree = sh_degree
         self.agr = agr
@@ -25,11 +25,11 @@ class Schedule:
         self.reset_every = max(self.scaled(densify.reset_every), STEPS_BETWEEN_RESETS)
 
     def scaled(self, step: int) -> int:
-        """A step of the recipe in this run; at least 1."""
+        """Scale a step of the recipe to this run; at least 1."""
         return max(1, round(step * self.config.iterations / self.config.recipe_iterations))
 
     def phase(self, step: int) -> Phase:
-        """What of the model is on at a step, counted from 0."""
+        """Tell which parts of the model are switched on at a step, counted from 0."""
         return Phase(
             sh_degree=min(self.sh_degree, step // self.scaled(self.config.sh_every)),
             refine=self.agr and step >= self.scaled(self.config.refine_from),
@@ -37,30 +37,36 @@ class Schedule:
         )
 
     def densifies(self, step: int) -> bool:
-        """Whether Gaussians are cloned, split and pruned after a step (3DGS: after 500, every 100, until 15,000)."""
+        """Tell whether Gaussians are cloned, split and pruned after a step (3DGS: from 500 to 15,000, every 100)."""
         done = step + 1
         return self.densify_start < done <= self.densify_stop and done % self.densify_every == 0
 
     def resets(self, step: int) -> bool:
-        """Whether opacities are reset after a step: while densifying, and only with time left to recover."""
+        """Tell whether opacities are reset after a step: while densifying, and only with steps left to recover."""
         done = step + 1
         return done % self.reset_every == 0 and done + self.reset_every // 2 <= max(self.densify_stop, 1)
 
     def has_reset(self, step: int) -> bool:
-        """Whether an opacity reset lies behind, from when on Gaussians too large are pruned."""
+        """Tell whether there was an opacity reset; from then on Gaussians that are too large are pruned."""
         return step + 1 > self.reset_every
 
     def measures(self, step: int) -> bool:
-        """Whether a point of the curve is taken after a step; the last step always is."""
+        """Tell whether a point of the curve is measured after a step; after the last step it always is."""
         points = max(1, self.config.curve_points)
         done, total = step + 1, self.config.iterations
         return done == total or done * points // total != step * points // total
 
 
 def batch(step: int, views: int, batch_size: int, seed: int) -> list[int]:
-    """Numbers of the views seen at a step: every view once an epoch, in an order drawn from (seed, epoch).
+    """List the views of a step: every view appears once an epoch, in an order drawn from (seed, epoch).
 
-    A function of its arguments alone, so that a resumed run sees what an unbroken one would have.
+    The result depends on the arguments alone, so that a resumed run sees the same views as an uninterrupted one.
+
+    Args:
+        step: counted from 0.
+        views: the number of training views.
+        batch_size: views in a step.
+        seed: of the run.
     """
     chosen = []
     for position in range(step * batch_size, (step + 1) * batch_size):
@@ -70,7 +76,7 @@ def batch(step: int, views: int, batch_size: int, seed: int) -> list[int]:
 
 
 def generator(seed: int, *purpose: int) -> torch.Generator:
-    """A random stream of its own for a run's seed and a purpose, such as a step's number."""
+    """Make a random generator for a seed and a purpose, such as the number of a step."""
     mixed = 0
     for number in (seed, *purpose):
         mixed = (mixed * 6364136223846793005 + number + 1442695040888963407) % (1 << 63)

@@ -1,11 +1,11 @@
-"""Whether training goes well: the loss, and the first value that is not finite, found without waiting for a GPU."""
+"""Watch a training for the first loss or gradient that is not finite, without waiting for the GPU at every step."""
 
 import math
 
 import torch
 from torch import Tensor, nn
 
-LOOK_EVERY = 50  # steps on a GPU, which a look waits for; on the CPU there is nothing to wait for
+LOOK_EVERY = 50  # steps on a GPU, since a look waits for it; on the CPU every step is looked at
 
 
 class DivergedError(RuntimeError):
@@ -13,30 +13,30 @@ class DivergedError(RuntimeError):
 
 
 class Watch:
-    """Sees every step's loss and gradients on their device, and raises when they are looked at.
+    """Checks the loss and the gradients of every step on their device, and raises when the result is read.
 
-    On a GPU that may be some steps late. So from the first bad step on `skip` [] is 1 instead of 0, and torch's fused
-    Adam, which takes it as its `found_inf`, leaves every parameter as it is.
+    On a GPU the result is read some steps later. From the first bad step on, `skip` [] is therefore 1 instead of 0, and
+    torch's fused Adam, which takes it as its `found_inf`, changes no parameter.
     """
 
     def __init__(self, device: str) -> None:
         """Watch a training on `device` ("cpu", "cuda", "cuda:1")."""
         self.every = LOOK_EVERY if device.startswith("cuda") else 1
-        self.loss = math.nan  # of the step last looked at
+        self.loss = math.nan  # of the last step that was read
         self._names: list[str] = []
         self._state = torch.zeros(4, device=device)  # skip, step, the first bad one of `_names`, loss
         self.skip = self._state[0]
 
     @torch.no_grad()
     def see(self, step: int, loss: Tensor, groups: dict[str, list[nn.Parameter]]) -> None:
-        """Take in a step, before its gradients are applied; every `every` steps, look.
+        """Check a step before its gradients are applied; `look` every `every` steps.
 
         Raises:
             DivergedError: as `look`.
         """
         gradients = {name: [p.grad for p in group if p.grad is not None] for name, group in groups.items()}
         if self.every == 1:
-            # A finite sum hides no NaN. Only where it is not finite, as it may be of large numbers, each is looked at.
+            # A finite sum contains no NaN. A sum of large numbers may overflow; then each gradient is checked.
             total = sum([g.sum() for given in gradients.values() for g in given], loss)
             if math.isfinite(float(total)):
                 self.loss = float(loss)
@@ -50,10 +50,10 @@ class Watch:
             self.look()
 
     def look(self) -> None:
-        """Read what was seen so far.
+        """Read the result of the checks so far.
 
         Raises:
-            DivergedError: with the step and the parameter.
+            DivergedError: a check failed; the message names the step and the parameter.
         """
         bad, step, which, self.loss = self._state.tolist()
         if not bad:
@@ -65,7 +65,7 @@ class Watch:
 
 
 def _all_finite(gradients: list[Tensor], like: Tensor) -> Tensor:
-    """[] bool, on the device."""
+    """Tell whether all gradients are finite, as [] bool on the device."""
     finite = torch.ones_like(like, dtype=torch.bool)
     for gradient in gradients:
         finite = finite & gradient.isfinite().all()

@@ -216,7 +216,7 @@ def test_a_picture_too_small_for_a_metric_leaves_it_empty():
 
 def test_no_picture_is_an_error():
     """Would catch a mean over nothing."""
-    with pytest.raises(InputError, match="at least one picture"):
+    with pytest.raises(InputError, match="at least one image"):
         quality.evaluate([], background=(0.0, 0.0, 0.0))
 
 

@@ -1,4 +1,4 @@
-"""Factors, colours, the refinement's networks and directions, each against its definition."""
+"""Factors, colours, AGR's networks and directions, each against its definition."""
 
 import math
 

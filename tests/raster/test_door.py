@@ -134,7 +134,7 @@ def test_auto_says_once_that_the_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     ("built", "device", "said"),
     [(False, False, "it is not built here"), (True, False, "no CUDA device was found"),
-     (True, True, "does not draw on device 'cpu': use device=cuda")],
+     (True, True, "does not render on device 'cpu': use device=cuda")],
 )  # fmt: skip
 def test_cuda_without_its_kernels_its_gpu_or_tensors_on_it(
     built: bool, device: bool, said: str, monkeypatch: pytest.MonkeyPatch

@@ -1,4 +1,4 @@
-"""The embedded scenes, shipped as package data: one folder a scene, in the layout of `gsbench.scenes.blender`."""
+"""Locate the embedded scenes, which are package data in the layout of `gsbench.scenes.blender`."""
 
 from importlib import resources
 from pathlib import Path
