@@ -1,4 +1,4 @@
-"""Do one run: a model is trained on a scene and measured, and a record of it is written.
+"""Do one run: train a model on a scene, measure it and write its record.
 
 The function for it is `gsbench.run.run.run`. It is not exported here, where its name is that of its module.
 """

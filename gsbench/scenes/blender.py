@@ -214,12 +214,12 @@ def _read_views(
     views: dict[str, list[View]] = {}
     digests: dict[str, str] = {}
     with images.quiet_opencv(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        photographs = pool.map(read, [frame for split in splits.values() for frame in split.frames])
+        decoded = pool.map(read, [frame for split in splits.values() for frame in split.frames])
         expected: tuple[int, int] | None = None
         for name, split in splits.items():
             views[name] = []
             for frame in split.frames:
-                size, image, digest = next(photographs)
+                size, image, digest = next(decoded)
                 expected = expected or size
                 _check_size(size, expected, split, frame)
                 K = split.intrinsics.matrix(*size, downscale)

@@ -1,1 +1,1 @@
-"""Hard cases against an oracle: where each scheme and backend breaks, what the defaults promise, what safety costs."""
+"""Compare models and backends with an oracle on numerically hard cases, and check the bounds of the defaults."""

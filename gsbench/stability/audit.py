@@ -1,4 +1,4 @@
-"""The audit: every case for every model, scheme and backend, a million hard slices, what accuracy and safety cost."""
+"""Run the stability audit: every case for every model, scheme and backend, a million hard slices, and their costs."""
 
 import sys
 import time
@@ -20,8 +20,8 @@ from gsbench.stability.training_cases import LONG_STEPS
 
 BACKENDS = ("cpu", "cuda", "reference")
 MILLION = 1_000_000
-NOT_DEFAULT = 100_000  # of them for the factor order that is not the default, in the short audit
-SUBTRACTING = 50_000  # Gaussians for the schemes that subtract: their failures are no rare event
+NOT_DEFAULT = 100_000  # hard slices for the factor order that is not the default, in the short audit
+SUBTRACTING = 50_000  # Gaussians for the schemes that subtract, which fail often
 DEFAULT_ORDER = "conditioned_first"
 SEED = 0
 T = TypeVar("T")
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 @dataclass
 class Audit:
-    """All that was found."""
+    """The results of an audit."""
 
     backends: list[str]
     cells: list[Cell] = field(default_factory=list)
@@ -46,7 +46,7 @@ class Audit:
 
 
 def present() -> list[str]:
-    """The backends of this installation on this machine."""
+    """List the backends that work on this machine."""
     found = []
     for name in BACKENDS:
         try:
@@ -57,11 +57,11 @@ def present() -> list[str]:
 
 
 def run(million: int = MILLION, *, long: bool = False) -> Audit:
-    """Everything, with a progress bar on stderr.
+    """Run the whole audit, with a progress bar on stderr.
 
     Args:
-        million: how many hard slices are drawn.
-        long: train for 2,000 steps where the short audit trains for 150, and draw as many slices for each factor order.
+        million: the number of hard slices.
+        long: train for 2,000 steps instead of 150, and use as many hard slices for each factor order.
     """
     began = time.perf_counter()
     audit = Audit(present())
@@ -74,7 +74,7 @@ def run(million: int = MILLION, *, long: bool = False) -> Audit:
 
 
 def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Callable[[], None]]]:
-    """What is to be done, as names and calls."""
+    """List the steps of the audit, as names and calls."""
     steps: list[tuple[str, Callable[[], None]]] = []
 
     def add(name: str, found: list[T], more: Callable[[], Iterable[T]]) -> None:
@@ -100,7 +100,7 @@ def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Callable[[
 
 
 def hard_slices(audit: Audit, order: str, N: int) -> None:
-    """7DGS on N random factors with diagonals to 1e-5; a cell's errors are the 99.9th percentiles."""
+    """Slice N random 7D factors with diagonals down to 1e-5; the errors of a cell are 99.9th percentiles."""
     hard = population.draw(torch.Generator().manual_seed(SEED), N, order)
     known = population.truth(hard, order)
     audit.verified[order] = population.verify(hard, order)

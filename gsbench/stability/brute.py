@@ -1,7 +1,7 @@
-"""The truth about pictures by brute force: float64, every Gaussian at every pixel, no tiles, no bounds, no code shared.
+"""Render exact images by brute force in float64: every Gaussian at every pixel, without tiles or bounds.
 
-Written from the rules of the picture (3DGS: Kerbl et al. 2023; EWA: Zwicker et al. 2001) and not from a rasterizer.
-Gradients are those of autograd through these lines.
+This follows the definition of the image (3DGS: Kerbl et al. 2023; EWA: Zwicker et al. 2001) and shares no code with a
+rasterizer. Gradients are those of autograd.
 """
 
 from collections.abc import Iterator
@@ -11,25 +11,25 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-PRODUCTS = 1 << 21  # (Gaussian, pixel) products at a time: bounds memory
+PRODUCTS = 1 << 21  # (Gaussian, pixel) products at a time, which bounds memory
 Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors")
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What the oracle saw."""
+    """The exact image, and which of its pixels are sure."""
 
     image: Tensor  # [C, H, W, D]
     alpha: Tensor  # [C, H, W, 1]
     touched: Tensor  # [C, N, H, W] bool: the Gaussian's alpha is at least 1/255 here
-    slack: Tensor  # [C, H, W] relative distance of the closest decision to its threshold: small ones may flip
+    slack: Tensor  # [C, H, W] relative distance of a decision to its threshold; if small, float32 may differ
 
 
 class _Splats(NamedTuple):
-    """Gaussians on the picture of one camera, front to back."""
+    """Gaussians on the image plane of one camera, front to back."""
 
-    order: Tensor  # [M] their numbers; what is out of range is left out
+    order: Tensor  # [M] their indices, without those outside near and far
     centers: Tensor  # [M, 2] pixels
     covs: Tensor  # [M, 2, 2] pixels^2
     opacities: Tensor  # [M]
@@ -40,7 +40,21 @@ def paint(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     width: int, height: int, *, offsets2d: Tensor | None = None, background: Tensor | None = None, **options: Any,
 ) -> Picture:  # fmt: skip
-    """Draw what `gsbench.raster.rasterize` is asked to, from float64 tensors; `offsets2d` [C, N, 2] moves centres."""
+    """Render the image of `gsbench.raster.rasterize` in float64.
+
+    Args:
+        means: [N, 3], and so on as in `gsbench.raster.rasterize`, but in float64.
+        factors: [N, 3, 3].
+        opacities: [N].
+        colors: [N, D] or [C, N, D].
+        viewmats: [C, 4, 4].
+        Ks: [C, 3, 3].
+        width: of the images, pixels.
+        height: of the images, pixels.
+        offsets2d: [C, N, 2] moves the projected means, pixels.
+        background: colour [D].
+        options: near, far, eps2d and antialias.
+    """
     C, N, D = len(viewmats), len(means), colors.shape[-1]
     background = torch.zeros(D).double() if background is None else background
     image, alpha = means.new_zeros(C, height * width, D), means.new_zeros(C, height * width, 1)
@@ -57,7 +71,7 @@ def paint(
 
 
 def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) -> dict[str, Tensor]:
-    """Gradients of the sum of weight [C, H, W, D] x image + weight_alpha [C, H, W, 1] x alpha, by DIFFERENTIABLE."""
+    """Compute the gradients of the sum of weight [C, H, W, D] x image + weight_alpha [C, H, W, 1] x alpha."""
     inputs = {name: arguments[name].detach().requires_grad_() for name in DIFFERENTIABLE}
     rest = {name: value for name, value in arguments.items() if name not in DIFFERENTIABLE}
     viewmats, Ks, width, height = (rest.pop(name) for name in ("viewmats", "Ks", "width", "height"))
@@ -76,7 +90,7 @@ def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) ->
 
 
 def _pixels(width: int, height: int, N: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Numbers of some pixels [P] and their centres [P, 2], until all were given."""
+    """Yield the indices [P] and the centres [P, 2] of all pixels, some at a time."""
     for at in torch.arange(width * height).split(max(1, PRODUCTS // max(1, N))):
         yield at, torch.stack([at % width, at // width], -1) + 0.5
 
@@ -93,7 +107,7 @@ def _project(
     x, y, z = camera[order].T
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     centers = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
-    # The Jacobian is taken at the mean, moved to at most 15 % of the picture outside of it (3DGS).
+    # The Jacobian is taken at the mean, moved to at most 15 % of the image outside of it (3DGS).
     size = means.new_tensor([width, height])
     u, v = ((centers.clamp(-0.15 * size, 1.15 * size) - K[:2, 2]) / torch.stack([fx, fy])).T
     J = means.new_zeros(len(order), 2, 3)
@@ -109,7 +123,7 @@ def _project(
 
 
 def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Image [P, D], alpha [P, 1], touched [M, P] and slack [P] of some pixels."""
+    """Compute image [P, D], alpha [P, 1], touched [M, P] and slack [P] of some pixels."""
     dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
     xx, xy, yy = (splats.covs[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     power = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
@@ -121,7 +135,7 @@ def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor,
     weight = torch.where(blended, a * before, 0.0)
     alpha = weight.sum(0)[:, None]
     image = weight.T @ splats.colors + (1 - alpha) * background
-    going = before >= 1e-4  # the first that would bring the light below this ends the pixel
+    going = before >= 1e-4  # the first Gaussian that would take the transmittance below this ends the pixel
     distance = torch.where(going, (255 * a - 1).abs(), torch.inf)
     distance = torch.where(going & touched, torch.minimum(distance, (after / 1e-4 - 1).abs()), distance)
     slack = distance.amin(0) if len(distance) else torch.full((len(pixels),), torch.inf).double()

@@ -1,4 +1,4 @@
-"""What a hard case is, and the list of them all: named, bounded, and grown by a severity that hypothesis can search."""
+"""Define hard cases: each has a name, a bound on its errors, and a severity that hypothesis can search."""
 
 import math
 import zlib
@@ -13,7 +13,7 @@ AREAS = ("slicing", "colour", "projection", "blending", "training", "drift")
 
 @dataclass(frozen=True)
 class Bound:
-    """What the defaults promise in one case. An error is relative unless the case says otherwise."""
+    """The largest errors that the defaults may have in a case. They are relative unless the case says otherwise."""
 
     forward: float = 1e-4
     gradient: float = 1e-3
@@ -21,28 +21,28 @@ class Bound:
 
 @dataclass(frozen=True)
 class Case:
-    """One hard case: `build(generator, severity, **more)` makes it, tame at severity 0 and at its hardest at 1."""
+    """A hard case, made by `build(generator, severity, **more)`: ordinary at severity 0 and hardest at 1."""
 
     name: str
     area: str
     build: Callable[..., Any]
-    subjects: tuple[str, ...]  # the models it is put to; empty: it needs none
+    subjects: tuple[str, ...]  # the models that are tested with it; empty: it needs none
     bound: Bound
 
     @property
     def stresses(self) -> str:
-        """What it stresses, and where it was met in practice: the builder's docstring."""
+        """What the case stresses, and where it was met in practice: the builder's docstring."""
         return " ".join((self.build.__doc__ or "").split())
 
     def __call__(self, severity: float = 1.0, seed: int = 0, **more: Any) -> Any:
-        """Build it; the same numbers for the same arguments."""
+        """Build the case; the same arguments give the same numbers."""
         mixed = zlib.crc32(f"{self.name}/{seed}".encode())
         return self.build(torch.Generator().manual_seed(mixed), severity, **more)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What came out of one case, for one model, scheme and backend."""
+    """The result of a case for one model, scheme and backend."""
 
     area: str
     case: str
@@ -50,7 +50,7 @@ class Cell:
     scheme: str
     backend: str
     forward: float  # error of the result; NaN where it is not finite
-    gradient: float  # error of its gradient; NaN where it is not finite, or there is none to judge
+    gradient: float  # error of its gradient; NaN where it is not finite or not judged
     bad: float  # share of Gaussians (pixels, steps) whose result or gradient is not finite, or is indefinite
     ms: float  # forward and backward
     bound: Bound
@@ -58,23 +58,23 @@ class Cell:
 
     @property
     def is_default(self) -> bool:
-        """Whether users meet it without asking for it; the other schemes are there to be compared with."""
+        """Whether it belongs to a default; the other schemes are for comparison."""
         return self.scheme in ("square_root", "-")
 
     @property
     def holds(self) -> bool:
-        """Whether it keeps its bound: nothing bad, and both errors below theirs."""
+        """Whether it keeps its bound: nothing is bad, and both errors are below their bounds."""
         gradient = math.isnan(self.bound.gradient) or self.gradient <= self.bound.gradient
         return self.bad == 0 and self.forward <= self.bound.forward and gradient
 
 
 def device_of(backend: str) -> str:
-    """Where a backend computes."""
+    """Return the kind of device on which a backend computes."""
     return "cuda" if backend == "cuda" else "cpu"
 
 
 def backends_with(scheme: str, model: str, backends: list[str]) -> list[str]:
-    """Where a scheme has code of its own: square_root everywhere, cholesky for 6D and 7D on the CPU, schur in torch."""
+    """List the backends with code for a scheme: square_root all, cholesky for 6D and 7D the CPU too, schur torch."""
     if scheme == "square_root":
         return backends
     if scheme == "cholesky" and model != "4dgs":
@@ -86,7 +86,14 @@ CASES: dict[str, Case] = {}
 
 
 def case(area: str, *subjects: str, forward: float = 1e-4, gradient: float = 1e-3) -> Callable[..., Any]:
-    """Enter a builder into CASES under its own name."""
+    """Decorate a builder so that CASES lists its case under its name.
+
+    Args:
+        area: one of AREAS.
+        subjects: the models that are tested with it.
+        forward: bound of the error of the result.
+        gradient: bound of the error of the gradient.
+    """
 
     def enter(build: Callable[..., Any]) -> Case:
         made = Case(build.__name__, area, build, subjects, Bound(forward, gradient))
@@ -97,5 +104,5 @@ def case(area: str, *subjects: str, forward: float = 1e-4, gradient: float = 1e-
 
 
 def of_area(area: str) -> list[Case]:
-    """The cases of one area, in the order they were written."""
+    """List the cases of one area, in the order of their definition."""
     return [found for found in CASES.values() if found.area == area]

@@ -1,4 +1,4 @@
-"""Hard colours and their judge: spherical harmonics and waves in time, beside mpmath."""
+"""Compare hard colours, of spherical harmonics and waves in time, with mpmath."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from gsbench.stability import oracle
 from gsbench.stability.cases import Case, Cell, case, device_of
 from gsbench.stability.slices import fastest, worst
 
-COUNT = 3  # Gaussians a case
+COUNT = 3  # Gaussians in a case
 WAVES = {"3dgs": 1, "4dgs": 3}
-COPIES = 1024  # of a case's Gaussians, where it is timed
+COPIES = 1024  # of a case's Gaussians, for its timing
 
 
 @dataclass
 class Shown:
-    """Gaussians of one model, and where they are looked at from, when."""
+    """Gaussians of one model, with the place and the time of a query."""
 
     model: str
     means: Tensor  # [COUNT, 3]
@@ -32,7 +32,7 @@ class Shown:
 
 
 def ordinary(g: Generator, model: str) -> Shown:
-    """Colours of the size that training finds."""
+    """Make colours of the size that training finds."""
     sh = 0.3 * torch.randn(COUNT, 16 * WAVES[model], 3, generator=g)
     return Shown(model, torch.randn(COUNT, 3, generator=g), torch.rand(COUNT, 1, generator=g), sh,
                  torch.tensor([0.3, -0.2, -4.0]))  # fmt: skip
@@ -40,7 +40,7 @@ def ordinary(g: Generator, model: str) -> Shown:
 
 @case("colour", "3dgs", "4dgs")
 def ordinary_colors(g: Generator, severity: float, model: str) -> Shown:  # noqa: ARG001
-    """Nothing: the floor that the other rows are read against."""
+    """Nothing is stressed: this row is the floor to compare the others with."""
     return ordinary(g, model)
 
 
@@ -70,7 +70,7 @@ def far_in_time(g: Generator, severity: float, model: str) -> Shown:
 
 
 def judge(found: Case, backends: list[str]) -> Iterator[Cell]:
-    """Every model and backend; errors relative to the brightest colour or 1, and to each gradient."""
+    """Judge every model and backend; errors are relative to the brightest colour or 1, and to each gradient."""
     for model in found.subjects:
         shown = found(model=model)
         g = torch.Generator().manual_seed(1)
@@ -89,7 +89,7 @@ def judge(found: Case, backends: list[str]) -> Iterator[Cell]:
 
 
 def truth(shown: Shown, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
-    """Colours [COUNT, 3] and gradients [COUNT, 5]: by mean, time, and one direction of all coefficients at once."""
+    """Compute exact colours [COUNT, 3] and gradients [COUNT, 5]: by mean, time, and along one line of coefficients."""
     layout = {"means": 3, "times": 1, "sh": len(along)}
     time = float(torch.tensor(shown.time))
     colors, slopes = [], []
@@ -107,7 +107,7 @@ def truth(shown: Shown, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def differentiate(shown: Shown, backend: str, weight: Tensor, copies: int) -> tuple[Tensor, Tensor]:
-    """Colours [N, 3] and their gradients [N, 4 + coefficients], computed in float32."""
+    """Compute colours [N, 3] and their gradients [N, 4 + coefficients] in float32."""
     model, device = build(shown.model, backend=BACKENDS[backend]), device_of(backend)
     rows = torch.arange(COUNT).repeat(copies)
     inputs = [value[rows].requires_grad_() for value in (shown.means, shown.times, shown.sh)]

@@ -1,4 +1,4 @@
-"""Error against condition number, error against time, and what the square-root scheme costs beside the others."""
+"""Measure errors by condition number and by time, and the cost of the square-root scheme beside the others."""
 
 import itertools
 import time
@@ -20,15 +20,15 @@ from gsbench.stability.cases import backends_with, device_of
 from gsbench.stability.picture_cases import Arguments
 
 SPREAD = 40_000  # Gaussians of the curve by condition number
-DECADES = 8.0  # their factors' diagonals go down to 10^-DECADES, each Gaussian's to somewhere between that and 1
+DECADES = 8.0  # factors' diagonals go down to 10^-DECADES, those of each Gaussian to a random part of that
 BINS = np.arange(0, 13)  # powers of ten of the condition number
-LEAST = 50  # Gaussians in a bin, below which it is not shown
+LEAST = 50  # a bin with fewer Gaussians is not shown
 TIMED = 100_000  # Gaussians of the comparison of costs
-REPEATS = 9  # but of torch's slow ways one
+REPEATS = 9  # one for the slow schemes in torch
 SLICED = 20_000  # Gaussians, and ..
-DRAWN = 1_500  # .. Gaussians in a picture of so many pixels a side, of the accuracy-for-time curve
+DRAWN = 1_500  # .. Gaussians in an image of PICTURE pixels a side, for the accuracy-for-time curve
 PICTURE = 96
-PERCENTILE = 0.999  # of errors over a population, that bounds are about
+PERCENTILE = 0.999  # of the errors of a population, to which the bounds apply
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class ConditionCurve:
 
 @dataclass(frozen=True)
 class Cost:
-    """Milliseconds of slicing TIMED 7D Gaussians; of kernels medians over REPEATS."""
+    """Milliseconds of slicing TIMED 7D Gaussians; for kernels the medians over REPEATS."""
 
     order: str
     scheme: str
@@ -55,7 +55,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Point:
-    """What accuracy costs: one way to do one thing."""
+    """The accuracy and the time of one way to do a thing."""
 
     thing: str  # "slicing" or "picture"
     way: str
@@ -64,7 +64,7 @@ class Point:
 
 
 def accuracy_for_time(backends: list[str]) -> Iterator[Point]:
-    """Slices of SLICED hard Gaussians and a picture of a crowd, in every scheme, precision and instruction set."""
+    """Slice SLICED hard Gaussians and render a crowd, in every scheme, precision and instruction set."""
     hard = population.draw(torch.Generator().manual_seed(4), SLICED, "paper")
     known = population.truth(hard, "paper")
     for scheme in SCHEMES:
@@ -121,12 +121,12 @@ def _drawn(arguments: Arguments, truth: pictures.Truth, backend: str, dtype: tor
 
 
 def percentile(errors: population.Floats) -> float:
-    """The 99.9th percentile, what is not finite counted as infinitely wrong."""
+    """Return the 99.9th percentile; an error that is not finite counts as infinite."""
     return float(np.quantile(np.nan_to_num(errors, nan=np.inf), PERCENTILE, method="higher"))
 
 
 def by_condition() -> Iterator[ConditionCurve]:
-    """The paper's order of the factor, where every scheme has something to do; the backend is torch for all."""
+    """Measure errors by condition number in torch, in the paper's factor order, in which no scheme is trivial."""
     order = "paper"
     generator = torch.Generator().manual_seed(2)
     decades = DECADES * torch.rand(SPREAD, 1, generator=generator, dtype=torch.float64)
@@ -148,7 +148,7 @@ def by_condition() -> Iterator[ConditionCurve]:
 
 
 def safety(backends: list[str]) -> Iterator[Cost]:
-    """Every scheme on every backend that has it."""
+    """Time every scheme on every backend that has it."""
     for order in FACTOR_ORDERS:
         hard = population.draw(torch.Generator().manual_seed(3), TIMED, order, 1.0)
         for scheme in SCHEMES:

@@ -1,9 +1,9 @@
-"""The truth about single Gaussians in mpmath: slices, splats, colours and gradients, from the textbook formulas.
+"""Compute exact slices, splats, colours and gradients of single Gaussians in mpmath, by the textbook formulas.
 
-Nothing here is shared with what it judges: covariances are formed, inverted and subtracted as the papers write them,
-which is sound because it is done in DIGITS digits. The hardest case here (a factor with four diagonals of 1e-7) squares
-to a condition number of 1e56, so fifty digits would not do. A gradient is a central difference with a step of
-1e-30, whose error is 1e-60 of the third derivative.
+This shares no code with the models. Covariances are formed, inverted and subtracted as in the papers, which is safe in
+DIGITS digits: the hardest case (a factor with four diagonals of 1e-7) has a squared condition number of 1e56, for which
+50 digits would not suffice. A gradient is a central difference with a step of 1e-30, whose error is 1e-60 of the third
+derivative.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,8 +13,8 @@ from mpmath import mp, mpf
 
 DIGITS = 120
 STEP = mpf(10) ** -30
-LOG_SIZE_MAX = 16  # by definition, a logarithm of a size beyond acts as this one (docs/stability.md)
-TIME_GATE_MIN = mpf("0.05")  # 4DGS draws nothing whose f_temp is not above this
+LOG_SIZE_MAX = 16  # by definition, a larger logarithm of a size acts as this one (docs/stability.md)
+TIME_GATE_MIN = mpf("0.05")  # 4DGS culls a Gaussian unless its f_temp is above this
 UNDEFINED = mpf(10) ** -20  # |v|^2 of a vector too short to have a direction; it becomes zero
 
 Vector = list[Any]  # of mpf
@@ -23,7 +23,7 @@ Function = Callable[[Vector], Vector]
 
 
 def gradient(function: Function, at: Sequence[float], weights: Sequence[float], first: int | None = None) -> Vector:
-    """d(weights . function)/dx by central differences, one entry for each of the `first` (all) numbers of `at`."""
+    """Compute d(weights . function)/dx by central differences, for the `first` (default: all) numbers of `at`."""
     with mp.workdps(DIGITS):
         x = [mpf(v) for v in at]
         out = []
@@ -38,20 +38,27 @@ def gradient(function: Function, at: Sequence[float], weights: Sequence[float], 
 
 
 def evaluate(function: Function, at: Sequence[float]) -> Vector:
-    """function(at) in DIGITS digits."""
+    """Evaluate function(at) in DIGITS digits."""
     with mp.workdps(DIGITS):
         return function([mpf(v) for v in at])
 
 
-# ---- slices: mean (3), covariance (9, by rows) and opacity of the 3D Gaussian that is drawn
+# ---- slices: mean (3), covariance (9, by rows) and opacity of the conditional 3D Gaussian
 
 
 def slice_triangular(x: Vector, layout: dict[str, int], order: str, half: float, log_lambda: dict[str, float],
                      center: Sequence[float], time: float | None, relative: bool = True) -> Vector:  # fmt: skip
-    """6DGS and 7DGS (7DGS eq. 9 to 12). `x` holds the raw parameters named in `layout`, each of so many numbers.
+    """Slice a Gaussian of 6DGS or 7DGS (7DGS eq. 9 to 12).
 
-    `order` names the variable of each row of the triangular factor, such as `dddtppp`. Where it is `relative`, entries
-    of shape are in units of their row's diagonal.
+    Args:
+        x: the raw parameters, one after the other.
+        layout: their names, and how many numbers each has.
+        order: the variable of each row of the triangular factor, such as "dddtppp".
+        half: the factor in the exponent of f_dir.
+        log_lambda: ln lambda_d ("direction") and ln lambda_t ("time").
+        center: of the camera.
+        time: of the query; None for 6DGS.
+        relative: whether entries of shape are in units of their row's diagonal.
     """
     raw = _unpack(x, layout)
     n = len(order)
@@ -74,7 +81,7 @@ def slice_triangular(x: Vector, layout: dict[str, int], order: str, half: float,
 
 
 def slice_rotated(x: Vector, layout: dict[str, int], log_lambda: dict[str, float], time: float) -> Vector:
-    """4DGS: S = (R s)(R s)^T, R = M_left(l) M_right(r) (4DGS eq. 5 to 9)."""
+    """Slice a Gaussian of 4DGS: S = (R s)(R s)^T, R = M_left(l) M_right(r) (4DGS eq. 5 to 9)."""
     raw = _unpack(x, layout)
     a, b, c, d = _normalised(raw["left_quats"])
     p, q, r, s = _normalised(raw["right_quats"])
@@ -90,7 +97,7 @@ def slice_rotated(x: Vector, layout: dict[str, int], log_lambda: dict[str, float
 
 
 def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vector) -> tuple[Vector, Vector]:
-    """mu_p + K delta and S_pp - K S_qp with K = S_pq S_qq^-1."""
+    """Compute mu_p + K delta and S_pp - K S_qp with K = S_pq S_qq^-1."""
     S_pq = _block(S, p, q)
     K = [_solve(_block(S, q, q), row) for row in S_pq]
     moved = [m + mp.fdot(k, delta) for m, k in zip(mean, K, strict=True)]
@@ -102,16 +109,22 @@ def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vecto
 
 def alphas(x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[float]], size: tuple[int, int],
            pixels: Sequence[tuple[float, float]], eps2d: float) -> Vector:  # fmt: skip
-    """opacity exp(-power) at pixel centres (EWA: Zwicker et al. 2001 eq. 29); x = mean (3), factor (9), opacity.
+    """Compute opacity exp(-power) at pixel centres (EWA: Zwicker et al. 2001 eq. 29), without limits 0.999 and 1/255.
 
-    Neither held below 0.999 nor cut at 1/255: the caller leaves out what is near either.
+    Args:
+        x: mean (3), factor (9) and opacity.
+        viewmat: world to camera.
+        K: intrinsics.
+        size: width and height of the image, pixels.
+        pixels: their centres.
+        eps2d: added to the diagonal of the 2D covariance, pixels^2.
     """
     mean, F, opacity = x[:3], [x[3:6], x[6:9], x[9:12]], x[12]
     W = [[mpf(v) for v in row] for row in viewmat]
     px, py, pz = (mp.fdot(row[:3], mean) + row[3] for row in W[:3])
     (fx, _, cx), (_, fy, cy) = ([mpf(v) for v in row] for row in K[:2])
     u, v = fx * px / pz + cx, fy * py / pz + cy
-    # The Jacobian is taken at the mean, moved to at most 15 % of the picture outside of it (3DGS).
+    # The Jacobian is taken at the mean, moved to at most 15 % of the image outside of it (3DGS).
     tangents = [(min(max(u, -mpf(3) / 20 * size[0]), mpf(23) / 20 * size[0]) - cx) / fx,
                 (min(max(v, -mpf(3) / 20 * size[1]), mpf(23) / 20 * size[1]) - cy) / fy]  # fmt: skip
     J = [[fx / pz, mpf(0), -fx * tangents[0] / pz], [mpf(0), fy / pz, -fy * tangents[1] / pz]]
@@ -126,10 +139,17 @@ def alphas(x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[f
 
 
 def colors(x: Vector, layout: dict[str, int], center: Sequence[float], waves: int, time: float) -> Vector:
-    """max(0, sum beta Y_lm(d) cos(2 pi n (t - mu_t)) + 1/2), degree 3 (3DGS; 4DGS eq. 12); x has means, times, sh.
+    """Compute max(0, sum beta Y_lm(d) cos(2 pi n (t - mu_t)) + 1/2) to degree 3 (3DGS; 4DGS eq. 12).
 
-    Y_lm by the general formula, with associated Legendre functions of cos(theta): real harmonics in 3DGS' signs. Where
-    d is undefined only the constant one is not zero, by definition.
+    Y_lm are real harmonics in the signs of 3DGS, by the general formula with associated Legendre functions of
+    cos(theta). Where d is undefined, all but the constant one are zero by definition.
+
+    Args:
+        x: means, times and sh.
+        layout: their names, and how many numbers each has.
+        center: of the camera.
+        waves: frequencies in time, with the constant one.
+        time: of the query.
     """
     raw = _unpack(x, layout)
     dx, dy, dz = unit([m - mpf(c) for m, c in zip(raw["means"], center, strict=True)])
@@ -145,7 +165,7 @@ LEGENDRE = ((1,), (0, 1), (-0.5, 0, 1.5), (0, -1.5, 0, 2.5))  # coefficients of 
 
 
 def _harmonic(degree: int, order: int, x: Any, y: Any, z: Any) -> Any:
-    """N_lm d^m P_l/dz^m Re or Im (x + i y)^m, with (-1)^m as 3DGS has it."""
+    """Compute N_lm d^m P_l/dz^m Re or Im (x + i y)^m, with the Condon-Shortley phase (-1)^m as in 3DGS."""
     m = abs(order)
     scale = mp.sqrt((2 * degree + 1) / (4 * mp.pi) * mp.factorial(degree - m) / mp.factorial(degree + m))
     legendre = [mpf(c) for c in LEGENDRE[degree]]
@@ -161,7 +181,7 @@ def _harmonic(degree: int, order: int, x: Any, y: Any, z: Any) -> Any:
 
 
 def unit(v: Vector) -> Vector:
-    """v at length 1; a vector too short to have a direction becomes zero."""
+    """Normalise v; a vector too short to have a direction becomes zero."""
     square = mp.fdot(v, v)
     return [x / mp.sqrt(square) for x in v] if square > UNDEFINED else [mpf(0)] * 3
 
@@ -196,7 +216,7 @@ def _mahalanobis(S: Matrix, delta: Vector) -> Any:
 
 
 def _solve(A: Matrix, b: Vector) -> Vector:
-    """A^-1 b by Gauss' elimination; the digits make up for the pivots not being chosen (A is positive definite)."""
+    """Compute A^-1 b by Gaussian elimination; A is positive definite and digits are many, so it needs no pivoting."""
     n = len(b)
     rows = [[*row, value] for row, value in zip(A, b, strict=True)]
     for i in range(n):

@@ -1,4 +1,4 @@
-"""The audit as files: table.md, table.csv, audit.json, plots, and page.md that shows them all."""
+"""Write the audit to files: table.md, table.csv, audit.json, plots, and page.md, which shows them all."""
 
 import csv
 import io
@@ -20,25 +20,25 @@ RUNS = ("training", "drift")  # areas whose cells are whole trainings
 
 
 def write(audit: Audit, folder: Path) -> None:
-    """Write everything to `folder`."""
+    """Write all files to `folder`."""
     tables = table(audit)
     write_atomically(folder / "table.md", tables.encode())
     write_atomically(folder / "table.csv", csv_of(audit.cells).encode())
     write_atomically(folder / "audit.json", json.dumps(_plain(audit), indent=1).encode())
-    pictures = plots.write(audit, folder)
-    write_atomically(folder / "page.md", page(audit, tables, pictures).encode())
+    figures = plots.write(audit, folder)
+    write_atomically(folder / "page.md", page(audit, tables, figures).encode())
 
 
-def page(audit: Audit, tables: str, pictures: list[plots.Picture]) -> str:
-    """The whole report in Markdown."""
+def page(audit: Audit, tables: str, figures: list[plots.Plot]) -> str:
+    """Compose the whole report in Markdown."""
     lines = ["# Stability audit", "", verdict(audit), "", *conditions(audit), ""]
-    for picture in pictures:
-        lines += [f"## {picture.title}", "", f"![{picture.title}]({picture.file})", "", picture.caption, ""]
+    for figure in figures:
+        lines += [f"## {figure.title}", "", f"![{figure.title}]({figure.file})", "", figure.caption, ""]
     return "\n".join([*lines, tables, *stresses()])
 
 
 def verdict(audit: Audit) -> str:
-    """One line: what the defaults break."""
+    """Say in one line which bounds the defaults break."""
     if audit.broken:
         names = ", ".join(sorted({f"{cell.case} ({cell.subject}, {cell.backend})" for cell in audit.broken}))
         return f"**{len(audit.broken)} cells of the defaults are over their bound:** {names}."
@@ -47,7 +47,7 @@ def verdict(audit: Audit) -> str:
 
 
 def conditions(audit: Audit) -> list[str]:
-    """Where, when and how it was measured."""
+    """State where and how it was measured."""
     checks = ", ".join(f"{value:.0e} ({order})" for order, value in audit.verified.items())
     return [
         f"{processor_name()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the end; commit {git_commit()}; "
@@ -63,7 +63,7 @@ def conditions(audit: Audit) -> list[str]:
 
 
 def table(audit: Audit) -> str:
-    """A table for each area and model, then what safety costs."""
+    """Make a table for each area and model, of the trainings, and of the costs."""
     lines = []
     for area in ("population", *(area for area in AREAS if area not in RUNS)):
         for subject in dict.fromkeys(cell.subject for cell in audit.cells if cell.area == area):
@@ -73,7 +73,7 @@ def table(audit: Audit) -> str:
 
 
 def runs(audit: Audit) -> list[str]:
-    """Trainings: whether they ended as they should, and what came out."""
+    """Make the table of trainings: whether they ended as they should, and their results."""
     lines = ["## training", "", "| case | model | backend | result | not finite | s | what came out |",
              "| --- | --- | --- | --- | ---: | ---: | --- |"]  # fmt: skip
     for cell in (cell for cell in audit.cells if cell.area in RUNS):
@@ -96,7 +96,7 @@ def _grid(cells: list[Cell]) -> list[str]:
 
 
 def show(cell: Cell) -> str:
-    """A cell of the table."""
+    """Format a cell of the table."""
     numbers = f"{_number(cell.forward)} / {_number(cell.gradient)} / {100 * cell.bad:.3g} % / {cell.ms:.3g}"
     return ("" if cell.holds else MARK) + numbers
 
@@ -106,7 +106,7 @@ def _number(x: float) -> str:
 
 
 def costs(audit: Audit) -> list[str]:
-    """What square_root costs beside the schemes that subtract."""
+    """Make the table of the costs of square_root beside the schemes that subtract."""
     lines = [
         "## what safety costs", "",
         "Milliseconds of slicing 100,000 7D Gaussians, medians of nine (torch: one). The kernel of `cholesky` does",
@@ -125,13 +125,13 @@ def costs(audit: Audit) -> list[str]:
 
 
 def stresses() -> list[str]:
-    """What each case stresses."""
+    """List what each case stresses."""
     lines = ["## the cases", "", "| case | what it stresses, and where it was met |", "| --- | --- |"]
     return [*lines, *(f"| {case.name} | {case.stresses} |" for case in CASES.values()), ""]
 
 
 def csv_of(cells: list[Cell]) -> str:
-    """Every cell as a line."""
+    """Write every cell as a line of CSV."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)

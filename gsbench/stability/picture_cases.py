@@ -1,4 +1,4 @@
-"""Hard pictures: single Gaussians that projection can lose its digits on, and crowds that blending can."""
+"""Define hard images: single Gaussians whose projection loses digits, and crowds whose blending does."""
 
 import math
 from typing import Any
@@ -11,13 +11,13 @@ from gsbench.stability.cases import case
 Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`, float32
 WIDTH, HEIGHT = 16, 12
 FOCAL = 24.0
-DEPTH = 4.0  # of what is not said to be elsewhere; a power of two, so that a camera without rotation gives it exactly
+DEPTH = 4.0  # the default; a power of two, so that a camera without rotation gives it exactly
 CROWD = 100_000
-NO_GRADIENT = math.nan  # bound of a gradient that is not judged
+NO_GRADIENT = math.nan  # the bound of a gradient that is not judged
 
 
 def single(mean: Tensor, factor: Tensor, opacity: float = 0.9) -> Arguments:
-    """One Gaussian before one camera at the origin that looks along z."""
+    """Make the arguments for one Gaussian and one camera at the origin that looks along z."""
     return {
         "means": mean.float()[None], "factors": factor.float()[None], "opacities": torch.tensor([opacity]),
         "colors": torch.ones(1, 1), "viewmats": torch.eye(4)[None], "Ks": intrinsics(),
@@ -26,18 +26,18 @@ def single(mean: Tensor, factor: Tensor, opacity: float = 0.9) -> Arguments:
 
 
 def intrinsics(fx: float = FOCAL, fy: float = FOCAL, cx: float = WIDTH / 2, cy: float = HEIGHT / 2) -> Tensor:
-    """[1, 3, 3], pixels."""
+    """Make intrinsics [1, 3, 3], pixels."""
     return torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]])
 
 
 def ordinary(g: Generator, size: float = 0.2) -> Arguments:
-    """A Gaussian in view, a few pixels large."""
+    """Make a Gaussian in view that is a few pixels large."""
     mean = torch.tensor([0.2, -0.1, DEPTH]) + 0.1 * torch.randn(3, generator=g)
     return single(mean, size * torch.randn(3, 3, generator=g))
 
 
 def turned(g: Generator, sizes: Tensor) -> Tensor:
-    """A factor with these sizes along axes in random directions."""
+    """Make a factor with these sizes along axes in random directions."""
     return torch.linalg.qr(torch.randn(3, 3, generator=g))[0] * sizes
 
 
@@ -46,7 +46,7 @@ def turned(g: Generator, sizes: Tensor) -> Tensor:
 
 @case("projection")
 def ordinary_splats(g: Generator, severity: float) -> list[Arguments]:  # noqa: ARG001
-    """Nothing: the floor that the other rows are read against."""
+    """Nothing is stressed: this row is the floor to compare the others with."""
     return [ordinary(g) for _ in range(3)]
 
 
@@ -65,7 +65,7 @@ def at_the_near_plane(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def far_off_axis(g: Generator, severity: float) -> list[Arguments]:
-    """Means up to x/z = 100 that reach into the picture: EWA's Jacobian blows up (diff-gaussian-rasterization #75)."""
+    """Means up to x/z = 100 that reach into the image: EWA's Jacobian blows up (diff-gaussian-rasterization #75)."""
     made = []
     for tangent in (1.0, 10.0, 100.0):
         x = DEPTH * tangent**severity
@@ -112,14 +112,14 @@ def extreme_focal_lengths(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def oblong_pixels(g: Generator, severity: float) -> list[Arguments]:
-    """fx / fy = 100 and 1/100: anamorphic lenses; a renderer with one focal length draws something else."""
+    """fx / fy = 100 and 1/100: anamorphic lenses; a renderer with one focal length is wrong."""
     stretch = 10**severity
     return [ordinary(g, 0.1) | {"Ks": intrinsics(FOCAL * s, FOCAL / s)} for s in (stretch, 1 / stretch)]
 
 
 @case("projection")
 def principal_point_outside(g: Generator, severity: float) -> list[Arguments]:
-    """The principal point ten widths outside, as in crops; clamps that take it as centred fail (gsplat #305)."""
+    """The principal point ten widths outside, as in crops; clamps that assume it is centred fail (gsplat #305)."""
     away = 10 * WIDTH * severity
     made = ordinary(g)
     shift = away / FOCAL * DEPTH
@@ -131,7 +131,7 @@ def principal_point_outside(g: Generator, severity: float) -> list[Arguments]:
 
 
 def crowd(g: Generator, N: int, size: float) -> Arguments:
-    """N Gaussians of about `size` in view, at different depths."""
+    """Make N Gaussians of about `size` in view, at different depths."""
     spread = torch.tensor([1.0, 0.7, 1.0])
     means = (torch.rand(N, 3, generator=g) * 2 - 1) * spread + torch.tensor([0.0, 0.0, DEPTH])
     return {
@@ -144,13 +144,13 @@ def crowd(g: Generator, N: int, size: float) -> Arguments:
 
 @case("blending")
 def ordinary_crowd(g: Generator, severity: float) -> list[Arguments]:  # noqa: ARG001
-    """Nothing: the floor that the other rows are read against."""
+    """Nothing is stressed: this row is the floor to compare the others with."""
     return [crowd(g, 200, 0.15)]
 
 
 @case("blending")
 def faint_crowd(g: Generator, severity: float) -> list[Arguments]:
-    """10^5 Gaussians of opacity 1/100 over each other, all over the picture: products and sums of many small terms."""
+    """10^5 Gaussians of opacity 1/100 over each other, all over the image: products and sums of many small terms."""
     made = crowd(g, max(10, int(CROWD**severity)), 5.0)
     few = {"width": 8, "height": 6, "Ks": intrinsics(cx=4.0, cy=3.0)}  # brute force takes seconds for these
     return [made | few | {"opacities": torch.full((len(made["means"]),), 0.01)}]
@@ -173,9 +173,9 @@ def equal_depths(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending", forward=1.01 / 255, gradient=NO_GRADIENT)
 def alpha_at_its_limits(g: Generator, severity: float) -> list[Arguments]:
-    """Alpha within an ulp of 1/255 and of 0.999: one may be drawn or not, which is worth 1/255 and no more."""
+    """Alpha within an ulp of 1/255 and of 0.999: a Gaussian may be skipped or not, which is worth 1/255 and no more."""
     made = crowd(g, 3, 1.0)
-    made["factors"] = 1e4 * torch.eye(3).repeat(3, 1, 1)  # flat over the picture
+    made["factors"] = 1e4 * torch.eye(3).repeat(3, 1, 1)  # constant over the image
     faint = torch.tensor([1 / 255]) * torch.tensor([1 - 2**-23, 1.0, 1 + 2**-22]) ** severity
     full = torch.tensor([0.999]) * torch.tensor([1 - 2**-23, 1.0, 1 + 2**-23]) ** severity
     return [made | {"opacities": opacity[None]} | _only(made, i) for i, opacity in enumerate(faint)] + [
@@ -185,7 +185,7 @@ def alpha_at_its_limits(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending", forward=1e-3, gradient=NO_GRADIENT)
 def transmittance_at_the_stop(g: Generator, severity: float) -> list[Arguments]:
-    """Four of alpha 0.9 leave 1e-4, the stop itself: the fourth may be drawn or not, which is worth 9e-4."""
+    """Four of alpha 0.9 leave 1e-4, the stop itself: the fourth may be blended or not, which is worth 9e-4."""
     made = crowd(g, 6, 1.0)
     made["factors"] = 1e4 * torch.eye(3).repeat(6, 1, 1)
     return [made | {"opacities": torch.full((6,), 0.9 * severity + 0.5 * (1 - severity))}]

@@ -1,4 +1,4 @@
-"""Judges pictures: single Gaussians beside mpmath, crowds beside brute force in float64."""
+"""Judge images of the rasterizer: single Gaussians against mpmath, crowds against brute force in float64."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -13,16 +13,16 @@ from gsbench.stability import brute, oracle
 from gsbench.stability.cases import Case, Cell, device_of
 from gsbench.stability.slices import ALPHA_MIN, fastest, worst
 
-UNDECIDED = 1e-3  # what is relatively nearer to a threshold may fall to either side of it in float32
+UNDECIDED = 1e-3  # a pixel relatively nearer to a threshold may fall to either side of it in float32
 Arguments = dict[str, Any]
 Truth = tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]  # image and alpha [1, H, W, .], decided [1, H, W], gradients
 
 
 def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
-    """One cell a backend: the worst of the case's pictures."""
+    """Yield a cell for each backend: the worst of the images of a case."""
     pictures = case()
     truths = [(alone if case.area == "projection" else together)(arguments) for arguments in pictures]
-    if case.bound.gradient != case.bound.gradient:  # every pixel is at a threshold: what may flip is what is judged
+    if case.bound.gradient != case.bound.gradient:  # every pixel is at a threshold, and these are judged
         truths = [(image, alpha, torch.ones_like(decided), {}) for image, alpha, decided, _ in truths]
     for backend in backends:
         found = [compare(a, known, backend) for a, known in zip(pictures, truths, strict=True)]
@@ -32,7 +32,7 @@ def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
             case.area, case.name, "-", "-", backend, worst(forward),
             worst(gradient) if truths[0][3] else float("nan"), float(bad.mean()),
             fastest(partial(_all, pictures, backend)), case.bound,
-            f"{drawn} of {len(pictures)} pictures not empty",
+            f"{drawn} of {len(pictures)} images not empty",
         )  # fmt: skip
 
 
@@ -42,7 +42,7 @@ def _all(pictures: list[Arguments], backend: str) -> None:
 
 
 def weights(arguments: Arguments) -> tuple[Tensor, Tensor]:
-    """What the loss weighs image and alpha by, float64."""
+    """Make the weights of image and alpha in the loss, float64."""
     shape = (1, arguments["height"], arguments["width"])
     g = torch.Generator().manual_seed(1)
     D = arguments["colors"].shape[-1]
@@ -51,7 +51,7 @@ def weights(arguments: Arguments) -> tuple[Tensor, Tensor]:
 
 
 def together(arguments: Arguments) -> Truth:
-    """By brute force."""
+    """Render the exact image and gradients by brute force."""
     exact: Arguments = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
     with torch.no_grad():
         picture = brute.paint(**exact)
@@ -62,12 +62,12 @@ def together(arguments: Arguments) -> Truth:
 
 
 def alone(arguments: Arguments) -> Truth:
-    """By mpmath: one Gaussian of one channel of 1, so that image and alpha are the same."""
+    """Compute the exact image and gradients by mpmath, for one Gaussian whose one channel is 1: image equals alpha."""
     size = (arguments["width"], arguments["height"])
     pixels = [(i + 0.5, j + 0.5) for j in range(size[1]) for i in range(size[0])]
     parts = [arguments[name].flatten() for name in ("means", "factors", "opacities")]
     x, shape = torch.cat(parts).tolist(), (1, size[1], size[0], 1)
-    if not x[2] > torch.tensor(arguments.get("near", NEAR)).item():  # the camera is the world: z is the depth
+    if not x[2] > torch.tensor(arguments.get("near", NEAR)).item():  # camera axes are world axes, so z is the depth
         none = torch.zeros(shape, dtype=torch.float64)
         return none, none, none[..., 0] == 0, {k: torch.zeros_like(arguments[k]).double() for k in brute.DIFFERENTIABLE}
     function = partial(
@@ -88,7 +88,7 @@ def alone(arguments: Arguments) -> Truth:
 def differentiate(
     arguments: Arguments, backend: str, weight: Tensor, weight_alpha: Tensor
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """Image and alpha, and the gradients of the loss, by a rasterizer in float32."""
+    """Compute image, alpha and the gradients of the loss by a rasterizer in float32."""
     inputs = {name: arguments[name].detach().clone().requires_grad_() for name in brute.DIFFERENTIABLE}
     device = device_of(backend)
     there: Arguments = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in (arguments | inputs).items()}
@@ -100,12 +100,12 @@ def differentiate(
 
 
 def compare(arguments: Arguments, known: Truth, backend: str) -> tuple[float, float, float]:
-    """Largest error of a decided pixel, relative to the brightest colour or 1; of a gradient; share not finite."""
+    """Return the largest error of decided pixels, relative to the brightest colour or 1, and of gradients; 1 if bad."""
     image, alpha, decided, exact = known
     weight, weight_alpha = (w * decided[..., None] for w in weights(arguments))
     try:
         got, covered, gradients = differentiate(arguments, backend, weight, weight_alpha)
-    except InputError:  # refused at the door is not drawn wrong, but every case here is one that must be drawn
+    except InputError:  # a refusal is not a wrong image, but every case here must be rendered
         return float("nan"), float("nan"), 1.0
     finite = got.isfinite().all() & covered.isfinite().all() & all(g.isfinite().all() for g in gradients.values())
     brightest = max(1.0, float(arguments["colors"].abs().max())) if arguments["colors"].numel() else 1.0
@@ -116,6 +116,6 @@ def compare(arguments: Arguments, known: Truth, backend: str) -> tuple[float, fl
 
 
 def _relative(found: Tensor, exact: Tensor) -> float:
-    """|found - exact| / |exact|; where nothing is exact, |found|."""
+    """Compute |found - exact| / |exact|, or |found| where the exact gradient is zero."""
     size = float(exact.norm())
     return float((found - exact).norm()) / (size if size > 0 else 1.0)

@@ -1,4 +1,4 @@
-"""The audit's pictures, by matplotlib."""
+"""Plot the results of the audit by matplotlib."""
 
 import io
 from collections.abc import Callable
@@ -13,11 +13,11 @@ from gsbench.measure.atomic import write_atomically
 from gsbench.stability.audit import Audit
 
 COLORS = {"square_root": "tab:blue", "schur": "tab:red", "cholesky": "tab:orange"}
-LEAST, MOST = 1e-16, 1e3  # errors shown; what is beyond is drawn at the edge
+LEAST, MOST = 1e-16, 1e3  # the range of errors; one beyond it is plotted at the edge
 
 
 @dataclass(frozen=True)
-class Picture:
+class Plot:
     """A plot on the page."""
 
     title: str
@@ -25,38 +25,38 @@ class Picture:
     caption: str
 
 
-BY_CONDITION = Picture(
+BY_CONDITION = Plot(
     "Error against condition number", "condition.png",
     "Relative error of the sliced covariance: 7DGS in float32 by torch, the factor in the paper's order, random "
     "factors whose diagonals go down to 10^-8. Solid: median, dashed: 99th percentile, both on the left axis. "
     "Dotted, on the right axis: share of covariances that are indefinite or not finite.",
 )  # fmt: skip
 BY_TIME = (
-    Picture(
+    Plot(
         "Error against time: slicing", "time_slicing.png",
         "99.9th percentile of the covariance's relative error over 20,000 hard slices, against milliseconds forward "
         "and backward. Lower left is better. The reference is Gram-Schmidt in float64.",
     ),
-    Picture(
+    Plot(
         "Error against time: pictures", "time_picture.png",
         "Largest error of a pixel that no rounding can flip, 1,500 Gaussians at 96 x 96, against milliseconds forward "
         "and backward. The native kernel's exp2 is a polynomial and torch's exp is exact to an ulp: the two cannot be "
         "swapped within a backend, so backends stand for them. Tile bounds and the cut-offs at 1/255 and 1e-4 are "
-        "rules of the picture and cannot be switched off.",
+        "rules of the image and cannot be switched off.",
     ),
 )  # fmt: skip
 
 
-def write(audit: Audit, folder: Path) -> list[Picture]:
-    """Draw everything; return what the page shows."""
+def write(audit: Audit, folder: Path) -> list[Plot]:
+    """Write all plots; return what the page shows."""
     save(folder / BY_CONDITION.file, lambda axes: by_condition(axes, audit))
-    for picture, thing in zip(BY_TIME, ("slicing", "picture"), strict=True):
-        save(folder / picture.file, partial(by_time, audit=audit, thing=thing))
+    for figure, thing in zip(BY_TIME, ("slicing", "picture"), strict=True):
+        save(folder / figure.file, partial(by_time, audit=audit, thing=thing))
     return [BY_CONDITION, *BY_TIME]
 
 
 def save(path: Path, draw: Callable[[Axes], None], size: tuple[float, float] = (7.5, 4.5)) -> None:
-    """Draw on one pair of axes and write it as PNG."""
+    """Plot on one pair of axes and write it as PNG."""
     figure, axes = plt.subplots(figsize=size, layout="constrained")
     draw(axes)
     data = io.BytesIO()
@@ -66,7 +66,7 @@ def save(path: Path, draw: Callable[[Axes], None], size: tuple[float, float] = (
 
 
 def by_condition(axes: Axes, audit: Audit) -> None:
-    """Errors on the left axis, the share of failures on the right."""
+    """Plot errors on the left axis and the share of failures on the right."""
     shares = axes.twinx()
     for curve in audit.conditions:
         color = COLORS[curve.scheme]
@@ -81,14 +81,14 @@ def by_condition(axes: Axes, audit: Audit) -> None:
 
 
 def by_time(axes: Axes, audit: Audit, thing: str) -> None:
-    """A labelled point for each way."""
+    """Plot a labelled point for each way."""
     points = [point for point in audit.accuracy if point.thing == thing]
     points.sort(key=lambda point: point.ms)
     for i, (point, height) in enumerate(zip(points, shown([point.error for point in points]), strict=True)):
         color = next((color for scheme, color in COLORS.items() if scheme in point.way), "tab:blue")
         double = "float64" in point.way
         axes.scatter(point.ms, height, color=color, marker="s" if double else "o")
-        # Labels of neighbours would cover each other: schur's, which is near cholesky's, goes above.
+        # Labels of neighbours would overlap, so that of schur, which is near cholesky, goes above.
         above = "schur" in point.way if thing == "slicing" else i % 2 == 0
         aside = (6, 5 if above else -12)
         axes.annotate(point.way, (point.ms, height), textcoords="offset points", xytext=aside, fontsize=8, color=color)
@@ -100,5 +100,5 @@ def by_time(axes: Axes, audit: Audit, thing: str) -> None:
 
 
 def shown(errors: list[float]) -> list[float]:
-    """Errors within what the axes hold."""
+    """Clamp errors to the range of the axes."""
     return [min(max(error, LEAST), MOST) for error in errors]

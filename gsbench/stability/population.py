@@ -1,7 +1,7 @@
-"""A million random hard slices: what a scheme makes of them, beside Gram and Schmidt's answer in double precision.
+"""Judge a million random hard slices against modified Gram-Schmidt in float64.
 
-mpmath would need weeks for a million Gaussians. The reference here is modified Gram-Schmidt, done twice ("twice is
-enough": Giraud et al. 2005), in float64; `verify` holds it to mpmath's answer on a sample, in every audit.
+mpmath would need weeks for a million Gaussians. Gram-Schmidt is done twice ("twice is enough": Giraud et al. 2005), and
+every audit compares it with mpmath on a sample (`verify`).
 """
 
 from dataclasses import dataclass
@@ -20,30 +20,30 @@ from gsbench.stability import oracle
 from gsbench.stability.cases import device_of
 
 Floats = NDArray[np.float64]
-CHUNK = 50_000  # Gaussians at a time: bounds memory
+CHUNK = 50_000  # Gaussians at a time, which bounds memory
 BELOW = np.tril_indices(7, -1)
-NEVER = -110.0  # log lambda; exp of it is zero in float32, so that every Gaussian is seen whatever its query
+NEVER = -110.0  # log lambda; its exp is zero in float32, so that no Gaussian is culled at any query
 
 
 @dataclass(frozen=True)
 class Hard:
-    """Raw parameters of 7D Gaussians with mu_p = 0, seen from there at t = 0: the query (d, t) is 0 and exact."""
+    """Raw parameters of 7D Gaussians with mu_p = 0, queried from there at t = 0: (d, t) is 0 and exact."""
 
     log_diagonal: Tensor  # [N, 7] float32
-    off_diagonal: Tensor  # [N, 21] the factor's entries themselves, row by row
+    off_diagonal: Tensor  # [N, 21] entries of the factor, row by row
     offset: Tensor  # [N, 4] mu_d, mu_t
 
     def __len__(self) -> int:
         return len(self.offset)
 
     def rows(self, which: slice) -> "Hard":
-        """Some of them."""
+        """Select some of the Gaussians."""
         return Hard(self.log_diagonal[which], self.off_diagonal[which], self.offset[which])
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Of each Gaussian: mean [N, 3], covariance [N, 3, 3], and the gradient of `loss` by the raw parameters."""
+    """The mean [N, 3] and the covariance [N, 3, 3] of each slice, and the gradient of the loss by raw parameters."""
 
     mean: Floats
     cov: Floats
@@ -52,7 +52,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Errors:
-    """Of each Gaussian, relative; NaN and inf are kept."""
+    """The relative errors of each Gaussian; NaN and inf are kept."""
 
     cov: Floats
     gradient: Floats
@@ -60,7 +60,7 @@ class Errors:
 
 
 def draw(generator: torch.Generator, N: int, order: str, decades: Tensor | float = 5.0) -> Hard:
-    """Factors with diagonals 10^-u, u uniform in [0, decades], and normal entries below; queries one sigma away."""
+    """Sample factors with diagonals 10^-u, u uniform in [0, decades], normal entries below, queries a sigma away."""
     u = torch.rand(N, 7, generator=generator, dtype=torch.float64)
     log_diagonal = -(decades * u) * np.log(10.0)
     off_diagonal = torch.randn(N, 21, generator=generator, dtype=torch.float64)
@@ -71,7 +71,7 @@ def draw(generator: torch.Generator, N: int, order: str, decades: Tensor | float
 
 
 def factor(hard: Hard) -> Floats:
-    """The triangular factor in float64, [N, 7, 7]."""
+    """Compute the triangular factor in float64, [N, 7, 7]."""
     L = np.zeros((len(hard), 7, 7))
     L[:, *BELOW] = hard.off_diagonal.double().numpy()
     L[:, range(7), range(7)] = np.exp(hard.log_diagonal.double().numpy())
@@ -79,19 +79,19 @@ def factor(hard: Hard) -> Floats:
 
 
 def conditioned(order: str) -> list[int]:
-    """Rows of d and then t in the triangular factor of an order."""
+    """Return the rows of d and then t in the triangular factor of an order."""
     return [4, 5, 6, 3] if order == "paper" else [0, 1, 2, 3]
 
 
 def weights(N: int) -> tuple[Floats, Floats]:
-    """What the loss weighs means [N, 3] and (symmetric) covariances [N, 3, 3] by."""
+    """Make the weights of means [N, 3] and (symmetric) covariances [N, 3, 3] in the loss."""
     random = np.random.default_rng(1)
     W = random.standard_normal((N, 3, 3))
     return random.standard_normal((N, 3)), W + W.transpose(0, 2, 1)
 
 
 def truth(hard: Hard, order: str) -> Truth:
-    """Means, covariances and the gradient of the loss w . mean / |mean| + <W, cov> / |cov|, in float64."""
+    """Compute means, covariances and the gradient of the loss w . mean / |mean| + <W, cov> / |cov|, in float64."""
     w, W = weights(len(hard))
     chunks = [slice(i, i + CHUNK) for i in range(0, len(hard), CHUNK)]
     parts = [_truth(hard.rows(rows), order, w[rows].T, W[rows].transpose(1, 2, 0)) for rows in chunks]
@@ -99,7 +99,7 @@ def truth(hard: Hard, order: str) -> Truth:
 
 
 def _truth(hard: Hard, order: str, w: Floats, W: Floats) -> tuple[Floats, Floats, Floats]:
-    """The same, with the Gaussians along the last axis of every array."""
+    """Compute `truth` with the Gaussians along the last axis of every array."""
     L, q = np.ascontiguousarray(factor(hard).transpose(1, 2, 0)), conditioned(order)
     p = [i for i in range(7) if i not in q]
     Q, R = gram_schmidt(L[q + p])  # L = R^T Q^T
@@ -118,7 +118,7 @@ def _truth(hard: Hard, order: str, w: Floats, W: Floats) -> tuple[Floats, Floats
 
 
 def gram_schmidt(rows: Floats) -> tuple[Floats, Floats]:
-    """Q, R with rows^T = Q R for rows [n, n, N], each direction taken out twice."""
+    """Compute Q, R with rows^T = Q R for rows [n, n, N], orthogonalising twice."""
     Q, R = np.zeros_like(rows), np.zeros_like(rows)
     for i in range(len(rows)):
         v = rows[i].copy()
@@ -155,7 +155,7 @@ def _solve_upper(T: Floats, B: Floats) -> Floats:
 
 
 def verify(hard: Hard, order: str, count: int = 8) -> float:
-    """The largest relative error of `truth` on the first Gaussians, against mpmath: covariance and gradient."""
+    """Return the largest relative error of `truth` against mpmath on the first Gaussians: covariance and gradient."""
     some = hard.rows(slice(count))
     found = truth(some, order)
     w, W = weights(count)
@@ -197,7 +197,15 @@ def _relative(found: Floats, exact: Floats) -> float:
 
 
 def judge(hard: Hard, known: Truth, order: str, scheme: str, backend: str) -> Errors:
-    """What 7DGS in float32 makes of hard slices."""
+    """Measure the errors of 7DGS in float32 on hard slices.
+
+    Args:
+        hard: the Gaussians.
+        known: their exact slices.
+        order: of the triangular factor.
+        scheme: of slicing.
+        backend: by name.
+    """
     model = all_seen(order, scheme, backend)
     w, W = weights(len(hard))
     parts = [_judge(model, hard, known, w, W, slice(i, i + CHUNK)) for i in range(0, len(hard), CHUNK)]
@@ -206,7 +214,7 @@ def judge(hard: Hard, known: Truth, order: str, scheme: str, backend: str) -> Er
 
 
 def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
-    """A 7DGS that gates nothing away."""
+    """Make a 7DGS in which f_temp and f_dir are 1 everywhere."""
     model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme, off_diagonal="raw",
                   backend=BACKENDS[backend])  # fmt: skip
     assert isinstance(model, TriangularModel)
@@ -240,8 +248,8 @@ def _judge(
 
 @torch.no_grad()
 def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
-    """Whether the covariance a scheme subtracts to has a negative eigenvalue, [N]; F F^T never has one."""
-    scheme: str = model.scheme  # type: ignore[assignment]  # of every model that slices
+    """Tell whether the covariance of a scheme that subtracts has a negative eigenvalue, [N]; F F^T never has one."""
+    scheme: str = model.scheme  # type: ignore[assignment]  # every model that slices has one
     if scheme == "square_root":
         return torch.zeros(len(raw["means"]), dtype=torch.bool)
     cov = subtract(model.factors(raw), scheme)[1].double()  # type: ignore[operator]
@@ -251,7 +259,7 @@ def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
 
 
 def raw_parameters(hard: Hard, model: TriangularModel) -> dict[str, Tensor]:
-    """The raw parameters of a 7DGS made by `all_seen`."""
+    """Make the raw parameters of a 7DGS from `all_seen`."""
     N = len(hard)
     return {"means": torch.zeros(N, 3), "directions": hard.offset[:, :3], "times": hard.offset[:, 3:],
             "log_diagonal": hard.log_diagonal, **model.triangle.split(hard.off_diagonal),

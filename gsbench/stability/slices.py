@@ -1,4 +1,4 @@
-"""Judges slices and colours: what a model in float32 makes of a case, beside the truth in a hundred digits."""
+"""Judge slices of models in float32 against the oracle in mpmath."""
 
 import functools
 import time
@@ -21,14 +21,14 @@ OPTIONS = {
     "6dgs": {"lambda_d": 0.35, "directional_half": False},
     "7dgs": {"lambda_d": 0.35, "lambda_t": 0.35},
 }
-ALPHA_MIN = 1 / 255  # what is fainter is not drawn: its place and shape have no picture
+ALPHA_MIN = 1 / 255  # a fainter Gaussian is culled, so its place and shape do not matter
 SLOW_MS = 500.0
-COPIES = 1024  # of a case's Gaussians, where it is timed
+COPIES = 1024  # of a case's Gaussians, for its timing
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Of the Gaussians of a case: mean, covariance by rows and opacity, and the gradient of the loss."""
+    """The exact mean, covariance (by rows), opacity and gradient of the loss of the Gaussians of a case."""
 
     outputs: Tensor  # [COUNT, 13] float64
     weights: Tensor  # [COUNT, 13]: the loss is their product with the outputs, summed
@@ -37,7 +37,7 @@ class Truth:
 
 
 def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
-    """Every model, scheme and backend."""
+    """Judge every model, scheme and backend."""
     for model in case.subjects:
         observed = case(model=model)
         known = truth(observed)
@@ -47,9 +47,9 @@ def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
 
 
 def truth(observed: Observed) -> Truth:
-    """What mpmath says, and the loss: sums of mean, covariance and opacity, each relative to its own size.
+    """Evaluate mpmath, and choose the loss: a sum of mean, covariance and opacity, each relative to its size.
 
-    What is too faint to be drawn counts by its opacity alone, so that its gradient is zero or next to it.
+    A Gaussian that is too faint to be rendered counts by its opacity alone, so that its gradient is nearly zero.
     """
     outputs, scales, gradients = [], [], []
     weights = torch.randn(COUNT, 13, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -70,7 +70,7 @@ def truth(observed: Observed) -> Truth:
 
 
 def exact(observed: Observed) -> oracle.Function:
-    """The oracle's function of one Gaussian's raw parameters, with every constant as float32 holds it."""
+    """Return the oracle's function of the raw parameters of a Gaussian, with constants rounded to float32."""
     layout = {name: value[0].numel() for name, value in observed.raw.items()}
     log_lambda = {name: _single(value) for name, value in observed.log_lambda.items()}
     if observed.model == "4dgs":
@@ -85,7 +85,7 @@ def exact(observed: Observed) -> oracle.Function:
 
 
 def load(observed: Observed, scheme: str, backend: str, copies: int = 1) -> tuple[GaussianModel, dict[str, Tensor]]:
-    """A model that holds the case's Gaussians, `copies` times."""
+    """Make a model with the Gaussians of a case, `copies` times."""
     model = build(observed.model, scheme=scheme, backend=BACKENDS[backend], **OPTIONS[observed.model])
     for name, value in observed.log_lambda.items():
         model.log_modulation[name] = nn.Parameter(torch.tensor(value))
@@ -97,7 +97,7 @@ def load(observed: Observed, scheme: str, backend: str, copies: int = 1) -> tupl
 def differentiate(
     model: GaussianModel, raw: dict[str, Tensor], observed: Observed, weights: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Outputs [N, 13] and gradients [N, parameters] in float64, computed in float32 where the model's backend is."""
+    """Compute outputs [N, 13] and gradients [N, parameters] in float32 by the model's backend; return float64."""
     device = device_of(model.backend.name)
     moment = torch.tensor(observed.time, device=device) if "time" in model.observes else None
     there = {name: value.to(device) for name, value in raw.items()}
@@ -129,7 +129,7 @@ def _cell(case: Case, observed: Observed, known: Truth, scheme: str, backend: st
 
 
 def worst(errors: Tensor) -> float:
-    """The largest; NaN if any is."""
+    """Return the largest error; NaN if one is not finite."""
     return float(errors.max()) if bool(errors.isfinite().all()) else float("nan")
 
 
@@ -140,7 +140,7 @@ def _milliseconds(observed: Observed, known: Truth, scheme: str, backend: str) -
 
 
 def fastest(call: Callable[[], object], repeats: int = 3) -> float:
-    """Milliseconds of the fastest of a few calls, the machine may be shared; of one, if that takes half a second."""
+    """Time the fastest of a few calls in ms, as the machine may be shared; only one call if it takes half a second."""
     times: list[float] = []
     while len(times) < repeats and (not times or times[0] < SLOW_MS):
         start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Hard slices: raw parameters of a few Gaussians, as training can leave them, and where they are observed from."""
+"""Define hard slices: raw parameters of a few Gaussians, as training can leave them, and their query."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from gsbench.kernels.thresholds import LOG_SIZE_MAX
 from gsbench.models.factors import Triangle
 from gsbench.stability.cases import case
 
-COUNT = 4  # Gaussians a case: their truth takes a hundred evaluations each in a hundred digits
+COUNT = 4  # Gaussians in a case; the truth of each takes about a hundred evaluations in mpmath
 LN_10 = math.log(10)
 TIME_LIKE = ("4dgs", "7dgs")
 TRIANGULAR = ("6dgs", "7dgs")
@@ -19,7 +19,7 @@ ALL = ("4dgs", "6dgs", "7dgs")
 
 @dataclass
 class Observed:
-    """Gaussians of one model, seen from a place at a time."""
+    """Gaussians of one model, with the place and the time of a query."""
 
     model: str
     raw: dict[str, Tensor]  # float32, by the model's own names
@@ -29,12 +29,12 @@ class Observed:
 
 
 def variables(model: str) -> str:
-    """The variable of each row of the default triangular factor, conditioned ones first."""
+    """Return the variable of each row of the default triangular factor, with the conditioned ones first."""
     return "dddtppp" if model == "7dgs" else "dddppp"
 
 
 def ordinary(g: Generator, model: str) -> Observed:
-    """Gaussians as a training starts with them, moved a little: nothing is hard yet, and all can be seen."""
+    """Make Gaussians like those at the start of a training: nothing is hard, and all are visible."""
     means = torch.rand(COUNT, 3, generator=g) * 2 - 1
     center, time = torch.tensor([0.3, -0.2, -4.0]), 0.4
     raw = {"means": means, "opacities": torch.randn(COUNT, generator=g)}
@@ -56,7 +56,7 @@ def ordinary(g: Generator, model: str) -> Observed:
 
 
 def sizes(observed: Observed, variable: str) -> Tensor:
-    """A view on the log sizes of one variable, [COUNT, width], to be written to."""
+    """Return the log sizes of one variable, [COUNT, width], as a view that can be written to."""
     if observed.model == "4dgs":
         return observed.raw["scales"][:, 3:] if variable == "t" else observed.raw["scales"][:, :3]
     rows = [i for i, name in enumerate(variables(observed.model)) if name == variable]
@@ -64,30 +64,30 @@ def sizes(observed: Observed, variable: str) -> Tensor:
 
 
 def below(observed: Observed) -> Tensor:
-    """The parameters below the diagonal, [COUNT, n (n - 1) / 2] row by row."""
+    """Return the parameters below the diagonal, [COUNT, n (n - 1) / 2] row by row."""
     return Triangle(variables(observed.model)).join(observed.raw)
 
 
 def set_below(observed: Observed, values: Tensor) -> None:
-    """Write them."""
+    """Set the parameters below the diagonal."""
     observed.raw |= Triangle(variables(observed.model)).split(values)
 
 
 def upright(observed: Observed) -> None:
-    """Turn a 4D Gaussian so that its last axis is time itself."""
+    """Turn a 4D Gaussian so that its last axis is time."""
     for name in ("left_quats", "right_quats"):
         observed.raw[name][:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
 
 
 def entries(observed: Observed, variable: str) -> list[int]:
-    """Places among the parameters below the diagonal of those in the rows of one variable."""
+    """Return the places of the entries in the rows of one variable among the parameters below the diagonal."""
     rows = [i for i, name in enumerate(variables(observed.model)) if name == variable]
     return [i * (i - 1) // 2 + j for i in rows for j in range(i)]
 
 
 @case("slicing", *ALL)
 def ordinary_gaussians(g: Generator, severity: float, model: str) -> Observed:  # noqa: ARG001
-    """Nothing: what every scheme must get right, the floor that the other rows are read against."""
+    """Nothing is stressed: every scheme must get this right, and the other rows are compared with it."""
     return ordinary(g, model)
 
 

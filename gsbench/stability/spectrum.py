@@ -1,4 +1,4 @@
-"""Condition numbers of the factors in a trained model: how hard the slices are that training really makes."""
+"""Measure the condition numbers of the factors of a trained model."""
 
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,10 @@ PERCENTILES = (50, 90, 99, 99.9, 100)
 
 
 def measure(path: Path) -> dict[str, Floats]:
-    """Condition numbers of the joint factor and of the sliced one, of each Gaussian of a checkpoint, before AGR.
+    """Measure the condition numbers of the joint and the sliced factor of each Gaussian of a checkpoint, before AGR.
 
     Raises:
-        InputError: it is no checkpoint, or of a model that slices nothing.
+        InputError: the file is not a checkpoint, or its model has nothing to slice.
     """
     joint, k = joint_factors(_splats(path), path)
     sliced = reduce(joint).T_pp
@@ -31,9 +31,10 @@ def measure(path: Path) -> dict[str, Floats]:
 
 
 def failures(path: Path) -> dict[str, tuple[float, float]]:
-    """Of each scheme that subtracts, in float32: share of the checkpoint's covariances it makes indefinite, and the
-    99th percentile of their relative error.
-    """  # fmt: skip
+    """Measure the schemes that subtract on the Gaussians of a checkpoint, in float32.
+
+    For each scheme, return the share of covariances that are indefinite and the 99th percentile of relative errors.
+    """
     joint, _ = joint_factors(_splats(path), path)
     exact = reduce(joint).T_pp
     exact = exact @ exact.mT
@@ -51,7 +52,7 @@ def _splats(path: Path) -> dict[str, Tensor]:
 
 
 def joint_factors(splats: dict[str, Tensor], path: Path) -> tuple[Tensor, int]:
-    """Factors [N, 3+k, 3+k] with rows (p, q), and k. Triangular ones are taken as by default, (q, p) and `relative`."""
+    """Compute factors [N, 3+k, 3+k] with rows (p, q), and k, of a model with the default factor order and form."""
     if "log_diagonal" in splats:
         k = splats["log_diagonal"].shape[1] - 3
         L = Triangle("dddtppp" if k == 4 else "dddppp").factor(splats["log_diagonal"], splats)
@@ -63,7 +64,7 @@ def joint_factors(splats: dict[str, Tensor], path: Path) -> tuple[Tensor, int]:
 
 
 def report(found: dict[str, Floats]) -> str:
-    """Percentiles as a table."""
+    """Format percentiles as a table."""
     lines = [f"| condition number of | {' | '.join(f'{p:g} %' for p in PERCENTILES)} |",
              "| --- |" + " ---: |" * len(PERCENTILES)]  # fmt: skip
     for name, values in found.items():
@@ -72,7 +73,7 @@ def report(found: dict[str, Floats]) -> str:
 
 
 def draw(found: dict[str, Floats], folder: Path, title: str) -> Path:
-    """Write a histogram to `folder`; return where."""
+    """Write a histogram to `folder`; return its path."""
 
     def histogram(axes: Axes) -> None:
         most = max(float(values.max()) for values in found.values())

@@ -1,4 +1,4 @@
-"""Hard trainings: tiny scenes under recipes that drive a model where it should not go."""
+"""Define hard trainings: tiny scenes with recipes that drive parameters to extremes."""
 
 import math
 from dataclasses import dataclass, replace
@@ -23,16 +23,16 @@ LONG_STEPS = 2_000
 
 @dataclass
 class Training:
-    """A run to be made: the recipe and the photographs."""
+    """A training to do: its recipe and its scene."""
 
     model: str
     config: Config
     scene: Scene
-    refused: bool = False  # it must be refused at the door, rather than end well
+    refused: bool = False  # it must be refused before the first step
 
 
 def compose(model: str, steps: int, *overrides: str) -> Config:
-    """The config of `+exp=mini` with few steps; its scene is not loaded."""
+    """Compose the config of `+exp=mini` with few steps; its scene is not loaded."""
     register_schema()
     names = ["+exp=mini", "scene=moving-matte", f"model={model}", f"train.iterations={steps}",
              "train.densify.every=25", *overrides]  # fmt: skip
@@ -46,7 +46,7 @@ def compose(model: str, steps: int, *overrides: str) -> Config:
 
 
 def moving_square(views: int = VIEWS, dtype: torch.dtype = torch.float32) -> Scene:
-    """A white square on black that moves with time, seen from cameras on a circle around it."""
+    """Make a scene of a white square on black that moves with time, and cameras on a circle around it."""
     made = []
     for i in range(views):
         moment, angle = i / max(1, views - 1), 2 * math.pi * i / views
@@ -60,7 +60,7 @@ def moving_square(views: int = VIEWS, dtype: torch.dtype = torch.float32) -> Sce
 
 
 def camera_on_circle(angle: float, dtype: torch.dtype) -> Camera:
-    """Four units from the origin, looking at it."""
+    """Make a camera that is four units from the origin and looks at it."""
     c, s = math.cos(angle), math.sin(angle)
     viewmat = torch.eye(4, dtype=dtype)
     viewmat[:3, :3] = torch.tensor([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
@@ -71,7 +71,7 @@ def camera_on_circle(angle: float, dtype: torch.dtype) -> Camera:
 
 
 def faster(config: Config, factor: float) -> Config:
-    """The same recipe with every learning rate `factor` times as high."""
+    """Multiply every learning rate of a recipe by `factor`."""
     for rate in config.model.lr.values():
         rate.start *= factor
         rate.end = rate.end if rate.end is None else rate.end * factor
@@ -86,7 +86,7 @@ def learning_rates_times_30(g: Generator, severity: float, model: str, steps: in
 
 @case("training", *MODELS, forward=0.0, gradient=math.nan)
 def one_frame(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """A data set of one photograph: depth, time and direction are all free, and the cameras' extent is zero."""
+    """A data set of one image: depth, time and direction are all free, and the cameras' extent is zero."""
     scene = moving_square()
     views = scene.train[: max(1, round(VIEWS * (1 - severity)))]
     return Training(model, compose(model, STEPS), replace(scene, train=views, extent=4.4 * (1 - severity)))
@@ -94,7 +94,7 @@ def one_frame(g: Generator, severity: float, model: str) -> Training:  # noqa: A
 
 @case("training", *MODELS, forward=0.0, gradient=math.nan)
 def all_images_equal(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """Every photograph is black: nothing to show, so opacities sink and all Gaussians may be pruned."""
+    """Every image is black: there is nothing to show, so opacities sink and all Gaussians may be pruned."""
     scene = moving_square()
     views = [replace(view, image=view.image * (1 - severity)) for view in scene.train]
     return Training(model, compose(model, STEPS), replace(scene, train=views))
@@ -130,7 +130,7 @@ def modulation_switched_on(g: Generator, severity: float, model: str) -> Trainin
 
 @case("training", "3dgs", forward=0.0, gradient=math.nan)
 def poisoned_photograph(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """One pixel of one photograph is NaN: it must be refused at the door, not found in every parameter later."""
+    """One pixel of an image is NaN: it must be refused before step 0, not found in every parameter later."""
     scene = moving_square()
     scene.train[3].image[2, 5, 1] = math.nan
     return Training(model, compose(model, STEPS), scene, refused=True)
@@ -138,7 +138,7 @@ def poisoned_photograph(g: Generator, severity: float, model: str) -> Training: 
 
 @case("drift", "7dgs", forward=1.0, gradient=math.nan)
 def single_against_double(g: Generator, severity: float, model: str, run_seed: int = 0) -> Training:  # noqa: ARG001
-    """500 steps of one seed in float32 and in float64, whose rounding decides who is split; the error is in dB."""
+    """500 steps of a seed in float32 and float64, whose rounding decides which Gaussians split; the error is in dB."""
     scene = moving_square()
     assert scene.points is not None
     half = Points(scene.points.means[::2], scene.points.colors[::2])

@@ -1,4 +1,4 @@
-"""Judges trainings: whether they end well, with finite numbers everywhere, and how far float32 drifts from float64."""
+"""Judge trainings: whether they end well and finite, and how far float32 drifts from float64."""
 
 import contextlib
 import io
@@ -22,7 +22,7 @@ from gsbench.train.watch import DivergedError
 
 
 def judge(case: Case, backend: str, **more: Any) -> Iterator[Cell]:
-    """One cell a model: error 0 for a run that ends as it should, else 1."""
+    """Yield a cell for each model: error 0 for a training that ends as it should, else 1."""
     for name in case.subjects:
         training: Training = case(model=name, **more)
         start, end, bad, note = time.perf_counter(), 1.0, 1.0, ""
@@ -42,7 +42,7 @@ def judge(case: Case, backend: str, **more: Any) -> Iterator[Cell]:
 
 
 def drift(case: Case, backend: str) -> Iterator[Cell]:
-    """PSNR of a float32 training less that of the same one in float64, which only the reference has."""
+    """Compare the PSNR of a training in float32 with that of the same training in float64 by the reference."""
     for name in case.subjects:
         training: Training = case(model=name)
         exact = psnr(fit(replace(training, scene=double(training.scene)), "reference"))
@@ -59,7 +59,7 @@ def fit(training: Training, backend: str) -> Trainer:
     """Train to the end, in the precision of the scene's images.
 
     Raises:
-        DivergedError: a number was not finite; it says where.
+        DivergedError: a number was not finite; the message says where.
         InputError: the data was refused.
     """
     config, scene = training.config, training.scene
@@ -82,18 +82,18 @@ def fit(training: Training, backend: str) -> Trainer:
 
 
 def psnr(trainer: Trainer) -> float:
-    """Mean over the training views, dB."""
+    """Measure the mean PSNR over the training views, dB."""
     return trainer.psnr(trainer.scene.train)
 
 
 def share_not_finite(model: GaussianModel) -> float:
-    """Of all parameters, networks and lambdas included."""
+    """Return the share of all parameters, with networks and lambdas, that are not finite."""
     values = torch.cat([p.detach().flatten() for p in model.parameters()])
     return float((~values.isfinite()).double().mean()) if values.numel() else 0.0
 
 
 def double(scene: Scene) -> Scene:
-    """The scene in float64; its points stay, so that both trainings start from the same numbers."""
+    """Convert a scene to float64, except its points, so that both trainings start from the same numbers."""
 
     def view(seen: View) -> View:
         camera = Camera(seen.camera.viewmat.double(), seen.camera.K.double(), seen.camera.width, seen.camera.height)
