@@ -105,7 +105,7 @@ def allocate(what: str, like: Tensor, shape: tuple[int, ...], dtype: torch.dtype
         size = dtype.itemsize * functools.reduce(lambda a, b: a * b, shape, 1)
         reason = " ".join(str(error).split())
         raise torch.OutOfMemoryError(
-            f"{what} need {size / 2**20:.1f} MiB on {like.device}: lower the picture's size, the cameras drawn at once "
+            f"{what} need {size / 2**20:.1f} MiB on {like.device}: lower the image's size, the cameras drawn at once "
             f"or the number of Gaussians ({reason:.160})"
         ) from None
 

@@ -14,7 +14,7 @@ def require(size: int, what: str) -> None:
     free = available()
     if free is not None and size > free:
         raise TooLargeError(f"{what} need {size / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are available: "
-                            "use a smaller picture, fewer cameras at once or fewer Gaussians")  # fmt: skip
+                            "use a smaller image, fewer cameras at once or fewer Gaussians")  # fmt: skip
 
 
 def available() -> int | None:

@@ -32,7 +32,7 @@ def rasterize(
     backend: str | Backend = "auto",
     antialias: bool = False,
 ) -> RasterOutput:
-    """Splat N Gaussians into C pictures by 3DGS' rules (Kerbl et al. 2023, section 4 and appendix C).
+    """Splat N Gaussians into C images by 3DGS' rules (Kerbl et al. 2023, section 4 and appendix C).
 
     The covariance of a Gaussian is F F^T for any square `factors` F, so it is semi-definite by construction.
     Blending is front to back in order of camera depth (ties: lower index first); a Gaussian adds
@@ -46,8 +46,8 @@ def rasterize(
         colors: any number D of channels, one set for all cameras or one a camera.
         viewmats: world to camera, rigid, OpenCV axes (x right, y down, z forward).
         Ks: intrinsics [fx 0 cx; 0 fy cy; 0 0 1] in pixels; the first pixel's centre is (0.5, 0.5).
-        width: of the picture, pixels.
-        height: of the picture, pixels.
+        width: of the image, pixels.
+        height: of the image, pixels.
         background: colour behind everything; None is black.
         near: Gaussians whose mean is nearer than this are not drawn.
         far: nor are those farther than this.

@@ -42,7 +42,7 @@ def check_arguments(
     if D < 1 or C < 1:
         raise InputError(f"colors, viewmats: expected at least one channel and one camera, got D={D}, C={C}")
     if not all(isinstance(size, int) and size >= 1 for size in (width, height)):
-        raise InputError(f"expected a picture of at least 1x1 whole pixels, got width={width}, height={height}")
+        raise InputError(f"expected an image of at least 1x1 whole pixels, got width={width}, height={height}")
     if not 0 < near < far or not 0 <= eps2d < math.inf:
         raise InputError(f"expected 0 < near < far and eps2d >= 0, got near={near}, far={far}, eps2d={eps2d}")
     _last = call

@@ -7,7 +7,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class RasterInfo:
-    """What the rasterizer knows beside the picture."""
+    """What the rasterizer knows beside the image."""
 
     radii: Tensor  # [C, N] int32, pixels: half the side of the square that holds every pixel drawn; 0: not drawn
     means2d: Tensor  # [C, N, 2] pixels, in the autograd graph: its gradient drives densification
@@ -17,7 +17,7 @@ class RasterInfo:
 
 @dataclass(frozen=True)
 class RasterOutput:
-    """A picture, how much of it is covered, and `RasterInfo`."""
+    """An image, how much of it is covered, and `RasterInfo`."""
 
     image: Tensor  # [C, H, W, D]
     alpha: Tensor  # [C, H, W, 1]

@@ -37,7 +37,7 @@ def draw(
     splats = [
         project(means, factors, opacities, viewmat, K, *viewport) for viewmat, K in zip(viewmats, Ks, strict=True)
     ]
-    means2d = torch.stack([s.means2d for s in splats])  # every picture is drawn from it, so it has a gradient
+    means2d = torch.stack([s.means2d for s in splats])  # every image is made from it, so it has a gradient
     images, alphas, pairs = [], [], 0
     for splat, mean2d, color in zip(splats, means2d, colors, strict=True):
         tiles, gaussians = bin_tiles(splat, viewport.width, viewport.height)
@@ -76,7 +76,7 @@ def project(
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
 
-    # The Jacobian is taken no farther than 15 % of the picture's width outside of it (3DGS, forward.cu), where the
+    # The Jacobian is taken no farther than 15 % of the image's width outside of it (3DGS, forward.cu), where the
     # affine approximation would blow up.
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
     u = (x / z).clamp(-cx / fx - margin_x, (width - cx) / fx + margin_x)
@@ -97,7 +97,7 @@ def project(
     drawn = drawn & (det > 0)
     det = torch.where(drawn, det, 1.0)
     # Factored (x given y, then y), power = |U d|^2 / 2 is a sum of squares. Multiplied out it would cancel: along a
-    # needle 400 pixels long, pictures in float32 were off by 2e-3.
+    # needle 400 pixels long, images in float32 were off by 2e-3.
     yy = torch.where(drawn, yy + eps, 1.0)
     conics = torch.stack([yy, -xy, det.sqrt()], -1) / (yy * det).sqrt()[:, None] / size[:, None]
     if antialias:

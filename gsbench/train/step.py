@@ -26,7 +26,7 @@ Sums = dict[int, Tensor]  # gradients by the id of what they are by
 
 
 class Seen(NamedTuple):
-    """What a step leaves of one view."""
+    """What a step learns from one view."""
 
     loss: Tensor  # []
     radii: Tensor  # [1, N] int32, pixels
@@ -34,7 +34,7 @@ class Seen(NamedTuple):
 
 
 class Step:
-    """Sees views and leaves the gradient of their mean loss in the model's parameters."""
+    """See views, and leave the gradient of their mean loss in the model's parameters."""
 
     def __init__(
         self, model: GaussianModel, background: Tensor, ssim_weight: float, antialias: bool, stages: StageClock
@@ -91,7 +91,7 @@ class Step:
         return seen
 
     def _see(self, view: View, sources: list[nn.Parameter], sums: Sums, views: int, stages: StageClock) -> Seen:
-        """One view of a batch, whose gradients are added to `sums`."""
+        """See one view of a batch; its gradients are added to `sums`."""
         with Tape() as tape:
             with stages("slice"):
                 gaussians = self.model.slice(Query.of(view.camera, view.time))
@@ -117,7 +117,7 @@ class Step:
 
 @functools.cache
 def _pool(lanes: int, threads: int) -> ThreadPoolExecutor:
-    """So many lanes, whose kernels and torch operations run on `threads` threads each."""
+    """Start lanes whose kernels and torch operations run on `threads` threads each."""
     before = torch.get_num_threads()
     pool = ThreadPoolExecutor(lanes, "gsbench-view", lambda: torch.set_num_threads(threads))
     # A lane is started by each call that finds none idle, and setting its own number sets that of threads to come.

@@ -198,7 +198,7 @@ def test_out_of_memory_names_the_buffer_and_the_process_lives_on(
     for k in range(1, asked + 1):
         with pytest.raises(torch.OutOfMemoryError) as error:
             run(refused=k)
-        said = re.fullmatch("(.+) need [0-9.]+ MiB on .+: lower the picture's size.+", str(error.value))
+        said = re.fullmatch("(.+) need [0-9.]+ MiB on .+: lower the image's size.+", str(error.value))
         assert said, str(error.value)
         buffers.add(said[1])
     assert buffers >= {"projected Gaussians", "lists of each tile's Gaussians", "images", "gradients",
