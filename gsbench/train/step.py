@@ -24,6 +24,11 @@ from gsbench.train.watch import DivergedError
 
 Sums = dict[int, Tensor]  # gradients by the id of what they are by
 
+# A view of fewer Gaussians, with what its pixels cost in Gaussians, is done before two threads have taken turns at
+# Python's lock: on two cores a step of 1,000 Gaussians at 80 x 80 took twice as long by two lanes as by one.
+WORTH_A_LANE = 4_000
+PIXELS_OF_A_GAUSSIAN = 12
+
 
 class Seen(NamedTuple):
     """What a step learns from one view."""
@@ -55,21 +60,26 @@ class Step:
         """
         sources = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
         # Only the kernels' time is worth threads of Python's, and a GPU does one thing after the other anyway.
-        place = self.model.splats["means"]
-        on_cpu = place.device.type == "cpu" and self.model.backend.serves(place)
-        lanes = min(len(views), torch.get_num_threads()) if on_cpu else 1
+        place, threads = self.model.splats["means"], torch.get_num_threads()
         total: Sums = {}
-        if lanes == 1:
+        if threads == 1 or place.device.type != "cpu" or not self.model.backend.serves(place):
             seen = [self._see(view, sources, total, len(views), self.stages) for view in views]
         else:
-            seen = self._side_by_side(views, sources, total, lanes)
+            camera = views[0].camera
+            is_small = len(self.model) + camera.width * camera.height / PIXELS_OF_A_GAUSSIAN < WORTH_A_LANE
+            seen = self._side_by_side(views, sources, total, 1 if is_small else min(len(views), threads), is_small)
         with self.stages("backward"):
             for parameter in sources:
                 parameter.grad = total.get(id(parameter))
         return seen
 
-    def _side_by_side(self, views: Sequence[View], sources: list[nn.Parameter], total: Sums, lanes: int) -> list[Seen]:
-        """Deal the views to threads: those of the first lane go into `total`, each other into sums of its own."""
+    def _side_by_side(
+        self, views: Sequence[View], sources: list[nn.Parameter], total: Sums, lanes: int, is_small: bool
+    ) -> list[Seen]:
+        """Deal the views to threads: those of the first lane go into `total`, each other into sums of its own.
+
+        Where a scene is small its kernels run on one thread, too: to wake another one takes as long as they do.
+        """
         started = time.perf_counter()
         bounds = [len(views) * lane // lanes for lane in range(lanes + 1)]
         sums = [total if i < bounds[1] else {} for i in range(len(views))]
@@ -79,7 +89,7 @@ class Step:
             return [self._see(views[i], sources, sums[i], len(views), clocks[lane])
                     for i in range(bounds[lane], bounds[lane + 1])]  # fmt: skip
 
-        pool = _pool(lanes, max(1, torch.get_num_threads() // lanes))
+        pool = _pool(lanes, 1 if is_small else max(1, torch.get_num_threads() // lanes))
         seen = [one for part in pool.map(run, range(lanes)) for one in part]
         for own in sums[bounds[1] :]:
             for key, gradient in own.items():

@@ -16,6 +16,7 @@ from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes.scene import Camera, View
+from gsbench.train import step
 from gsbench.train.step import Step
 
 BACKGROUND = torch.tensor([0.1, 0.5, 0.9])
@@ -75,9 +76,11 @@ def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool) -> None:
 
 
 @pytest.mark.usefixtures("threads", "instruction_set")
+@pytest.mark.parametrize("worth", [0, step.WORTH_A_LANE])
 @pytest.mark.parametrize("name", ["4dgs", "7dgs"])
-def test_the_same_bits_for_any_number_of_threads(name: str) -> None:
-    """Catches views whose gradients are added in the order that threads come by."""
+def test_the_same_bits_for_any_number_of_threads(name: str, worth: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches views whose gradients are added in the order that threads come by, of large scenes and of small ones."""
+    monkeypatch.setattr(step, "WORTH_A_LANE", worth)
     made, batch = fitted(name, agr=True), views(5)
     found = []
     for count in (1, 2, 3, 8):
