@@ -23,7 +23,7 @@ from gsbench.train.density import DensityControl
 from gsbench.train.floor import Floor
 from gsbench.train.optim import Optimizer
 from gsbench.train.schedule import Schedule, batch, generator
-from gsbench.train.step import Step
+from gsbench.train.step import Step, fitting_threads
 from gsbench.train.watch import DivergedError, Watch
 
 
@@ -86,7 +86,9 @@ class Trainer:
             total=train.iterations, initial=self.step, desc=label, unit="it", mininterval=every, maxinterval=every
         ) as bar:
             while self.step < train.iterations:
-                self._descend()
+                camera = self.scene.train[0].camera
+                with fitting_threads(len(self.model), camera.width * camera.height):
+                    self._descend()
                 if self.schedule.measures(self.step):
                     self._measure()
                 self.step += 1

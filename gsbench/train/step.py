@@ -6,8 +6,9 @@ gradient is added in the order of the views, so that any number of threads gives
 
 import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
@@ -24,10 +25,22 @@ from gsbench.train.watch import DivergedError
 
 Sums = dict[int, Tensor]  # gradients by the id of what they are by
 
-# A view of fewer Gaussians, with what its pixels cost in Gaussians, is done before two threads have taken turns at
-# Python's lock: on two cores a step of 1,000 Gaussians at 80 x 80 took twice as long by two lanes as by one.
-WORTH_A_LANE = 4_000
+# A view of fewer Gaussians, with what its pixels cost in Gaussians, is done before a second thread is awake: on two
+# cores a step of 1,000 Gaussians at 80 x 80 took twice as long by two threads as by one.
+WORTH_A_THREAD = 4_000
 PIXELS_OF_A_GAUSSIAN = 12
+
+
+@contextmanager
+def fitting_threads(gaussians: int, pixels: int) -> Iterator[None]:
+    """Run a step on one thread where a view has too little work for two; the results are the same bits."""
+    threads = torch.get_num_threads()
+    if gaussians + pixels / PIXELS_OF_A_GAUSSIAN < WORTH_A_THREAD:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 class Seen(NamedTuple):
@@ -65,21 +78,14 @@ class Step:
         if threads == 1 or place.device.type != "cpu" or not self.model.backend.serves(place):
             seen = [self._see(view, sources, total, len(views), self.stages) for view in views]
         else:
-            camera = views[0].camera
-            is_small = len(self.model) + camera.width * camera.height / PIXELS_OF_A_GAUSSIAN < WORTH_A_LANE
-            seen = self._side_by_side(views, sources, total, 1 if is_small else min(len(views), threads), is_small)
+            seen = self._side_by_side(views, sources, total, min(len(views), threads))
         with self.stages("backward"):
             for parameter in sources:
                 parameter.grad = total.get(id(parameter))
         return seen
 
-    def _side_by_side(
-        self, views: Sequence[View], sources: list[nn.Parameter], total: Sums, lanes: int, is_small: bool
-    ) -> list[Seen]:
-        """Deal the views to threads: those of the first lane go into `total`, each other into sums of its own.
-
-        Where a scene is small its kernels run on one thread, too: to wake another one takes as long as they do.
-        """
+    def _side_by_side(self, views: Sequence[View], sources: list[nn.Parameter], total: Sums, lanes: int) -> list[Seen]:
+        """Deal the views to threads: those of the first lane go into `total`, each other into sums of its own."""
         started = time.perf_counter()
         bounds = [len(views) * lane // lanes for lane in range(lanes + 1)]
         sums = [total if i < bounds[1] else {} for i in range(len(views))]
@@ -89,7 +95,7 @@ class Step:
             return [self._see(views[i], sources, sums[i], len(views), clocks[lane])
                     for i in range(bounds[lane], bounds[lane + 1])]  # fmt: skip
 
-        pool = _pool(lanes, 1 if is_small else max(1, torch.get_num_threads() // lanes))
+        pool = _pool(lanes, max(1, torch.get_num_threads() // lanes))
         seen = [one for part in pool.map(run, range(lanes)) for one in part]
         for own in sums[bounds[1] :]:
             for key, gradient in own.items():

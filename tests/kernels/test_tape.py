@@ -16,8 +16,7 @@ from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes.scene import Camera, View
-from gsbench.train import step
-from gsbench.train.step import Step
+from gsbench.train.step import Step, fitting_threads
 
 BACKGROUND = torch.tensor([0.1, 0.5, 0.9])
 
@@ -76,11 +75,9 @@ def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool) -> None:
 
 
 @pytest.mark.usefixtures("threads", "instruction_set")
-@pytest.mark.parametrize("worth", [0, step.WORTH_A_LANE])
 @pytest.mark.parametrize("name", ["4dgs", "7dgs"])
-def test_the_same_bits_for_any_number_of_threads(name: str, worth: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches views whose gradients are added in the order that threads come by, of large scenes and of small ones."""
-    monkeypatch.setattr(step, "WORTH_A_LANE", worth)
+def test_the_same_bits_for_any_number_of_threads(name: str) -> None:
+    """Catches views whose gradients are added in the order that threads come by."""
     made, batch = fitted(name, agr=True), views(5)
     found = []
     for count in (1, 2, 3, 8):
@@ -92,6 +89,27 @@ def test_the_same_bits_for_any_number_of_threads(name: str, worth: int, monkeypa
         assert all(torch.equal(x, other[0][key]) for key, x in found[0][0].items())
         assert torch.equal(other[1], found[0][1])
         assert all(torch.equal(a, b) for a, b in zip(other[2], found[0][2], strict=True))
+
+
+@pytest.mark.usefixtures("threads")
+def test_small_scenes_are_trained_on_one_thread() -> None:
+    """Catches a number of threads that is not put back, also where a step fails, and large scenes held to one."""
+    torch.set_num_threads(3)
+    with fitting_threads(10_000, 80 * 80):
+        assert torch.get_num_threads() == 3
+    with fitting_threads(100, 400 * 400):
+        assert torch.get_num_threads() == 3
+    with fitting_threads(1_000, 80 * 80):
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 3
+
+    def fail() -> None:
+        with fitting_threads(1_000, 80 * 80):
+            raise ValueError
+
+    with pytest.raises(ValueError):  # noqa: PT011
+        fail()
+    assert torch.get_num_threads() == 3
 
 
 def test_what_torch_does_in_between_is_differentiated_too() -> None:
