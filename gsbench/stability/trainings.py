@@ -72,7 +72,6 @@ def fit(training: Training, backend: str) -> Trainer:
     model.to(config.device, dtype)
     scene = scene.to(config.device)
     trainer = Trainer(model, scene, scene.train, config)
-    trainer.background = trainer.background.to(dtype)
     with contextlib.redirect_stderr(io.StringIO()):  # one progress bar is enough
         try:
             trainer.run(lambda _: None, training.model)

@@ -59,7 +59,7 @@ class Trainer:
         self.scene = scene
         self.views = views
         self.config = config
-        self.background = torch.tensor(scene.background, device=config.device)
+        self.background = scene.train[0].image.new_tensor(scene.background)
         self.schedule = Schedule(train, config.model.sh_degree, config.agr)
         self.optimizer = Optimizer(model, config.model, train, scene.extent, config.optim)
         self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity, len(scene.train))

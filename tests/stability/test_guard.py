@@ -22,6 +22,7 @@ from gsbench.stability import (
     slicing_cases,  # noqa: F401
     spectrum,
     training_cases,
+    trainings,
 )
 from gsbench.stability.cases import CASES
 from gsbench.train import checkpoint, diagnosis
@@ -138,3 +139,12 @@ def test_spectrum_of_what_is_no_checkpoint(tmp_path: Path, capsys: pytest.Captur
     checkpoint.save(path, "config", "data", {"model": trainer("3dgs").model.state_dict()})
     with pytest.raises(InputError, match="4dgs, 6dgs or 7dgs"):
         spectrum.measure(path)
+
+
+def test_a_scene_in_float64_is_trained_in_float64() -> None:
+    """Catches a tensor of the trainer that stays float32: the audit's drift is measured against such a training."""
+    scene = trainings.double(training_cases.moving_square())
+    training = training_cases.Training("3dgs", training_cases.compose("3dgs", 2), scene)
+    fitted = trainings.fit(training, "reference")
+    assert all(p.dtype == torch.float64 for p in fitted.model.parameters())
+    assert math.isfinite(trainings.psnr(fitted))
