@@ -126,12 +126,7 @@ class Operation:
 
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
         """`forward`, and what backward can use again: sizes, numbers, and the inputs' memory in `rows`."""
-        slots = self.match(tensors, numbers).copy()
-        like = tensors[0]
-        rows = slots["rows"] = in_rows(tensors)
-        for key, x in zip(self.inputs, rows, strict=True):
-            slots[key] = x.data_ptr()
-        outputs = []
+        slots, like, outputs = self._slots_of(tensors, numbers), tensors[0], []
         for key, shape in self._out:
             outputs.append(allocate(self._memory, like, tuple([slots[x] if isinstance(x, str) else x for x in shape])))
             slots[key] = outputs[-1].data_ptr()
@@ -140,10 +135,16 @@ class Operation:
 
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
         """The slots that `run` returned, of what autograd has kept."""
+        slots = self._slots_of(tensors, numbers)
+        slots.update({key: x.data_ptr() for (key, _), x in zip(self._out, outputs, strict=True)})
+        return slots
+
+    def _slots_of(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
+        """Sizes, numbers and the addresses of the inputs, whose memory `rows` keeps alive."""
         slots = self.match(tensors, numbers).copy()
         rows = slots["rows"] = in_rows(tensors)
-        slots.update({key: x.data_ptr() for key, x in zip(self.inputs, rows, strict=True)})
-        slots.update({key: x.data_ptr() for (key, _), x in zip(self._out, outputs, strict=True)})
+        for key, x in zip(self.inputs, rows, strict=True):
+            slots[key] = x.data_ptr()
         return slots
 
     def backward(
@@ -222,8 +223,8 @@ class Operation:
             if not own:
                 continue
             actual, expected = list(x.shape), list(shape)
-            if str(expected[:1]).startswith("['?"):  # a first size that may be left out
-                expected = expected[1:] if len(actual) < len(expected) else [str(expected[0])[1:], *expected[1:]]
+            if expected and isinstance(first := expected[0], str) and first.startswith("?"):  # it may be left out
+                expected = expected[1:] if len(actual) < len(expected) else [first[1:], *expected[1:]]
             good = len(actual) == len(expected)
             for size, found in zip(expected, actual, strict=False):
                 good = good and found == (slots.setdefault(size, found) if isinstance(size, str) else size)

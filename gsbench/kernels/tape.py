@@ -27,6 +27,14 @@ def current() -> Tape | None:
     return getattr(_in_charge, "tape", None)
 
 
+def add_to(sums: dict[int, Tensor], key: int, gradient: Tensor) -> None:
+    """Add a gradient to the sum of a key, in place; the first one becomes the sum."""
+    if key in sums:
+        sums[key] += gradient
+    else:
+        sums[key] = gradient
+
+
 class _Note(NamedTuple):
     operation: Operation
     tensors: list[Tensor]
@@ -130,9 +138,5 @@ class _Gradients:
         """Add what was found by each source."""
         for key in self.sources:
             gradient = self.found.get(key)
-            if gradient is None:
-                continue
-            if key in self.sums:
-                self.sums[key] += gradient
-            else:
-                self.sums[key] = gradient
+            if gradient is not None:
+                add_to(self.sums, key, gradient)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from gsbench.errors import InputError, TooLargeError
-from gsbench.kernels.tape import Tape
+from gsbench.kernels.tape import Tape, add_to
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
@@ -99,10 +99,7 @@ class Step:
         seen = [one for part in pool.map(run, range(lanes)) for one in part]
         for own in sums[bounds[1] :]:
             for key, gradient in own.items():
-                if key in total:
-                    total[key] += gradient
-                else:
-                    total[key] = gradient
+                add_to(total, key, gradient)
         self.stages.share([clock.seconds for clock in clocks], time.perf_counter() - started)
         return seen
 
