@@ -1,6 +1,7 @@
-"""Compose a config from the command line and do a run for each of its scenes, without torch until the first starts."""
+"""Compose configs from the command line and do their runs, without torch until the first one starts."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -12,13 +13,15 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError, did_you_mean
+from gsbench.run.stop import Stopped, stop_at_once
+from gsbench.sweep.axes import expand
 
 _failures: list[str] = []  # one line for each run that did not end well; a Hydra sweep goes on after it
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def entry(composed: DictConfig) -> None:
-    """Do a run for every scene that the config names; a run that fails does not stop the others."""
+    """Do one run of the sweep; one that fails does not stop the others."""
     if OmegaConf.is_missing(composed, "experiment"):
         raise InputError(f"no experiment was chosen: add +exp=NAME. Valid: {', '.join(_group('exp'))}.")
     if composed.experiment == "stability":  # the only experiment that trains no model on a scene
@@ -34,40 +37,37 @@ def entry(composed: DictConfig) -> None:
                          f"Published at: {composed.data.published}")  # fmt: skip
     from gsbench.run.run import run  # imports torch
 
-    for one in _one_scene_each(composed):
-        try:
-            record = run(one)
-            problem = None if record.status == "ok" else f"{record.status}: {record.reason}"
-        except InputError as error:
-            problem = str(error)
-        if problem:
-            _failures.append(problem)
-            print(f"gsbench: error: {one.scene.name}: {problem}", file=sys.stderr)
+    chosen = HydraConfig.get()
+    try:
+        record = run(composed, chosen.runtime.choices, chosen.overrides.task)
+        problem = None if record is None or record.status == "ok" else f"{record.status}: {record.reason}"
+    except InputError as error:
+        problem = str(error)
+    if problem:
+        _failures.append(problem)
+        print(f"gsbench: error: {composed.scene.name}: {problem}", file=sys.stderr)
 
 
 def main() -> None:
     """Run the commands `python -m gsbench` and `gsbench`; print an error as one line instead of a stack trace."""
     register_schema()
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and they are explained in one line below
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(errors="replace")  # type: ignore[union-attr]  # a terminal in ASCII shows ? for other letters
+    signal.signal(signal.SIGTERM, stop_at_once)
     try:
+        sys.argv[1:] = expand(sys.argv[1:])
         entry()
     except InputError as error:
         sys.exit(f"gsbench: error: {error}")
     except (HydraException, OmegaConfBaseException) as error:
         sys.exit(f"gsbench: error: {_explain(error)}")
+    except OSError as error:  # of Hydra's own files; a run's errors end in its record
+        sys.exit(f"gsbench: error: {error.filename}: {error.strerror}")
+    except (Stopped, KeyboardInterrupt) as stopped:
+        print(f"gsbench: {str(stopped) or 'stopped by SIGINT'}", file=sys.stderr)
+        sys.exit(stopped.code if isinstance(stopped, Stopped) else 128 + signal.SIGINT)
     sys.exit(1 if _failures else 0)
-
-
-def _one_scene_each(composed: DictConfig) -> list[DictConfig]:
-    """Return the config, or for scene=all one config for each scene, composed as if that scene was named."""
-    if composed.scene.name != "all":
-        return [composed]
-    overrides = [o for o in HydraConfig.get().overrides.task if not o.startswith("scene=")]
-    known = _group("scene")
-    return [
-        hydra.compose("config", [*overrides, *([f"scene={x}"] if x in known else ["scene=custom", f"scene.name={x}"])])
-        for x in composed.data.scenes
-    ]
 
 
 def _group(name: str) -> list[str]:

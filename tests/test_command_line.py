@@ -59,7 +59,11 @@ def test_what_is_typed_wrong_is_told_in_one_line(arguments: list[str], expected:
     assert "Traceback" not in done.stderr
     for part in expected:
         assert part in errors[0]
-    assert not list(tmp_path.rglob("record.json"))
+    for path in record.find(tmp_path):  # a run that has a name leaves a row that says why it was refused
+        one = record.read(path)
+        assert (one.status, one.metrics) == ("failed", None)
+        assert one.reason is not None
+        assert one.reason in done.stderr
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +76,7 @@ def test_a_sweep_writes_a_record_a_run_and_keeps_what_is_finished(square: Path, 
     sweep = ["-m", *overrides(square, tmp_path), "model=4dgs,3dgs", "agr=true,false"]
     first = gsbench(*sweep)
     assert first.returncode == 0, first.stderr
-    found = {p.parent.parent.name: record.read(p) for p in record.find(tmp_path)}
+    found = {one.model: one for one in map(record.read, record.find(tmp_path))}
     assert set(found) == {"3dgs", "3dgs_agr", "4dgs", "4dgs_agr"}
     for label, one in found.items():
         assert one.status == "ok"
@@ -83,7 +87,8 @@ def test_a_sweep_writes_a_record_a_run_and_keeps_what_is_finished(square: Path, 
         assert len(one.curve) == 2
         assert one.metrics["psnr"] is not None
         assert set(one.cost.stage_s) >= {"slice", "raster", "loss", "backward", "optimizer"}
-        assert (tmp_path / "dnerf" / "square" / label / "seed0" / "pictures.png").is_file()
+        (pictures,) = (tmp_path / "dnerf" / "square").glob(f"{label},*/seed0/pictures.png")
+        assert pictures.is_file()
     written = {p: p.stat().st_mtime_ns for p in record.find(tmp_path)}
     again = gsbench(*sweep)
     assert again.returncode == 0
@@ -91,13 +96,45 @@ def test_a_sweep_writes_a_record_a_run_and_keeps_what_is_finished(square: Path, 
     assert {p: p.stat().st_mtime_ns for p in record.find(tmp_path)} == written
 
 
-def test_a_changed_config_runs_again_and_says_so(square: Path, tmp_path: Path) -> None:
-    """Catches a result of another config that is passed off as this one's."""
-    gsbench(*overrides(square, tmp_path, "model=3dgs"))
-    again = gsbench(*overrides(square, tmp_path, "model=3dgs", "train.iterations=31"))
-    assert "running again" in again.stderr
+def test_other_numbers_are_another_run(square: Path, tmp_path: Path) -> None:
+    """Catches a sweep over a number of the recipe whose runs overwrite each other, and finished runs done again."""
+    sweep = ["-m", *overrides(square, tmp_path, "model=3dgs", "train.iterations=30,31")]
+    assert gsbench(*sweep).returncode == 0
+    for one in map(record.read, record.find(tmp_path)):
+        assert f"iterations={one.curve[-1].iteration}" in one.variant.split(",")
+    assert len(record.find(tmp_path)) == 2
+    assert gsbench(*sweep).stdout.count("finished before, kept") == 2
+
+
+def test_other_data_run_again_and_say_so(tmp_path: Path) -> None:
+    """Catches a result of other data that is passed off as this one's."""
+    data = write_moving_square(tmp_path / "data")
+    arguments = overrides(data, tmp_path / "r", "model=3dgs")
+    assert gsbench(*arguments).returncode == 0
+    source = data / "square" / "transforms_train.json"
+    source.write_text(source.read_text().replace('"camera_angle_x": 0.7', '"camera_angle_x": 0.71'))
+    assert "running again" in gsbench(*arguments).stderr
+
+
+def test_what_is_measured_trains_nothing_again(square: Path, tmp_path: Path) -> None:
+    """Catches a training repeated for the sake of its pictures; the protocol is that of the last command."""
+    arguments = overrides(square, tmp_path, "model=3dgs")
+    assert gsbench(*arguments).returncode == 0
     (path,) = record.find(tmp_path)
-    assert record.read(path).curve[-1].iteration == 31
+    before = record.read(path)
+    more = ("protocol.quantise=true", "protocol.pictures=0", "protocol.renders=31", "data.published=there",
+            "train.checkpoint_minutes=1")  # fmt: skip
+    done = gsbench(*arguments, *more)
+    assert "measured again" in done.stderr
+    assert "goes on from step 30" in done.stderr
+    assert record.find(tmp_path) == [path]
+    after = record.read(path)
+    assert after.cost is not None
+    assert before.cost is not None
+    assert after.cost.train_s == before.cost.train_s
+    assert after.curve == before.curve
+    assert after.protocol["quantise"]
+    assert after.metrics != before.metrics
 
 
 def test_one_bad_scene_does_not_stop_the_others(tmp_path: Path) -> None:
@@ -114,7 +151,8 @@ def test_one_bad_scene_does_not_stop_the_others(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "gsbench: error: broken: " in done.stderr
     assert "gone" in done.stderr
-    assert [p.parts[-4] for p in record.find(tmp_path / "results")] == ["square"]
+    statuses = {one.scene: one.status for one in map(record.read, record.find(tmp_path / "results"))}
+    assert statuses == {"broken": "failed", "square": "ok"}
 
 
 def test_a_scene_without_time_is_refused_by_models_of_time(tmp_path: Path) -> None:
@@ -135,16 +173,16 @@ def test_a_scene_without_time_is_refused_by_models_of_time(tmp_path: Path) -> No
 def test_divergence_ends_as_a_record_and_the_rest_goes_on(square: Path, tmp_path: Path) -> None:
     """Catches a diverged run that is lost, hidden, or takes the sweep with it: one line, a record, exit code 1."""
     sweep = ["-m", *overrides(square, tmp_path), "model=3dgs", "seed=0,1"]
-    done = gsbench(*sweep, "train.ssim_weight=1e39")
+    done = gsbench(*sweep, "model.lr.means.start=1e38")
     assert done.returncode == 1
     found = [record.read(path) for path in record.find(tmp_path)]
     assert len(found) == 2
     for one in found:
         assert one.status == "diverged"
         assert one.reason is not None
-        assert one.reason.startswith("step 0: ")
+        assert one.reason.startswith("step 1: ")
         assert one.metrics is None
-    assert done.stderr.count("gsbench: error: square: diverged: step 0: ") == 2
+    assert done.stderr.count("gsbench: error: square: diverged: step 1: ") == 2
 
 
 @pytest.mark.parametrize(

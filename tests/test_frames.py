@@ -8,7 +8,7 @@ import torch
 
 from gsbench.backends import CPU, CUDA, Backend
 from gsbench.config import RasterConfig
-from gsbench.run import run
+from gsbench.run import attempt
 from gsbench.scenes.scene import Camera, View
 
 VIEW = View("test/r_0", Camera(torch.eye(4), torch.eye(3), 5, 4), 0.4, torch.zeros(4, 5, 3))
@@ -36,7 +36,7 @@ class Refused(Recorded):
 
 def test_on_a_cpu_frames_are_launched() -> None:
     """Catches a protocol that speaks of replays where there are none."""
-    frame, made = run.frames(trainer(CPU), VIEW)
+    frame, made = attempt.frames(trainer(CPU), VIEW)
     assert (frame(VIEW), made) == ("launched", {})
 
 
@@ -45,8 +45,8 @@ def test_on_a_gpu_the_record_says_which(
     replay: type[Recorded], made: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches a finished training lost to a model that waits for the device, and an FPS that hides how it was made."""
-    monkeypatch.setattr(run, "Replay", replay)
-    frame, told = run.frames(trainer(CUDA), VIEW)
+    monkeypatch.setattr(attempt, "Replay", replay)
+    frame, told = attempt.frames(trainer(CUDA), VIEW)
     assert (frame(VIEW), told) == (made, {"frames": made})
     said = capsys.readouterr().err
     assert ("cannot record this model: operation not permitted when stream is capturing\n" in said) == (

@@ -16,7 +16,7 @@ FLOORS: tuple[set[str], ...] = (
     {"models", "measure"},
     {"train", "report"},
     {"run"},
-    {"stability"},
+    {"stability", "sweep"},
     {"__main__"},
 )
 LEAST_WORDS = 4

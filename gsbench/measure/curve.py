@@ -50,5 +50,7 @@ class Curve:
         return [(p.iteration, p.seconds, p.psnr_val) for p in self.points]
 
     def load_state_dict(self, state: list[tuple[int, float, float | None]]) -> None:
-        """Continue from the points of a checkpoint."""
-        self.points = [Point(*point) for point in state]
+        """Continue from the points of a checkpoint; raises InputError where they do not make a curve."""
+        self.points = []
+        for iteration, seconds, psnr in state:
+            self.add(iteration, float(seconds), math.nan if psnr is None else float(psnr))

@@ -102,6 +102,8 @@ class Record:
     cost: Cost | None = None  # None only where the run is not ok
     curve: list[Point] = field(default_factory=list)
     version: int = VERSION
+    variant: str = ""  # what its training read that differs from the experiment's own, such as "iterations=10"
+    overrides: list[str] = field(default_factory=list)  # `python -m gsbench` and these words repeat the run
 
 
 def write(record: Record, path: Path) -> None:
@@ -139,7 +141,7 @@ def _validated(plain: Any, path: Path) -> Record:
     if type(version) is not int or version != VERSION:  # first: another version has other keys
         raise InputError(f"{path}: version: expected {VERSION}, got {ascii(version)[:80]}; run again with this gsbench")
     record = parse(Record, plain, str(path))
-    _check(record, str(path))
+    check(record, str(path))
     return record
 
 
@@ -148,40 +150,45 @@ def find(root: Path) -> list[Path]:
     return sorted(root.rglob(FILE_NAME))
 
 
-def run_path(root: Path, experiment: str, scene: str, model: str, seed: int) -> Path:
-    """Return the folder of a run, ``root/<experiment>/<scene>/<model>/seed<k>``.
+def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, variant: str = "") -> Path:
+    """Return the folder of a run, ``root/<experiment>/<scene>/<model>[,<variant>]/seed<k>``.
 
     Args:
         root: the folder of all results.
         experiment: its name.
         scene: its name.
         model: the label of the run, the model's name with _agr or _noagr where it is not as published.
-        seed: not negative.
+        seed: at least 0 and below 2^63.
+        variant: what differs from the experiment's own config; "" for nothing.
 
     Raises:
-        InputError: a name could leave its folder, or the seed is negative.
+        InputError: a name could leave its folder, or the seed is out of its range.
     """
-    for what, name in (("experiment", experiment), ("scene", scene), ("model", model)):
-        _check_name(name, what)
-    if seed < 0:
-        raise InputError(f"seed: expected >= 0, got {seed}")
-    return root / experiment / scene / model / f"seed{seed}"
+    _check_names(experiment, scene, model, variant, "")
+    _check_seed(seed, "")
+    return root / experiment / scene / (f"{model},{variant}" if variant else model) / f"seed{seed}"
 
 
-def _check_name(name: str, where: str) -> None:
+def _check_names(experiment: str, scene: str, model: str, variant: str, where: str) -> None:
     """Refuse a name that, as that of a folder, could leave its parent."""
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.+-]*", name):
-        raise InputError(f"{where}: expected a name of letters, digits and _ . + -, got {name!r:.80}")
+    for what, name in (("experiment", experiment), ("scene", scene), ("model", model)):
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}", name):
+            raise InputError(f"{where}{what}: expected a name of letters, digits and _ . + -, got {name!r:.80}")
+    if not re.fullmatch(r"([A-Za-z0-9][A-Za-z0-9_.+,=-]{0,99})?", variant):
+        raise InputError(f"{where}variant: expected words such as iterations=10, got {variant!r:.80}")
 
 
-def _check(record: Record, file: str) -> None:
+def _check_seed(seed: int, where: str) -> None:
+    if not 0 <= seed < 2**63:
+        raise InputError(f"{where}seed: expected 0 <= seed < 2^63, got {seed}")
+
+
+def check(record: Record, file: str) -> None:
     """Check what the types do not express; raises InputError that names `file` and the field."""
     if record.status not in STATUSES:
         raise InputError(f"{file}: status: got {record.status!r:.80}. {did_you_mean(record.status, STATUSES)}")
-    for what, name in (("experiment", record.experiment), ("scene", record.scene), ("model", record.model)):
-        _check_name(name, f"{file}: {what}")
-    if record.seed < 0:
-        raise InputError(f"{file}: seed: expected >= 0, got {record.seed}")
+    _check_names(record.experiment, record.scene, record.model, record.variant, f"{file}: ")
+    _check_seed(record.seed, f"{file}: ")
     ok = record.status == "ok"
     if ok == (record.reason is not None):
         raise InputError(f"{file}: reason: expected {'null' if ok else 'why the run is ' + record.status}")

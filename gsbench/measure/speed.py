@@ -134,7 +134,7 @@ class StageClock:
     def load_state_dict(self, state: dict[str, float]) -> None:
         """Continue from the sums of a checkpoint."""
         self._ended.clear()
-        self._seconds = dict(state)
+        self._seconds = {name: float(seconds) for name, seconds in state.items()}
 
 
 class _Clock(Protocol):

@@ -2,6 +2,6 @@
 
 from gsbench.models.base import GaussianModel, Gaussians3D, Phase
 from gsbench.models.query import Query
-from gsbench.models.registry import build, register
+from gsbench.models.registry import build, find, register
 
-__all__ = ["GaussianModel", "Gaussians3D", "Phase", "Query", "build", "register"]
+__all__ = ["GaussianModel", "Gaussians3D", "Phase", "Query", "build", "find", "register"]

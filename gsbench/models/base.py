@@ -249,6 +249,9 @@ class GaussianModel(nn.Module, ABC):
             if name not in expected or expected[name] != got.get(name):
                 raise InputError(f"checkpoint: not of this model: expected {name} of shape "
                                  f"{expected.get(name, 'none')}, got {got.get(name, 'none')!s:.60}")  # fmt: skip
+            if state[name].dtype != self.state_dict()[name].dtype or state[name].layout != torch.strided:
+                raise InputError(f"checkpoint: not of this model: expected {name} of {self.state_dict()[name].dtype}, "
+                                 f"got {state[name].dtype}, {state[name].layout}")  # fmt: skip
         for name, parameter in self.splats.items():
-            parameter.data = torch.empty_like(state[f"splats.{name}"], device=parameter.device)
+            parameter.data = torch.empty(state[f"splats.{name}"].shape, dtype=parameter.dtype, device=parameter.device)
         self.load_state_dict(state)

@@ -23,27 +23,51 @@ def register(name: str) -> Callable[[M], M]:
     return enter
 
 
-def build(name: str, **options: Any) -> GaussianModel:
-    """Build the model registered as `name`, without Gaussians yet.
+def find(name: str) -> type[GaussianModel]:
+    """Return the class registered as `name`.
 
     This imports every module of `gsbench.models`, so that a new model is one new file in that folder.
 
     Raises:
-        InputError: the model is unknown, does not have an option, or needs an option that is missing.
+        InputError: the model is unknown.
     """
     package = importlib.import_module("gsbench.models")
     for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"gsbench.models.{module.name}")
     if name not in _REGISTRY:
         raise InputError(f"model '{name}' is not known. {did_you_mean(name, _REGISTRY)}")
-    model = _REGISTRY[name]
+    return _REGISTRY[name]
+
+
+def build(name: str, **options: Any) -> GaussianModel:
+    """Build the model registered as `name`, without Gaussians yet.
+
+    Raises:
+        InputError: the model is unknown, does not have an option, needs an option that is missing, or the option has
+            another type.
+    """
+    model = find(name)
     # A constructor passes unknown options on to its base, so the options are those of all base classes.
-    signatures = [inspect.signature(cls.__init__) for cls in model.__mro__ if issubclass(cls, GaussianModel)]
-    known = {p.name: p.default for s in signatures for p in s.parameters.values() if p.kind is p.KEYWORD_ONLY}
-    for option in options:
+    known: dict[str, inspect.Parameter] = {}
+    for cls in (cls for cls in model.__mro__ if issubclass(cls, GaussianModel)):
+        own = inspect.signature(cls.__init__, eval_str=True).parameters.values()
+        known = {p.name: p for p in own if p.kind is p.KEYWORD_ONLY} | known
+    for option, value in options.items():
         if option not in known:
             raise InputError(f"model '{name}' has no option '{option}'. {did_you_mean(option, known)}")
-    for option, default in known.items():
-        if default is inspect.Parameter.empty and option not in options:
+        if not _is_a(value, known[option].annotation):
+            expected = getattr(known[option].annotation, "__name__", known[option].annotation)
+            raise InputError(f"model '{name}': option {option}: expected a {expected}, got {value!r:.80}")
+    for option, parameter in known.items():
+        if parameter.default is parameter.empty and option not in options:
             raise InputError(f"model '{name}' needs the option '{option}', which has no default")
     return model(**options)
+
+
+def _is_a(value: object, kind: Any) -> bool:
+    """Tell whether an option's value has the type of the constructor's argument; a number may be whole."""
+    if kind is float:
+        return type(value) in (int, float)
+    if kind in (bool, int, str):
+        return type(value) is kind
+    return not isinstance(kind, type) or isinstance(value, kind)

@@ -1,35 +1,114 @@
-"""Refuse a faulty config, data set or device before the first training step."""
+"""Refuse a faulty config, data set, device or folder before the first training step."""
 
+import dataclasses
 import importlib.resources
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from gsbench.backends import resolve
-from gsbench.config import Config
+from gsbench.config import Config, LearningRate
 from gsbench.errors import InputError, did_you_mean, one_line
+from gsbench.measure import perceptual
+from gsbench.measure.atomic import write_atomically
+from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
 from gsbench.scenes import Scene, View
 from gsbench.train.optim import OPTIMIZERS
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 SPLITS = ("test", "val")
+ENDLESS = 10**9  # more than any machine will do
+RANGES = {  # of numbers that the schema types but does not bound, both ends included
+    "train.iterations": (1, ENDLESS),
+    "train.recipe_iterations": (1, ENDLESS),
+    "train.batch_size": (1, 10_000),
+    "train.ssim_weight": (0, 1),
+    "train.sh_every": (1, ENDLESS),
+    "train.refine_from": (0, ENDLESS),
+    "train.modulation_from": (0, ENDLESS),
+    "train.densify.start": (0, ENDLESS),
+    "train.densify.stop": (0, ENDLESS),
+    "train.densify.every": (1, ENDLESS),
+    "train.densify.reset_every": (1, ENDLESS),
+    "train.densify.grad_threshold": (0, math.inf),
+    "train.densify.clone_below": (0, math.inf),
+    "train.densify.prune_above": (0, math.inf),
+    "train.curve_points": (1, ENDLESS),
+    "train.checkpoint_minutes": (0, ENDLESS),
+    "model.min_opacity": (0, 0.25),  # a reset lowers opacities to twice as much
+    "data.initial_points": (4, ENDLESS),
+    "data.initial_half_width": (1e-6, 1e6),
+    "scene.downscale": (1, 10_000),
+    "protocol.renders": (LEAST_RENDERS, 1_000_000),
+    "protocol.pictures": (0, 10_000),
+}
 
 
 def check_config(config: Config) -> None:
     """Raise InputError for a value of the config that no run can have on this machine."""
+    check_keys(config, Config, "")
     _check_choice("data.background", config.data.background, BACKGROUNDS)
     _check_choice("scene.eval_split", config.scene.eval_split, SPLITS)
     _check_choice("optim", config.optim, OPTIMIZERS)
-    train = config.train
-    counts = {"iterations": train.iterations, "recipe_iterations": train.recipe_iterations,
-              "batch_size": train.batch_size, "densify.every": train.densify.every}  # fmt: skip
-    for key, count in counts.items():
-        if count < 1:
-            raise InputError(f"train.{key}: expected at least 1, got {count}")
+    for key, value in _numbers(config, ""):
+        if not math.isfinite(value):
+            raise InputError(f"{key}: expected a finite number, got {value}")
+        low, high = RANGES.get(key, (-math.inf, math.inf))
+        if not low <= value <= high:
+            expected = f"{low} to {high}" if high < ENDLESS else f"at least {low}"
+            raise InputError(f"{key}: expected {expected}, got {value}")
+    for name, rate in config.model.lr.items():
+        _check_rate(f"model.lr.{name}", rate)
     check_device(config.device)
     resolve(config.raster.backend, torch.device(config.device).type)
+    for backbone, file in (("alex", config.protocol.lpips_alex), ("vgg", config.protocol.lpips_vgg)):
+        if file:
+            perceptual.load(backbone, Path(file).expanduser(), config.device)
+
+
+def check_keys(value: Any, kind: Any, place: str) -> None:
+    """Raise InputError for a key that the schema lacks: Hydra's `+key=` adds it, and nothing would read it."""
+    if isinstance(value, dict):
+        for name, one in value.items():
+            check_keys(one, type(one), f"{place}.{name}")
+    if not dataclasses.is_dataclass(kind):
+        return
+    known = {one.name for one in dataclasses.fields(kind)}
+    for name, one in vars(value).items():
+        dotted = f"{place}.{name}".lstrip(".")
+        if name not in known:
+            raise InputError(f"config key '{dotted}' is not known. {did_you_mean(name, known)}")
+        check_keys(one, type(one), dotted)
+
+
+def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
+    """Yield every number below a config with its dotted key."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        yield place, value
+    members = value if isinstance(value, dict) else vars(value) if dataclasses.is_dataclass(value) else {}
+    for name, one in members.items():
+        yield from _numbers(one, f"{place}.{name}".lstrip("."))
+
+
+def _check_rate(key: str, rate: LearningRate) -> None:
+    """Raise InputError for a rate that is negative, or falls log-linearly from or to zero."""
+    if rate.start < 0 or (rate.end is not None and (rate.end <= 0 or rate.start == 0)):
+        raise InputError(f"{key}: expected start >= 0, and start > 0 with end > 0 or null, "
+                         f"got start {rate.start}, end {rate.end}")  # fmt: skip
+
+
+def check_folder(folder: Path) -> None:
+    """Raise InputError unless files can be written in a run's folder, which is made where it is missing."""
+    probe = folder / ".probe"
+    try:
+        write_atomically(probe, b"")
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"results: expected a folder that can be written, got {folder}: {error.strerror}") from None
 
 
 def _check_choice(key: str, value: str, known: Iterable[str]) -> None:
@@ -40,7 +119,7 @@ def _check_choice(key: str, value: str, known: Iterable[str]) -> None:
 def check_device(name: str) -> None:
     """Raise InputError unless `name` is a device that torch can use here."""
     kind = name.partition(":")[0]
-    if kind not in ("cpu", "cuda"):
+    if kind not in ("cpu", "cuda") or name.startswith("cpu:"):
         raise InputError(f"device '{name}' is not known. {did_you_mean(kind, ['cpu', 'cuda'])}")
     try:
         torch.zeros(1, device=name)
@@ -52,13 +131,10 @@ def scene_folder(config: Config) -> Path:
     """Find the folder of the config's scene.
 
     Raises:
-        InputError: there is none inside data.root.
+        InputError: there is none in data.root.
     """
     data, name = config.data, config.scene.name
-    root = data_root(data.root)
-    folder = root / name
-    if root.resolve() not in folder.resolve().parents:
-        raise InputError(f"scene.name: expected the name of a folder in data.root, got '{name}'")
+    folder = data_root(data.root) / name  # a name has no slash: gsbench.measure.record.run_path
     if not folder.is_dir():
         published = f"; {data.dataset} is published at: {data.published}" if data.published else ""
         raise InputError(
@@ -69,16 +145,29 @@ def scene_folder(config: Config) -> Path:
 
 
 def data_root(root: str) -> Path:
-    """Return the folder that data.root names: a path, or pkg://module for data inside a package."""
+    """Return the folder that data.root names: a path, or pkg://module for data inside a package.
+
+    Raises:
+        InputError: there is no such module, or the path cannot be one.
+    """
+    if "\0" in root:
+        raise InputError(f"data.root: expected a path, got {root!r:.200}")
     if not root.startswith("pkg://"):
         return Path(root).expanduser()
-    return Path(str(importlib.resources.files(root.removeprefix("pkg://"))))
+    try:
+        return Path(str(importlib.resources.files(root.removeprefix("pkg://"))))
+    except (ImportError, ValueError, TypeError) as error:
+        raise InputError(f"data.root: expected pkg://MODULE of an installed package, got {root!r}: {error}") from None
 
 
-def check_times(model: GaussianModel, scene: Scene, name: str) -> None:
-    """Raise InputError where the model `name` observes time and the scene has no times."""
-    if "time" in model.observes and not scene.has_time:
-        raise InputError(f"{name}: expected a scene with times, {scene.name} has none: use 3dgs or 6dgs")
+def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
+    """Raise InputError where the scene cannot teach the model: no times, or all cameras in one place."""
+    if ("time" in model.observes or config.agr) and not scene.has_time:
+        what = "agr=true" if config.agr else config.model.name
+        raise InputError(f"{what}: expected a scene with times, {scene.name} has none: use 3dgs or 6dgs, agr=false")
+    if not scene.extent > 0:
+        raise InputError(f"{scene.name}: expected training cameras at different places, all are at one: sizes and "
+                         f"rates are relative to the cameras' radius, which is 0")  # fmt: skip
 
 
 def evaluated_views(scene: Scene, split: str) -> list[View]:

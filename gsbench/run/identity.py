@@ -1,14 +1,34 @@
-"""Identify a run by its config: its label, its folder, and the config that its record keeps."""
+"""Identify a run by what its training reads: its label, its variant, its folder and the hash of its training."""
 
-from dataclasses import dataclass
+import hashlib
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config import Config
 from gsbench.measure import record as records
-from gsbench.run.checks import check_config
+from gsbench.measure.provenance import config_hash
+
+Plain = dict[str, Any]  # a resolved config in plain JSON
+
+# What is measured after a training, and where data and results lie, changes no training. `best_on_test` and
+# `eval_split` are not here: the best iteration is looked for while the model trains.
+MEASURING = (
+    "experiment", "results", "resume", "data.dataset", "data.paper_dataset", "data.published", "data.root",
+    "data.scenes", "train.checkpoint_minutes", "protocol.name", "protocol.quantise", "protocol.lpips_alex",
+    "protocol.lpips_vgg", "protocol.renders", "protocol.pictures",
+)  # fmt: skip
+OWN_NAMES = ("exp", "model", "scene")  # the groups that have a place in a run's path
+DEFAULTS = {"train": "default", "raster": "default", "protocol": "gsbench"}  # groups of conf/config.yaml
+UNNAMED = ("results", "resume")  # where results lie and whether they are kept identifies nothing
+LONGEST_VARIANT = 80  # characters: several such folders must fit into a path of 255
 
 
 @dataclass(frozen=True)
@@ -16,28 +36,121 @@ class Run:
     """One model on one scene with one seed."""
 
     config: Config
-    plain: dict[str, Any]  # the config as recorded
+    plain: Plain  # the config as recorded
     folder: Path  # where the record, the checkpoint and the images go
     label: str  # the model's name, with _agr or _noagr where it is not as published
+    variant: str = ""  # what its training reads that differs from the experiment's own, such as "iterations=10"
+    overrides: list[str] = field(default_factory=list)  # what `python -m gsbench` needs to repeat it
 
     @property
     def name(self) -> str:
-        """The scene, the label and the seed, as messages show them."""
-        return f"{self.config.scene.name} {self.label} seed{self.config.seed}"
+        """The scene, the label, the variant and the seed, as messages show them."""
+        variant = f" {self.variant}" if self.variant else ""
+        return f"{self.config.scene.name} {self.label}{variant} seed{self.config.seed}"
 
 
-def identify(composed: DictConfig) -> Run:
-    """Resolve and check a config of one scene.
+def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, overrides: Sequence[str] = ()) -> Run:
+    """Resolve the config of one run and name the run.
+
+    Args:
+        composed: the config of one scene, as Hydra composed it.
+        choices: what was chosen of each config group (HydraConfig.runtime.choices); None for a run without variant.
+        overrides: the words of the command line that made it (HydraConfig.overrides.task).
 
     Raises:
-        InputError: a value that no run can have. Hydra has already refused unknown keys and wrong types.
+        InputError: a name cannot be that of a folder. Hydra has already refused unknown keys and wrong types.
     """
     config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
-    check_config(config)
+    plain: Plain = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
     as_published = config.agr == config.model.published_with_agr
     label = config.model.name + ("" if as_published else "_agr" if config.agr else "_noagr")
-    folder = records.run_path(Path(config.results), config.experiment, config.scene.name, label, config.seed)
-    plain: dict[str, Any] = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
-    for key in ("results", "resume"):  # where results lie and whether they are kept changes no number
+    variant = name_variant(plain, choices) if choices else ""
+    folder = records.run_path(
+        Path(config.results), config.experiment, config.scene.name, label, config.seed, variant=variant
+    )
+    for key in UNNAMED:
         del plain[key]
-    return Run(config, plain, folder, label)
+    plain = _storable(plain)
+    repeating = sorted(word for word in overrides if word.partition("=")[0].lstrip("+") not in (*UNNAMED, "launch"))
+    return Run(config, plain, folder, label, variant, repeating)
+
+
+def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
+    """Name in a few words what a training reads beyond its experiment, model, scene and seed; "" for nothing.
+
+    Groups are named by their choice (`recipe=paper`); keys by their value, where it differs from that of the config
+    which the same choices give alone. A long name is cut at a whole word and ends in a hash of the rest.
+    """
+    groups = {
+        group: choice
+        for group, choice in choices.items()
+        if choice and group not in OWN_NAMES and not group.startswith(("hydra", "launch"))
+    }
+    words = [f"{group}={_printed(choice)}" for group, choice in groups.items() if DEFAULTS.get(group) != choice]
+    own = [f"{'' if group in DEFAULTS or group in ('model', 'scene') else '+'}{group}={choice}"
+           for group, choice in [*((name, choices[name]) for name in OWN_NAMES), *groups.items()]]  # fmt: skip
+    own += [f"seed={plain['seed']}", f"agr={str(plain['agr']).lower()}", f"scene.name={plain['scene']['name']}"]
+    base: Plain = OmegaConf.to_container(hydra.compose("config", own), resolve=True)  # type: ignore[assignment]
+    theirs = dict(flat(training_part(base)))
+    changed = {key: value for key, value in flat(training_part(plain)) if key not in theirs or value != theirs[key]}
+    shorts = [key.removeprefix("model.options.").partition(".")[2] or key.rpartition(".")[2] for key in changed]
+    for (key, value), short in zip(changed.items(), shorts, strict=True):
+        words.append(f"{short if shorts.count(short) == 1 else key}={_printed(value)}")
+    return _cut(words)
+
+
+def training_part(plain: Plain) -> Plain:
+    """Return the part of a resolved config that a training reads."""
+    part: Plain = {key: dict(value) if isinstance(value, dict) else value for key, value in plain.items()}
+    for dotted in MEASURING:
+        head, _, tail = dotted.partition(".")
+        if not tail:
+            part.pop(head, None)
+        elif isinstance(part.get(head), dict):
+            part[head].pop(tail, None)
+    return part
+
+
+def training_hash(plain: Plain) -> str:
+    """Compute the SHA-256 of what a training reads: equal for two runs whose checkpoints can be exchanged."""
+    return config_hash(training_part(plain))
+
+
+def flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the leaves of a nested config as (dotted key, value)."""
+    for key, value in plain.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _storable(value: Any) -> Any:
+    """Put what a record cannot hold, such as NaN, as text: the run is refused, and its row says why."""
+    if isinstance(value, dict):
+        return {key: _storable(one) for key, one in value.items()}
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    return value if not isinstance(value, int) or abs(value) < 2**63 else str(value)
+
+
+def _printed(value: Any) -> str:
+    """Print a value for the name of a folder; as a hash where it has characters that a folder should not have."""
+    text = value if isinstance(value, str) else json.dumps(value)
+    text = text.replace("/", ".")
+    return text if re.fullmatch(r"[A-Za-z0-9_.+-]+", text) else _digest(text)
+
+
+def _cut(words: list[str]) -> str:
+    """Join words by commas; where that is too long, keep the first ones and a hash of all."""
+    whole = ",".join(words)
+    if len(whole) <= LONGEST_VARIANT:
+        return whole
+    ending = f",{_digest(whole)}"
+    while words and len(",".join(words) + ending) > LONGEST_VARIANT:
+        words = words[:-1]
+    return (",".join(words) + ending).lstrip(",")
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:8]

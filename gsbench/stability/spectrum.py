@@ -47,7 +47,7 @@ def failures(path: Path) -> dict[str, tuple[float, float]]:
 
 
 def _splats(path: Path) -> dict[str, Tensor]:
-    state: dict[str, Any] = checkpoint.read(path)[1].get("model", {})
+    state: dict[str, Any] = checkpoint.read(path).state.get("model", {})
     return {name.removeprefix("splats."): value.double() for name, value in state.items() if name[:7] == "splats."}
 
 

@@ -11,7 +11,7 @@ import torch
 
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel
-from gsbench.run import build
+from gsbench.run.setup import build
 from gsbench.scenes.scene import Camera, Points, Scene, View
 from gsbench.stability.cases import Case, Cell, device_of
 from gsbench.stability.training_cases import Training

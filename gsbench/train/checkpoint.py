@@ -1,48 +1,114 @@
-"""Save the state of a training to a checkpoint, atomically, and read it back as untrusted input."""
+"""Save a training to a checkpoint, atomically and with its SHA-256, and read it back as untrusted input."""
 
+import hashlib
 import io
 import pickle
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import torch
+from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 
-VERSION = 3
+MAGIC = b"gsbench checkpoint 4\n"  # then the SHA-256 of the rest in hex and a line feed, then what torch.save writes
 FILE_NAME = "checkpoint.pt"
+DIGEST = 64  # hex digits
 
 
-def save(path: Path, config_hash: str, data_hash: str, state: dict[str, Any]) -> None:
-    """Write the state of a run, with the hashes of its config and its data."""
+@dataclass(frozen=True)
+class Checkpoint:
+    """Everything that goes on from where a training was, and that draws its model without the data set."""
+
+    training: str  # hash of what the training reads: gsbench.run.identity.training_hash
+    data: str  # Scene.fingerprint
+    state: dict[str, Any]  # Trainer.state_dict
+    config: dict[str, Any] = field(default_factory=dict)  # the whole resolved config, plain
+    scene: dict[str, Any] = field(default_factory=dict)  # gsbench.run.load.SceneDescription, plain
+
+
+def save(path: Path, content: Checkpoint) -> None:
+    """Write a checkpoint; a reader of `path` sees the old one or the new one, never a part."""
     buffer = io.BytesIO()
-    torch.save({"version": VERSION, "config": config_hash, "data": data_hash, "state": state}, buffer)
-    write_atomically(path, buffer.getvalue())
+    torch.save({f.name: getattr(content, f.name) for f in fields(content)}, buffer)
+    payload = buffer.getbuffer()
+    write_atomically(path, b"".join((MAGIC, hashlib.sha256(payload).hexdigest().encode(), b"\n", payload)))
 
 
-def load(path: Path, config_hash: str, data_hash: str, device: str) -> dict[str, Any] | None:
-    """Read the state at `path`; None where there is no file, or its config, data or version differs.
+def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | None:
+    """Read the state at `path`; None where there is no file, or it is of another training or other data.
 
     Raises:
-        InputError: the file exists and is not a checkpoint.
+        InputError: the file exists and is not a checkpoint, or is a damaged one.
     """
     if not path.exists():
         return None
-    found, state = read(path, device)
-    return state if found == (VERSION, config_hash, data_hash) else None
+    found = read(path, device)
+    return found.state if (found.training, found.data) == (training, data) else None
 
 
-def read(path: Path, device: str = "cpu") -> tuple[tuple[int, str, str], dict[str, Any]]:
-    """Read (version, config hash, data hash) and the state of the checkpoint at `path`, without comparing them.
+def read(path: Path, device: str = "cpu") -> Checkpoint:
+    """Read the checkpoint at `path`, whatever training it is of.
 
     Raises:
-        InputError: the file is not a checkpoint.
+        InputError: there is no file, or it is not a checkpoint, or not every bit is as it was written.
     """
     try:
-        content = torch.load(path, map_location=device, weights_only=True)
-        state: dict[str, Any] = content["state"]
-        return (content["version"], content["config"], content["data"]), state
-    except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: expected a checkpoint, got {reason}; delete it to start over") from None
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise _fault(path, "something that is not a file")
+        with path.open("rb") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                raise _fault(path, "a file of another kind, or of another version of gsbench")
+            digest = file.read(DIGEST + 1)
+            payload = file.read()
+        if digest != hashlib.sha256(payload).hexdigest().encode() + b"\n":
+            raise _fault(path, "a damaged one: its SHA-256 is not the one written with it")
+        content = torch.load(io.BytesIO(payload), map_location=device, weights_only=True)
+        found = Checkpoint(**content)
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError, EOFError, BadZipFile,
+            pickle.UnpicklingError) as error:  # fmt: skip
+        if isinstance(error, InputError):
+            raise
+        raise _fault(path, str(error).splitlines()[0] if str(error) else type(error).__name__) from None
+    for name, value in vars(found).items():
+        expected = str if name in ("training", "data") else dict
+        if not isinstance(value, expected):
+            raise _fault(path, f"'{name}' as {type(value).__name__}")
+    return found
+
+
+def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
+    """Take a tensor out of a checkpoint's state, contiguous.
+
+    Args:
+        state: the dict that should hold it.
+        name: its key.
+        shape: that it must have.
+        dtype: that it must have.
+
+    Raises:
+        InputError: it is missing, or its shape or type is not that of this training.
+    """
+    value = state.get(name) if isinstance(state, dict) else None
+    if not isinstance(value, Tensor) or value.layout != torch.strided:
+        raise InputError(f"checkpoint: expected '{name}' as a tensor, got {type(value).__name__}")
+    if value.dtype != dtype or tuple(value.shape) != tuple(shape):
+        raise InputError(f"checkpoint: expected '{name}' as {dtype} of shape {list(shape)}, "
+                         f"got {value.dtype} of shape {list(value.shape)}")  # fmt: skip
+    return value.contiguous()
+
+
+def whole_number(name: str, value: object, most: int) -> int:
+    """Take a number from 0 to `most` out of a checkpoint's state; raises InputError where it is none."""
+    if type(value) is not int or not 0 <= value <= most:
+        raise InputError(f"checkpoint: expected '{name}' from 0 to {most}, got {value!r:.80}")
+    return value
+
+
+def _fault(path: Path, got: str) -> InputError:
+    return InputError(f"{path}: expected a checkpoint, got {got}; delete it, or start over with resume=false")

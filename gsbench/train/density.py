@@ -6,6 +6,7 @@ from torch import Tensor
 from gsbench.config import DensifyConfig
 from gsbench.models import GaussianModel
 from gsbench.models.base import CHILDREN
+from gsbench.train.checkpoint import tensor
 from gsbench.train.optim import Optimizer
 
 
@@ -96,8 +97,12 @@ class DensityControl:
         return {"gradient": self.gradient, "seen": self.seen, "unseen": self.unseen}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from the `state_dict` of a checkpoint."""
-        self.gradient, self.seen, self.unseen = state["gradient"], state["seen"], state["unseen"]
+        """Continue from the `state_dict` of a checkpoint; raises InputError where it is not of this many Gaussians."""
+        opacities = self.model.splats["opacities"]
+        self.gradient, self.seen = (
+            tensor(state, name, opacities.shape, opacities.dtype) for name in ("gradient", "seen")
+        )
+        self.unseen = tensor(state, "unseen", opacities.shape, torch.int32)
 
     def _select(self, rows: Tensor, fresh: int) -> None:
         is_fresh = torch.arange(len(rows), device=rows.device) >= len(rows) - fresh

@@ -25,7 +25,8 @@ def explain(model: GaussianModel) -> str:
             case = resembles(model, index)
             like = f"it resembles the stability case '{case}'" if case else "it resembles no stability case"
             return f"the first is Gaussian {index} of {len(parameter)} in '{name}' ({int(bad.sum())} in all): {like}"
-    return "no Gaussian's gradient is: look at AGR's networks or at lambda"
+    where = "AGR's networks or lambda" if model.refinement is not None else "the learning rates"
+    return f"no Gaussian's gradient is: look at {where}"
 
 
 @torch.no_grad()

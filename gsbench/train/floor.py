@@ -5,6 +5,7 @@ from torch import Tensor
 
 from gsbench.models import GaussianModel
 from gsbench.scenes import Camera
+from gsbench.train.checkpoint import tensor
 
 # The rasterizer adds 0.3 px^2 to every projected covariance (eps2d); a standard deviation of 0.05 px changes that by
 # less than 1 %. A thinner Gaussian has the same image, so its size would follow a random walk. Mip-Splatting (Yu et al.
@@ -36,10 +37,11 @@ class Floor:
         """Raise sizes that are below the floor."""
         self.model.hold_sizes(self.least)
 
-    def state_dict(self) -> Tensor:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return the floor, for the checkpoint."""
-        return self.least
+        return {"least": self.least}
 
-    def load_state_dict(self, state: Tensor) -> None:
-        """Continue from the `state_dict` of a checkpoint."""
-        self.least = state
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Continue from the `state_dict` of a checkpoint; raises InputError where it is not of this many Gaussians."""
+        means = self.model.splats["means"]
+        self.least = tensor(state, "least", means.shape[:1], means.dtype)

@@ -19,6 +19,7 @@ from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel
 from gsbench.models.render import render
 from gsbench.scenes import Scene, View
+from gsbench.train.checkpoint import whole_number
 from gsbench.train.density import DensityControl
 from gsbench.train.floor import Floor
 from gsbench.train.optim import Optimizer
@@ -73,13 +74,22 @@ class Trainer:
         self.best = Best()
         self.step = 0
 
-    def run(self, save: Callable[[dict[str, Any]], None], label: str) -> None:
-        """Train to the end, calling `save(state)` every `checkpoint_minutes` and once at the end.
+    def run(
+        self, save: Callable[[dict[str, Any]], None], label: str, goes_on: Callable[[], bool] = lambda: True
+    ) -> None:
+        """Train to the end, or until `goes_on()` says no after a step; `step` tells which.
+
+        Args:
+            save: is given the state every `checkpoint_minutes` and once at the end.
+            label: names the run in the progress bar.
+            goes_on: is asked after every step.
 
         Raises:
             DivergedError: a loss or gradient was not finite; the last saved state is from before that step.
         """
         train = self.config.train
+        if self.step == train.iterations:  # a checkpoint of a finished training
+            return
         saved = time.monotonic()
         every = 0.2 if sys.stderr.isatty() else 20.0  # seconds between updates, fewer where stderr is a log file
         with tqdm(
@@ -98,6 +108,8 @@ class Trainer:
                 bar.set_postfix_str(
                     f"loss {self.watch.loss:.4f}, val {shown}, {len(self.model)} Gaussians", refresh=False
                 )
+                if not goes_on():
+                    break
                 if time.monotonic() - saved >= 60 * train.checkpoint_minutes and self.step < train.iterations:
                     save(self.state_dict())
                     saved = time.monotonic()
@@ -161,7 +173,7 @@ class Trainer:
         return {
             "step": self.step,
             "model": self.model.state_dict(),
-            "optimizer": self.optimizer.adam.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
             "density": self.density.state_dict(),
             "floor": self.floor.state_dict(),
             "stages": self.stages.state_dict(),
@@ -170,13 +182,22 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`: results are bit-equal to those of an uninterrupted run."""
-        self.step = state["step"]
-        self.model.load_state(state["model"])
-        self.optimizer.adam.load_state_dict(state["optimizer"])
-        self.density.load_state_dict(state["density"])
-        self.floor.load_state_dict(state["floor"])
-        self.stages.load_state_dict(state["stages"])
-        self.curve.load_state_dict(state["curve"])
-        self.best = Best(**state["best"])
+        """Continue from a `state_dict`: results are bit-equal to those of an uninterrupted run.
+
+        Raises:
+            InputError: a part is missing, or is not of this training.
+        """
+        try:
+            self.step = whole_number("step", state["step"], self.config.train.iterations)
+            self.model.load_state(state["model"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.density.load_state_dict(state["density"])
+            self.floor.load_state_dict(state["floor"])
+            self.stages.load_state_dict(state["stages"])
+            self.curve.load_state_dict(state["curve"])
+            self.best = Best(**state["best"])
+        except InputError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            raise InputError(f"checkpoint: expected the state of this training: {error!r:.200}") from None
         self.model.set_phase(self.schedule.phase(max(0, self.step - 1)))

@@ -11,6 +11,7 @@ from torch import Tensor
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.adam import adam
 from gsbench.models import GaussianModel
+from gsbench.train.checkpoint import tensor
 
 if TYPE_CHECKING:  # config.py needs hydra, which a machine that checks kernels may lack
     from gsbench.config import LearningRate, ModelConfig, TrainConfig
@@ -109,6 +110,30 @@ class Optimizer:
         for name in ("exp_avg", "exp_avg_sq"):
             if parameter in self.adam.state:
                 self.adam.state[parameter][name].zero_()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the moments and the number of steps of every parameter, for the checkpoint."""
+        return {f"{group['name']}.{i}": dict(self.adam.state[parameter])
+                for group in self.adam.param_groups for i, parameter in enumerate(group["params"])
+                if parameter in self.adam.state}  # fmt: skip
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from the `state_dict` of a checkpoint, once the model's parameters are loaded.
+
+        Raises:
+            InputError: moments are not of this model's parameters.
+        """
+        self.adam.state.clear()
+        own = {f"{group['name']}.{i}": p for group in self.adam.param_groups for i, p in enumerate(group["params"])}
+        for name, moments in state.items():
+            if name not in own:
+                raise InputError(f"checkpoint: expected moments of {', '.join(own)}, got some of {name!r:.80}")
+            parameter = own[name]
+            self.adam.state[parameter] = {
+                "step": tensor(moments, "step", (), torch.float32),
+                "exp_avg": tensor(moments, "exp_avg", parameter.shape, parameter.dtype),
+                "exp_avg_sq": tensor(moments, "exp_avg_sq", parameter.shape, parameter.dtype),
+            }
 
 
 def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) -> float:

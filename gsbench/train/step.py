@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from gsbench.errors import InputError, TooLargeError
+from gsbench.errors import InputError
 from gsbench.kernels.tape import Tape, add_to
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
@@ -69,7 +69,7 @@ class Step:
 
         Raises:
             DivergedError: a slice is not finite.
-            TooLargeError: memory would not suffice.
+            InputError: the rasterizer refuses a slice for another reason; TooLargeError: memory would not suffice.
         """
         sources = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
         # Only the kernels' time is worth threads of Python's, and a GPU does one thing after the other anyway.
@@ -113,9 +113,9 @@ class Step:
                     output = rasterize_slice(
                         gaussians, view.camera, self.background, self.model.backend, self.antialias
                     )
-                except TooLargeError:
-                    raise
                 except InputError as error:  # the rasterizer's door is the first to see a slice that is not finite
+                    if all(tensor.isfinite().all() for tensor in gaussians):
+                        raise
                     raise DivergedError(str(error)) from None
             with stages("loss"):
                 loss = photometric(output.image, view.image[None], self.ssim_weight, self.model.backend)

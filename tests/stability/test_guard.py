@@ -26,6 +26,7 @@ from gsbench.stability import (
 )
 from gsbench.stability.cases import CASES
 from gsbench.train import checkpoint, diagnosis
+from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.loop import Trainer
 from gsbench.train.schedule import generator
 from gsbench.train.step import Seen
@@ -67,12 +68,12 @@ def test_the_step_the_parameter_the_gaussian_and_the_case(tmp_path: Path) -> Non
     poison(run, "log_diagonal", after=5)
     path = tmp_path / "checkpoint.pt"
     with contextlib.redirect_stderr(io.StringIO()), pytest.raises(DivergedError, match=r"step 5.*'log_diagonal'"):
-        run.run(lambda state: checkpoint.save(path, "config", "data", state), "poisoned")
+        run.run(lambda state: checkpoint.save(path, Checkpoint("training", "data", state)), "poisoned")
     assert diagnosis.explain(run.model) == (
         "the first is Gaussian 7 of 80 in 'log_diagonal' (1 in all): it resembles the stability case 'instant'"
     )
     assert all(p.isfinite().all() for p in run.model.parameters())
-    state = checkpoint.load(path, "config", "data", "cpu")
+    state = checkpoint.load(path, "training", "data", "cpu")
     assert state is not None
     assert state["step"] == 5
     assert all(value.isfinite().all() for value in state["model"].values())
@@ -121,7 +122,7 @@ def test_spectrum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     logs = torch.tensor([0.0, 0.0, 0.0, 3.0, -1.0, -2.0, -3.0])
     model.splats["log_diagonal"].data[:] = logs
     path = tmp_path / "checkpoint.pt"
-    checkpoint.save(path, "config", "data", {"model": model.state_dict()})
+    checkpoint.save(path, Checkpoint("training", "data", {"model": model.state_dict()}))
     joint, sliced = spectrum.measure(path).values()
     torch.testing.assert_close(torch.from_numpy(joint), torch.full((80,), math.exp(6)).double(), rtol=1e-6, atol=0)
     torch.testing.assert_close(torch.from_numpy(sliced), torch.full((80,), math.exp(2)).double(), rtol=1e-6, atol=0)
@@ -136,7 +137,7 @@ def test_spectrum_of_what_is_no_checkpoint(tmp_path: Path, capsys: pytest.Captur
     path.write_text("no")
     assert command.main(["--checkpoint", str(path), "--out", str(tmp_path)]) == 2
     assert "expected a checkpoint" in capsys.readouterr().err
-    checkpoint.save(path, "config", "data", {"model": trainer("3dgs").model.state_dict()})
+    checkpoint.save(path, Checkpoint("training", "data", {"model": trainer("3dgs").model.state_dict()}))
     with pytest.raises(InputError, match="4dgs, 6dgs or 7dgs"):
         spectrum.measure(path)
 

@@ -15,6 +15,7 @@ from tiny_run import ROOT, command, environment, gsbench, overrides, write_movin
 from gsbench.errors import InputError
 from gsbench.measure import record
 from gsbench.train import checkpoint
+from gsbench.train.checkpoint import Checkpoint
 
 RUN = (
     "model=7dgs",
@@ -32,7 +33,7 @@ def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def final_state(results: Path) -> dict[str, object]:
     (path,) = results.rglob(checkpoint.FILE_NAME)
-    return torch.load(path, weights_only=True)["state"]
+    return checkpoint.read(path).state
 
 
 def assert_same_bits(a: object, b: object, where: str = "state") -> None:
@@ -78,7 +79,7 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, tmp_pa
             assert process.poll() is None, "the run ended before it could be killed"
             time.sleep(0.01)
             found = list((tmp_path / "broken").rglob(checkpoint.FILE_NAME))
-            step = torch.load(found[0], weights_only=True)["state"]["step"] if found else 0
+            step = checkpoint.read(found[0]).state["step"] if found else 0
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
         killed_at.append(step)
@@ -136,7 +137,7 @@ def test_a_file_that_is_no_checkpoint_is_refused(
     monkeypatch.chdir(tmp_path)
     path = tmp_path / checkpoint.FILE_NAME
     path.write_bytes(content)
-    with pytest.raises(InputError, match="delete it to start over"):
+    with pytest.raises(InputError, match="start over with resume=false"):
         checkpoint.load(path, "config", "data", "cpu")
     assert not Path("owned").exists()
 
@@ -144,8 +145,8 @@ def test_a_file_that_is_no_checkpoint_is_refused(
 def test_a_checkpoint_of_another_run_is_not_taken(tmp_path: Path) -> None:
     """Catches a run that goes on from another config's or another data set's parameters."""
     path = tmp_path / checkpoint.FILE_NAME
-    assert checkpoint.load(path, "config", "data", "cpu") is None
-    checkpoint.save(path, "config", "data", {"step": 3})
-    assert checkpoint.load(path, "config", "data", "cpu") == {"step": 3}
+    assert checkpoint.load(path, "training", "data", "cpu") is None
+    checkpoint.save(path, Checkpoint("training", "data", {"step": 3}))
+    assert checkpoint.load(path, "training", "data", "cpu") == {"step": 3}
     assert checkpoint.load(path, "other", "data", "cpu") is None
-    assert checkpoint.load(path, "config", "other", "cpu") is None
+    assert checkpoint.load(path, "training", "other", "cpu") is None

@@ -9,7 +9,7 @@ import torch
 from gsbench.backends import AUTO, REFERENCE
 from gsbench.measure.curve import Point
 from gsbench.models import Query
-from gsbench.run import build
+from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene
 from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.loop import Trainer

@@ -1,0 +1,218 @@
+"""Attempt a run: prepare it and refuse what can be refused, fit the model, measure it, describe how it went."""
+
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from gsbench import models
+from gsbench.config import Config
+from gsbench.errors import InputError, one_line
+from gsbench.measure import record as records
+from gsbench.measure.provenance import provenance
+from gsbench.measure.quality import Quality, evaluate, evenly
+from gsbench.measure.record import Cost, Effects, Record
+from gsbench.measure.speed import peak_memory, reset_peak_memory, synchroniser, time_renders
+from gsbench.models import GaussianModel
+from gsbench.models.replay import Replay
+from gsbench.report.pictures import strip, write_png
+from gsbench.run import progress, stop
+from gsbench.run.checks import check_config, check_scene, evaluated_views
+from gsbench.run.identity import Run, training_hash
+from gsbench.run.load import plain_description
+from gsbench.run.setup import build, load_scene
+from gsbench.scenes import Scene, View
+from gsbench.scenes.points import random_points
+from gsbench.train import checkpoint
+from gsbench.train.checkpoint import Checkpoint
+from gsbench.train.loop import Trainer
+from gsbench.train.schedule import generator
+from gsbench.train.watch import DivergedError
+
+
+class Attempt:
+    """One attempt at a run. What it has come to, it can describe in a record, whatever stopped it."""
+
+    def __init__(self, this: Run) -> None:
+        """Attempt a run that has a name and a folder; nothing is read or checked yet."""
+        self.this = this
+        self.config = this.config
+        self.model: GaussianModel | None = None
+        self.scene: Scene | None = None
+        self._shown: list[tuple[npt.ArrayLike, npt.ArrayLike]] = []
+
+    def prepare(self) -> Trainer:
+        """Check everything that can be refused before step 0, load the scene and build the trainer.
+
+        Raises:
+            InputError: the config, the device or the data has a fault.
+        """
+        check_config(self.config)
+        self.model = build(self.config)
+        self.scene = scene = load_scene(self.config)
+        check_scene(self.model, scene, self.config)
+        views = evaluated_views(scene, self.config.scene.eval_split)
+        records.check(self.describe("failed", "not run"), "planned record")
+        data, random = self.config.data, generator(self.config.seed)
+        points = scene.points or random_points(data.initial_points, data.initial_half_width, random)
+        self.model.initialise(points, scene.extent, random)
+        self.model.to(self.config.device)
+        return Trainer(self.model, scene, views, self.config)
+
+    def fit(self, trainer: Trainer) -> None:
+        """Train to the end, from the checkpoint in the run's folder if there is one of this training.
+
+        Raises:
+            InputError: the checkpoint is damaged.
+            DivergedError: a loss or gradient was not finite.
+            Stopped: the process was told to end; the checkpoint is saved.
+        """
+        this, scene = self.this, trainer.scene
+        reset_peak_memory(self.config.device)
+        path, hashes = this.folder / checkpoint.FILE_NAME, (training_hash(this.plain), scene.fingerprint)
+        state = checkpoint.load(path, *hashes, self.config.device) if self.config.resume else None
+        if state is not None:
+            trainer.load_state_dict(state)
+            print(f"{this.name}: goes on from step {trainer.step} of {path}", file=sys.stderr)
+        about = this.plain, plain_description(scene)
+        with stop.requested() as request:
+            report = progress.Reporter(this.folder, this.overrides, self.config.train.iterations)
+
+            def goes_on() -> bool:
+                report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
+                return request.signal is None
+
+            trainer.run(lambda state: checkpoint.save(path, Checkpoint(*hashes, state, *about)), this.name, goes_on)
+            if request.signal is not None and trainer.step < self.config.train.iterations:
+                report.end()
+                if request.signal == signal.SIGUSR2:  # submitit's handler puts the job back into the queue, and ends it
+                    request.hand_on(request.signal)
+                raise stop.Stopped(request.signal, f"{this.name}: stopped at step {trainer.step}, saved in {path}: "
+                                                   f"the same command goes on from there")  # fmt: skip
+        for name, parameter in trainer.model.named_parameters():  # a colour of -inf is drawn as black, and not noticed
+            if not parameter.isfinite().all():
+                raise DivergedError(f"step {trainer.step}: '{name}' has values that are not finite")
+        if not len(trainer.model):
+            raise InputError("no Gaussian is left: the training pruned all of them; look at train.densify, "
+                             "model.min_opacity and data.initial_half_width")  # fmt: skip
+
+    def measure(self, trainer: Trainer) -> Record:
+        """Measure the images, the speed and the size of a fitted model."""
+        config, views = self.config, trainer.views
+        images = [(view.name, trainer.render(view), view.image) for view in views]
+        given = {"alex": config.protocol.lpips_alex, "vgg": config.protocol.lpips_vgg}
+        weights = {backbone: Path(file).expanduser() for backbone, file in given.items() if file}
+        quality = evaluate(
+            images, background=trainer.scene.background, quantised=config.protocol.quantise, weights=weights
+        )
+        frame, made = frames(trainer, views[0])
+        times = time_renders(
+            lambda i: frame(views[i % len(views)]),
+            count=max(config.protocol.renders, len(views)),
+            synchronise=synchroniser(config.device),
+        )
+        pictures = config.protocol.pictures
+        shown = images[:: max(1, len(images) // max(1, pictures))][:pictures]
+        self._shown = [(render.cpu().numpy(), truth.cpu().numpy()) for _, render, truth in shown]
+        cost = Cost(
+            train_s=sum(trainer.stages.seconds.values()),
+            stage_s=trainer.stages.state_dict(),
+            render_ms=times,
+            fps=times.fps,
+            num_gaussians=len(trainer.model),
+            bytes=sum(p.numel() * p.element_size() for p in trainer.model.parameters()),
+            peak_memory=peak_memory(config.device),
+        )
+        metrics, missing = with_best(quality, trainer, config)
+        metrics["psnr_train"] = trainer.psnr(evenly(trainer.scene.train, len(views)))
+        record = self.describe("ok", None)
+        return replace(
+            record, protocol=record.protocol | made,
+            metrics=metrics, missing=missing, per_view=quality.per_view, cost=cost, curve=trainer.curve.points,
+        )  # fmt: skip
+
+    def draw(self) -> None:
+        """Write pictures.png of what was measured; a disk that is full then costs the pictures and not the record."""
+        if not self._shown:
+            return
+        path = self.this.folder / "pictures.png"
+        try:
+            write_png(strip(self._shown), path)
+        except OSError as error:
+            print(f"{self.this.name}: no pictures: {path}: {error.strerror}", file=sys.stderr)
+
+    def describe(self, status: str, reason: str | None) -> Record:
+        """Describe the run in a record without measurements: what was run, where, and how it ended.
+
+        Args:
+            status: ok, failed or diverged.
+            reason: why it failed or diverged; None where it ended well.
+        """
+        config, scene, this = self.config, self.scene, self.this
+        observes = models.find(config.model.name).observes
+        camera = scene.train[0].camera if scene else None
+        on_gpu = config.device.startswith("cuda") and self.model is not None
+        return Record(
+            status=status,
+            reason=reason,
+            experiment=config.experiment,
+            model=this.label,
+            scene=config.scene.name,
+            dataset=config.data.dataset,
+            seed=config.seed,
+            effects=Effects("time" in observes, "direction" in observes, config.agr),
+            protocol={
+                "name": config.protocol.name,
+                "background": config.data.background,
+                "downscale": config.scene.downscale,
+                "resolution": f"{camera.width}x{camera.height}" if camera else "not loaded",
+                "eval_split": config.scene.eval_split,
+                "quantise": config.protocol.quantise,
+                "backend": self.model.backend.name if self.model else config.raster.backend,
+                "paper_dataset": config.data.paper_dataset,
+            },
+            provenance=provenance(
+                config=this.plain,
+                data_hash=scene.fingerprint if scene else "not loaded",
+                threads=torch.get_num_threads(),
+                device=torch.cuda.get_device_name(config.device) if on_gpu else None,
+            ),
+            variant=this.variant,
+            overrides=this.overrides,
+        )
+
+
+def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dict[str, str]]:
+    """Choose the function that FPS is measured on, and say for the record how it makes frames on a GPU.
+
+    Frames are `replayed` from a CUDA graph where CUDA can record the model, and otherwise `launched` anew each time.
+    """
+    config = trainer.config
+    if trainer.model.backend.name != "cuda":
+        return trainer.render, {}
+    replay = Replay(trainer.model, trainer.background, config.raster.antialias)
+    try:
+        replay(first.camera, first.time)
+    except RuntimeError as error:  # an operation that waits for the device, in a model or a scheme written in torch
+        print(f"FPS is that of launched frames: CUDA cannot record this model: {one_line(error)}", file=sys.stderr)
+        return trainer.render, {"frames": "launched"}
+    return lambda view: replay(view.camera, view.time), {"frames": "replayed"}
+
+
+def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[str, float | None], dict[str, str]]:
+    """Add to the metrics of the last iteration those that the evaluated split had at the best iterations."""
+    metrics, missing = dict(quality.metrics), dict(quality.missing)
+    metrics["psnr_best_on_val"] = trainer.best.eval_at_best_val
+    if config.scene.eval_split == "val":
+        metrics["psnr_best_on_val"] = None
+        missing["psnr_best_on_val"] = "measured on val, so no other split is left to choose an iteration by"
+    elif metrics["psnr_best_on_val"] is None:
+        missing["psnr_best_on_val"] = "the scene has no val split"
+    if config.protocol.best_on_test:
+        metrics["psnr_best_on_test"] = trainer.best.eval
+    return metrics, missing

@@ -1,0 +1,100 @@
+"""Load the model of a finished or broken run back from its folder."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gsbench.config import Config
+from gsbench.errors import InputError
+from gsbench.measure.schema import parse
+from gsbench.models import GaussianModel
+from gsbench.run.setup import build
+from gsbench.scenes import Scene
+from gsbench.scenes.scene import Points
+from gsbench.train import checkpoint
+from gsbench.train.schedule import Schedule, generator
+
+
+@dataclass(frozen=True)
+class SceneDescription:
+    """What is to be known of a scene to render a model of it, without its images."""
+
+    name: str
+    fingerprint: str  # Scene.fingerprint of the data that the model was trained on
+    extent: float  # world units
+    background: list[float]  # RGB in [0, 1]
+    has_time: bool
+    width: int  # of the first training view, pixels
+    height: int
+
+    @classmethod
+    def of(cls, scene: Scene) -> "SceneDescription":
+        """Describe a loaded scene."""
+        camera = scene.train[0].camera
+        return cls(scene.name, scene.fingerprint, scene.extent, list(scene.background), scene.has_time,
+                   camera.width, camera.height)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """A trained model, ready to render, with the config and the scene that it was trained by."""
+
+    model: GaussianModel
+    config: Config
+    scene: SceneDescription
+    step: int  # finished steps; below config.train.iterations where the run was broken off
+    folder: Path
+
+
+def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> LoadedRun:
+    """Load the model, the config and a description of the scene from the folder of a run.
+
+    Only the checkpoint is read. It is untrusted: nothing in it is executed, and its config and tensors are checked.
+
+    Args:
+        folder: of the run, such as results/mini/suzanne/7dgs/seed0.
+        device: to render on.
+        backend: to render with, whatever the run was trained with: auto, reference, cpu or cuda.
+
+    Raises:
+        InputError: the folder has no checkpoint, or the checkpoint is damaged or not of its own config.
+    """
+    path = Path(folder) / checkpoint.FILE_NAME
+    if not path.exists():
+        raise InputError(f"{folder}: expected the folder of a run with a {checkpoint.FILE_NAME}, found none: "
+                         f"run it again, or name its folder, results/EXPERIMENT/SCENE/MODEL/seedK")  # fmt: skip
+    found = checkpoint.read(path, device)
+    config = _config(found.config, path)
+    config.device, config.raster.backend = device, backend
+    scene = parse(SceneDescription, found.scene, str(path))
+    model = build(config)
+    points = torch.eye(4, 3)  # as few as there can be; `load_state` replaces them
+    model.initialise(Points(points, points), scene.extent, generator(config.seed))
+    model.to(device)
+    try:
+        model.load_state(found.state["model"])
+        step = checkpoint.whole_number("step", found.state["step"], config.train.iterations)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: expected a training's state, it lacks {error}") from None
+    schedule = Schedule(config.train, config.model.sh_degree, config.agr)
+    model.set_phase(schedule.phase(max(0, step - 1)))
+    return LoadedRun(model.requires_grad_(False), config, scene, step, Path(folder))
+
+
+def plain_description(scene: Scene) -> dict[str, Any]:
+    """Describe a scene in plain values, as a checkpoint holds it."""
+    return asdict(SceneDescription.of(scene))
+
+
+def _config(plain: dict[str, Any], path: Path) -> Config:
+    """Type the plain config of a checkpoint; raises InputError where it is not one."""
+    try:
+        typed = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.create(plain))
+        config: Config = OmegaConf.to_object(typed)  # type: ignore[assignment]
+    except (OmegaConfBaseException, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: expected the config of a run: {str(error).splitlines()[0]}") from None
+    return config

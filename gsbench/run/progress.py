@@ -1,0 +1,110 @@
+"""Tell other processes how far a run is: progress.json lies in its folder while it runs. Needs no torch."""
+
+import dataclasses
+import json
+import os
+import socket
+import stat
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gsbench.errors import InputError
+from gsbench.measure.atomic import write_atomically
+from gsbench.measure.curve import Point
+from gsbench.measure.schema import parse
+
+FILE_NAME = "progress.json"
+EVERY = 5.0  # seconds between two writes
+LARGEST = 1 << 20  # bytes
+SILENT = 600.0  # seconds after which a run that nobody can be asked about counts as lost
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is, and the process that does it."""
+
+    overrides: list[str]  # of the run, as in its record
+    host: str = field(default_factory=socket.gethostname)
+    pid: int = field(default_factory=os.getpid)
+    born: int | None = field(default_factory=lambda: born(os.getpid()))
+    job: str | None = field(default_factory=lambda: slurm_job())
+    started: float = field(default_factory=time.time)  # Unix seconds
+    updated: float = field(default_factory=time.time)  # Unix seconds
+    step: int = 0
+    steps: int = 0
+    seconds: float = 0.0  # of training so far
+    psnr_val: float | None = None  # dB, the last one measured
+
+
+def write(folder: Path, progress: Progress) -> None:
+    """Write the progress of the run in `folder`, atomically."""
+    text = json.dumps(dataclasses.asdict(progress), indent=1, allow_nan=False)
+    write_atomically(folder / FILE_NAME, text.encode(), lasting=False)
+
+
+class Reporter:
+    """Writes the progress of a run from inside its training, at most every EVERY seconds."""
+
+    def __init__(self, folder: Path, overrides: list[str], steps: int) -> None:
+        """Say at once that the run in `folder`, of so many steps, has started."""
+        self.folder = folder
+        self.progress = Progress(overrides, steps=steps)
+        write(folder, self.progress)
+        self._written = time.monotonic()
+
+    def __call__(self, step: int, seconds: float, last: Point | None) -> None:
+        """Report finished steps, seconds of training and the last point of the curve."""
+        if time.monotonic() - self._written < EVERY:
+            return
+        psnr = last.psnr_val if last else None
+        self.progress = dataclasses.replace(
+            self.progress, step=step, seconds=seconds, psnr_val=psnr, updated=time.time()
+        )
+        self._written = time.monotonic()
+        try:
+            write(self.folder, self.progress)
+        except OSError:  # a full disk ends the run where something is lost by it: at its checkpoint or its record
+            return
+
+    def end(self) -> None:
+        """Say that nobody is at this run any more."""
+        (self.folder / FILE_NAME).unlink(missing_ok=True)
+
+
+def read(path: Path) -> Progress:
+    """Read a progress.json; raises InputError where it is not one."""
+    try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode) or found.st_size > LARGEST:
+            raise InputError(f"{path}: expected the progress of a run, got something else")
+        return parse(Progress, json.loads(path.read_bytes()), str(path))
+    except InputError:
+        raise
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: expected the progress of a run: {error}") from None
+
+
+def is_alive(progress: Progress) -> bool:
+    """Tell whether the process that wrote a progress still runs; on another host, whether it wrote lately."""
+    if progress.host == socket.gethostname():
+        return progress.born is not None and born(progress.pid) == progress.born
+    return time.time() - progress.updated < SILENT
+
+
+def born(pid: int) -> int | None:
+    """Return when a process of this machine started, in clock ticks after the machine did; None where there is none.
+
+    With it a process is told from a later one that was given the same number.
+    """
+    try:
+        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return None if after_name[0] == "Z" else int(after_name[19])  # field 22 of proc(5); a zombie has ended
+
+
+def slurm_job() -> str | None:
+    """Return the Slurm job of this process as squeue names it (`12` or `12_3`), None outside of Slurm."""
+    array, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
+    return f"{array}_{task}" if array and task else os.environ.get("SLURM_JOB_ID")

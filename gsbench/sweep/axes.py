@@ -1,0 +1,68 @@
+"""Expand a command line before Hydra reads it: scene=all becomes an axis of the sweep, one run for each scene."""
+
+import re
+from collections.abc import Sequence
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+from gsbench.config import CONF
+from gsbench.errors import InputError, did_you_mean
+
+MULTIRUN = ("-m", "--multirun")
+SCENES_DEPEND_ON = ("exp", "data.scenes")  # the overrides that say which scenes there are
+INFORM = ("-h", "--help", "--hydra-help", "--version", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion")
+
+NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{'\"].*|")  # what Hydra reads as a value
+
+
+def expand(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line with `--multirun` first, and with the scenes of the experiment as an axis.
+
+    A command line that names one scene, asks for information or has a fault is left as it is: Hydra explains the fault.
+
+    Raises:
+        InputError: a group's choice is a number, the experiment has no scenes, or scene=all stands beside several
+            experiments.
+    """
+    multirun = any(word in MULTIRUN for word in words)
+    words = [word for word in words if word not in MULTIRUN]
+    for word in words:
+        _check_group(*word.lstrip("+").partition("=")[::2])
+    keys = {word.partition("=")[0].lstrip("+"): word.partition("=")[2] for word in words if "=" in word}
+    wants_all = keys.get("scene", "all") == "all" and "exp" in keys and keys["exp"] != "stability"
+    if wants_all and not any(word in INFORM for word in words):
+        if "," in keys["exp"]:
+            raise InputError(f"scene=all: expected one experiment, got exp={keys['exp']}: name the scenes, scene=A,B")
+        scenes = scenes_of([word for word in words if word.partition("=")[0].lstrip("+") in SCENES_DEPEND_ON])
+        if scenes is not None:
+            if not scenes:
+                raise InputError("data.scenes: expected the names of scenes, got an empty list")
+            words = [*(word for word in words if not word.startswith("scene=")), f"scene={','.join(scenes)}"]
+            multirun = True
+    return ["--multirun", *words] if multirun else words
+
+
+def _check_group(name: str, choices: str) -> None:
+    """Raise InputError for a group's choice that is a number or the like: Hydra would raise an error of its insides."""
+    if not name or not (CONF / name).is_dir():
+        return
+    for choice in choices.split(","):
+        if NO_NAME.fullmatch(choice.lower()):
+            known = sorted(path.stem for path in (CONF / name).glob("*.yaml"))
+            raise InputError(f"{name} '{choice}' is not known. {did_you_mean(choice, known)}")
+
+
+def scenes_of(overrides: list[str]) -> list[str] | None:
+    """Return the scenes of an experiment, each of them then a choice of the group `scene`; None where Hydra fails."""
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            scenes: list[str] = list(compose("config", overrides).data.scenes)
+    except (HydraException, OmegaConfBaseException):
+        return None
+    for scene in scenes:
+        if not (CONF / "scene" / f"{scene}.yaml").exists():
+            ConfigStore.instance().store(group="scene", name=scene, node={"name": scene})
+    return scenes

@@ -1,0 +1,163 @@
+"""Hostile overrides: a faulty value is refused in one line before step 0, and no training that finished is lost.
+
+Every case is a run of three steps in this process with one to three random overrides. It may end well, or be refused.
+"""
+
+import io
+import random
+import re
+import signal
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from types import FrameType
+
+import hydra
+import pytest
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from tiny_run import overrides, write_moving_square
+
+from gsbench.config import CONF, register_schema
+from gsbench.errors import InputError
+from gsbench.measure import record
+from gsbench.run.identity import flat
+from gsbench.run.run import run
+from gsbench.sweep.axes import expand
+
+SAMPLE, ALL = 30, 700
+NUMBERS = ("0", "1", "-1", "2", "0.5", "1e-3", "1e39", "-1e-9", "nan", "inf", "-inf", "1.5", "9223372036854775807",
+           "9223372036854775808", "1e400", "100000", "true", "null", "abc", "''", "[]", "{a: 1}", "no", "'\\0'",
+           "../..", "pkg://nosuch", "/dev/zero", "/proc/self/mem", "cuda:7", "cpu:5", "é")  # fmt: skip
+LONG = (
+    "train.iterations",
+    "train.recipe_iterations",
+    "data.initial_points",
+    "protocol.renders",
+)  # would only take long
+SECONDS = 60
+
+
+class TooLong(Exception):  # noqa: N818
+    """A case that took longer than SECONDS."""
+
+
+@pytest.fixture(scope="module")
+def square(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    register_schema()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        yield write_moving_square(tmp_path_factory.mktemp("data"))
+
+
+def keys() -> list[str]:
+    """Every key of the config, and some that are none."""
+    composed = hydra.compose("config", ["+exp=mini", "scene=suzanne", "model=7dgs"])
+    plain = OmegaConf.to_container(composed)
+    assert isinstance(plain, dict)
+    return [*(key for key, _ in flat(plain) if key != "results"), "+foo", "+train.foo", "+model.options.foo",
+            "+model.lr.means.foo", "~data.root", "~model.lr.motion", "model", "scene", "train", "protocol"]  # fmt: skip
+
+
+def case(seed: int, known: list[str]) -> list[str]:
+    """The overrides of a case."""
+    draw = random.Random(seed)
+    words = []
+    for key in draw.sample(known, draw.choice((1, 1, 2, 3))):
+        value = draw.choice(NUMBERS)
+        if key in LONG and value in ("100000", "9223372036854775807"):
+            value = "7"
+        words.append(key if key.startswith("~") else f"{key}={value}")
+    return words
+
+
+def end(words: list[str], square: Path, results: Path) -> str:
+    """Do the run of a case; how it ended."""
+    model = random.Random(repr(words)).choice(("3dgs", "4dgs", "7dgs", "7dgs agr=false"))
+    base = overrides(square, results, f"model={model.split()[0]}", *model.split()[1:], "train.curve_points=1")
+    base = ["train.iterations=3" if word == "train.iterations=30" else word for word in base]
+    try:
+        composed: DictConfig = hydra.compose("config", [w for w in expand([*base, *words]) if w != "--multirun"])
+        composed.results = str(results)
+        done = run(composed)
+    except (InputError, HydraException, OmegaConfBaseException):
+        return "refused"
+    assert done is not None
+    assert done.status in record.STATUSES
+    (path,) = record.find(results)
+    assert record.read(path).status == done.status
+    if done.status == "failed":
+        assert done.reason
+        assert "\n" not in done.reason
+        assert not list(results.rglob("checkpoint.pt")), f"trained, and then lost: {done.reason}"
+    return done.status
+
+
+def check(seeds: range, square: Path, tmp_path: Path) -> dict[str, int]:
+    """Do the cases of some seeds; how many ended in which way."""
+    known, ends = keys(), dict.fromkeys(("refused", "ok", "failed", "diverged"), 0)
+
+    def give_up(_: int, __: FrameType | None) -> None:
+        raise TooLong
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    try:
+        for seed in seeds:
+            words = case(seed, known)
+            signal.alarm(SECONDS)
+            try:
+                with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+                    ends[end(words, square, tmp_path / str(seed))] += 1
+            except Exception as error:
+                raise AssertionError(f"case {seed}: {words}: {type(error).__name__}: {error}") from error
+            finally:
+                signal.alarm(0)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    return ends
+
+
+def test_a_sample_of_hostile_overrides_is_refused_or_runs(square: Path, tmp_path: Path) -> None:
+    """Catches a stack trace, a hang, and a training that ends well and is then lost."""
+    ends = check(range(SAMPLE), square, tmp_path)
+    assert ends["refused"] + ends["failed"] > SAMPLE / 4
+    assert ends["ok"] > 0
+
+
+@pytest.mark.slow
+def test_all_hostile_overrides_are_refused_or_run(square: Path, tmp_path: Path) -> None:
+    """The same for many more."""
+    check(range(SAMPLE, ALL), square, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["protocol.renders=5"], "protocol.renders: expected 30 to 1000000, got 5"),
+        (["protocol.lpips_alex=/nowhere.npz"], "/nowhere.npz: expected the weights"),
+        (["train.checkpoint_minutes=nan"], "train.checkpoint_minutes: expected a finite number, got nan"),
+        (["seed=9223372036854775808"], "seed: expected 0 <= seed < 2^63"),
+        (["train.densify.grad_threshold=nan"], "train.densify.grad_threshold: expected a finite number"),
+        (["train.ssim_weight=2"], "train.ssim_weight: expected 0 to 1, got 2"),
+        (["model.lr.means.start=-1"], "model.lr.means: expected start >= 0"),
+        (["+foo=1"], "config key 'foo' is not known"),
+        (["+train.iteratons=1"], "config key 'train.iteratons' is not known. Did you mean 'iterations'?"),
+        (["model=7dgs", "model.options.directional_half=no"], "option directional_half: expected a bool, got 'no'"),
+        (["device=cpu:5"], "device 'cpu:5' is not known"),
+        (["data.root=pkg://nosuch"], "data.root: expected pkg://MODULE"),
+    ],
+)  # fmt: skip
+def test_what_used_to_be_found_after_the_training_is_refused_before_it(
+    words: list[str], said: str, square: Path, tmp_path: Path
+) -> None:
+    """Catches faults that cost a whole training before they were noticed, and refusals that leave no row."""
+    composed = hydra.compose("config", [*overrides(square, tmp_path, "model=3dgs"), *words])
+    if "seed" in words[0]:  # it has no name, so it can have no row
+        with pytest.raises(InputError, match=re.escape(said)):
+            run(composed)
+        return
+    done = run(composed)
+    assert done is not None
+    assert done.status == "failed"
+    assert said in str(done.reason)
+    assert not list(tmp_path.rglob("checkpoint.pt"))

@@ -1,0 +1,108 @@
+"""A run's name: made of what its training reads, equal for equal trainings, and fit for a folder."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+from omegaconf import OmegaConf
+
+from gsbench.config import CONF, register_schema
+from gsbench.run.identity import LONGEST_VARIANT, Run, flat, identify, training_hash, training_part
+
+
+@pytest.fixture(scope="module", autouse=True)
+def composer() -> Iterator[None]:
+    register_schema()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        yield
+
+
+def named(*words: str) -> Run:
+    """The run of `python -m gsbench +exp=mini scene=suzanne` and these words."""
+    composed = hydra.compose("config", ["+exp=mini", "scene=suzanne", *words], return_hydra_config=True)
+    choices = OmegaConf.to_container(composed.hydra.runtime.choices)
+    OmegaConf.set_struct(composed, False)
+    del composed.hydra
+    return identify(composed, choices, ["+exp=mini", "scene=suzanne", *words])
+
+
+@pytest.mark.parametrize(
+    ("words", "folder"),
+    [
+        ([], "7dgs"),
+        (["model=4dgs", "seed=3"], "4dgs"),
+        (["agr=false"], "7dgs_noagr"),
+        (["train.iterations=1000"], "7dgs"),  # the experiment's own number
+        (["train.iterations=10"], "7dgs,iterations=10"),
+        (["train.densify.reset_every=50", "model.options.scheme=schur"], "7dgs,scheme=schur,densify.reset_every=50"),
+        (["model.lr.means.start=1e-3"], "7dgs,lr.means.start=0.001"),
+        (["scene.downscale=4", "optim=sparse_adam"], "7dgs,optim=sparse_adam,downscale=4"),
+        (["+recipe=paper"], "7dgs,recipe=paper"),
+        (["+trial=7dgs/fast", "train.batch_size=1"], "7dgs,trial=7dgs.fast,batch_size=1"),
+        (["raster.antialias=true"], "7dgs,antialias=true"),
+        (["protocol=published"], "7dgs,protocol=published"),
+    ],
+)  # fmt: skip
+def test_a_folder_says_what_is_not_the_experiments_own(words: list[str], folder: str) -> None:
+    """Catches two runs in one folder, and a folder named after what the experiment does anyway."""
+    run = named(*words)
+    assert run.folder == Path(f"results/mini/suzanne/{folder}/seed{run.config.seed}")
+    assert run.folder.parent.name == run.label + (f",{run.variant}" if run.variant else "")
+
+
+@pytest.mark.parametrize(
+    "word",
+    ["protocol.pictures=1", "protocol.quantise=true", "protocol.renders=60", "data.published=there", "data.root=/x",
+     "train.checkpoint_minutes=9", "protocol.lpips_alex=weights.npz", "results=elsewhere", "resume=false"],
+)  # fmt: skip
+def test_measuring_is_not_training(word: str) -> None:
+    """Catches a training that is repeated because its images are measured in another way."""
+    assert training_hash(named(word).plain) == training_hash(named().plain)
+    assert named(word).variant == ""
+
+
+@pytest.mark.parametrize(
+    "word",
+    ["seed=1", "train.iterations=9", "model.lr.means.end=1e-5", "scene.eval_split=val", "protocol.best_on_test=true",
+     "data.initial_points=9", "raster.backend=reference"],
+)  # fmt: skip
+def test_training_is_training(word: str) -> None:
+    """Catches a checkpoint that is taken by a run with other numbers."""
+    assert training_hash(named(word).plain) != training_hash(named().plain)
+
+
+def test_every_key_is_of_training_or_of_measuring() -> None:
+    """Catches a new key of the config that nobody has sorted: then add it to MEASURING, or to this list."""
+    keys = {key for key, _ in flat(training_part(named("model=3dgs").plain)) if not key.startswith("model.lr.")}
+    assert keys == {
+        "seed", "device", "agr", "optim", "scene.name", "scene.downscale", "scene.eval_split", "data.background",
+        "data.modulation", "data.initial_points", "data.initial_half_width", "raster.backend", "raster.antialias",
+        "protocol.best_on_test", "model.name", "model.published_with_agr", "model.agr", "model.agr_octaves",
+        "model.sh_degree", "model.min_opacity", *(f"train.{name}" for name in (
+            "iterations", "recipe_iterations", "batch_size", "ssim_weight", "sh_every", "refine_from",
+            "modulation_from", "curve_points", *(f"densify.{name}" for name in (
+                "start", "stop", "every", "reset_every", "grad_threshold", "clone_below", "prune_above")))),
+    }  # fmt: skip
+
+
+def test_long_names_are_cut_at_a_word_and_stay_different() -> None:
+    """Catches folders that no file system takes, and two runs that are cut to one name."""
+    many = [
+        f"model.lr.{name}.start={i}e-3" for i, name in enumerate(("means", "times", "directions", "shape", "motion"), 1)
+    ]
+    one, other = named(*many), named(*many[:-1], "model.lr.motion.start=9e-3")
+    for run in (one, other):
+        assert len(run.variant) <= LONGEST_VARIANT
+        assert run.variant.startswith("lr.means.start=0.001,lr.times.start=0.002,")
+    assert one.variant != other.variant
+    assert named(*many[::-1]).variant == one.variant  # whatever the order of the words
+
+
+def test_the_words_repeat_the_run(tmp_path: Path) -> None:
+    """Catches a record whose command line does another run than its own."""
+    run = named("train.iterations=10", f"results={tmp_path}", "seed=2")
+    assert run.overrides == ["+exp=mini", "scene=suzanne", "seed=2", "train.iterations=10"]
+    words: list[Any] = [word for word in run.overrides if word not in ("+exp=mini", "scene=suzanne")]
+    assert named(*words).plain == run.plain

@@ -1,0 +1,119 @@
+"""A run that is told to end: it saves, says so in one line, and goes on from there with the same bits."""
+
+import os
+import re
+import signal
+import subprocess
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from tiny_run import ROOT, command, environment, gsbench, overrides, write_moving_square
+
+from gsbench.measure.atomic import HOST
+from gsbench.run import progress, stop
+from gsbench.train import checkpoint
+
+LONG = ("model=3dgs", "train.iterations=100000", "train.curve_points=1", "train.densify.stop=1")
+
+
+@pytest.fixture(scope="module")
+def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_square(tmp_path_factory.mktemp("data"))
+
+
+def started(*arguments: str, results: Path) -> subprocess.Popen[str]:
+    """A run in a process of its own, once it trains."""
+    process = subprocess.Popen(
+        command(*arguments), cwd=ROOT, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 120
+    while not list(results.rglob(progress.FILE_NAME)) and time.monotonic() < deadline:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    return process
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_saves_and_ends_in_one_line(number: signal.Signals, code: int, square: Path, tmp_path: Path) -> None:
+    """Catches the minutes since the last checkpoint lost, a stack trace, and a run that looks as if it still ran."""
+    process = started(*overrides(square, tmp_path, *LONG), results=tmp_path)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == code, said
+    assert "Traceback" not in said
+    found = re.search(r"stopped at step (\d+), saved in (.*): the same command goes on from there", said)
+    assert found, said
+    assert checkpoint.read(Path(found[2])).state["step"] == int(found[1])
+    assert not list(tmp_path.rglob(progress.FILE_NAME))
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+def test_a_run_that_another_process_does_is_left_to_it(square: Path, tmp_path: Path) -> None:
+    """Catches two sweeps on one folder that train the same run twice, and a dead process that is waited for."""
+    process = started(*overrides(square, tmp_path, *LONG), results=tmp_path)
+    second = gsbench(*overrides(square, tmp_path, *LONG))
+    assert second.returncode == 0, second.stderr
+    assert f"left to process {process.pid}" in second.stderr
+    process.kill()
+    process.wait()
+    (path,) = tmp_path.rglob(progress.FILE_NAME)
+    assert not progress.is_alive(progress.read(path))
+    third = started(*overrides(square, tmp_path, *LONG), results=tmp_path)
+    deadline = time.monotonic() + 60
+    while progress.read(path).pid != third.pid and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert progress.read(path).pid == third.pid
+    third.kill()
+
+
+def test_the_handler_of_before_acts_once_the_run_has_saved() -> None:
+    """Catches a job of Slurm that is not put back into its queue: submitit's handler of SIGUSR2 does that."""
+    called = []
+    before = signal.signal(signal.SIGUSR2, lambda number, _: called.append(number))
+    try:
+        with stop.requested() as request:
+            os.kill(os.getpid(), signal.SIGUSR2)
+            assert request.signal == signal.SIGUSR2
+            assert not called
+            request.hand_on(signal.SIGUSR2)
+            assert called == [signal.SIGUSR2]
+        os.kill(os.getpid(), signal.SIGUSR2)
+        assert len(called) == 2
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+
+
+def test_a_second_signal_ends_at_once() -> None:
+    """Catches a process that cannot be stopped while it saves to a disk that hangs."""
+    with stop.requested():
+        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_leftovers_of_killed_processes_go(square: Path, tmp_path: Path) -> None:
+    """Catches folders that fill with parts of checkpoints, and a part that another process is just writing removed."""
+    arguments = overrides(square, tmp_path, "model=3dgs", "train.iterations=3", "protocol.pictures=0")
+    assert gsbench(*arguments).returncode == 0
+    (record,) = tmp_path.rglob("record.json")
+    dead = subprocess.Popen(["true"])
+    dead.wait()
+    parts = {pid: record.with_name(f".record.json.{HOST}.{pid}.0123abcd.tmp") for pid in (dead.pid, os.getpid())}
+    for part in parts.values():
+        part.write_bytes(b"{")
+    assert gsbench(*arguments).returncode == 0
+    assert [part.exists() for part in parts.values()] == [False, True]
+
+
+def test_progress_can_be_read_and_a_later_process_with_its_number_is_not_it(tmp_path: Path) -> None:
+    """Catches a lost run that counts as running because its process number was given away again."""
+    mine = progress.Progress(["seed=1"], step=3, steps=9, psnr_val=20.5)
+    progress.write(tmp_path, mine)
+    assert progress.read(tmp_path / progress.FILE_NAME) == mine
+    assert progress.is_alive(mine)
+    assert mine.born is not None
+    assert not progress.is_alive(replace(mine, born=mine.born - 1))
+    assert progress.is_alive(replace(mine, host="elsewhere"))
+    assert not progress.is_alive(replace(mine, host="elsewhere", updated=mine.updated - 2 * progress.SILENT))
