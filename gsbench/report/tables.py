@@ -45,11 +45,11 @@ def load(root: Path) -> list[Record]:
     """All records under `root`; raises InputError if there is none, one is damaged, or a run appears twice."""
     if not root.is_dir():
         raise InputError(f"{root}: expected a folder of results, found none")
-    seen: dict[tuple[str, str, str, str, int], Path] = {}
+    seen: dict[tuple[str, str, str, str, str, int], Path] = {}
     records = []
     for path in files.find(root):
         record = files.read(path)
-        run = (record.experiment, record.dataset, record.scene, record.model, record.seed)
+        run = (record.experiment, record.dataset, record.scene, record.model, record.variant, record.seed)
         if run in seen:
             raise InputError(f"{path}: the same run as {seen[run]}; keep one of them")
         seen[run] = path
@@ -66,7 +66,9 @@ def tidy(records: list[Record]) -> pd.DataFrame:
 
 def _quantities(r: Record) -> dict[str, Any]:
     """Flatten a record to quantities by name."""
-    flat: dict[str, Any] = {name: getattr(r, name) for name in ("experiment", "dataset", "scene", "model", "seed")}
+    flat: dict[str, Any] = {
+        name: getattr(r, name) for name in ("experiment", "dataset", "scene", "model", "variant", "seed")
+    }
     flat |= {"status": r.status, "reason": r.reason}
     flat |= {LEAKS if name == "psnr_best_on_test" else name: (r.metrics or {}).get(name) for name in METRICS}
     flat["missing"] = "; ".join(f"{name}: {why}" for name, why in sorted(r.missing.items()))
@@ -83,7 +85,7 @@ def _quantities(r: Record) -> dict[str, Any]:
 def build(records: list[Record], *, train: bool = False) -> list[Table]:
     """Make a table for every experiment and data set in `records`, sorted by name; `train` adds `psnr_train`."""
     groups: dict[tuple[str, str], list[Record]] = {}
-    for record in sorted(records, key=lambda r: (r.experiment, r.dataset, r.scene, r.model, r.seed)):
+    for record in sorted(records, key=lambda r: (r.experiment, r.dataset, r.scene, r.model, r.variant, r.seed)):
         groups.setdefault((record.experiment, record.dataset), []).append(record)
     return [_Builder(group, train).table() for group in groups.values()]
 
@@ -94,19 +96,25 @@ class _Builder:
     def __init__(self, records: list[Record], train: bool) -> None:
         self.records = records
         self.scenes = sorted({r.scene for r in records})
-        self.models = sorted({r.model for r in records})
+        variants = {r.variant for r in records}
+        self.common = variants.pop() if len(variants) == 1 else ""  # said once, below the table
+        self.models = sorted({self._name(r) for r in records})
         flat = [_quantities(r) for r in records]
         shown = [COLUMNS[0], *([TRAIN] if train else []), *COLUMNS[1:]]
         self.columns = [*shown, *(c for c in EXTRA_COLUMNS if any(q[c.key] is not None for q in flat))]
         finished: dict[tuple[str, str], list[dict[str, Any]]] = {}
-        for q in flat:
+        for q, name in zip(flat, map(self._name, records), strict=True):
             if q["status"] == "ok":
-                finished.setdefault((q["scene"], q["model"]), []).append(q)
+                finished.setdefault((q["scene"], name), []).append(q)
         self.values = {  # by scene and model, then column: a value for each seed, NaN where it is missing
             run: {c.key: [math.nan if q[c.key] is None else float(q[c.key]) for q in seeds] for c in self.columns}
             for run, seeds in finished.items()
         }
         self.marks: list[str] = []
+
+    def _name(self, record: Record) -> str:
+        """Name the row of a run: its model, and what of its training is not the experiment's own."""
+        return f"{record.model} {record.variant}" if record.variant != self.common else record.model
 
     def table(self) -> Table:
         """Make the table: a section for every scene, and their average if there are several."""
@@ -115,7 +123,8 @@ class _Builder:
         if len(sections) > 1:
             sections.append(self._average())
         title = f"experiment {first.experiment}, data {printable(first.dataset)}"
-        return Table(title, self.columns, sections, self.marks, [*conditions(self.records), *self._no_vgg()])
+        common = [f"every run with {self.common}, not the experiment's own."] if self.common else []
+        return Table(title, self.columns, sections, self.marks, [*common, *conditions(self.records), *self._no_vgg()])
 
     def _no_vgg(self) -> list[str]:
         """Say why there is no column for LPIPS-VGG, if there is none."""
@@ -135,7 +144,7 @@ class _Builder:
         notes = []
         leader = _leader([self.values[scene, model] for model in self.models if (scene, model) in self.values])
         for model in self.models:
-            runs = [r for r in self.records if (r.scene, r.model) == (scene, model)]
+            runs = [r for r in self.records if (r.scene, self._name(r)) == (scene, model)]
             finished = [r for r in runs if r.status == "ok"]
             if finished:
                 cells = {c.key: self._cell(c, finished) for c in self.columns}
@@ -151,7 +160,7 @@ class _Builder:
 
     def _cell(self, column: Column, finished: list[Record]) -> str:
         """Show the mean and the spread over the seeds, or the reason why a seed lacks the number."""
-        values = self.values[finished[0].scene, finished[0].model][column.key]
+        values = self.values[finished[0].scene, self._name(finished[0])][column.key]
         if not math.isnan(fmean(values)):
             return column.show(fmean(values), stdev(values) if len(values) > 1 else math.nan)
         name = "psnr_best_on_test" if column.key == LEAKS else column.key
@@ -182,11 +191,11 @@ class _Builder:
 
     def _paper_row(self, scenes: list[str], model: str) -> list[Row]:
         """Make the paper's row for `model`, averaged over `scenes`; none if the paper lacks one of them."""
-        runs = [r for r in self.records if r.model == model and r.scene in scenes]
-        if any(r.effects.refinement != paper.MODELS.get(model) for r in runs):
+        runs = [r for r in self.records if self._name(r) == model and r.scene in scenes]
+        if any(r.effects.refinement != paper.MODELS.get(r.model) for r in runs):
             return []  # the model has the same name as one of the paper but differs in AGR
         datasets = {r.scene: str(r.protocol.get("paper_dataset")) for r in runs}
-        found = [paper.paper_row(datasets[scene], scene, model) for scene in scenes]
+        found = [paper.paper_row(datasets[scene], scene, runs[0].model) for scene in scenes]
         rows = [row for row in found if row is not None]
         if len(rows) < len(scenes):
             return []
