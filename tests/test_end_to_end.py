@@ -46,7 +46,9 @@ def test_every_model_learns_and_time_is_worth_something(results: Path) -> None:
 def test_the_table_has_every_run_and_the_papers_row(results: Path) -> None:
     """Catches a table that drops runs, the average, or the paper's row beside the stand-in scene."""
     folder = results / "mini"
-    text = layout.terminal(tables.write(tables.load(folder), folder))
+    records, faults = tables.load(folder)
+    assert not faults
+    text = layout.terminal(tables.write(records, folder))
     for word in ("moving-matte", "suzanne", "3dgs", "4dgs", "7dgs", "28.26"):
         assert word in text
         assert word in (folder / "table.md").read_text()

@@ -10,6 +10,8 @@ from tiny_run import ROOT
 # From the ground up: a module imports from its own room and from rooms on lower floors, never from its neighbours.
 FLOORS: tuple[set[str], ...] = (
     {"errors", "config"},
+    {"memory"},
+    {"reading"},
     {"scenes", "kernels"},
     {"backends"},
     {"raster"},

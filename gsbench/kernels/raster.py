@@ -9,13 +9,14 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.library import Library, allocate, library_of
-from gsbench.kernels.memory import require
 from gsbench.kernels.operation import Operation, address
+from gsbench.memory import require
 
 TILE = 16  # pixels a side, as cpu/kernels.h and cuda/launch.h have it
 TILE_PIXELS = TILE * TILE
 MAX_PAIRS = (1 << 31) - 1  # splats, and pairs of a tile and a splat, are numbered by int32
 GEOMETRY = 6  # of a splat: x, y, p, q, r, opacity
+LOWER = "use a smaller image, fewer cameras at once or fewer Gaussians"  # where memory does not suffice
 
 
 class Viewport(NamedTuple):
@@ -182,7 +183,7 @@ def _bin_on_cpu(library: Library, splats: Splats, viewport: Viewport) -> Bins:
     total = like.new_empty(1, dtype=torch.int64)
     library.call("count_tiles", slots | {"out.offsets": address(offsets), "out.pairs": address(total)}, like)
     pairs = _countable(int(total.item()))
-    require(4 * pairs, f"the lists of {pairs} pairs of a tile and a Gaussian")
+    require(4 * pairs, f"the lists of {pairs} pairs of a tile and a Gaussian", LOWER)
     ids = like.new_empty(pairs, dtype=torch.int32)
     library.call("fill_tiles", slots | {"out.offsets": address(offsets), "out.ids": address(ids)}, like)
     return Bins(offsets, ids)

@@ -7,6 +7,7 @@ and where the numbers come from (provenance). A missing number is null, and `mis
 import dataclasses
 import json
 import math
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,7 @@ from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
 from gsbench.measure.schema import parse
 from gsbench.measure.speed import RenderTimes
+from gsbench.reading import MAX_JSON, parse_json, read_file
 
 VERSION = 1
 FILE_NAME = "record.json"
@@ -124,15 +126,7 @@ def write(record: Record, path: Path) -> None:
 
 def read(path: Path) -> Record:
     """Read and validate the record at `path`; raises InputError that names the file and the field."""
-    try:
-        plain = json.loads(path.read_bytes().decode(), object_pairs_hook=_unique_keys)
-        return _validated(plain, path)
-    except OSError as error:
-        raise InputError(f"{path}: expected a record, could not read it: {error.strerror}") from None
-    except InputError:
-        raise
-    except (ValueError, RecursionError) as error:  # also bad UTF-8 and integers of thousands of digits
-        raise InputError(f"{path}: expected a record in JSON: {error}; delete it and run again") from None
+    return _validated(parse_json(read_file(path, str(path), MAX_JSON), str(path)), path)
 
 
 def _validated(plain: Any, path: Path) -> Record:
@@ -146,8 +140,12 @@ def _validated(plain: Any, path: Path) -> Record:
 
 
 def find(root: Path) -> list[Path]:
-    """List the paths of all records under `root`, sorted."""
-    return sorted(root.rglob(FILE_NAME))
+    """List the paths of all records under `root`, sorted; a broken link counts, as what it should show is missing."""
+    return sorted(
+        Path(folder, FILE_NAME)
+        for folder, folders, names in os.walk(root)
+        if FILE_NAME in names or FILE_NAME in folders
+    )
 
 
 def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, variant: str = "") -> Path:
@@ -224,11 +222,3 @@ def _without_non_finite(record: Record) -> Record:
 
 def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Refuse an object with two equal keys: JSON does not define which of them counts."""
-    unique = dict(pairs)
-    if len(unique) < len(pairs):
-        raise ValueError("a key appears twice in one object")
-    return unique

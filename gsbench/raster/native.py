@@ -3,8 +3,8 @@
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.memory import require
 from gsbench.kernels.raster import (
+    LOWER,
     MAX_PAIRS,
     TILE_PIXELS,
     Viewport,
@@ -15,6 +15,7 @@ from gsbench.kernels.raster import (
     flag_values,
     project,
 )
+from gsbench.memory import require
 from gsbench.raster.checks import check_values
 from gsbench.raster.output import RasterInfo, RasterOutput
 
@@ -74,4 +75,4 @@ def _check_room(C: int, N: int, D: int, viewport: Viewport) -> None:
         raise InputError(f"raster backend 'cpu': expected fewer than {MAX_GAUSSIANS} Gaussians, got {N}")
     pixels = C * count_tiles(viewport.width, viewport.height) * TILE_PIXELS
     size = f"{C} images of {viewport.width}x{viewport.height} with {N} Gaussians"
-    require(4 * (pixels * (2 * D + 4) + C * N * 20), size)
+    require(4 * (pixels * (2 * D + 4) + C * N * 20), size, LOWER)

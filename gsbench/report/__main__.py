@@ -4,24 +4,31 @@ import argparse
 import sys
 from pathlib import Path
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, one_line
 from gsbench.report import layout, tables
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the tables, write ``table.md`` and ``table.csv``; return 2 if there is no record."""
+    """Print the tables, write ``table.md`` and ``table.csv``; return 1 if a record is left out, 2 if there is none.
+
+    A record that is damaged, or that of a run which has another record, is left out and named with the reason.
+    """
     parser = argparse.ArgumentParser(prog="python -m gsbench.report", description=__doc__)
     parser.add_argument("results", type=Path, metavar="RESULTS_DIR", help="a folder with records, at any depth")
     parser.add_argument("--train", action="store_true", help="also PSNR on training views: the gap is overfitting")
     asked = parser.parse_args(arguments)
     folder = asked.results
     try:
-        print(layout.terminal(tables.write(tables.load(folder), folder, train=asked.train)))
-    except InputError as error:
-        print(f"gsbench.report: {error}", file=sys.stderr)
+        records, faults = tables.load(folder)
+        if records:
+            print(layout.terminal(tables.write(records, folder, train=asked.train)))
+            print(f"Written: {folder / 'table.md'}, {folder / 'table.csv'}")
+    except (InputError, OSError) as error:
+        print(f"gsbench.report: {one_line(error)}", file=sys.stderr)
         return 2
-    print(f"Written: {folder / 'table.md'}, {folder / 'table.csv'}")
-    return 0
+    for fault in faults:
+        print(f"gsbench.report: left out: {fault}", file=sys.stderr)
+    return 1 if faults else 0
 
 
 if __name__ == "__main__":

@@ -41,22 +41,31 @@ PAPER_LPIPS = (
 )
 
 
-def load(root: Path) -> list[Record]:
-    """All records under `root`; raises InputError if there is none, one is damaged, or a run appears twice."""
+def load(root: Path) -> tuple[list[Record], list[str]]:
+    """Return all records under `root`, and for every one that is damaged or of a run that was read before, why.
+
+    Raises:
+        InputError: there is no record at all.
+    """
     if not root.is_dir():
         raise InputError(f"{root}: expected a folder of results, found none")
     seen: dict[tuple[str, str, str, str, str, int], Path] = {}
-    records = []
+    records, faults = [], []
     for path in files.find(root):
-        record = files.read(path)
+        try:
+            record = files.read(path)
+        except InputError as error:
+            faults.append(printable(error))
+            continue
         run = (record.experiment, record.dataset, record.scene, record.model, record.variant, record.seed)
         if run in seen:
-            raise InputError(f"{path}: the same run as {seen[run]}; keep one of them")
+            faults.append(printable(f"{path}: the same run as {seen[run]}; keep one of them"))
+            continue
         seen[run] = path
         records.append(record)
-    if not records:
+    if not records and not faults:
         raise InputError(f"{root}: expected results, found no {files.FILE_NAME} in it or below")
-    return records
+    return records, faults
 
 
 def tidy(records: list[Record]) -> pd.DataFrame:

@@ -1,7 +1,7 @@
 """Load scenes from files: `load(path)` detects the layout of a data set by a file in its folder."""
 
 import importlib
-import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,15 +45,29 @@ def load(
         InputError: there is no known layout at `path`, or the data has a fault; the message names file and field.
     """
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
-        raise InputError(f"downscale: expected a whole number of at least 1, got {downscale!r}")
-    if len(background) != 3 or not all(math.isfinite(value) and 0 <= value <= 1 for value in background):
-        raise InputError(f"background: expected three numbers in [0, 1], got {background!r}")
-    root = Path(path)
+        raise InputError(f"downscale: expected a whole number of at least 1, got {downscale!r:.80}")
+    numbers = isinstance(background, tuple | list) and all(isinstance(value, int | float) for value in background)
+    if not numbers or len(background) != 3 or not all(0 <= value <= 1 for value in background):
+        raise InputError(f"background: expected three numbers in [0, 1], got {background!r:.80}")
+    root = _folder(path)
     for layout in _LAYOUTS:
-        if (root / layout.marker).is_file():
+        if os.path.lexists(root / layout.marker):
             reader = importlib.import_module(f"gsbench.scenes.{layout.reader}")
             scene: Scene = reader.load(root, downscale=downscale, background=background)
             return scene
     found = "a folder without it" if root.is_dir() else "no such folder"
     layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
     raise InputError(f"{root}: {found}: looked for {layouts}")
+
+
+def _folder(path: object) -> Path:
+    """Return `path` as a Path; raises InputError where it is no text that can be shown and looked up."""
+    if not isinstance(path, str | Path) or not str(path).isprintable():
+        raise InputError(f"path: expected the path of a scene's folder, got {path!r:.200}")
+    try:
+        Path(path).stat()
+    except FileNotFoundError:
+        pass  # the message says what was looked for
+    except OSError as error:
+        raise InputError(f"path: expected the path of a scene's folder, {str(path)!r:.200}: {error.strerror}") from None
+    return Path(path)

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.reading import MAX_JSON, parse_json, read_file
 from gsbench.scenes import files, images
 from gsbench.scenes.scene import Camera, Scene, View, scene_extent
 
 _RIGID_TOLERANCE = 1e-4  # D-NeRF writes single precision: its trex is orthonormal to 2.2e-6
+_SMALLEST = 1e-6  # pixels; smaller ones become zero in single precision
 _LARGEST = 1e30  # squares in double and sums in single precision stay finite up to here
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # as instant-ngp and nerfstudio write them
 
@@ -78,7 +80,7 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float]) 
     """
     root = root.resolve()
     splits = {"train": _read_split(root, "train"), "test": _read_split(root, "test")}
-    if (root / "transforms_val.json").exists():
+    if os.path.lexists(root / "transforms_val.json"):  # a broken link is a fault, and not a data set without val
         splits["val"] = _read_split(root, "val")
     _check_times(splits)
     views, digests = _read_views(splits, downscale, background)
@@ -98,11 +100,8 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float]) 
 def _read_split(root: Path, name: str) -> _Split:
     """Read and check transforms_<name>.json."""
     source = root / f"transforms_{name}.json"
-    data = files.read_file(source, str(source))
-    try:
-        content = json.loads(data)
-    except (ValueError, RecursionError) as error:  # ValueError: not JSON, not text, or an integer of 4300 digits
-        raise InputError(f"{source}: expected JSON: {error}") from error
+    data = read_file(source, str(source), MAX_JSON)
+    content = parse_json(data, str(source))
     if not isinstance(content, dict):
         raise InputError(f"{source}: expected a JSON object with 'frames', got a {type(content).__name__}")
     frames = content.get("frames")
@@ -126,7 +125,7 @@ def _read_intrinsics(content: dict[str, Any], source: Path) -> _Intrinsics:
         if values.get(key, 0) != 0:
             raise InputError(f"{source}: {key}: expected a pinhole camera, got {values[key]}: undistort the images")
     for key in ("fl_x", "fl_y", "w", "h"):
-        if key in values and values[key] <= 0:
+        if key in values and values[key] < _SMALLEST:
             raise InputError(f"{source}: {key}: expected a positive number of pixels, got {values[key]}")
     angle = values.get("camera_angle_x")
     if angle is not None and not 1e-6 < angle < math.pi:
@@ -202,30 +201,30 @@ def _read_views(
     """Read all images on threads, in order; return the views by split and the images' digests by name.
 
     Threads suffice because reading and decoding release the interpreter's lock; a fork after OpenMP ran would hang.
-    Only the final float images are kept.
+    Only the final float images are kept. An image of another size than the first is refused before it is decoded, so
+    that the memory of all of them is known at the first.
     """
+    listed = [(split, frame) for split in splits.values() for frame in split.frames]
+    first = listed[0][1]
+    expected = images.png_size(images.read_png(first.path, first.where), first.where)
 
-    def read(frame: _Frame) -> tuple[tuple[int, int], Tensor, str]:
-        data = files.read_file(frame.path, frame.where)
-        pixels = images.decode_png(data, frame.where)
-        height, width = pixels.shape[:2]
-        return (width, height), images.composite(pixels, background, downscale, frame.where), files.digest(data)
+    def read(entry: tuple[_Split, _Frame]) -> tuple[View, str]:
+        split, frame = entry
+        data = images.read_png(frame.path, frame.where)
+        _check_size(images.png_size(data, frame.where), expected, split, frame)
+        image = images.composite(images.decode_png(data, frame.where), background, downscale, frame.where)
+        camera = Camera(frame.viewmat, split.intrinsics.matrix(*expected, downscale), image.shape[1], image.shape[0])
+        return View(frame.name[: -len(".png")], camera, frame.time, image), files.digest(data)
 
-    views: dict[str, list[View]] = {}
-    digests: dict[str, str] = {}
-    with images.quiet_opencv(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        decoded = pool.map(read, [frame for split in splits.values() for frame in split.frames])
-        expected: tuple[int, int] | None = None
+    threads = images.count_readers(expected, len(listed), downscale, first.where)
+    with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
+        decoded = pool.map(read, listed)
+        digests = {}
+        views: dict[str, list[View]] = {name: [] for name in splits}
         for name, split in splits.items():
-            views[name] = []
             for frame in split.frames:
-                size, image, digest = next(decoded)
-                expected = expected or size
-                _check_size(size, expected, split, frame)
-                K = split.intrinsics.matrix(*size, downscale)
-                camera = Camera(frame.viewmat, K, image.shape[1], image.shape[0])
-                views[name].append(View(frame.name[: -len(".png")], camera, frame.time, image))
-                digests[frame.name] = digest
+                view, digests[frame.name] = next(decoded)
+                views[name].append(view)
     return views, digests
 
 

@@ -1,4 +1,4 @@
-"""Read the files of a data set as untrusted input: only inside the scene's folder, and with a fingerprint."""
+"""Find the files of a data set inside the scene's folder only, and compute their fingerprint."""
 
 import hashlib
 from collections.abc import Mapping
@@ -24,19 +24,6 @@ def find_inside(
             f"{where}: expected a path inside {root}, got {name!r}, which leaves it: move the file into the folder"
         )
     return path
-
-
-def read_file(
-    path: Path,
-    where: str,  # the path, and the file and field that name it, for the message
-) -> bytes:
-    """Return the bytes of the regular file `path`."""
-    try:
-        if not path.is_file():  # reading a pipe could wait for ever
-            raise InputError(f"{where}: expected a file, found none: is the data set complete?")
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{where}: cannot be read: {error.strerror}") from error
 
 
 def digest(data: bytes) -> str:

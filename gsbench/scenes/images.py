@@ -1,9 +1,11 @@
 """Read images from PNG: check the file, decode it by OpenCV, composite it over the background, filter it to size."""
 
+import os
 import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -13,9 +15,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.memory import available, require
+from gsbench.reading import read_file
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
+_DEPTHS = {2: (8, 16), 6: (8, 16), 3: (1, 2, 4, 8)}  # bits, by colour type: RGB, RGBA, and a palette of RGB
+_DECODING = 64  # bytes a pixel while an image is decoded and composited; measured: 48 for 8 bits, 52 for 16
+_MAX_FILE = 1 << 30  # bytes; the largest image has 2^29 before it is compressed
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _MAX_PIXELS = 2**26  # a few kilobytes of PNG can claim gigabytes of pixels; 8192 x 8192 is beyond every data set
 
@@ -30,6 +37,66 @@ def quiet_opencv() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(before)
 
 
+def read_png(
+    path: Path,
+    where: str,  # the path, and the file and field that name it, for the message
+) -> bytes:
+    """Return the bytes of the file `path`; raises InputError as `gsbench.reading.read_file`."""
+    return read_file(path, where, _MAX_FILE)
+
+
+def png_size(
+    data: bytes,
+    where: str,  # the file's path, for the message
+) -> tuple[int, int]:
+    """Return width and height of a PNG, without decoding it.
+
+    Length and checksum of all chunks are checked, IHDR to IEND (PNG specification, section 5).
+
+    Raises:
+        InputError: the file is not a PNG, truncated, damaged, neither RGB nor RGBA, of zero size, or too large.
+    """
+    if not data.startswith(_SIGNATURE):
+        raise InputError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
+    size = (0, 0)
+    at = len(_SIGNATURE)
+    while True:
+        header = data[at : at + 8]
+        length, kind = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
+        body, checksum = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
+        if len(checksum) < 4:
+            raise InputError(f"{where}: truncated PNG, it ends at byte {len(data)} before its IEND: copy it again")
+        if zlib.crc32(kind + body) != int.from_bytes(checksum, "big"):
+            raise InputError(f"{where}: damaged PNG, wrong checksum of chunk {kind!r} at byte {at}: copy it again")
+        if at == len(_SIGNATURE):
+            if kind != b"IHDR" or length != 13:
+                raise InputError(f"{where}: damaged PNG, its first chunk is {kind!r} and not IHDR: copy it again")
+            size = _check_header(body, where)
+        if kind == b"IEND":
+            return size
+        at += 12 + length
+
+
+def count_readers(
+    size: tuple[int, int],  # width and height of every image
+    count: int,
+    downscale: int,
+    where: str,  # the first image's path, for the message
+) -> int:
+    """Return how many threads may decode images at once, so that memory suffices for them and for all images.
+
+    Raises:
+        TooLargeError: it does not suffice for one.
+    """
+    pixels = size[0] * size[1]
+    kept, decoding = count * 12 * pixels // downscale**2, _DECODING * pixels
+    what = f"{where}: {count} images of {size[0]}x{size[1]}, reduced {downscale} times,"
+    require(kept + decoding, what, "use a larger scene.downscale or fewer images")
+    free = available()
+    threads = os.cpu_count() or 1
+    return threads if free is None else max(1, min(threads, (free - kept) // decoding))
+
+
 def decode_png(
     data: bytes,
     where: str,  # the file's path, for the message
@@ -42,11 +109,7 @@ def decode_png(
     Raises:
         InputError: the file is not a PNG, truncated, damaged, of zero size, or neither RGB nor RGBA.
     """
-    width, height = _check_structure(data, where)
-    if width == 0 or height == 0:
-        raise InputError(f"{where}: expected an image with pixels, its size is {width}x{height}: render it again")
-    if width * height > _MAX_PIXELS:
-        raise InputError(f"{where}: expected at most {_MAX_PIXELS} pixels, its size is {width}x{height}: resize it")
+    png_size(data, where)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -89,24 +152,15 @@ def composite(
     return torch.from_numpy(np.clip(image, 0, 1))  # float rounding may leave [0, 1] by an ulp
 
 
-def _check_structure(data: bytes, where: str) -> tuple[int, int]:
-    """Check length and checksum of all chunks, IHDR to IEND (PNG specification, section 5); return width and height."""
-    if not data.startswith(_SIGNATURE):
-        raise InputError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
-    size = (0, 0)
-    at = len(_SIGNATURE)
-    while True:
-        header = data[at : at + 8]
-        length, kind = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
-        body, checksum = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
-        if len(checksum) < 4:
-            raise InputError(f"{where}: truncated PNG, it ends at byte {len(data)} before its IEND: copy it again")
-        if zlib.crc32(kind + body) != int.from_bytes(checksum, "big"):
-            raise InputError(f"{where}: damaged PNG, wrong checksum of chunk {kind!r} at byte {at}: copy it again")
-        if at == len(_SIGNATURE):
-            if kind != b"IHDR" or length != 13:
-                raise InputError(f"{where}: damaged PNG, its first chunk is {kind!r} and not IHDR: copy it again")
-            size = struct.unpack(">II", body[:8])
-        if kind == b"IEND":
-            return size
-        at += 12 + length
+def _check_header(header: bytes, where: str) -> tuple[int, int]:
+    """Check the 13 bytes of IHDR (PNG specification, section 11.2.2); return width and height."""
+    width, height, depth, color, compression, filtering, interlacing = struct.unpack(">IIBBBBB", header)
+    if width == 0 or height == 0:
+        raise InputError(f"{where}: expected an image with pixels, its size is {width}x{height}: render it again")
+    if width * height > _MAX_PIXELS:
+        raise InputError(f"{where}: expected at most {_MAX_PIXELS} pixels, its size is {width}x{height}: resize it")
+    if depth not in _DEPTHS.get(color, ()):
+        raise InputError(f"{where}: expected 8- or 16-bit RGB or RGBA, got PNG's colour type {color} of {depth} bits")
+    if compression or filtering or interlacing > 1:
+        raise InputError(f"{where}: damaged PNG, its compression, filter or interlacing is unknown: copy it again")
+    return width, height

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.scenes import files
+from gsbench.memory import require
+from gsbench.reading import read_file
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -19,6 +20,8 @@ _TYPES = {
     **dict.fromkeys(("float", "float32"), "<f4"),
     **dict.fromkeys(("double", "float64"), "<f8"),
 }
+_MAX_FILE = 1 << 32  # bytes; 17 million Gaussians of 3DGS
+_ASCII_VALUE = 100  # bytes of memory that a value takes while it is parsed
 _HEADER_LIMIT = 65536  # bytes; a 3DGS header of 62 properties takes 1,600
 _HEADER_END = re.compile(rb"\nend_header[ \t]*\r?\n")
 
@@ -32,20 +35,18 @@ def read_vertices(path: Path) -> NDArray[np.void]:
     Raises:
         InputError: the file is not such a PLY, or has fewer bytes or values than its header states.
     """
-    data = files.read_file(path, str(path))
+    data = read_file(path, str(path), _MAX_FILE)
     end = _HEADER_END.search(data, 0, _HEADER_LIMIT)
     if not data.startswith(b"ply") or end is None:
         raise InputError(f"{path}: expected a PLY: 'ply' first and 'end_header' within {_HEADER_LIMIT} bytes")
     lines = data[: end.start()].decode("ascii", "replace").splitlines()
     encoding, count, dtype = _read_header(lines, path)
-    body = data[end.end() :]
     if encoding == "ascii":
-        return _read_ascii(body, count, dtype, path)
-    if count * dtype.itemsize > len(body):
-        raise InputError(
-            f"{path}: element vertex: expected {count} x {dtype.itemsize} bytes, found {len(body)}: truncated"
-        )
-    return np.frombuffer(body, dtype, count)
+        return _read_ascii(data[end.end() :], count, dtype, path)
+    found = len(data) - end.end()
+    if count * dtype.itemsize > found:
+        raise InputError(f"{path}: element vertex: expected {count} x {dtype.itemsize} bytes, found {found}: truncated")
+    return np.frombuffer(data, dtype, count, end.end())
 
 
 def _read_header(lines: list[str], path: Path) -> tuple[str, int, np.dtype[np.void]]:
@@ -79,11 +80,14 @@ def _read_header(lines: list[str], path: Path) -> tuple[str, int, np.dtype[np.vo
 def _read_ascii(body: bytes, count: int, dtype: np.dtype[np.void], path: Path) -> NDArray[np.void]:
     """Parse `count` rows of numbers; refuse a value that the type of its property cannot hold."""
     names = dtype.names or ()
-    values = body.split()[: count * len(names)]
-    if len(values) < count * len(names):
-        raise InputError(
-            f"{path}: element vertex: expected {count} x {len(names)} values, found {len(values)}: truncated"
-        )
+    expected = count * len(names)
+    # A value takes two bytes at least, so that a count which is a lie allocates nothing.
+    values = []
+    if 2 * expected <= len(body) + 1:
+        require(_ASCII_VALUE * expected, f"{path}: {expected} values in ascii", "write a binary PLY")
+        values = body.split(maxsplit=expected)[:expected]
+    if len(values) < expected:
+        raise InputError(f"{path}: element vertex: expected {count} x {len(names)} values, the file is truncated")
     try:
         table = np.array([float(value) for value in values]).reshape(count, len(names))
     except ValueError as error:
@@ -95,5 +99,6 @@ def _read_ascii(body: bytes, count: int, dtype: np.dtype[np.void], path: Path) -
             limits = np.iinfo(kind)
             if not ((column >= limits.min) & (column <= limits.max)).all():
                 raise InputError(f"{path}: {name}: expected values of {limits.min}..{limits.max}, some are outside")
-        vertices[name] = column
+        with np.errstate(over="ignore"):  # becomes infinite, and is refused where the property is read
+            vertices[name] = column
     return vertices

@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 from make_golden import GOLDEN, GOLDEN_TERMINAL, make, records
 
-from gsbench.errors import InputError
 from gsbench.measure import record as files
 from gsbench.report import layout, tables
 from gsbench.report.__main__ import main
@@ -225,17 +224,43 @@ def test_the_command_is_clear_where_there_is_nothing_to_show(tmp_path, capsys):
         assert main([str(folder)]) == 2
         assert "found no" in capsys.readouterr().err
     (tmp_path / "record.json").write_text("{")
-    assert main([str(tmp_path)]) == 2
-    assert "record.json: expected a record in JSON" in capsys.readouterr().err
+    assert main([str(tmp_path)]) == 1
+    assert f"left out: {tmp_path}/record.json: expected JSON" in capsys.readouterr().err
     assert not (tmp_path / "table.md").exists()
 
 
-def test_the_same_run_twice_is_refused(tmp_path):
+def test_a_damaged_record_is_named_and_the_rest_is_reported(tmp_path, capsys):
+    """Would catch one damaged file that hides a whole sweep, and a table that leaves a run out without a word."""
+    files.write(make(), tmp_path / "a" / files.FILE_NAME)
+    for name, damage in (("b", b"\xff"), ("c", b"{}")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / files.FILE_NAME).write_bytes(damage)
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / files.FILE_NAME).symlink_to("nowhere")
+    assert main([str(tmp_path)]) == 1
+    printed = capsys.readouterr()
+    assert "25.00*" in printed.out
+    assert len(pd.read_csv(tmp_path / "table.csv")) == 1
+    left_out = printed.err.splitlines()
+    assert [line.split(":")[2] for line in left_out] == [f" {tmp_path}/{name}/record.json" for name in "bcd"]
+    assert main([str(tmp_path / "a")]) == 0
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, capsys):
+    """Would catch a stack trace at the end of a report: here table.md is a folder."""
+    files.write(make(), tmp_path / files.FILE_NAME)
+    (tmp_path / "table.md").mkdir()
+    assert main([str(tmp_path)]) == 2
+    assert "table.md" in capsys.readouterr().err
+
+
+def test_the_same_run_twice_counts_once(tmp_path):
     """Would catch a copied folder that counts as a second seed and halves the spread."""
     for name in ("a", "b"):
         files.write(make(), tmp_path / name / "record.json")
-    with pytest.raises(InputError, match="the same run as"):
-        tables.load(tmp_path)
+    kept, faults = tables.load(tmp_path)
+    assert len(kept) == 1
+    assert [fault.split(":")[1] for fault in faults] == [f" the same run as {tmp_path}/a/record.json; keep one of them"]
 
 
 def test_python_dash_m_runs():

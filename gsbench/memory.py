@@ -1,4 +1,7 @@
-"""Whether a request fits into memory, asked before it is made: the kernel's OOM killer gives no message."""
+"""Ask whether a request fits into memory before it is made: the system kills a process that takes too much in silence.
+
+Needs no torch.
+"""
 
 from pathlib import Path
 
@@ -7,14 +10,20 @@ from gsbench.errors import TooLargeError
 SMALL = 1 << 26  # bytes not worth asking the system about
 
 
-def require(size: int, what: str) -> None:
-    """Raise TooLargeError if `size` bytes for `what` are more than this process can still get."""
+def require(size: int, what: str, instead: str) -> None:
+    """Raise TooLargeError if `size` bytes are more than this process can still get.
+
+    Args:
+        size: bytes.
+        what: needs them, in the plural.
+        instead: what to do, for the message.
+    """
     if size < SMALL:
         return
     free = available()
     if free is not None and size > free:
         raise TooLargeError(f"{what} need {size / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are available: "
-                            "use a smaller image, fewer cameras at once or fewer Gaussians")  # fmt: skip
+                            f"{instead}")  # fmt: skip
 
 
 def available() -> int | None:
@@ -34,6 +43,9 @@ def _system() -> int | None:
 def _control_group() -> int | None:
     folder = Path("/sys/fs/cgroup")
     try:
-        return int((folder / "memory.max").read_text()) - int((folder / "memory.current").read_text())
+        left = int((folder / "memory.max").read_text()) - int((folder / "memory.current").read_text())
+        lines = (folder / "memory.stat").read_text().splitlines()
     except (OSError, ValueError):  # no control group, or no limit ("max")
         return None
+    # `current` counts files that were read and can be dropped again at any time.
+    return left + next((int(line.split()[1]) for line in lines if line.startswith("inactive_file ")), 0)

@@ -1,0 +1,76 @@
+"""Read files that may be damaged or hostile: regular files of a limited size, and JSON without keys that appear twice.
+
+Needs no torch.
+"""
+
+import json
+import stat
+from pathlib import Path
+from typing import Any
+
+from gsbench.errors import InputError
+from gsbench.memory import require
+
+MAX_JSON = 1 << 26  # bytes; the largest record and the largest transforms_train.json known have less than a million
+
+
+def read_file(
+    path: Path,
+    where: str,  # the path, and the file and field that name it, for the message
+    most: int,  # bytes
+) -> bytes:
+    """Return the bytes of the regular file `path`, which are at most `most`.
+
+    A pipe or a device is refused, as reading it could wait or go on for ever.
+
+    Raises:
+        InputError: there is no such file, it is no regular file, is too large, or cannot be read.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(f"{where}: expected a file, found {_kind(status.st_mode)}: put the file there")
+        if status.st_size > most:
+            raise InputError(f"{where}: expected at most {most} bytes, found {status.st_size}: is it the right file?")
+        require(status.st_size, f"{where}: its bytes", "use a smaller file")
+        with path.open("rb") as file:
+            return file.read(status.st_size)
+    except FileNotFoundError:
+        raise InputError(f"{where}: expected a file, found none: is the data complete?") from None
+    except OSError as error:
+        raise InputError(f"{where}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{where}: cannot be read: {error}") from None  # a NUL byte in the path
+
+
+def parse_json(
+    data: bytes,
+    where: str,  # the path, for the message
+) -> Any:
+    """Parse JSON, in which no object has two equal keys: it is not defined which of them counts.
+
+    Raises:
+        InputError: it is no such JSON.
+    """
+    try:
+        return json.loads(data, object_pairs_hook=_unique)
+    except (ValueError, RecursionError) as error:  # also bad UTF-8 and integers of thousands of digits
+        raise InputError(f"{where}: expected JSON: {error}") from None
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make an object of its pairs of key and value; raises ValueError where a key appears twice."""
+    unique: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in unique:
+            raise ValueError(f"the key {ascii(key)[:80]} appears twice in one object")
+        unique[key] = value
+    return unique
+
+
+def _kind(mode: int) -> str:
+    """Name a kind of file that is no regular one."""
+    kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
+    return kinds.get(stat.S_IFMT(mode), "a device")
