@@ -15,7 +15,7 @@ class TooLargeError(InputError, MemoryError):
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
     """Return ``Did you mean 'x'? Valid: a, b, x.`` for a name that is not among `valid`."""
     choices = sorted(valid)
-    close = difflib.get_close_matches(name, choices, n=1, cutoff=0.4)
+    close = difflib.get_close_matches(str(name), choices, n=1, cutoff=0.4)
     guess = f"Did you mean '{close[0]}'? " if close else ""
     return f"{guess}Valid: {', '.join(choices)}."
 

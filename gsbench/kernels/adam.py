@@ -5,7 +5,8 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.library import library_of
-from gsbench.kernels.operation import address
+from gsbench.kernels.operation import address, in_rows
+from gsbench.tensors import check_number, check_tensor
 
 
 @torch.no_grad()
@@ -38,21 +39,30 @@ def adam(
     """
     named = {"parameter": parameter, "gradient": gradient, "mean": mean, "square": square}
     for name, x in named.items():
+        check_tensor(x, f"adam: {name}", (torch.float32,))
         if x.shape != parameter.shape:
             raise InputError(f"adam: expected {name} of shape {list(parameter.shape)}, got {list(x.shape)}")
-        if x.dtype != torch.float32 or x.device != parameter.device:
-            raise InputError(f"adam: expected {name} as float32 on {parameter.device}, got {x.dtype} on {x.device}")
-    if drawn.shape != parameter.shape[:1] or drawn.dtype != torch.bool or drawn.device != parameter.device:
-        raise InputError(f"adam: expected drawn as bool of shape {list(parameter.shape[:1])} on {parameter.device}, "
-                         f"got {drawn.dtype} of shape {list(drawn.shape)} on {drawn.device}")  # fmt: skip
-    if step.shape != () or step.dtype != torch.float32 or step.device != parameter.device:
-        raise InputError(f"adam: expected step as float32 of shape [] on {parameter.device}, got {step.dtype} of "
-                         f"{list(step.shape)} on {step.device}")  # fmt: skip
-    if not all(x.is_contiguous() for x in (parameter, mean, square)):
+        if x.device != parameter.device:
+            raise InputError(f"adam: expected {name} on {parameter.device}, got it on {x.device}")
+    if not parameter.dim():
+        raise InputError("adam: expected parameter of at least one dimension, got none")
+    check_tensor(drawn, "adam: drawn", (torch.bool,))
+    if drawn.shape != parameter.shape[:1] or drawn.device != parameter.device:
+        raise InputError(f"adam: expected drawn of shape {list(parameter.shape[:1])} on {parameter.device}, got "
+                         f"{list(drawn.shape)} on {drawn.device}")  # fmt: skip
+    check_tensor(step, "adam: step", (torch.float32,))
+    if step.shape != () or step.device != parameter.device:
+        raise InputError(f"adam: expected step of shape [] on {parameter.device}, got {list(step.shape)} on "
+                         f"{step.device}")  # fmt: skip
+    if not isinstance(betas, list | tuple) or len(betas) != 2:
+        raise InputError(f"adam: expected two betas, got {betas!r:.80}")
+    for name, number in (("rate", rate), ("eps", eps), ("betas", betas[0]), ("betas", betas[1])):
+        check_number(number, f"adam: {name}")
+    if not all(x.is_contiguous() and not x.is_neg() for x in (parameter, mean, square)):
         raise InputError("adam: expected parameter, mean and square row by row in memory: call .contiguous()")
     if not len(parameter):
         return
-    rows, of = gradient.contiguous(), drawn.contiguous()
+    rows, of = in_rows([gradient, drawn])
     slots = {"N": len(parameter), "width": parameter[0].numel(), "drawn": address(of), "gradient": address(rows),
              "rate": rate, "beta1": betas[0], "beta2": betas[1], "eps": eps, "step": address(step),
              "out.parameter": address(parameter), "out.mean": address(mean), "out.square": address(square)}  # fmt: skip

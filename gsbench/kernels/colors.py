@@ -17,9 +17,11 @@ def _bases(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
     """Harmonics stored for each frequency."""
     shN, degree, waves = given["shN"], numbers["degree"], numbers["waves"]
     stored = shN.shape[1] + 1 if shN.dim() == 3 else 0
-    if not 0 <= degree <= 3 or not 1 <= waves <= MAX_WAVES or stored % waves or stored // waves < (degree + 1) ** 2:
-        raise InputError(f"show_colors: expected degree 0 to 3 and 1 to 8 frequencies with (degree + 1)^2 coefficients "
-                         f"each, got degree={degree}, waves={waves} and {stored} coefficients")  # fmt: skip
+    if stored % waves or stored // waves < (degree + 1) ** 2:
+        raise InputError(f"show_colors: expected (degree + 1)^2 coefficients for each frequency, got degree={degree}, "
+                         f"waves={waves} and {stored} coefficients")  # fmt: skip
+    if waves > 1 and "times" not in given:
+        raise InputError("show_colors: expected times and a time, as colours change with them (waves > 1)")
     return {"bases": stored // waves}
 
 
@@ -68,8 +70,9 @@ def show_colors(
     Raises:
         InputError: not float32 on one device, or shapes that do not fit.
     """
-    if waves > 1 and (times is None or time is None):
-        raise InputError("show_colors: expected times and a time, as colours change with them (waves > 1)")
+    if degree not in range(4) or waves not in range(1, MAX_WAVES + 1):
+        raise InputError(f"show_colors: expected degree 0 to 3 and 1 to {MAX_WAVES} frequencies, got "
+                         f"degree={degree!r:.40} and waves={waves!r:.40}")  # fmt: skip
     if waves == 1:
         times = time = None
     return _show(sh0, shN, means, opacities, times, center, time, degree, waves)[0]

@@ -9,6 +9,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.library import Slots, allocate, library_of
 from gsbench.kernels.operation import Operation, Tensors, address, in_rows
+from gsbench.tensors import check_number, check_tensor
 
 
 class _Similarity(Operation):
@@ -62,6 +63,9 @@ def l1_ssim(
     Raises:
         InputError: not two float32 images of one size on one device, or a gradient by `target` is asked for.
     """
+    check_tensor(image, "l1_ssim: image", (torch.float32,))
+    check_tensor(target, "l1_ssim: target", (torch.float32,))
+    check_number(ssim_weight, "l1_ssim: ssim_weight", 0, 1)
     if image.dim() not in (3, 4) or image.shape[-1] != 3 or target.shape != image.shape or not image.numel():
         raise InputError(f"l1_ssim: expected image and target [H, W, 3] or [1, H, W, 3] of one size, got "
                          f"{list(image.shape)} and {list(target.shape)}")  # fmt: skip

@@ -5,6 +5,7 @@ charge (gsbench.kernels.tape), or else by torch's autograd, for which it is regi
 """
 
 from collections.abc import Callable, Sequence
+from types import NoneType
 from typing import Any
 
 import torch
@@ -13,12 +14,14 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels import tape
 from gsbench.kernels.library import Slots, allocate, library_of
+from gsbench.tensors import check_tensor
 
 Tensors = list[Tensor]  # an input that is left out is an empty tensor of one dimension
 Shape = tuple[int | str, ...]
 Sizes = dict[str, int]
 
 _SCHEMA = {int: "int", float: "float", bool: "bool"}
+_KINDS: dict[type, tuple[type, ...]] = {int: (int,), float: (float, int), bool: (bool,)}  # what is accepted for each
 
 
 class Operation:
@@ -52,7 +55,7 @@ class Operation:
             numbers: what is no tensor, by type; an int is a size too.
             constant: inputs by which there is no gradient, and asking for one is an error.
             passive: inputs and outputs that no gradient goes through, in silence.
-            optional: inputs that may be left out.
+            optional: inputs that may be left out, all of them or none.
             adds: inputs to whose gradient the kernel adds, so that those of several views need one memory.
             zeroed: inputs whose gradient is a sum over Gaussians, of which a GPU's blocks each add a part.
             on_request: inputs whose gradient costs something, and is computed where it is wanted only.
@@ -81,6 +84,8 @@ class Operation:
         self._given = [f"given.{key}" for key in outputs]
         self._needed = {f"given.{key}" for key in outputs if key not in passive} - _MAY_BE_NULL
         self._grad = [f"grad.{key}" if own else None for key, own in zip(inputs, self._differentiable, strict=True)]
+        self._kinds: list[tuple[type, ...]] = [(Tensor, NoneType) if key in optional else (Tensor,) for key in inputs]
+        self._kinds += [_KINDS[kind] for kind in self.numbers.values()]
         self._last: tuple[list[Any] | None, Slots] = None, {}
         self.backward_kernel = f"{name}_backward"  # of the same arguments as any other that is put here
         self._traced = _register(self)
@@ -106,6 +111,8 @@ class Operation:
 
     def split(self, arguments: Sequence[Any]) -> tuple[Tensors, tuple[Any, ...]]:
         """Tensors and numbers of a call."""
+        if not all(map(isinstance, arguments, self._kinds)):
+            raise self._wrong_kind(arguments)
         count = len(self.inputs)
         like = arguments[0]
         return [like.new_empty(0) if x is None else x for x in arguments[:count]], tuple(arguments[count:])
@@ -205,7 +212,7 @@ class Operation:
 
     def match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
         """The sizes and numbers of a call; raises InputError unless everything is as declared."""
-        call = [*numbers, *[(x.shape, x.dtype, x.device) for x in tensors]]
+        call = [*numbers, *[(x.shape, x.dtype, x.device, x.layout) for x in tensors]]
         last, slots = self._last
         if call != last:  # a training step asks the same a thousand times
             slots = self._match(tensors, numbers)
@@ -215,11 +222,17 @@ class Operation:
     def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
         slots: Slots = dict(zip(self.numbers, numbers, strict=True))
         there = [not self._is_left_out(i, x) for i, x in enumerate(tensors)]
+        if len({there[i] for i in self._optional}) > 1:  # a kernel takes the address of each for that of a number
+            names = ", ".join(key for i, key in enumerate(self.inputs) if i in self._optional)
+            raise InputError(f"{self.name}: expected all of {names}, or none of them")
+        for key, x, dtype, own in zip(self.inputs, tensors, self._dtypes, there, strict=True):
+            if own:
+                check_tensor(x, f"{self.name}: {key}", (dtype,))
         if self._derive is not None:
             given = {key: x for key, x, own in zip(self.inputs, tensors, there, strict=True) if own}
             slots.update(self._derive(given, slots))
         device = tensors[0].device
-        for (key, shape), x, dtype, own in zip(self.inputs.items(), tensors, self._dtypes, there, strict=True):
+        for (key, shape), x, own in zip(self.inputs.items(), tensors, there, strict=True):
             if not own:
                 continue
             actual, expected = list(x.shape), list(shape)
@@ -231,10 +244,17 @@ class Operation:
             if not good:
                 known = [slots.get(size, size) if isinstance(size, str) else size for size in expected]
                 raise InputError(f"{self.name}: expected {key} of shape {known}, got {actual}")
-            if x.dtype != dtype or x.device != device:
-                raise InputError(f"{self.name}: expected {key} as {str(dtype).removeprefix('torch.')} on {device}, as "
-                                 f"{next(iter(self.inputs))} is, got {x.dtype} on {x.device}")  # fmt: skip
+            if x.device != device:
+                raise InputError(f"{self.name}: expected {key} on {device}, as {next(iter(self.inputs))} is, got it on "
+                                 f"{x.device}")  # fmt: skip
         return slots
+
+    def _wrong_kind(self, arguments: Sequence[Any]) -> InputError:
+        """Say which argument is neither a tensor nor a number, where it should be one."""
+        named = zip([*self.inputs, *self.numbers], arguments, self._kinds, strict=True)
+        key, x, kinds = next((key, x, kinds) for key, x, kinds in named if not isinstance(x, kinds))
+        expected = "a tensor" if Tensor in kinds else kinds[0].__name__
+        return InputError(f"{self.name}: expected {key} as {expected}, got {type(x).__name__}")
 
     def _is_left_out(self, i: int, x: Tensor) -> bool:
         """Whether an input stands for none."""
@@ -262,8 +282,8 @@ def address(x: Tensor | None) -> int:
 
 
 def in_rows(tensors: Tensors) -> Tensors:
-    """The same values row by row in memory."""
-    return [x if x.is_contiguous() else x.contiguous() for x in tensors]
+    """The same values row by row in memory; a view that torch negates when it reads it is written out."""
+    return [x if x.is_contiguous() and not x.is_neg() else x.resolve_neg().contiguous() for x in tensors]
 
 
 def _shape(text: str) -> Shape:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.library import Library, allocate, library_of
-from gsbench.kernels.operation import Operation, address
+from gsbench.kernels.operation import Operation, address, in_rows
 from gsbench.memory import require
 
 TILE = 16  # pixels a side, as cpu/kernels.h and cuda/launch.h have it
@@ -124,7 +124,7 @@ def flag_values(*values: Tensor) -> Tensor:
     `values` are means, factors, opacities, colours, viewmats, Ks, background, as of `rasterize`.
     """
     means, _, _, colors, viewmats, *_ = values
-    flags, rows = torch.zeros(1, dtype=torch.int64, device=means.device), [x.contiguous() for x in values]
+    flags, rows = torch.zeros(1, dtype=torch.int64, device=means.device), in_rows(list(values))
     names = ("means", "factors", "opacities", "colors", "viewmats", "Ks", "background")
     slots = {"N": len(means), "C": len(viewmats), "all_colors": colors.numel(), "D": colors.shape[-1],
              "out.flags": address(flags)}  # fmt: skip

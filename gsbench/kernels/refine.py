@@ -10,6 +10,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.library import Slots, allocate, library_of
 from gsbench.kernels.operation import Operation, Tensors, address, in_rows
+from gsbench.tensors import check_tensor
 
 HIDDEN = 64
 MAX_NETWORKS, MAX_VALUES = 4, 12  # as arguments.h has them
@@ -78,7 +79,7 @@ class _Refine(Operation):
             "weight_out": torch.cat(weights_out).detach() * units[:, None],
             "bias_out": torch.cat(biases_out).detach() * units,
         }
-        return in_rows(values), weights
+        return in_rows(values), dict(zip(weights, in_rows(list(weights.values())), strict=True))
 
     def _of_layers(self, tensors: Tensors, networks: int, g: dict[str, Tensor]) -> Tensors:
         """The gradients of the layers' own weights."""
@@ -134,6 +135,13 @@ def refine(
     Raises:
         InputError: not float32 on one device, or shapes that do not fit.
     """
+    given = {"values": values, "weight_in": [weight_in], "bias_in": [bias_in], "weights_out": weights_out,
+             "biases_out": biases_out, "units": [units], "gamma": [gamma]}  # fmt: skip
+    for name, listed in given.items():
+        for x in listed:
+            check_tensor(x, f"refine: {name}", (torch.float32,))
+            if x.dim() == 0:
+                raise InputError(f"refine: {name}: expected at least one dimension, got none")
     widths, moved = [w.shape[0] for w in weights_out], [x.shape[-1] for x in values]
     last, rows = len(widths) - 1, HIDDEN * len(widths)
     if last < 1 or [*moved[:last], sum(moved[last:])] != widths:
@@ -150,7 +158,7 @@ def refine(
     shapes += [("biases_out", b, (c,)) for b, c in zip(biases_out, widths, strict=True)]
     shapes += [("units", units, (sum(widths),)), ("gamma", gamma, (G,))]
     for name, x, shape in shapes:
-        if tuple(x.shape) != shape or x.dtype != torch.float32 or x.device != values[0].device:
-            raise InputError(f"refine: expected {name} as float32 of shape {list(shape)} on {values[0].device}, got "
-                             f"{x.dtype} of {list(x.shape)} on {x.device}")  # fmt: skip
+        if tuple(x.shape) != shape or x.device != values[0].device:
+            raise InputError(f"refine: expected {name} of shape {list(shape)} on {values[0].device}, got "
+                             f"{list(x.shape)} on {x.device}")  # fmt: skip
     return _refine(*values, weight_in, bias_in, *weights_out, *biases_out, units, gamma, len(widths))

@@ -19,6 +19,8 @@ from gsbench.errors import InputError
 from gsbench.measure import perceptual
 from gsbench.measure.perceptual import BACKBONES, BackboneMissing
 from gsbench.measure.record import ViewScore
+from gsbench.memory import require
+from gsbench.tensors import check_number, check_tensor
 
 T = TypeVar("T")
 
@@ -72,6 +74,8 @@ def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = N
 
 def quantise(image: Tensor) -> Tensor:  # [..., 3]
     """Round an image to the values that an 8-bit PNG can hold, in [0, 1]."""
+    check_tensor(image, "quantise: the image")
+    require(3 * image.element_size() * image.numel(), f"quantise: images {list(image.shape)}", "use smaller ones")
     return (image.clamp(0, 1) * 255).round() / 255
 
 
@@ -106,16 +110,21 @@ def evaluate(
         "psnr": psnr,
         "psnr_channel_mean": psnr_channel_mean,
         "ssim": ssim,
-        "psnr_background_only": lambda _, truth: psnr(truth.new_tensor(background).expand_as(truth), truth),
+        "psnr_background_only": lambda _, truth: psnr(torch.tensor(background).to(truth).expand_as(truth), truth),
     }
     least_side = {"ssim": SSIM_LEAST_SIDE}
     for backbone, known in BACKBONES.items():
         measures[f"lpips_{backbone}"] = partial(lpips, backbone=backbone, weights=(weights or {}).get(backbone))
         least_side[f"lpips_{backbone}"] = known.least_side
+    if not isinstance(background, tuple | list) or len(background) != 3:
+        raise InputError(f"evaluate: expected a background of three numbers, got {background!r:.80}")
+    for value in background:
+        check_number(value, "evaluate: background", 0, 1)
     scores: dict[str, list[float]] = {metric: [] for metric in measures}
     missing: dict[str, str] = {}
     per_view = []
     for name, render, truth in images:
+        _check_images(render, truth, 1, f"evaluate: {name}")
         side = min(truth.shape[:2])
         shown = quantise(render) if quantised else render
         here: dict[str, float] = {}
@@ -139,11 +148,17 @@ def evaluate(
 
 def _images(a: Tensor, b: Tensor, least_side: int, what: str) -> tuple[Tensor, Tensor]:
     """Clamp both images to [0, 1] in float64; raises InputError unless they are two images of one size."""
+    _check_images(a, b, least_side, what)
+    require(64 * a.numel(), f"{what}: two images {list(a.shape)}", "use smaller ones")
+    return a.detach().double().clamp(0, 1), b.detach().double().clamp(0, 1)
+
+
+def _check_images(a: Tensor, b: Tensor, least_side: int, what: str) -> None:
+    """Raise InputError unless they are two images of one size, with sides of at least `least_side` pixels."""
     for image in (a, b):
-        if image.ndim != 3 or image.shape[2] != 3 or not image.is_floating_point():
-            raise InputError(
-                f"{what}: expected images [H, W, 3] of floats in [0, 1], got {list(image.shape)} of {image.dtype}"
-            )
+        check_tensor(image, f"{what}: an image")
+        if image.ndim != 3 or image.shape[2] != 3:
+            raise InputError(f"{what}: expected images [H, W, 3], got {list(image.shape)}")
     if a.shape != b.shape or a.device != b.device:
         raise InputError(
             f"{what}: expected two images of one size on one device, "
@@ -151,7 +166,6 @@ def _images(a: Tensor, b: Tensor, least_side: int, what: str) -> tuple[Tensor, T
         )
     if min(a.shape[:2]) < least_side:
         raise InputError(f"{what}: expected at least {least_side} pixels a side, got {list(a.shape)}")
-    return a.detach().double().clamp(0, 1), b.detach().double().clamp(0, 1)
 
 
 def _squared_error(a: Tensor, b: Tensor) -> Tensor:  # [H, W, 3]

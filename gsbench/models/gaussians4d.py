@@ -19,6 +19,8 @@ from gsbench.models.slicing import check_scheme, mahalanobis, slice_gaussians
 from gsbench.scenes.points import size_of
 from gsbench.scenes.scene import Points
 
+MAX_DEGREE = 32  # of the Fourier series; above it are only frequencies that no clip resolves
+
 
 @register("4dgs")
 class Gaussians4DModel(GaussianModel):
@@ -50,8 +52,8 @@ class Gaussians4DModel(GaussianModel):
             InputError: an option is out of its range.
         """
         super().__init__(**options)
-        if not isinstance(time_degree, int) or time_degree < 0:
-            raise InputError(f"time_degree: expected 0, 1, 2, .., got {time_degree}")
+        if not isinstance(time_degree, int) or not 0 <= time_degree <= MAX_DEGREE:
+            raise InputError(f"time_degree: expected 0, 1, .., {MAX_DEGREE}, got {time_degree}")
         check_scheme(scheme)
         self.time_degree = time_degree
         self.scheme = scheme

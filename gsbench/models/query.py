@@ -7,7 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsbench.errors import InputError
 from gsbench.scenes.scene import Camera
+from gsbench.tensors import check_number, check_tensor
 
 
 class Query(NamedTuple):
@@ -23,8 +25,23 @@ class Query(NamedTuple):
 
     @classmethod
     def at(cls, center: Tensor, time: float | Tensor | None) -> Query:
-        """Make the query of a place [3] at a time. A time that is a tensor stays one, so a CUDA graph can read it."""
-        return cls(center, center.new_full((), time) if isinstance(time, float | int) else time)
+        """Make the query of a place [3] at a time. A time that is a tensor stays one, so a CUDA graph can read it.
+
+        Raises:
+            InputError: the place is not a tensor [3], or the time is not a finite number.
+        """
+        check_tensor(center, "query: center")
+        if center.shape != (3,):
+            raise InputError(f"query: center: expected shape [3], got {list(center.shape)}")
+        if isinstance(time, Tensor):
+            check_tensor(time, "query: time", (center.dtype,))
+            if time.dim() or time.device != center.device:
+                raise InputError(f"query: time: expected a number on {center.device}, got {list(time.shape)} on "
+                                 f"{time.device}")  # fmt: skip
+        elif time is not None:
+            check_number(time, "query: time")
+            time = center.new_full((), time)
+        return cls(center, time)
 
 
 def unit(vectors: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ def find(name: str) -> type[GaussianModel]:
     package = importlib.import_module("gsbench.models")
     for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"gsbench.models.{module.name}")
-    if name not in _REGISTRY:
+    if not isinstance(name, str) or name not in _REGISTRY:
         raise InputError(f"model '{name}' is not known. {did_you_mean(name, _REGISTRY)}")
     return _REGISTRY[name]
 
@@ -57,7 +57,7 @@ def build(name: str, **options: Any) -> GaussianModel:
             raise InputError(f"model '{name}' has no option '{option}'. {did_you_mean(option, known)}")
         if not _is_a(value, known[option].annotation):
             expected = getattr(known[option].annotation, "__name__", known[option].annotation)
-            raise InputError(f"model '{name}': option {option}: expected a {expected}, got {value!r:.80}")
+            raise InputError(f"model '{name}': {option}: expected {expected}, got {value!r:.80}")
     for option, parameter in known.items():
         if parameter.default is parameter.empty and option not in options:
             raise InputError(f"model '{name}' needs the option '{option}', which has no default")

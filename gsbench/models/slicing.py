@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
+from gsbench.tensors import check_tensor
 
 SCHEMES = ("square_root", "schur", "cholesky")
 
@@ -54,8 +55,13 @@ def slice_gaussians(
             with a Cholesky factor of S_qq and subtracts. The last two are for comparison: they lose half the digits.
 
     Raises:
-        InputError: shapes do not fit, or the scheme is unknown.
+        InputError: types or shapes do not fit, or the scheme is unknown.
     """
+    for name, x in (("mean", mean), ("factor", factor), ("query", query)):
+        check_tensor(x, f"slice_gaussians: {name}")
+        if x.dtype != mean.dtype or x.device != mean.device:
+            raise InputError(f"slice_gaussians: expected {name} as {mean.dtype} on {mean.device}, as the mean is, got "
+                             f"{x.dtype} on {x.device}")  # fmt: skip
     N, n = mean.shape if mean.dim() == 2 else (0, 0)
     if n < 3 or factor.shape != (N, n, n) or query.shape not in ((N, n - 3), (n - 3,)):
         raise InputError(f"slice_gaussians: expected mean [N, 3+k], factor [N, 3+k, 3+k] and query [N, k] or [k], "

@@ -58,6 +58,9 @@ def rasterize(
     Raises:
         InputError: a shape, dtype, device or value is not as above, or the backend is unknown or not installed.
     """
+    if not isinstance(backend, str | Backend) or not isinstance(antialias, bool):
+        raise InputError(f"backend, antialias: expected a name or a Backend, and True or False, got {backend!r:.40} "
+                         f"and {antialias!r:.40}")  # fmt: skip
     check_arguments(means, factors, opacities, colors, viewmats, Ks, width, height, background, near, far, eps2d)
     if background is None:
         background = colors.new_zeros(colors.shape[-1])

@@ -6,6 +6,9 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.raster import LOWER
+from gsbench.memory import require
+from gsbench.tensors import check_tensor
 
 _last: list[object] = []  # what was found good last: a training asks the same a thousand times
 
@@ -18,34 +21,45 @@ def check_arguments(
     global _last
     sizes = width, type(width), height, type(height), near, far, eps2d
     given = means, factors, opacities, colors, viewmats, Ks, background
-    call: list[object] = [*sizes, *[isinstance(x, Tensor) and (x.shape, x.dtype, x.device) for x in given]]
+    call: list[object] = [*sizes, *[isinstance(x, Tensor) and (x.shape, x.dtype, x.device, x.layout) for x in given]]
     if call == _last:
         return
+    _check_viewport(width, height, near, far, eps2d)
     tensors = {"means": means, "factors": factors, "opacities": opacities, "colors": colors,
                "viewmats": viewmats, "Ks": Ks}  # fmt: skip
     if background is not None:
         tensors["background"] = background
     for name, tensor in tensors.items():
-        if not isinstance(tensor, Tensor) or tensor.dim() == 0:
-            what = "one of shape []" if isinstance(tensor, Tensor) else type(tensor).__name__
-            raise InputError(f"{name}: expected a tensor of at least one dimension, got {what}")
+        check_tensor(tensor, name)
+        if tensor.dim() == 0:
+            raise InputError(f"{name}: expected a tensor of at least one dimension, got one of shape []")
     N, C, D = len(means), len(viewmats), colors.shape[-1]
     shapes = {"means": (N, 3), "factors": (N, 3, 3), "opacities": (N,), "viewmats": (C, 4, 4), "Ks": (C, 3, 3),
               "colors": (N, D) if colors.dim() == 2 else (C, N, D), "background": (D,)}  # fmt: skip
     for name, tensor in tensors.items():
         if tuple(tensor.shape) != shapes[name]:
             raise InputError(f"{name}: expected shape {list(shapes[name])}, got {list(tensor.shape)}")
-        if tensor.dtype != means.dtype or not tensor.is_floating_point():
-            raise InputError(f"{name}: expected {means.dtype} as means are (a float type), got {tensor.dtype}")
+        if tensor.dtype != means.dtype:
+            raise InputError(f"{name}: expected {means.dtype} as means are, got {tensor.dtype}")
         if tensor.device != means.device:
             raise InputError(f"{name}: expected on {means.device} as means are, got {tensor.device}")
     if D < 1 or C < 1:
         raise InputError(f"colors, viewmats: expected at least one channel and one camera, got D={D}, C={C}")
-    if not all(isinstance(size, int) and size >= 1 for size in (width, height)):
-        raise InputError(f"expected an image of at least 1x1 whole pixels, got width={width}, height={height}")
-    if not 0 < near < far or not 0 <= eps2d < math.inf:
-        raise InputError(f"expected 0 < near < far and eps2d >= 0, got near={near}, far={far}, eps2d={eps2d}")
+    if means.device.type == "cpu":
+        size = f"{C} images of {width}x{height} with {D} channels and {N} Gaussians"
+        require(means.element_size() * (C * width * height * (D + 1) + C * N * 30), size, LOWER)
     _last = call
+
+
+def _check_viewport(width: int, height: int, near: float, far: float, eps2d: float) -> None:
+    """Raise InputError unless there are pixels, and depths between the planes."""
+    if not all(isinstance(size, int) and size >= 1 for size in (width, height)):
+        raise InputError(f"expected an image of at least 1x1 whole pixels, got width={width!r:.40}, "
+                         f"height={height!r:.40}")  # fmt: skip
+    numbers = all(isinstance(x, float | int) for x in (near, far, eps2d))
+    if not numbers or not 0 < near < far or not 0 <= eps2d < math.inf:
+        raise InputError(f"expected 0 < near < far and eps2d >= 0, got near={near!r:.40}, far={far!r:.40}, "
+                         f"eps2d={eps2d!r:.40}")  # fmt: skip
 
 
 def check_values(

@@ -10,11 +10,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.memory import require
 from gsbench.scenes.ply import read_vertices
 from gsbench.scenes.scene import Points
+from gsbench.tensors import check_number, check_tensor
 
 SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic Y_00; 3DGS: colour = 0.5 + SH_C0 f_dc
 
+_POINT = 100  # bytes a point takes while it is drawn or its neighbours are looked for, at least
 _MIN_SQUARED_DISTANCE = 1e-7  # 3DGS, create_from_pcd: clamp_min(distCUDA2, 1e-7), so that log(scale) stays finite
 
 
@@ -24,12 +27,12 @@ def random_points(count: int, half_width: float, generator: torch.Generator) -> 
     Colours are 0.5 + SH_C0 u / 255 with u uniform in [0, 1), as 3DGS and 4DGS draw them (readNerfSyntheticInfo:
     SH2RGB(random / 255)). Everything is float32 on the generator's device.
     """
-    if count < 1:
-        raise InputError(f"random points: expected a count of at least 1, got {count}")
-    if not (math.isfinite(half_width) and half_width > 0):
-        raise InputError(f"random points: expected a positive half width, got {half_width}")
+    if type(count) is not int or count < 1:
+        raise InputError(f"random points: expected a count of at least 1, got {count!r:.80}")
+    check_number(half_width, "random points: half width", 1e-30, 1e30)
+    require(_POINT * count, f"{count} random points", "use fewer")
     draws = torch.rand(2, count, 3, generator=generator, device=generator.device)
-    return Points(means=(2 * draws[0] - 1) * half_width, colors=0.5 + SH_C0 * draws[1] / 255)
+    return Points(means=(2 * draws[0] - 1) * float(half_width), colors=0.5 + SH_C0 * draws[1] / 255)
 
 
 def read_ply(path: str | Path) -> Points:
@@ -67,8 +70,12 @@ def nearest_distances(
     Raises:
         InputError: there are at most `k` points, or a point is not finite.
     """
+    check_tensor(means, "points")
+    if type(k) is not int or k < 1 or means.dim() != 2 or means.shape[1] != 3:
+        raise InputError(f"points: expected [P, 3] and at least one neighbour, got {list(means.shape)} and {k!r:.80}")
     if means.shape[0] <= k:
         raise InputError(f"points: expected more than {k} to measure their spacing, got {means.shape[0]}")
+    require(_POINT * len(means), f"the neighbours of {len(means)} points", "use fewer")
     positions = means.detach().cpu().double().numpy()
     if not np.isfinite(positions).all():
         raise InputError("points: expected finite positions, some are not")

@@ -142,7 +142,7 @@ def test_all_hostile_overrides_are_refused_or_run(square: Path, tmp_path: Path) 
         (["model.lr.means.start=-1"], "model.lr.means: expected start >= 0"),
         (["+foo=1"], "config key 'foo' is not known"),
         (["+train.iteratons=1"], "config key 'train.iteratons' is not known. Did you mean 'iterations'?"),
-        (["model=7dgs", "model.options.directional_half=no"], "option directional_half: expected a bool, got 'no'"),
+        (["model=7dgs", "model.options.directional_half=no"], "directional_half: expected bool, got 'no'"),
         (["device=cpu:5"], "device 'cpu:5' is not known"),
         (["data.root=pkg://nosuch"], "data.root: expected pkg://MODULE"),
     ],

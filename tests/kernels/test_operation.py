@@ -47,8 +47,8 @@ def test_every_kernel_is_declared() -> None:
     [
         ((torch.zeros(4, 3), torch.zeros(5, 4), torch.zeros(4)), r"expected quats of shape \[4, 4\], got \[5, 4\]"),
         ((torch.zeros(4, 3), torch.zeros(4, 4), torch.zeros(4, 1)), r"expected opacities of shape \[4\], got \[4, 1\]"),
-        ((torch.zeros(4, 3), torch.zeros(4, 4).double(), torch.zeros(4)), "expected quats as float32"),
-        ((torch.zeros(4, 3).long(), torch.zeros(4, 4), torch.zeros(4)), "expected scales as float32"),
+        ((torch.zeros(4, 3), torch.zeros(4, 4).double(), torch.zeros(4)), "quats: expected float32"),
+        ((torch.zeros(4, 3).long(), torch.zeros(4, 4), torch.zeros(4)), "scales: expected float32"),
     ],
 )
 def test_what_does_not_fit_is_refused(given: tuple[torch.Tensor, ...], said: str) -> None:

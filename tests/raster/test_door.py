@@ -1,11 +1,13 @@
 """What `rasterize` refuses: every fault is an InputError of one line that names the argument."""
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 from cases import case
+from torch import Tensor
 
 from gsbench import backends
 from gsbench.backends import AUTO, REFERENCE, resolve
@@ -61,9 +63,39 @@ def test_types_and_places(name: str) -> None:
     value = {**case("tall"), "background": torch.zeros(3)}[name]
     wrong_type = "opacities" if name == "means" else name  # the others are held to the means
     refused({name: value.float()} if name != "means" else {"opacities": value[:, 0].float()}, wrong_type)
-    refused({name: value.int()}, name if name != "means" else "float type")
+    refused({name: value.int()}, name if name != "means" else "expected float32 or float64")
     if name != "means":
         refused({name: torch.zeros(TENSORS[name], dtype=torch.float64, device="meta")}, name)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu", "auto"])
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (Tensor.half, "got float16: convert it by .to(torch.float32)"),
+        (Tensor.bfloat16, "got bfloat16"),
+        (lambda x: x.to(torch.complex64), "got complex64"),
+        (Tensor.long, "got int64"),
+        (Tensor.to_sparse, "expected a dense tensor, got a sparse_coo one"),
+        (Tensor.numpy, "expected a tensor, got ndarray"),
+        (lambda x: x.to("meta"), "on the meta device"),
+    ],
+)
+def test_kinds_of_tensors(change: Callable[[Tensor], Any], said: str, backend: str) -> None:
+    """Catches half precision, sparse and complex tensors that fail in the depths or are drawn in too few digits."""
+    for name in TENSORS:
+        arguments = case("tall", torch.float32) | {"background": torch.zeros(3)}
+        refused(arguments | {name: change(arguments[name]), "backend": backend}, f"{name}: ")
+        refused(arguments | {name: change(arguments[name]), "backend": backend}, said)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_memory_is_asked_for(backend: str) -> None:
+    """Catches an image, or colours of stride 0, that take more memory than there is and end the process."""
+    refused({"width": 10**7, "height": 10**7, "backend": backend}, "GiB are available")
+    many = {name: torch.zeros(1, *shape[1:]).expand(10**9, *shape[1:]) for name, shape in list(TENSORS.items())[:4]}
+    arguments = case("tall", torch.float32) | {"background": None, "backend": backend}
+    refused(arguments | many, "1000000000 Gaussians")
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
@@ -88,6 +120,10 @@ def test_large_sums_are_finite() -> None:
         ({"width": 0}, "width=0"),
         ({"height": -3}, "height=-3"),
         ({"width": 8.5}, "width=8.5"),
+        ({"width": "8"}, "width='8'"),
+        ({"near": None}, "near=None"),
+        ({"antialias": "no"}, "antialias"),
+        ({"backend": 3}, "backend"),
         ({"near": 0.0}, "near=0.0"),
         ({"near": -1.0}, "near=-1.0"),
         ({"near": 2.0, "far": 2.0}, "far=2.0"),

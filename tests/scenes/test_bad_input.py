@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import FRONT, edit, write_png, write_tiny
 
-from gsbench import scenes
-from gsbench.errors import InputError
+from gsbench import memory, scenes
+from gsbench.errors import InputError, TooLargeError
 from gsbench.scenes import images
 from gsbench.scenes.sample import folder
 
@@ -63,6 +63,11 @@ def link_out(root: Path) -> None:
     image.symlink_to(root.parent / "outside.png")
 
 
+def link(name: str, target: str) -> Break:
+    """Replace a file by a link."""
+    return lambda root: [(root / name).unlink(missing_ok=True), (root / name).symlink_to(target)]
+
+
 def replace_by_pipe(root: Path) -> None:
     (root / "train" / "r_1.png").unlink()
     os.mkfifo(root / "train" / "r_1.png")
@@ -72,9 +77,9 @@ def chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-def png(width: int, height: int, pixels: bytes, color: int = 6) -> bytes:
+def png(width: int, height: int, pixels: bytes, color: int = 6, depth: int = 8) -> bytes:
     """A PNG with right checksums around whatever it is given."""
-    header = struct.pack(">IIBBBBB", width, height, 8, color, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(pixels)) + chunk(b"IEND", b"")
 
 
@@ -94,6 +99,8 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "png of zero size": (write(IMAGE, png(0, 6, b"")), IMAGE, "0x6"),
     "png of absurd size": (write(IMAGE, png(60000, 60000, b"")), IMAGE, "60000x60000"),
     "png with too few rows": (write(IMAGE, png(8, 6, bytes(33))), IMAGE, "cannot decode"),
+    "png of 10 GB": (lambda root: os.truncate(root / IMAGE, 10**10), IMAGE, "at most"),
+    "png of 3 bits": (write(IMAGE, png(8, 6, bytes(6 * 9), color=6, depth=3)), IMAGE, "3 bits"),
     "png is grey": (write(IMAGE, png(8, 6, bytes(9 * 6), color=0)), IMAGE, "RGB or RGBA"),
     "png of another size": (lambda root: write_png(root / IMAGE, np.zeros((6, 9, 4), np.uint8)), IMAGE, "9x6"),
     "png of another size in test": (
@@ -106,6 +113,11 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "json is binary": (write(JSON, b"\xff\xfe\xfd\x00\x81"), JSON, "expected JSON"),
     "json nested too deep": (write(JSON, b"[" * 100_000), JSON, "expected JSON"),
     "json integer too long": (write(JSON, b"9" * 5000), JSON, "expected JSON"),
+    "json with a key twice": (write(JSON, b'{"frames": [], "frames": []}'), JSON, "'frames' appears twice"),
+    "json is a pipe": (lambda root: [(root / JSON).unlink(), os.mkfifo(root / JSON)], JSON, "found a pipe"),
+    "json without an end": (link(JSON, "/dev/zero"), JSON, "found a device"),
+    "json of 10 GB": (lambda root: os.truncate(root / JSON, 10**10), JSON, "at most"),
+    "val is a broken link": (link("transforms_val.json", "nowhere"), "transforms_val.json", "found none"),
     "json is a list": (write(JSON, b"[]"), JSON, "'frames'"),
     "frames missing": (drop("frames"), JSON, "frames"),
     "frames is text": (change(frames="all"), JSON, "frames"),
@@ -122,6 +134,7 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "angle zero": (change(camera_angle_x=0), JSON, "camera_angle_x"),
     "angle of pi": (change(camera_angle_x=3.15), JSON, "camera_angle_x"),
     "angle not finite": (change(camera_angle_x=float("nan")), JSON, "camera_angle_x"),
+    "focal zero in single precision": (change(fl_x=1e-50), JSON, "fl_x"),
     "focal zero": (change(fl_x=0), JSON, "fl_x"),
     "focal negative": (change(fl_x=10, fl_y=-10), JSON, "fl_y"),
     "focal is text": (change(fl_x="10"), JSON, "fl_x"),
@@ -208,6 +221,40 @@ def test_background_must_be_a_colour(tiny: Path, background: Any) -> None:
     """Catches a background that would make every image wrong or NaN without a word."""
     with pytest.raises(InputError, match="background"):
         scenes.load(tiny, background=background)
+
+
+def test_memory_is_asked_for_before_an_image_is_decoded(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches images of a few kilobytes that fill the memory with gigabytes of pixels, and a message without sizes."""
+    for name in ("train/r_0.png", "train/r_1.png", "val/r_0.png", "test/r_0.png"):
+        (tiny / name).write_bytes(png(8192, 8192, b""))
+    monkeypatch.setattr(images, "decode_png", lambda *_: pytest.fail("decoded"))
+    monkeypatch.setattr(memory, "available", lambda: 6 * 2**30)
+    with pytest.raises(TooLargeError) as caught:
+        scenes.load(tiny)
+    check_message(caught.value, "4 images of 8192x8192", "need 7.0 GiB of memory, 6.0 GiB are available", "downscale")
+
+
+def test_images_are_decoded_by_as_many_threads_as_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches threads that together take more than there is: 4 images of 3 GiB in all are kept, 4 GiB decode one."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    for free, threads in ((7, 1), (10.9, 1), (11, 2), (10**6, 64)):
+        for module in (memory, images):
+            monkeypatch.setattr(module, "available", lambda free=free: int(free * 2**30))
+        assert images.count_readers((8192, 8192), 4, 1, "x.png") == threads
+
+
+def test_a_linked_scene_is_loaded(tiny: Path, tmp_path: Path) -> None:
+    """Catches a check for files that leave the folder by a link which refuses a folder that is itself a link."""
+    (tmp_path / "linked").symlink_to(tiny)
+    assert scenes.load(tmp_path / "linked").fingerprint == scenes.load(tiny).fingerprint
+
+
+@pytest.mark.parametrize("path", ["a\0b", "a\nb", "x" * 5000, "/dev/null/x", None, 7])
+def test_a_path_that_is_none_is_refused_in_one_line(path: Any) -> None:
+    """Catches a stack trace from the file system for a name that no folder can have."""
+    with pytest.raises(InputError) as caught:
+        scenes.load(path)
+    check_message(caught.value, "expected the path of a scene's folder")
 
 
 @pytest.mark.parametrize("name", ["nothing", "empty"])

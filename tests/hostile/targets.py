@@ -1,0 +1,94 @@
+"""List the public functions that take tensors, each with arguments that it accepts."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from cases import camera, gaussians
+from torch import Tensor
+
+from gsbench.kernels.adam import adam
+from gsbench.kernels.colors import show_colors
+from gsbench.kernels.loss import l1_ssim
+from gsbench.kernels.refine import HIDDEN, refine
+from gsbench.kernels.slices import observe_rotated, observe_still, observe_triangular
+from gsbench.measure.quality import evaluate, psnr, psnr_channel_mean, quantise, ssim
+from gsbench.models.slicing import slice_gaussians
+from gsbench.raster import rasterize
+from gsbench.scenes.points import nearest_distances, random_points
+
+N = 6
+
+
+@dataclass(frozen=True)
+class Target:
+    """A function and arguments that it accepts, by name; the tensors among them are float32 but where it says so."""
+
+    function: Callable[..., Any]
+    arguments: dict[str, Any]
+    constant: tuple[str, ...] = ()  # tensors by which there is no gradient
+
+
+def targets() -> dict[str, Target]:
+    """Every function by its name."""
+    g = torch.Generator().manual_seed(0)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g)
+
+    scene = {key: x.float() if isinstance(x, Tensor) else x for key, x in (gaussians(g, N) | camera(20, 12)).items()}
+    images = {"a": rand(12, 13, 3), "b": rand(12, 13, 3)}
+    common = {"means": rand(N, 3), "opacities": rand(N)}
+    still = {"scales": rand(N, 3), "quats": rand(N, 4), "opacities": rand(N)}
+    rotated = {**common, "times": rand(N, 1), "scales": rand(N, 4), "left_quats": rand(N, 4),
+               "right_quats": rand(N, 4), "clock": torch.tensor(2.0), "time": torch.tensor(0.5),
+               "log_lambda_t": torch.tensor(0.1)}  # fmt: skip
+    triangular = {**common, "directions": rand(N, 3), "times": rand(N, 1), "log_diagonal": rand(N, 7),
+                  "shape": rand(N, 3), "motion": rand(N, 12), "coupling": rand(N, 6), "center": rand(3),
+                  "time": torch.tensor(0.5), "log_lambda_d": torch.tensor(0.1), "log_lambda_t": torch.tensor(0.1),
+                  "conditioned_first": True}  # fmt: skip
+    colors = {**common, "sh0": rand(N, 1, 3), "shN": rand(N, 15, 3), "center": rand(3), "degree": 3}
+    moved = {"a": rand(N, 3), "b": rand(N, 7), "weight_in": rand(2 * HIDDEN, 5), "bias_in": rand(2 * HIDDEN),
+             "out_a": rand(3, HIDDEN), "out_b": rand(7, HIDDEN), "bias_a": rand(3), "bias_b": rand(7),
+             "units": rand(10) + 1, "gamma": rand(2)}  # fmt: skip
+    step = {"parameter": rand(N, 3), "gradient": rand(N, 3), "mean": rand(N, 3), "square": rand(N, 3),
+            "drawn": torch.ones(N, dtype=torch.bool), "rate": 0.1, "betas": [0.9, 0.999], "eps": 1e-8,
+            "step": torch.tensor(1.0)}  # fmt: skip
+    return {
+        "rasterize": Target(rasterize, {**scene, "background": rand(3), "backend": "cpu"}, ("Ks",)),
+        "rasterize by auto": Target(rasterize, {**scene, "background": rand(3), "antialias": True}, ("Ks",)),
+        "rasterize by reference": Target(rasterize, {**scene, "near": 0.1, "backend": "reference"}, ("Ks",)),
+        "slice_gaussians": Target(
+            slice_gaussians, {"mean": rand(N, 7), "factor": rand(N, 7, 7) + 2 * torch.eye(7), "query": rand(N, 4),
+                              "scheme": "square_root"}
+        ),
+        "observe_still": Target(observe_still, still),
+        "observe_rotated": Target(observe_rotated, rotated, ("clock", "time")),
+        "observe_triangular": Target(observe_triangular, triangular, ("center", "time")),
+        "show_colors": Target(show_colors, colors, ("center", "opacities")),
+        "l1_ssim": Target(l1_ssim, {"image": rand(12, 13, 3), "target": rand(12, 13, 3), "ssim_weight": 0.2},
+                          ("target",)),
+        "refine": Target(_refine, moved, ("units", "gamma")),
+        "adam": Target(adam, step, tuple(step)),
+        "psnr": Target(psnr, images, ("a", "b")),
+        "psnr_channel_mean": Target(psnr_channel_mean, images, ("a", "b")),
+        "ssim": Target(ssim, images, ("a", "b")),
+        "quantise": Target(quantise, {"image": rand(12, 13, 3)}, ("image",)),
+        "evaluate": Target(_evaluate, {**images, "background": (0.0, 0.5, 1.0)}, ("a", "b")),
+        "random_points": Target(_random_points, {"count": 5, "half_width": 1.3}),
+        "nearest_distances": Target(nearest_distances, {"means": rand(N, 3), "k": 3}, ("means",)),
+    }  # fmt: skip
+
+
+def _refine(a: Any, b: Any, weight_in: Any, bias_in: Any, out_a: Any, out_b: Any, bias_a: Any, bias_b: Any, units: Any,
+            gamma: Any) -> list[Tensor]:  # fmt: skip
+    return refine([a, b], weight_in, bias_in, [out_a, out_b], [bias_a, bias_b], units, gamma)
+
+
+def _evaluate(a: Any, b: Any, background: Any) -> float | None:
+    return evaluate([("view", a, b)], background=background).metrics["psnr"]
+
+
+def _random_points(count: Any, half_width: Any) -> Tensor:
+    return random_points(count, half_width, torch.Generator().manual_seed(0)).means

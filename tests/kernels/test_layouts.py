@@ -1,0 +1,91 @@
+"""Tensors that are not row by row in memory: the results and gradients of the same values that are."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from raster.cases import case
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.kernels.colors import show_colors
+from gsbench.kernels.refine import HIDDEN, refine
+from gsbench.kernels.slices import observe_still, observe_triangular
+from gsbench.raster import rasterize
+
+N = 5
+LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
+    "one row for all, stride 0": lambda x: x[:1].expand(x.shape),
+    "one number a row, stride 0": lambda x: x[..., :1].expand(x.shape),
+    "every second row": lambda x: x.repeat_interleave(2, 0)[::2],
+    "transposed": lambda x: x.transpose(0, -1).contiguous().transpose(0, -1),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("name", ["means", "factors", "opacities", "colors", "background"])
+def test_gradient_of_a_leaf_of_any_layout(name: str, layout: str) -> None:
+    """Catches a gradient that is added up in the memory that the rows of a leaf share, or written in another order."""
+    arguments = case("tall", torch.float32) | {"background": torch.tensor([0.1, 0.5, 0.9])}
+    leaf = LAYOUTS[layout](arguments[name])
+    gradients = {}
+    for backend, x in (("cpu", leaf.detach()), ("reference", leaf.detach().double().contiguous())):
+        given = {k: v.to(x.dtype) if isinstance(v, Tensor) else v for k, v in arguments.items()}
+        given |= {name: x.requires_grad_(), "backend": backend}
+        rasterize(**given).image.square().sum().backward()
+        assert x.grad is not None
+        gradients[backend] = x.grad.double()
+    torch.testing.assert_close(gradients["cpu"], gradients["reference"], rtol=1e-3, atol=1e-3)
+
+
+def test_a_negated_view_is_negated() -> None:
+    """Catches memory read as it lies where torch has only noted that its sign is another, as of an imaginary part."""
+    scales, quats, opacities = torch.rand(N, 3), torch.rand(N, 4), torch.rand(N)
+    negated = torch._neg_view(-scales)
+    assert negated.is_contiguous()
+    for x, y in zip(observe_still(negated, quats, opacities), observe_still(scales, quats, opacities), strict=True):
+        assert torch.equal(x, y)
+
+
+def test_transposed_weights_of_agr() -> None:
+    """Catches weights whose columns are taken for rows: results were wrong by a tenth, in silence."""
+    g = torch.Generator().manual_seed(0)
+    shapes = [(2 * HIDDEN, 5), (2 * HIDDEN,), (3, HIDDEN), (7, HIDDEN), (3,), (7,)]
+    plain = [torch.rand(*shape, generator=g) for shape in shapes]
+    values = [torch.rand(N, 3, generator=g), torch.rand(N, 7, generator=g)]
+
+    def run(weights: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        weights = [x.detach().requires_grad_() for x in weights]
+        moved = refine(values, weights[0], weights[1], weights[2:4], weights[4:], torch.ones(10), torch.rand(2) * 0)
+        sum(x.square().sum() for x in moved).backward()
+        return moved, [x.grad for x in weights if x.grad is not None]
+
+    for got, expected in zip(run([LAYOUTS["transposed"](x) for x in plain]), run(plain), strict=True):
+        for x, y in zip(got, expected, strict=True):
+            torch.testing.assert_close(x, y)
+
+
+def triangular() -> dict[str, Any]:
+    return {"means": torch.rand(N, 3), "directions": torch.rand(N, 3), "times": torch.rand(N, 1),
+            "log_diagonal": torch.rand(N, 7), "shape": torch.rand(N, 3), "motion": torch.rand(N, 12),
+            "coupling": torch.rand(N, 6), "opacities": torch.rand(N), "center": torch.rand(3),
+            "time": torch.tensor(0.5), "log_lambda_d": torch.tensor(0.0), "log_lambda_t": torch.tensor(0.0),
+            "conditioned_first": True}  # fmt: skip
+
+
+@pytest.mark.parametrize("nothing", [None, torch.zeros(0)])
+@pytest.mark.parametrize("name", ["times", "time", "log_lambda_t"])
+def test_a_part_of_time_alone_is_refused(name: str, nothing: Tensor | None) -> None:
+    """Catches a null address in a kernel, which ended the process by a signal."""
+    observe_triangular(**triangular())
+    with pytest.raises(InputError):
+        observe_triangular(**triangular() | {name: nothing})
+
+
+def test_waves_without_times_are_refused() -> None:
+    """Catches empty tensors in the place of times, which passed for times that are left out."""
+    given = torch.rand(N, 1, 3), torch.rand(N, 1, 3), torch.rand(N, 3), torch.rand(N), torch.rand(3), 0
+    for times, time in ((None, None), (torch.zeros(0), torch.zeros(0)), (torch.zeros(0), torch.tensor(0.5))):
+        with pytest.raises(InputError, match="times"):
+            show_colors(*given, times, time, 2)
