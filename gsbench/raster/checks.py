@@ -53,7 +53,7 @@ def check_arguments(
 
 def _check_viewport(width: int, height: int, near: float, far: float, eps2d: float) -> None:
     """Raise InputError unless there are pixels, and depths between the planes."""
-    if not all(isinstance(size, int) and size >= 1 for size in (width, height)):
+    if not all(type(size) is int and size >= 1 for size in (width, height)):
         raise InputError(f"expected an image of at least 1x1 whole pixels, got width={width!r:.40}, "
                          f"height={height!r:.40}")  # fmt: skip
     numbers = all(isinstance(x, float | int) for x in (near, far, eps2d))

@@ -55,7 +55,7 @@ def check_record(path: Path, folder: Path) -> None:
     assert files.read(folder / "again.json") == record
 
 
-@sample(50, 300)
+@sample(30, 300)
 def test_any_record_is_read_or_an_input_error(count: int, pool: Pool) -> None:
     """Catches a stack trace, a record that is read and cannot be reported, and one damaged record that hides others."""
     pool.check(__name__, count)

@@ -121,6 +121,7 @@ def test_large_sums_are_finite() -> None:
         ({"height": -3}, "height=-3"),
         ({"width": 8.5}, "width=8.5"),
         ({"width": "8"}, "width='8'"),
+        ({"width": True}, "width=True"),
         ({"near": None}, "near=None"),
         ({"antialias": "no"}, "antialias"),
         ({"backend": 3}, "backend"),
