@@ -4,15 +4,14 @@ import dataclasses
 import json
 import os
 import socket
-import stat
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
 from gsbench.measure.schema import parse
+from gsbench.reading import parse_json, read_file
 
 FILE_NAME = "progress.json"
 EVERY = 5.0  # seconds between two writes
@@ -74,15 +73,7 @@ class Reporter:
 
 def read(path: Path) -> Progress:
     """Read a progress.json; raises InputError where it is not one."""
-    try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode) or found.st_size > LARGEST:
-            raise InputError(f"{path}: expected the progress of a run, got something else")
-        return parse(Progress, json.loads(path.read_bytes()), str(path))
-    except InputError:
-        raise
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected the progress of a run: {error}") from None
+    return parse(Progress, parse_json(read_file(path, str(path), LARGEST), str(path)), str(path))
 
 
 def is_alive(progress: Progress) -> bool:
