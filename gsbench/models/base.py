@@ -117,9 +117,15 @@ class GaussianModel(nn.Module, ABC):
         rest = dc.new_zeros(len(dc), (self.sh_degree + 1) ** 2 - 1, 3)
         return {"sh0": dc[:, None], "shN": rest}
 
-    def show(self, raw: Raw, directions: Tensor, query: Query) -> Tensor:
-        """Compute the colours [N, 3] in unit directions [N, 3]."""
-        return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), directions, self.phase.sh_degree)
+    def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
+        """Compute the colours [N, 3] of a slice; a model whose colours are not these harmonics overrides it.
+
+        The kernel skips Gaussians that are culled by their opacity.
+        """
+        degree = self.phase.sh_degree
+        if self.backend.serves(means):
+            return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, degree)
+        return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), unit(means - query.center), degree)
 
     # ---- what every model does
 
@@ -165,12 +171,6 @@ class GaussianModel(nn.Module, ABC):
         """Compute the means, factors and opacities of a slice; models that have a kernel for it call the kernel."""
         means, factors, gate = self.condition(raw, query)
         return means, factors, torch.sigmoid(raw["opacities"]) * gate
-
-    def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
-        """Compute the colours of a slice; the kernel skips Gaussians that are culled by their opacity."""
-        if type(self).show is GaussianModel.show and self.backend.serves(means):
-            return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, self.phase.sh_degree)
-        return self.show(raw, unit(means - query.center), query)
 
     def refined(self, query: Query) -> Raw:
         """Apply AGR to the raw parameters: raw + phi(f) (7DGS eq. 15), to log-diagonals before the exp."""

@@ -13,7 +13,7 @@ from gsbench.kernels.thresholds import TIME_GATE_MIN
 from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
 from gsbench.models.factors import rotation4d, sizes
-from gsbench.models.query import Query
+from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
 from gsbench.models.slicing import check_scheme, mahalanobis, slice_gaussians
 from gsbench.scenes.points import size_of
@@ -104,24 +104,20 @@ class Gaussians4DModel(GaussianModel):
         )
 
     def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
-        """Compute 4DSH by the kernel where the backend has one."""
-        if self.time_degree >= MAX_WAVES or not self.backend.serves(means):
-            return super().paint(raw, means, opacities, query)
+        """Compute 4DSH, by the kernel where the backend has one for so many waves."""
         assert query.time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.phase.sh_degree, self.time_degree + 1
-        return show_colors(sh0, raw["shN"], means, opacities, query.center, degree, raw["times"], query.time, waves)
+        if waves <= MAX_WAVES and self.backend.serves(means):
+            return show_colors(sh0, raw["shN"], means, opacities, query.center, degree, raw["times"], query.time, waves)
+        coefficients = torch.cat([sh0, raw["shN"]], 1).unflatten(1, (waves, -1))
+        directions = unit(means - query.center)
+        return sh_time_colors(coefficients, directions, degree, query.time - raw["times"][:, 0])
 
     def initial_colors(self, dc: Tensor) -> Raw:
         """Return 4DSH coefficients [N, time_degree + 1, K, 3], of which only the constant one is not zero."""
         K = (self.sh_degree + 1) ** 2
         waves = dc.new_zeros(len(dc), self.time_degree + 1, K, 3)
         return {"sh0": dc[:, None, None], "shN": waves.flatten(1, 2)[:, 1:]}
-
-    def show(self, raw: Raw, directions: Tensor, query: Query) -> Tensor:
-        """Compute 4DSH in torch."""
-        assert query.time is not None
-        coefficients = torch.cat([raw["sh0"].flatten(1, 2), raw["shN"]], 1).unflatten(1, (self.time_degree + 1, -1))
-        return sh_time_colors(coefficients, directions, self.phase.sh_degree, query.time - raw["times"][:, 0])
 
     def scales(self) -> Tensor:
         """Return the largest of the three spatial scales, as density control in 4DGS does."""
