@@ -9,6 +9,8 @@ from tiny_run import ROOT
 
 # From the ground up: a module imports from its own room and from rooms on lower floors, never from its neighbours.
 FLOORS: tuple[set[str], ...] = (
+    {"openmp"},
+    {""},  # the package itself, which Python imports before any room
     {"errors", "config"},
     {"memory", "tensors"},
     {"reading"},
@@ -104,7 +106,7 @@ GSBENCH = modules(ROOT / "gsbench")
 
 def test_every_room_has_a_floor() -> None:
     """Catches a new room that no one has placed, which the next test could not judge."""
-    assert {room(name) for name in GSBENCH} - {""} == set().union(*FLOORS)
+    assert {room(name) for name in GSBENCH} == set().union(*FLOORS)
 
 
 def test_imports_run_down() -> None:
