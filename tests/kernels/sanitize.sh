@@ -25,14 +25,18 @@ from gsbench import kernels
 assert '$build' in kernels.native().__file__, kernels.native().__file__
 import pytest
 sys.exit(pytest.main(sys.argv[1:]))"
+# The first test that needs the CUDA kernels builds them by the shim, sanitized: that may take longer than pytest allows a
+# test. They are kept for the next call.
+limit="timeout=3600"
 # Python itself is not sanitized: the runtime is loaded first, and what the interpreter leaves behind is no leak of ours.
 LD_PRELOAD="$(c++ -print-file-name=libasan.so) $(c++ -print-file-name=libstdc++.so)" \
     ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 OMP_NUM_THREADS=2 \
-    GSBENCH_SANITIZE=address,undefined \
-    "$python" -c "$run" tests/kernels -o "pythonpath=. tests" -p no:cacheprovider \
+    GSBENCH_SANITIZE=address,undefined GSBENCH_SHIM_BUILD=$build/shim \
+    "$python" -c "$run" tests/kernels -o "pythonpath=. tests" -o "$limit" -p no:cacheprovider \
     --ignore tests/kernels/test_cuda_compiles.py  # nvcc does not run with that runtime loaded
 # Only the CUDA kernels are built with ThreadSanitizer: what else runs is not looked at. It needs addresses not shuffled.
 LD_PRELOAD="$(c++ -print-file-name=libtsan.so) $(c++ -print-file-name=libstdc++.so)" \
     TSAN_OPTIONS=halt_on_error=1:ignore_noninstrumented_modules=1 OMP_NUM_THREADS=1 GSBENCH_SANITIZE=thread \
-    setarch "$(uname -m)" -R "$python" -m pytest tests/kernels/test_cuda.py tests/kernels/test_cuda_models.py \
+    GSBENCH_SHIM_BUILD=$build/shim_of_threads \
+    setarch "$(uname -m)" -R "$python" -m pytest -o "$limit" tests/kernels/test_cuda.py tests/kernels/test_cuda_models.py \
     tests/kernels/test_cuda_replay.py -p no:cacheprovider
