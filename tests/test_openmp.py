@@ -9,7 +9,7 @@ from tiny_run import ROOT
 
 from gsbench import kernels
 
-# A kernel of two threads, then work of Python's thread alone; prints the CPU time of all threads in units of this one's.
+# A kernel of two threads, then work of Python's thread alone; prints the CPU time of all threads, in that of this one.
 ALTERNATE = """
 import time
 from gsbench.kernels.loss import l1_ssim

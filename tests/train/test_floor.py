@@ -54,3 +54,17 @@ def test_no_camera_sees_the_floor(name: str) -> None:
     assert (torch.linalg.svdvals(factors)[:, 2] >= 0.99 * floor.least).all()
     assert all(torch.equal(model.splats[n], p) for n, p in others.items())
     assert durations is None or torch.equal(model.splats["scales"][:, 3:], durations)
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_only_sizes_in_space_are_held(name: str) -> None:
+    """Catches a floor that lengthens what is short in time, or widens what is narrow in direction."""
+    model = flat(name)
+    space = model.rows["p"] if name in ("6dgs", "7dgs") else [0, 1, 2]
+    sizes = model.splats["log_diagonal" if name in ("6dgs", "7dgs") else "scales"].data
+    sizes.fill_(math.log(1e-7))
+    floor = Floor(model, [camera(4.0)])
+    floor.hold()
+    for column in range(sizes.shape[1]):
+        expected = floor.least if column in space else torch.full((200,), 1e-7)
+        torch.testing.assert_close(sizes[:, column].exp(), expected, rtol=1e-4, atol=0)

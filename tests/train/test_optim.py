@@ -42,6 +42,7 @@ def test_rate_is_log_linear() -> None:
     assert rate_at(rate, 50, train, 5) == pytest.approx(8e-5)
     assert rate_at(rate, 100, train, 5) == pytest.approx(8e-6)
     assert rate_at(LearningRate(0.05), 70, train, 5) == 0.05
+    assert rate_at(LearningRate(0.05, per_extent=True), 70, train, 5) == 0.25  # constant, but in units of the scene
     assert math.isclose(rate_at(LearningRate(0.0), 70, train, 5), 0.0)
 
 
@@ -52,6 +53,7 @@ def test_rates_of_short_runs() -> None:
     assert rate_at(rate, 300, TrainConfig(iterations=300), 5) == pytest.approx(1e-4)
     assert rate_at(rate, 0, TrainConfig(), 5) == pytest.approx(1e-3)
     assert rate_at(LearningRate(1e-3), 0, TrainConfig(iterations=300), 5) == 1e-3
+    assert rate_at(LearningRate(1e-3, per_run=True), 0, TrainConfig(iterations=300), 5) == pytest.approx(1e-2)
 
 
 def test_a_copied_gaussian_does_not_inherit_momentum() -> None:
@@ -86,7 +88,10 @@ def drawn_with(gradients: torch.Tensor, drawn: torch.Tensor | None = None) -> tu
 
 
 def test_density_control_clones_small_splits_large_prunes_faint() -> None:
-    """Catches a wrong criterion or count of any of the three, and a gradient in pixels instead of half pictures."""
+    """Catches a wrong criterion or count of any of the three, and a gradient in pixels instead of half pictures.
+
+    Also a clone or a child that goes on with its parent's momentum.
+    """
     model, optimizer = fitted(6)
     descend(model, optimizer, 0)
     control = DensityControl(model, optimizer, DensifyConfig(grad_threshold=1.0), min_opacity=0.01, views=3)
@@ -105,6 +110,10 @@ def test_density_control_clones_small_splits_large_prunes_faint() -> None:
     assert len(model) == 7  # 1, 2, 4 kept; 0 cloned to two; 3 split in two; 5 pruned
     assert means[:5].tolist() == [0, 1, 2, 4, 0]
     assert (model.splats["scales"][5:] < math.log(0.1) - math.log(1.59)).all()
+    for parameter in model.splats.values():
+        for moment in ("exp_avg", "exp_avg_sq"):
+            has_moved = optimizer.adam.state[parameter][moment].reshape(7, -1).any(1)
+            assert has_moved.tolist() == [True] * 4 + [False] * 3
     assert control.gradient.shape == (7,)
     assert not control.gradient.any()
     descend(model, optimizer, 1)

@@ -15,6 +15,7 @@ from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import rate_at
 from gsbench.train.schedule import generator
+from gsbench.train.step import Seen
 
 
 def trainer(model: str = "7dgs", *overrides: str, scene: Scene | None = None) -> Trainer:
@@ -87,6 +88,24 @@ def test_opacities_are_reset_when_the_schedule_says() -> None:
     state = fitted.optimizer.adam.state[opacities]
     assert not state["exp_avg"].any()
     assert not state["exp_avg_sq"].any()
+
+
+def test_what_any_view_of_the_batch_saw_is_moved() -> None:
+    """Catches sparse_adam that moves what the last view saw alone, or the first."""
+    fitted = trainer("3dgs", "train.batch_size=3")
+    N = len(fitted.model)
+    radii = torch.zeros(3, 1, N, dtype=torch.int32)
+    for view in range(3):
+        radii[view, 0, view] = 5  # each view sees the Gaussian of its number
+    seen = [Seen(torch.ones(()), one, torch.zeros(1, N, 2)) for one in radii]
+    fitted.gradients = lambda _: seen  # type: ignore[assignment]
+    moved = []
+    fitted.optimizer.step = lambda _, drawn: moved.append(drawn)  # type: ignore[method-assign]
+    for step in (0, 1):
+        fitted.step = step
+        fitted._descend()
+    assert all(drawn.tolist() == [True] * 3 + [False] * (N - 3) for drawn in moved)
+    assert len(moved) == 2
 
 
 def test_large_gaussians_go_once_opacities_were_reset() -> None:
