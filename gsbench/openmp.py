@@ -18,6 +18,7 @@ def sleep_when_idle() -> None:
 
     A runtime that is already loaded waits for 300,000 rounds before it sleeps, but for only 100 while there are more
     OpenMP threads than processors (manual of libgomp, GOMP_SPINCOUNT). There it is given that many, which do nothing.
+    Another library's own copy of the runtime, under another name, is not reached.
     """
     if "OMP_WAIT_POLICY" in os.environ or "GOMP_SPINCOUNT" in os.environ:
         return
