@@ -137,6 +137,26 @@ def test_what_torch_does_in_between_is_differentiated_too() -> None:
         torch.testing.assert_close(sums[id(x)], gradient, rtol=1e-5, atol=1e-5)
 
 
+def test_what_is_added_does_not_depend_on_what_is_there() -> None:
+    """Catches coefficients that two operations read, each of which adds its own part to other views' gradient.
+
+    Which views share a sum depends on the number of threads, and its rounding would too.
+    """
+    g = torch.Generator().manual_seed(4)
+    sh0, shN = torch.randn(50, 1, 3, generator=g).requires_grad_(), torch.randn(50, 15, 3, generator=g).requires_grad_()
+    means, faded, other = torch.randn(50, 3, generator=g), torch.ones(50), torch.randn(50, 1, 3, generator=g)
+
+    def gradient(sums: dict[int, Tensor]) -> Tensor:
+        with Tape() as tape:
+            shown = [show_colors(sh0, shN, place, faded, torch.zeros(3), 3) for place in (means, 3 * means + 1)]
+            value = (shown[0] * shown[1].square()).sum()
+        tape.backward(value, torch.ones(()), [sh0, shN], sums)
+        return sums[id(sh0)]
+
+    alone = gradient({})
+    assert torch.equal(gradient({id(sh0): other.clone()}), other + alone)
+
+
 def test_nothing_is_noted_where_nothing_is_wanted() -> None:
     """Catches a tape that keeps every tensor of a rendering."""
     with Tape() as tape, torch.no_grad():
