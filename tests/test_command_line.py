@@ -106,16 +106,6 @@ def test_other_numbers_are_another_run(square: Path, tmp_path: Path) -> None:
     assert gsbench(*sweep).stdout.count("finished before, kept") == 2
 
 
-def test_other_data_run_again_and_say_so(tmp_path: Path) -> None:
-    """Catches a result of other data that is passed off as this one's."""
-    data = write_moving_square(tmp_path / "data")
-    arguments = overrides(data, tmp_path / "r", "model=3dgs")
-    assert gsbench(*arguments).returncode == 0
-    source = data / "square" / "transforms_train.json"
-    source.write_text(source.read_text().replace('"camera_angle_x": 0.7', '"camera_angle_x": 0.71'))
-    assert "running again" in gsbench(*arguments).stderr
-
-
 def test_what_is_measured_trains_nothing_again(square: Path, tmp_path: Path) -> None:
     """Catches a training repeated for the sake of its pictures; the protocol is that of the last command."""
     arguments = overrides(square, tmp_path, "model=3dgs")
