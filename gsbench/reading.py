@@ -35,14 +35,12 @@ def read_file(
         require(status.st_size, f"{where}: its bytes", "use a smaller file")
         with path.open("rb") as file:
             return file.read(status.st_size)
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{where}: expected a file, found none: is the data complete?") from None
-    except OSError as error:
-        raise InputError(f"{where}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{where}: cannot be read: {error}") from None  # a NUL byte in the path
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
+        raise InputError(f"{where}: cannot be read: {getattr(error, 'strerror', error)}") from None
 
 
 def parse_json(

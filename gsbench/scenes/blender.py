@@ -78,6 +78,7 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float]) 
     Raises:
         InputError: something is missing, damaged or contradictory; the message names file and field.
     """
+    name = Path(os.path.abspath(root)).name  # of the link, where the folder is one
     root = root.resolve()
     splits = {"train": _read_split(root, "train"), "test": _read_split(root, "test")}
     if os.path.lexists(root / "transforms_val.json"):  # a broken link is a fault, and not a data set without val
@@ -86,7 +87,7 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float]) 
     views, digests = _read_views(splits, downscale, background)
     digests |= {split.source.name: split.digest for split in splits.values()}
     return Scene(
-        name=root.name,
+        name=name,
         train=views["train"],
         val=views.get("val", []),
         test=views["test"],

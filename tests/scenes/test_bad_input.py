@@ -244,9 +244,11 @@ def test_images_are_decoded_by_as_many_threads_as_memory_allows(monkeypatch: pyt
 
 
 def test_a_linked_scene_is_loaded(tiny: Path, tmp_path: Path) -> None:
-    """Catches a check for files that leave the folder by a link which refuses a folder that is itself a link."""
+    """Catches a folder that is refused because it is a link, or whose scene has another name than was asked for."""
     (tmp_path / "linked").symlink_to(tiny)
-    assert scenes.load(tmp_path / "linked").fingerprint == scenes.load(tiny).fingerprint
+    scene = scenes.load(tmp_path / "linked")
+    assert scene.name == "linked"
+    assert scene.fingerprint == scenes.load(tiny).fingerprint
 
 
 @pytest.mark.parametrize("path", ["a\0b", "a\nb", "x" * 5000, "/dev/null/x", None, 7])
