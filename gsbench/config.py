@@ -26,7 +26,7 @@ class DataConfig:
     background: str = "black"  # or white: the colour behind the images and the renders
     modulation: float = 0.5  # the initial lambda_t and lambda_d of 7DGS here (7DGS, implementation details)
     initial_points: int = 100_000  # drawn at random where the data set gives none ..
-    initial_half_width: float = 1.3  # .. in the cube [-w, w]^3
+    initial_half_width: float | None = 1.3  # .. in the cube [-w, w]^3; None: in the frustum that all cameras share
 
 
 @dataclass
@@ -36,6 +36,7 @@ class SceneConfig:
     name: str = MISSING
     downscale: int = 1  # integer factor by which images are made smaller, by an area filter
     eval_split: str = "test"  # or val, where the test split is wrong (D-NeRF lego)
+    frames: list[int] | None = None  # the first and the last frame of a Technicolor scene; None: all that are there
 
 
 @dataclass

@@ -38,7 +38,7 @@ class MethodRow:
 
 def paper_row(dataset: str, scene: str, model: str) -> PaperRow | None:
     """Return a row of Table 1, such as ``paper_row("D-NeRF", "trex", "7dgs")``; None if the paper has no such row."""
-    return table1().get((dataset, scene, model))
+    return table1().get((dataset, scene.lower(), model))  # Technicolor's folders are named Birthday, ..
 
 
 @cache

@@ -2,7 +2,7 @@
 
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsbench import models
-from gsbench.config import Config
+from gsbench.config import Config, DataConfig
 from gsbench.errors import InputError, one_line
 from gsbench.measure import record as records
 from gsbench.measure.provenance import provenance
@@ -26,8 +26,8 @@ from gsbench.run.checks import check_config, check_scene, evaluated_views
 from gsbench.run.identity import Run, training_hash
 from gsbench.run.load import plain_description
 from gsbench.run.setup import build, load_scene
-from gsbench.scenes import Scene, View
-from gsbench.scenes.points import random_points
+from gsbench.scenes import Points, Scene, View
+from gsbench.scenes.points import frustum_points, random_points
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.loop import Trainer
@@ -58,8 +58,8 @@ class Attempt:
         check_scene(self.model, scene, self.config)
         views = evaluated_views(scene, self.config.scene.eval_split)
         records.check(self.describe("failed", "not run"), "planned record")
-        data, random = self.config.data, generator(self.config.seed)
-        points = scene.points or random_points(data.initial_points, data.initial_half_width, random)
+        random = generator(self.config.seed)
+        points = scene.points or initial_points(self.config.data, scene, random)
         self.model.initialise(points, scene.extent, random)
         self.model.to(self.config.device)
         return Trainer(self.model, scene, views, self.config)
@@ -104,11 +104,20 @@ class Attempt:
     def measure(self, trainer: Trainer) -> Record:
         """Measure the images, the speed and the size of a fitted model."""
         config, views = self.config, trainer.views
-        images = [(view.name, trainer.render(view), view.image) for view in views]
         given = {"alex": config.protocol.lpips_alex, "vgg": config.protocol.lpips_vgg}
         weights = {backbone: Path(file).expanduser() for backbone, file in given.items() if file}
+        pictures = config.protocol.pictures
+        chosen = range(0, len(views), max(1, len(views) // max(1, pictures)))[:pictures]
+
+        def images() -> Iterator[tuple[str, Tensor, Tensor]]:
+            for i, view in enumerate(views):  # one at a time: fifty views of 2048 x 1088 take 3 GB
+                render, truth = trainer.render(view), view.image
+                if i in chosen:
+                    self._shown.append((render.cpu().numpy(), truth.cpu().numpy()))
+                yield view.name, render, truth
+
         quality = evaluate(
-            images, background=trainer.scene.background, quantised=config.protocol.quantise, weights=weights
+            images(), background=trainer.scene.background, quantised=config.protocol.quantise, weights=weights
         )
         frame, made = frames(trainer, views[0])
         times = time_renders(
@@ -116,9 +125,6 @@ class Attempt:
             count=max(config.protocol.renders, len(views)),
             synchronise=synchroniser(config.device),
         )
-        pictures = config.protocol.pictures
-        shown = images[:: max(1, len(images) // max(1, pictures))][:pictures]
-        self._shown = [(render.cpu().numpy(), truth.cpu().numpy()) for _, render, truth in shown]
         cost = Cost(
             train_s=sum(trainer.stages.seconds.values()),
             stage_s=trainer.stages.state_dict(),
@@ -185,6 +191,14 @@ class Attempt:
             variant=this.variant,
             overrides=this.overrides,
         )
+
+
+def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:
+    """Draw the points to start from, where the data set gives none: in a cube, or in what all cameras see."""
+    if data.initial_half_width is not None:
+        return random_points(data.initial_points, data.initial_half_width, random)
+    cameras = [view.to("cpu").camera for view in scene.train]
+    return frustum_points(data.initial_points, cameras, scene.extent, random)
 
 
 def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dict[str, str]]:

@@ -112,8 +112,11 @@ def training_part(plain: Plain) -> Plain:
 
 
 def training_hash(plain: Plain) -> str:
-    """Compute the SHA-256 of what a training reads: equal for two runs whose checkpoints can be exchanged."""
-    return config_hash(training_part(plain))
+    """Compute the SHA-256 of what a training reads: equal for two runs whose checkpoints can be exchanged.
+
+    A key that is null counts as absent, so that a new key which is null by default changes no older run.
+    """
+    return config_hash({key: value for key, value in flat(training_part(plain)) if value is not None})
 
 
 def flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, Any]]:

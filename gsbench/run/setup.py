@@ -29,4 +29,6 @@ def load_scene(config: Config) -> Scene:
         InputError: the data set is missing or has a fault.
     """
     background = BACKGROUNDS[config.data.background]
-    return scenes.load(scene_folder(config), downscale=config.scene.downscale, background=background).to(config.device)
+    chosen = config.scene
+    scene = scenes.load(scene_folder(config), downscale=chosen.downscale, background=background, frames=chosen.frames)
+    return scene.to(config.device)

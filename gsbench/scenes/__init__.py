@@ -2,6 +2,7 @@
 
 import importlib
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +28,12 @@ _LAYOUTS = (
         "github.com/albertpumarola/D-NeRF; 7DGS-PBR: the Data link of gaozhongpai.github.io/7dgs)",
         "blender",
     ),
+    _Layout(
+        "cameras_parameters.txt",
+        "cameras_parameters.txt beside images <Scene>_undist_<frame>_<camera>.png (Technicolor: by request to the "
+        "authors of Sabater et al. 2017)",
+        "technicolor",
+    ),
 )
 
 
@@ -35,6 +42,7 @@ def load(
     *,
     downscale: int = 1,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    frames: Sequence[int] | None = None,  # the first and the last one, of layouts with frames; None: all
 ) -> Scene:
     """Load the scene in the folder `path` and detect its layout.
 
@@ -52,12 +60,24 @@ def load(
     root = _folder(path)
     for layout in _LAYOUTS:
         if os.path.lexists(root / layout.marker):
+            more = {} if frames is None else {"frames": _frames(frames, layout)}
             reader = importlib.import_module(f"gsbench.scenes.{layout.reader}")
-            scene: Scene = reader.load(root, downscale=downscale, background=background)
+            scene: Scene = reader.load(root, downscale=downscale, background=background, **more)
             return scene
     found = "a folder without it" if root.is_dir() else "no such folder"
     layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
     raise InputError(f"{root}: {found}: looked for {layouts}")
+
+
+def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
+    """Check the first and the last frame that are asked for; raises InputError where the layout has no frames."""
+    if layout.reader != "technicolor":
+        raise InputError(f"frames: {layout.marker} lists its own frames and times, got {frames!r:.80}: leave it out")
+    if not isinstance(frames, tuple | list) or len(frames) != 2 or not all(type(n) is int for n in frames):
+        raise InputError(f"frames: expected the numbers of the first and the last frame, got {frames!r:.80}")
+    if not 0 <= frames[0] <= frames[1]:
+        raise InputError(f"frames: expected 0 <= first <= last, got {frames!r:.80}")
+    return frames[0], frames[1]
 
 
 def _folder(path: object) -> Path:

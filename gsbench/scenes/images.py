@@ -82,6 +82,7 @@ def count_readers(
     count: int,
     downscale: int,
     where: str,  # the first image's path, for the message
+    kept: int = 12,  # bytes a pixel of the reduced image
 ) -> int:
     """Return how many threads may decode images at once, so that memory suffices for them and for all images.
 
@@ -89,12 +90,12 @@ def count_readers(
         TooLargeError: it does not suffice for one.
     """
     pixels = size[0] * size[1]
-    kept, decoding = count * 12 * pixels // downscale**2, _DECODING * pixels
+    all_kept, decoding = count * kept * pixels // downscale**2, _DECODING * pixels
     what = f"{where}: {count} images of {size[0]}x{size[1]}, reduced {downscale} times,"
-    require(kept + decoding, what, "use a larger scene.downscale or fewer images")
+    require(all_kept + decoding, what, "use a larger scene.downscale or fewer images")
     free = available()
     threads = os.cpu_count() or 1
-    return threads if free is None else max(1, min(threads, (free - kept) // decoding))
+    return threads if free is None else max(1, min(threads, (free - all_kept) // decoding))
 
 
 def decode_png(

@@ -1,6 +1,7 @@
 """Provide initial points, at random or from a PLY, and measure their distances and their extent."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,15 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.memory import require
 from gsbench.scenes.ply import read_vertices
-from gsbench.scenes.scene import Points
+from gsbench.scenes.scene import Camera, Points
 from gsbench.tensors import check_number, check_tensor
 
 SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic Y_00; 3DGS: colour = 0.5 + SH_C0 f_dc
 
 _POINT = 100  # bytes a point takes while it is drawn or its neighbours are looked for, at least
+NEAREST, FARTHEST = 2.0, 100.0  # depth of points in a frustum, in radii of the cameras
+ROUNDS = 50  # of drawing points in a frustum
+
 _MIN_SQUARED_DISTANCE = 1e-7  # 3DGS, create_from_pcd: clamp_min(distCUDA2, 1e-7), so that log(scale) stays finite
 
 
@@ -33,6 +37,50 @@ def random_points(count: int, half_width: float, generator: torch.Generator) -> 
     require(_POINT * count, f"{count} random points", "use fewer")
     draws = torch.rand(2, count, 3, generator=generator, device=generator.device)
     return Points(means=(2 * draws[0] - 1) * float(half_width), colors=0.5 + SH_C0 * draws[1] / 255)
+
+
+def frustum_points(count: int, cameras: Sequence[Camera], radius: float, generator: torch.Generator) -> Points:
+    """Draw `count` points in the frustum that all cameras share, all of nearly the same grey.
+
+    Each lies on a random pixel's ray of a random camera, uniformly in inverse depth between `NEAREST` and `FARTHEST`
+    times the cameras' radius: a rig that looks in one direction says nothing about how far away the scene is.
+
+    Args:
+        count: of points.
+        cameras: of the training views.
+        radius: of the cameras around their mean, world units.
+        generator: the source of all random numbers.
+
+    Raises:
+        InputError: the cameras share too little for that many points.
+    """
+    K, viewmats = torch.stack([camera.K for camera in cameras]), torch.stack([camera.viewmat for camera in cameras])
+    size = torch.tensor([[camera.width, camera.height] for camera in cameras])  # [C, 2]
+    found = torch.zeros(0, 3)
+    for _ in range(ROUNDS):
+        chosen = torch.randint(len(cameras), (count,), generator=generator)
+        draws = torch.rand(count, 3, generator=generator)
+        depth = radius / (draws[:, 2] * (1 / NEAREST - 1 / FARTHEST) + 1 / FARTHEST)
+        pixel = torch.cat([draws[:, :2] * size[chosen], torch.ones(count, 1)], 1)
+        inside = depth[:, None] * (K.inverse()[chosen] @ pixel[:, :, None])[..., 0]  # [count, 3] in the camera
+        rotation, translation = viewmats[chosen, :3, :3], viewmats[chosen, :3, 3]
+        points = (rotation.mT @ (inside - translation)[:, :, None])[..., 0]
+        found = torch.cat([found, points[_seen_by_all(points, K, viewmats, size)]])
+        if len(found) >= count:
+            colors = 0.5 + SH_C0 * torch.rand(count, 3, generator=generator) / 255
+            return Points(found[:count].contiguous(), colors)
+    raise InputError(f"initial points: expected training cameras that see something in common, {len(found)} of "
+                     f"{ROUNDS * count} random points are seen by all: set data.initial_half_width")  # fmt: skip
+
+
+def _seen_by_all(points: Tensor, K: Tensor, viewmats: Tensor, size: Tensor) -> Tensor:
+    """Tell which points [P, 3] every camera has in its image, [P] bool."""
+    seen = torch.ones(len(points), dtype=torch.bool)
+    for camera, viewmat, extent in zip(K, viewmats, size, strict=True):
+        x = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ camera.T
+        pixel = x[:, :2] / x[:, 2:]
+        seen &= (x[:, 2] > 0) & (pixel >= 0).all(1) & (pixel <= extent).all(1)
+    return seen
 
 
 def read_ply(path: str | Path) -> Points:

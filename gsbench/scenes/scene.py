@@ -32,11 +32,16 @@ class View:
     name: str  # in the data set, such as "train/r_000"
     camera: Camera
     time: float | None  # in [0, 1]; None where the data set has no time
-    image: Tensor  # [H, W, 3] float32 in [0, 1], composited over the scene's background
+    pixels: Tensor  # [H, W, 3], composited over the scene's background: floats in [0, 1], or 8 bits to save memory
+
+    @property
+    def image(self) -> Tensor:
+        """The image, [H, W, 3] of floats in [0, 1]; one of 8 bits is converted each time it is looked at."""
+        return self.pixels if self.pixels.is_floating_point() else self.pixels.float() / 255
 
     def to(self, device: str) -> "View":
         """Return the same view with its tensors on `device`."""
-        return replace(self, camera=self.camera.to(device), image=self.image.to(device))
+        return replace(self, camera=self.camera.to(device), pixels=self.pixels.to(device))
 
 
 @dataclass(frozen=True)

@@ -96,7 +96,7 @@ def one_frame(g: Generator, severity: float, model: str) -> Training:  # noqa: A
 def all_images_equal(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
     """Every image is black: there is nothing to show, so opacities sink and all Gaussians may be pruned."""
     scene = moving_square()
-    views = [replace(view, image=view.image * (1 - severity)) for view in scene.train]
+    views = [replace(view, pixels=view.image * (1 - severity)) for view in scene.train]
     return Training(model, compose(model, STEPS), replace(scene, train=views))
 
 

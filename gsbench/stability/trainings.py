@@ -96,7 +96,7 @@ def double(scene: Scene) -> Scene:
 
     def view(seen: View) -> View:
         camera = Camera(seen.camera.viewmat.double(), seen.camera.K.double(), seen.camera.width, seen.camera.height)
-        return replace(seen, camera=camera, image=seen.image.double())
+        return replace(seen, camera=camera, pixels=seen.image.double())
 
     points = scene.points and Points(scene.points.means, scene.points.colors)
     return replace(scene, train=[view(v) for v in scene.train], test=[view(v) for v in scene.test], points=points)

@@ -53,7 +53,7 @@ class Trainer:
             InputError: a training image has a value that is not finite.
         """
         for view in scene.train:
-            if not view.image.isfinite().all():
+            if view.pixels.is_floating_point() and not view.pixels.isfinite().all():
                 raise InputError(f"{view.name}: expected an image of finite values, got NaN or inf: render it again")
         train = config.train
         self.model = model

@@ -1,0 +1,188 @@
+"""Load the raw Technicolor layout: cameras_parameters.txt and a PNG for each frame and camera of a 4 x 4 array."""
+
+import math
+import re
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from scipy.spatial.transform import Rotation
+
+from gsbench.errors import InputError
+from gsbench.reading import read_file
+from gsbench.scenes import colmap, files, images
+from gsbench.scenes.points import read_ply
+from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent
+
+CAMERAS = "cameras_parameters.txt"
+COLUMNS = ("f", "cu", "cv", "ar", "sk", "qw", "qx", "qy", "qz", "tx", "ty", "tz")  # pixels, w first, world units
+DISTORTION = ("d1", "d2")  # of the originals, which are not undistorted
+TEST_CAMERA = 10  # held out by every paper that reports on this data (row 2, column 2 of the array)
+IMAGE = re.compile(r"(?P<scene>.+)_undist_(?P<frame>\d{5})_(?P<camera>\d{2})\.png")
+_MAX_TEXT = 1 << 20  # bytes of cameras_parameters.txt
+_UNIT = 1e-3  # quaternions are written with nine digits
+
+
+@dataclass(frozen=True)
+class _Image:
+    """One image that is to be read."""
+
+    path: Path
+    frame: int
+    camera: int
+
+
+def load(
+    root: Path, *, downscale: int, background: tuple[float, float, float], frames: tuple[int, int] | None = None
+) -> Scene:
+    """Load a scene of the Technicolor light field data (Sabater et al. 2017) as it is released.
+
+    The folder has `cameras_parameters.txt`, a header and a row for each camera (intrinsics in pixels of the images,
+    world to camera in OpenCV axes), and images `<Scene>_undist_<frame>_<camera>.png`. Camera 10 is the test split, all
+    others are for training; there is no val split. The first frame has the time 0, the last 1. Initial points are those
+    of a COLMAP model in `sparse/0`, else of `points3d.ply`, else none.
+
+    Args:
+        root: the scene's folder.
+        downscale: as `gsbench.scenes.load`; images that are not reduced stay in 8 bits.
+        background: of the renders; the images are opaque.
+        frames: the first and the last frame, which is included; None: all that are there.
+
+    Raises:
+        InputError: something is missing, damaged or contradictory; the message names the file.
+    """
+    root = root.resolve()
+    source = root / CAMERAS
+    text = read_file(source, str(source), _MAX_TEXT)
+    rows = _read_rows(text.decode("utf-8", "replace"), source)
+    if len(rows) <= TEST_CAMERA:
+        raise InputError(f"{source}: expected more than {TEST_CAMERA} cameras, number {TEST_CAMERA} is the test view, "
+                         f"got {len(rows)}")  # fmt: skip
+    listed = _list_images(root, frames, len(rows))
+    views, digests = _read_views(listed, rows, downscale)
+    digests[CAMERAS] = files.digest(text)
+    train = [view for image, view in zip(listed, views, strict=True) if image.camera != TEST_CAMERA]
+    test = [view for image, view in zip(listed, views, strict=True) if image.camera == TEST_CAMERA]
+    return Scene(
+        name=root.name,
+        train=train,
+        val=[],
+        test=test,
+        background=background,
+        extent=scene_extent(torch.stack([view.camera.viewmat for view in train])),
+        points=_points(root),
+        fingerprint=files.fingerprint(digests),
+    )
+
+
+def _read_rows(text: str, source: Path) -> list[dict[str, float]]:
+    """Read the table of cameras by the names in its header."""
+    lines = [line.split() for line in text.splitlines() if line.strip()]
+    header = lines[0] if lines else []
+    missing = [name for name in COLUMNS if name not in header]
+    if missing or len(set(header)) != len(header):
+        raise InputError(f"{source}: expected a header with {' '.join(COLUMNS)}, got {' '.join(header)[:120]!a}")
+    rows = []
+    for i, values in enumerate(lines[1:]):
+        where = f"{source}: camera {i}"
+        if len(values) != len(header):
+            raise InputError(f"{where}: expected {len(header)} numbers as the header has names, got {len(values)}")
+        row = {name: _number(value, f"{where}: {name}") for name, value in zip(header, values, strict=True)}
+        for name in ("sk", *DISTORTION):
+            if row.get(name, 0.0) != 0:
+                raise InputError(f"{where}: {name}: expected 0, a pinhole camera, got {row[name]}: take the release's "
+                                 f"*_undist_* images with their parameters, or undistort by cv2.undistort")  # fmt: skip
+        if row["f"] <= 0 or row["ar"] <= 0:
+            raise InputError(f"{where}: expected positive f and ar, got {row['f']} and {row['ar']}")
+        if abs(math.hypot(row["qw"], row["qx"], row["qy"], row["qz"]) - 1) > _UNIT:
+            raise InputError(f"{where}: expected a unit quaternion qw qx qy qz")
+        rows.append(row)
+    return rows
+
+
+def _number(text: str, where: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not abs(number) < 1e9:
+        raise InputError(f"{where}: expected a number, got {text[:40]!a}")
+    return number
+
+
+def _camera(row: dict[str, float], width: int, height: int, downscale: int) -> Camera:
+    """Make the camera of a row for images of width x height after they were reduced."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    rotation = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")])  # scipy has w last
+    viewmat[:3, :3] = torch.from_numpy(rotation.as_matrix())
+    viewmat[:3, 3] = torch.tensor([row["tx"], row["ty"], row["tz"]], dtype=torch.float64)
+    s = 1 / downscale
+    K = torch.tensor([[row["f"] * s, 0, row["cu"] * s], [0, row["f"] * row["ar"] * s, row["cv"] * s], [0, 0, 1]])
+    return Camera(viewmat.float(), K, width, height)
+
+
+def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> list[_Image]:
+    """List the images by frame, then camera; refuse a frame that a camera lacks."""
+    found: dict[tuple[int, int], Path] = {}
+    scenes = set()
+    for path in sorted(root.glob("*.png")):
+        name = IMAGE.fullmatch(path.name)
+        if name is None:
+            continue
+        scenes.add(name["scene"])
+        key = int(name["frame"]), int(name["camera"])
+        if frames is None or frames[0] <= key[0] <= frames[1]:
+            found[key] = files.find_inside(root, path.name, str(root))
+    if len(scenes) > 1:
+        raise InputError(f"{root}: expected images of one scene, got those of {', '.join(sorted(scenes))[:120]}")
+    numbers = sorted({frame for frame, _ in found}) if frames is None else range(frames[0], frames[1] + 1)
+    if not numbers:
+        raise InputError(f"{root}: expected images <Scene>_undist_<frame>_<camera>.png, found none")
+    for frame in numbers:
+        for camera in range(cameras):
+            if (frame, camera) not in found:
+                raise InputError(f"{root}: expected an image *_undist_{frame:05d}_{camera:02d}.png of every camera in "
+                                 f"{CAMERAS}, it is missing: copy it, or choose other scene.frames")  # fmt: skip
+    return [_Image(found[frame, camera], frame, camera) for frame in numbers for camera in range(cameras)]
+
+
+def _read_views(
+    listed: list[_Image], rows: list[dict[str, float]], downscale: int
+) -> tuple[list[View], dict[str, str]]:
+    """Read all images on threads, in order; return their views, and the digests of the files by name."""
+    first, last = listed[0].frame, listed[-1].frame
+    where = str(listed[0].path)
+    size = images.png_size(images.read_png(listed[0].path, where), where)
+    if size[0] % downscale or size[1] % downscale:
+        raise InputError(f"{where}: expected a downscale that divides the image, got downscale={downscale} for "
+                         f"{size[0]}x{size[1]}")  # fmt: skip
+    cameras = [_camera(row, size[0] // downscale, size[1] // downscale, downscale) for row in rows]
+
+    def read(image: _Image) -> tuple[View, str]:
+        where = str(image.path)
+        data = images.read_png(image.path, where)
+        if images.png_size(data, where) != size:
+            raise InputError(f"{where}: expected {size[0]}x{size[1]} as the first image, got another size")
+        decoded = images.decode_png(data, where)
+        if decoded.shape[2] != 3:
+            raise InputError(f"{where}: expected an opaque RGB image, got one with alpha")
+        is_kept = downscale == 1 and decoded.dtype.name == "uint8"
+        pixels = torch.from_numpy(decoded) if is_kept else images.composite(decoded, (0, 0, 0), downscale, where)
+        time = (image.frame - first) / max(1, last - first)
+        return View(image.path.stem, cameras[image.camera], time, pixels), files.digest(data)
+
+    kept = 3 if downscale == 1 else 12
+    threads = images.count_readers(size, len(listed), downscale, where, kept)
+    with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
+        read_all = list(pool.map(read, listed))
+    digests = {image.path.name: digest for image, (_, digest) in zip(listed, read_all, strict=True)}
+    return [view for view, _ in read_all], digests
+
+
+def _points(root: Path) -> Points | None:
+    """Read the initial points that the folder has; None where it has none."""
+    if (root / "sparse" / "0").is_dir():
+        return colmap.read_points(root / "sparse" / "0")
+    ply = root / "points3d.ply"
+    return read_ply(ply) if ply.exists() else None

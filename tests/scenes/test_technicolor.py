@@ -1,0 +1,173 @@
+"""The Technicolor layout: cameras and images land where they should, and what is wrong is said in one line."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsbench import scenes
+from gsbench.errors import InputError
+from gsbench.scenes import colmap
+from gsbench.scenes.points import frustum_points
+from gsbench.scenes.technicolor import CAMERAS, TEST_CAMERA
+
+PLAYROOM = Path(__file__).resolve().parents[2] / "../shared/data/scenes/playroom"
+HEADER = "f cu cv ar sk qw qx qy qz tx ty tz"
+COUNT, FRAMES, WIDTH, HEIGHT = 16, (100, 101, 102), 8, 6
+
+
+def row(camera: int) -> str:
+    """A camera at (x, y, 0) of a 4 x 4 array that looks along +z; its centre is not the middle of the image."""
+    x, y = camera % 4, camera // 4
+    return f"10.0 3.5 2.5 1.5 0.0 1.0 0.0 0.0 0.0 {-0.1 * x} {-0.1 * y} 0.0"
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A release of three frames; the red of an image is its camera, the green its frame."""
+    folder = tmp_path / "Tiny"
+    folder.mkdir()
+    (folder / CAMERAS).write_text("\n".join([HEADER, *map(row, range(COUNT))]) + "\n")
+    for frame in FRAMES:
+        for camera in range(COUNT):
+            image = np.full((HEIGHT, WIDTH, 3), (7, frame, camera), np.uint8)  # BGR
+            assert cv2.imwrite(str(folder / f"Tiny_undist_{frame:05d}_{camera:02d}.png"), image)
+    return folder
+
+
+def test_cameras_times_and_splits(root: Path) -> None:
+    """Catches a transposed rotation, a centre in the middle, a held-out camera that trains, and times of raw frames."""
+    scene = scenes.load(root)
+    assert (len(scene.train), len(scene.val), len(scene.test)) == (45, 0, 3)
+    assert [view.time for view in scene.test] == [0.0, 0.5, 1.0]
+    assert all(view.name.endswith(f"_{TEST_CAMERA}") for view in scene.test)
+    view = scene.test[1]
+    torch.testing.assert_close(view.image[0, 0] * 255, torch.tensor([10.0, 101.0, 7.0]))
+    torch.testing.assert_close(view.camera.center, torch.tensor([0.2, 0.2, 0.0]))
+    torch.testing.assert_close(view.camera.K, torch.tensor([[10.0, 0, 3.5], [0, 15.0, 2.5], [0, 0, 1]]))
+    assert (view.camera.width, view.camera.height) == (WIDTH, HEIGHT)
+    assert scene.points is None
+
+
+def test_images_stay_in_eight_bits_unless_they_are_reduced(root: Path) -> None:
+    """Catches 21 GB for a scene of the release, and pixels that lose their fraction by the filter."""
+    assert scenes.load(root).train[0].pixels.dtype == torch.uint8
+    half = scenes.load(root, downscale=2).train[0]
+    assert half.pixels.dtype == torch.float32
+    assert half.image.shape == (HEIGHT // 2, WIDTH // 2, 3)
+    torch.testing.assert_close(half.camera.K[:2], torch.tensor([[5.0, 0, 1.75], [0, 7.5, 1.25]]))
+
+
+def test_frames_can_be_chosen(root: Path) -> None:
+    """Catches frames counted from 0, and a last one that is left out."""
+    scene = scenes.load(root, frames=(101, 102))
+    assert [view.name for view in scene.test] == ["Tiny_undist_00101_10", "Tiny_undist_00102_10"]
+    assert [view.time for view in scene.test] == [0.0, 1.0]
+    for frames, said in (((100, 103), "00103_00"), ((102, 101), "first <= last"), ((1.5, 2), "frames")):
+        with pytest.raises(InputError, match=said):
+            scenes.load(root, frames=frames)  # type: ignore[arg-type]
+
+
+def test_columns_are_read_by_name(root: Path) -> None:
+    """Catches numbers taken by their place: releases differ in their columns, and originals have d1 d2 after sk."""
+    turned = [" ".join(reversed(line.split())) for line in (root / CAMERAS).read_text().splitlines()]
+    first = scenes.load(root).test[0].camera
+    (root / CAMERAS).write_text("\n".join(turned))
+    other = scenes.load(root).test[0].camera
+    assert torch.equal(first.viewmat, other.viewmat)
+    assert torch.equal(first.K, other.K)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda text: text.replace(HEADER, HEADER.replace(" qw", "")), "expected a header with"),
+        (lambda text: text.replace(" sk ", " sk d1 d2 ").replace("1.5 0.0 ", "1.5 0.0 0.1 0.0 "), "d1: expected 0"),
+        (lambda text: text.replace("1.5 0.0 ", "1.5 0.2 "), "sk: expected 0"),
+        (lambda text: text.replace("1.0 0.0 0.0 0.0", "2.0 0.0 0.0 0.0"), "unit quaternion"),
+        (lambda text: text.replace("10.0 ", "nan "), "f: expected a number"),
+        (lambda text: text.replace("10.0 ", "-1 "), "positive f"),
+        (lambda text: "\n".join(text.splitlines()[:9]), "more than 10 cameras"),
+        (lambda text: text.replace("2.5 ", ""), "expected 12 numbers"),
+        (lambda _: "", "expected a header"),
+        (lambda text: text + row(16), "16.png of every camera"),
+    ],
+)
+def test_faulty_parameters_are_told(root: Path, change: Callable[[str], str], said: str) -> None:
+    """Catches distorted originals taken for undistorted ones, and tables that are read askew."""
+    path = root / CAMERAS
+    path.write_text(change(path.read_text()))
+    with pytest.raises(InputError, match=said):
+        scenes.load(root)
+
+
+def test_faulty_images_are_told(root: Path) -> None:
+    """Catches a missing view, one of another size, and two scenes in one folder."""
+    image = root / "Tiny_undist_00101_03.png"
+    kept = image.read_bytes()
+    image.unlink()
+    with pytest.raises(InputError, match="undist_00101_03"):
+        scenes.load(root)
+    assert cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(InputError, match="expected 8x6"):
+        scenes.load(root)
+    image.write_bytes(kept)
+    (root / "Other_undist_00101_03.png").write_bytes(kept)
+    with pytest.raises(InputError, match="images of one scene, got those of Other, Tiny"):
+        scenes.load(root)
+
+
+def test_points_of_colmap(root: Path) -> None:
+    """Catches a track that is read as a point; text and binary give the same."""
+    folder = root / "sparse" / "0"
+    folder.mkdir(parents=True)
+    means = [(0.5, -1.0, 4.0), (1.5, 2.0, 5.0)]
+    rows = [colmap._POINT.pack(i, *xyz, 255, 51, 0, 0.3, i) + b"\0" * 8 * i for i, xyz in enumerate(means, 1)]
+    (folder / "points3D.bin").write_bytes(len(rows).to_bytes(8, "little") + b"".join(rows))
+    binary = scenes.load(root).points
+    assert binary is not None
+    torch.testing.assert_close(binary.means, torch.tensor(means))
+    torch.testing.assert_close(binary.colors, torch.tensor([[1.0, 0.2, 0.0]]).expand(2, 3))
+    (folder / "points3D.bin").write_bytes(len(rows).to_bytes(8, "little") + b"".join(rows)[:-3])
+    with pytest.raises(InputError, match="truncated"):
+        scenes.load(root)
+    (folder / "points3D.bin").unlink()
+    lines = [f"{i} {x} {y} {z} 255 51 0 0.3 1 2" for i, (x, y, z) in enumerate(means, 1)]
+    (folder / "points3D.txt").write_text("\n".join(["# a comment", *lines]))
+    text = scenes.load(root).points
+    assert text is not None
+    assert torch.equal(text.means, binary.means)
+
+
+def test_points_in_the_frustum_are_seen_by_all(root: Path) -> None:
+    """Catches initial points behind the array or beside what it sees, which would never get a gradient."""
+    scene = scenes.load(root)
+    cameras = [view.camera for view in scene.train[:15]]
+    points = frustum_points(500, cameras, scene.extent, torch.Generator().manual_seed(0))
+    assert points.means.shape == (500, 3)
+    for camera in cameras:
+        x = (points.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
+        pixel = x[:, :2] / x[:, 2:]
+        assert (x[:, 2] > 0).all()
+        assert ((pixel >= 0) & (pixel <= torch.tensor([WIDTH, HEIGHT]))).all()
+    depth = points.means[:, 2]
+    assert depth.min() >= 2 * scene.extent - 1e-4
+    assert depth.quantile(0.9) > 5 * scene.extent
+
+
+@pytest.mark.skipif(not PLAYROOM.is_dir(), reason="../shared/data/scenes/playroom is not here")
+def test_playrooms_points_project_onto_their_colours() -> None:
+    """Catches a pose that is inverted or mirrored: points of the scene have the colours of the pixels they fall on."""
+    scene = scenes.load(PLAYROOM)
+    assert scene.points is not None
+    for view in scene.train[:15:7]:
+        x = scene.points.means @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
+        pixel = (x @ view.camera.K.T)[:, :2] / x[:, 2:]
+        inside = (pixel > 0).all(1) & (pixel < torch.tensor([view.camera.width, view.camera.height])).all(1)
+        assert inside.float().mean() > 0.9
+        column, line = pixel[inside].long().unbind(1)
+        error = (view.image[line, column] - scene.points.colors[inside]).abs().mean()
+        assert error < 0.08  # 0.17 where points are shuffled
