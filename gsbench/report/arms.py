@@ -1,0 +1,182 @@
+"""Group the records of an experiment by model, setting and scene, and read quantities from them.
+
+An arm is a model with a setting (a length of training, a capacity): what its seeds repeat, and one point of a frontier.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from gsbench.measure.record import Record
+
+Values = npt.NDArray[np.float64]
+
+
+def psnr_val(record: Record) -> float:
+    """Return the PSNR on val at the end of the run, dB; NaN where it was not measured."""
+    if record.protocol.get("eval_split") == "val":
+        return _number((record.metrics or {}).get("psnr"))
+    return _number(record.curve[-1].psnr_val) if record.curve else math.nan
+
+
+QUANTITIES: dict[str, Callable[[Record], float]] = {
+    "psnr": lambda r: _number((r.metrics or {}).get("psnr")),  # dB, the evaluated split
+    "psnr_val": psnr_val,  # dB
+    "seconds": lambda r: r.cost.train_s if r.cost else math.nan,  # of training
+    "ms": lambda r: r.cost.render_ms.p50 if r.cost else math.nan,  # a frame, median
+    "mb": lambda r: r.cost.bytes / 1e6 if r.cost else math.nan,  # of the model's parameters
+}
+OF_THE_MACHINE = ("seconds", "ms")  # quantities that compare only between runs of one machine
+
+
+@dataclass(frozen=True)
+class Arm:
+    """The finished runs of a model at one setting."""
+
+    model: str
+    variant: str  # empty: the experiment's own setting
+    runs: dict[str, list[Record]]  # by scene, in order of the seeds
+
+    @property
+    def name(self) -> str:
+        """The model and its setting."""
+        return f"{self.model}, {self.variant}" if self.variant else self.model
+
+    @property
+    def iterations(self) -> int | None:
+        """The length of training, if all runs have the same."""
+        lengths = {iterations(r) for runs in self.runs.values() for r in runs}
+        return lengths.pop() if len(lengths) == 1 else None
+
+
+@dataclass(frozen=True)
+class Group:
+    """The records of one experiment on one data set."""
+
+    records: list[Record]  # sorted by scene, model, variant, seed
+
+    @property
+    def experiment(self) -> str:
+        """The experiment's name."""
+        return self.records[0].experiment
+
+    @property
+    def dataset(self) -> str:
+        """The data set's name."""
+        return self.records[0].dataset
+
+    @cached_property
+    def finished(self) -> list[Record]:
+        """The runs that are ok."""
+        return [r for r in self.records if r.status == "ok"]
+
+    @cached_property
+    def scenes(self) -> list[str]:
+        """The scenes of all runs, also of those that failed."""
+        return sorted({r.scene for r in self.records})
+
+    @cached_property
+    def models(self) -> list[str]:
+        """The models of all runs, also of those that failed."""
+        return sorted({r.model for r in self.records})
+
+    @cached_property
+    def arms(self) -> list[Arm]:
+        """The models with their settings that finished somewhere, the experiment's own setting first."""
+        runs: dict[tuple[str, str], dict[str, list[Record]]] = {}
+        for r in self.finished:
+            runs.setdefault((r.model, r.variant), {}).setdefault(r.scene, []).append(r)
+        return [Arm(model, variant, scenes) for (model, variant), scenes in sorted(runs.items())]
+
+    @cached_property
+    def setting(self) -> str:
+        """The setting at which models are compared: the one that most of them share, first the experiment's own."""
+        shared = Counter(arm.variant for arm in self.arms)
+        return min(shared, key=lambda variant: (-shared[variant], variant), default="")
+
+    @cached_property
+    def main_arms(self) -> list[Arm]:
+        """The arm of every model at the common setting."""
+        return [arm for arm in self.arms if arm.variant == self.setting]
+
+    @cached_property
+    def covered(self) -> list[str]:
+        """The scenes that every model has finished at the common setting, over which averages are taken."""
+        return [s for s in self.scenes if self.main_arms and all(s in arm.runs for arm in self.main_arms)]
+
+    @cached_property
+    def machine(self) -> str:
+        """The machine of most runs; seconds of other machines are left out."""
+        return Counter(map(machine, self.finished or self.records)).most_common(1)[0][0]
+
+    @cached_property
+    def elsewhere(self) -> int:
+        """The number of finished runs on other machines."""
+        return sum(machine(r) != self.machine for r in self.finished)
+
+    def value(self, record: Record, quantity: str) -> float:
+        """Read one of QUANTITIES from a record; NaN where it is missing or measured on another machine."""
+        if quantity in OF_THE_MACHINE and machine(record) != self.machine:
+            return math.nan
+        return QUANTITIES[quantity](record)
+
+    def sample(self, arm: Arm, scene: str, quantity: str) -> Values:
+        """Return a quantity of an arm's runs on a scene, [seeds], without the missing ones."""
+        values = np.array([self.value(r, quantity) for r in arm.runs.get(scene, [])])
+        return values[np.isfinite(values)]
+
+    def contrast(self, weights: list[tuple[float, Arm]], quantity: str) -> list[Values]:
+        """Return a weighted sum of arms, paired: for each scene that all of them have, [seeds, views].
+
+        Only seeds and views that all arms have on the scene count. PSNR is paired view by view; other quantities, and
+        PSNR of records without views, have one column.
+        """
+        scenes = [s for s in self.scenes if all(s in arm.runs for _, arm in weights)]
+        return [paired for s in scenes if (paired := self._paired(weights, s, quantity)).size]
+
+    def _paired(self, weights: list[tuple[float, Arm]], scene: str, quantity: str) -> Values:
+        """Return the weighted sum on one scene, [seeds, views], empty where the arms share no seed or no view."""
+        by_seed = [{r.seed: s for r in arm.runs[scene] if (s := self.scores(r, quantity))} for _, arm in weights]
+        seeds = sorted(set.intersection(*map(set, by_seed)))
+        every = [scores[seed] for scores in by_seed for seed in seeds]
+        views = sorted(set.intersection(*map(set, every))) if every else []
+        total = np.zeros((len(seeds), len(views)))
+        for (weight, _), scores in zip(weights, by_seed, strict=True):
+            total += weight * np.array([[scores[seed][view] for view in views] for seed in seeds])
+        return total
+
+    def scores(self, record: Record, quantity: str) -> dict[str, float]:
+        """Return a quantity by view; a single value where it is not one of views."""
+        if quantity == "psnr" and record.per_view:
+            return {v.name: v.psnr for v in record.per_view if v.psnr is not None}
+        value = self.value(record, quantity)
+        return {"": value} if math.isfinite(value) else {}
+
+
+def groups(records: list[Record]) -> list[Group]:
+    """Return a group for every experiment and data set, sorted by name."""
+    found: dict[tuple[str, str], list[Record]] = {}
+    for r in sorted(records, key=lambda r: (r.experiment, r.dataset, r.scene, r.model, r.variant, r.seed)):
+        found.setdefault((r.experiment, r.dataset), []).append(r)
+    return [Group(runs) for runs in found.values()]
+
+
+def machine(record: Record) -> str:
+    """Name the machine of a run: its device and its threads."""
+    return f"{record.provenance.device}, {record.provenance.threads} threads"
+
+
+def iterations(record: Record) -> int | None:
+    """Return the length of training, which old or foreign records may not hold."""
+    train = record.provenance.config.get("train")
+    value = train.get("iterations") if isinstance(train, dict) else None
+    return value if isinstance(value, int) else None
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -1,0 +1,166 @@
+"""Compare models pair by pair, and price each effect in dB, seconds, milliseconds and bytes."""
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsbench.report.arms import Arm, Group, Values
+from gsbench.report.intervals import LEVEL, Estimate, estimate, holm
+
+Cell = tuple[bool, bool, bool]  # simulates time, direction, AGR
+FACTORS = ("time", "direction", "AGR")
+PRICES = ("psnr", "seconds", "ms", "mb")
+PUBLISHED = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")  # first where two models simulate the same effects
+
+
+@dataclass(frozen=True)
+class Pair:
+    """How much better one model is than another at the common setting."""
+
+    better: Arm  # by its mean; by name where they tie
+    other: Arm
+    difference: Estimate  # dB
+    improvement: float  # the probability that a run of `better` beats one of `other` on a view they share
+    p_holm: float  # of no difference, adjusted for all the pairs shown; NaN where no spread is known
+
+    @property
+    def differs(self) -> bool:
+        """Whether the pair is told apart after Holm's correction."""
+        return self.p_holm < 1 - LEVEL
+
+
+def pairs(group: Group) -> list[Pair]:
+    """Compare every two models at the common setting, on what both have finished; the largest difference first."""
+    found = []
+    for a, b in itertools.combinations(group.main_arms, 2):
+        difference = estimate(group.contrast([(1.0, a), (-1.0, b)], "psnr"))
+        if difference.scenes == 0:
+            continue
+        if difference.mean < 0:
+            a, b = b, a
+            difference = estimate(group.contrast([(1.0, a), (-1.0, b)], "psnr"))
+        found.append((a, b, difference))
+    adjusted = holm([difference.p for *_, difference in found])
+    compared = [Pair(a, b, d, improvement(group, a, b), p) for (a, b, d), p in zip(found, adjusted, strict=True)]
+    return sorted(compared, key=lambda pair: -pair.difference.mean)
+
+
+def improvement(group: Group, a: Arm, b: Arm) -> float:
+    """Return the probability that a run of `a` has a higher PSNR than one of `b` on the same view of the same scene.
+
+    Every run of `a` meets every run of `b`; a tie counts half; scenes count equally (Agarwal et al. 2021,
+    arXiv 2108.13264, who compare runs; here views too). NaN where they share no view.
+    """
+    shares = []
+    for scene in sorted(set(a.runs) & set(b.runs)):
+        mine, theirs = _views(group, a, scene), _views(group, b, scene)
+        common = sorted(set(mine) & set(theirs))
+        ahead = [np.sign(mine[v][:, None] - theirs[v][None]).mean() / 2 + 0.5 for v in common]
+        if ahead:
+            shares.append(np.mean(ahead))
+    return float(np.mean(shares)) if shares else math.nan
+
+
+def _views(group: Group, arm: Arm, scene: str) -> dict[str, Values]:
+    """Return the PSNR of an arm on a scene by view, [seeds]; views that a seed lacks are left out."""
+    runs = [group.scores(r, "psnr") for r in arm.runs[scene]]
+    common = set.intersection(*map(set, runs))
+    return {view: np.array([scores[view] for scores in runs]) for view in common}
+
+
+@dataclass(frozen=True)
+class Price:
+    """What an effect, or the interaction of several, brings and costs."""
+
+    name: str
+    order: int  # 1: an effect, 2 and 3: an interaction
+    models: str  # the sum of models it is computed from
+    costs: dict[str, Estimate]  # by PRICES
+
+
+@dataclass(frozen=True)
+class Cube:
+    """The 2 x 2 x 2 of time, direction and AGR, as far as it was run."""
+
+    cells: dict[Cell, Arm]
+    prices: list[Price]
+    missing: list[str]  # the cells that no finished run fills, in words
+    left_out: list[str]  # models that simulate the same effects as one that is used
+
+
+def cube(group: Group) -> Cube:
+    """Price every effect whose cells were run at the common setting.
+
+    An effect is priced given that the other two are on or off (12 differences), an interaction is the difference of
+    two such prices (6), that of all three the difference of two interactions; the mean effects need all eight cells.
+    """
+    cells: dict[Cell, Arm] = {}
+    left_out = []
+    rank = {name: i for i, name in enumerate(PUBLISHED)}
+    for arm in sorted(group.main_arms, key=lambda arm: (rank.get(arm.model, len(rank)), arm.model)):
+        if cells.setdefault(_cell(arm), arm) is not arm:
+            left_out.append(arm.model)
+    every: list[Cell] = list(itertools.product((False, True), (False, True), (False, True)))
+    missing = [_words(cell) for cell in every if cell not in cells]
+    prices = [price for weights in _contrasts() if (price := _price(group, cells, *weights))]
+    return Cube(cells, prices, missing, left_out)
+
+
+def _cell(arm: Arm) -> Cell:
+    effects = next(iter(arm.runs.values()))[0].effects
+    return effects.time, effects.direction, effects.refinement
+
+
+def _words(cell: Cell) -> str:
+    """Say which effects a cell has."""
+    on = [name for name, has in zip(FACTORS, cell, strict=True) if has]
+    return " + ".join(on) or "none of them"
+
+
+def _contrasts() -> list[tuple[str, dict[Cell, float]]]:
+    """Return the name and the weights of every effect and interaction: effects first, then means over the others."""
+    found = []
+    for size in (1, 2, 3):
+        for varied in itertools.combinations(range(3), size):
+            held = [i for i in range(3) if i not in varied]
+            name = " x ".join(FACTORS[i] for i in varied)
+            given = list(itertools.product((False, True), repeat=len(held)))
+            each = [(_given(name, held, values), _weights(varied, held, [values], 1.0)) for values in given]
+            found += each
+            if size == 1:
+                found.append((f"{name}, mean over the others", _weights(varied, held, given, 1 / len(given))))
+    return found
+
+
+def _given(name: str, held: list[int], values: tuple[bool, ...]) -> str:
+    """Name an effect with the other effects that are on."""
+    on = [FACTORS[i] for i, value in zip(held, values, strict=True) if value]
+    return f"{name}, with {' and '.join(on)}" if on else f"{name} alone" if len(held) == 2 else name
+
+
+def _weights(
+    varied: tuple[int, ...], held: list[int], given: list[tuple[bool, ...]], share: float
+) -> dict[Cell, float]:
+    """Return the weight of each cell: plus where an even number of the varied effects is off, minus otherwise."""
+    weights = {}
+    for values in given:
+        for on in itertools.product((False, True), repeat=len(varied)):
+            state = dict(zip((*varied, *held), (*on, *values), strict=True))
+            weights[state[0], state[1], state[2]] = share * (-1.0) ** (len(varied) - sum(on))
+    return weights
+
+
+def _price(group: Group, cells: dict[Cell, Arm], name: str, weights: dict[Cell, float]) -> Price | None:
+    """Estimate a contrast in each unit; None where a cell is missing or no scene has all of them."""
+    if not weights.keys() <= cells.keys():
+        return None
+    sums = sorted(((w, cells[cell]) for cell, w in weights.items()), key=lambda term: (-term[0], term[1].model))
+    costs = {unit: estimate(group.contrast(sums, unit)) for unit in PRICES}
+    if costs["psnr"].scenes == 0:
+        return None
+    sign = {True: "+", False: "−"}
+    share = "" if abs(sums[0][0]) == 1 else f"{abs(sums[0][0]):g} ("
+    terms = " ".join(f"{sign[w > 0]} {arm.model}" for w, arm in sums).removeprefix("+ ")
+    return Price(name, name.count(" x ") + 1, f"{share}{terms}{')' if share else ''}", costs)

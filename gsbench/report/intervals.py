@@ -1,0 +1,134 @@
+"""Estimate a mean over scenes, seeds and views with a 95 % interval that holds its coverage from three seeds on.
+
+With three seeds a percentile bootstrap of any hierarchy covers far less than it says: resampling three values finds two
+thirds of their variance, and its quantiles are those of a normal distribution where Student's t has 4.3 instead of 2.
+So the spread of each level is estimated and given its own quantile of t (docs/statistics.md has the simulations):
+
+- three scenes and more: the means of the scenes are a sample of scenes like these, and hold the spread of seeds and
+  views already; t with (scenes - 1) degrees of freedom is exact for normal means.
+- one or two scenes say nothing of others. On these, seeds and views are crossed (each seed sees the same views): the
+  half widths of seeds and of views, each with its own t, add in squares (MOVER: Zou and Donner 2008), what seeds and
+  views share is taken from the seeds once, and the interval is at least that of the seeds alone.
+- one seed: no spread is known, and there is no interval.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy import optimize, special
+
+Values = npt.NDArray[np.float64]
+LEVEL = 0.95
+LEAST_SCENES = 3  # from which on an interval is one of scenes like these
+LEAST_P = 1e-12
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The variance of a mean that one level brings, and its degrees of freedom."""
+
+    variance: float
+    freedom: float
+
+    def half_width(self, level: float) -> float:
+        """Return half the width of this spread's own interval, by Student's t."""
+        if self.variance <= 0:
+            return 0.0
+        return float(special.stdtrit(self.freedom, (1 + level) / 2)) * math.sqrt(self.variance)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over scenes with its interval; without one where no spread is known."""
+
+    mean: float  # NaN: nothing was measured
+    scenes: int
+    seeds: int  # the fewest of a scene
+    over: str  # what the interval generalises to: "scenes", "seeds and views", "seeds"; "" without an interval
+    levels: tuple[Spread, ...] = ()  # their half widths add in squares
+    floor: Spread | None = None  # the interval is not narrower than this one
+
+    @cached_property
+    def half(self) -> float:
+        """Half the width of the 95 % interval; NaN without one."""
+        return self._half(LEVEL) if self.over else math.nan
+
+    @property
+    def low(self) -> float:
+        """The lower end of the interval."""
+        return self.mean - self.half
+
+    @property
+    def high(self) -> float:
+        """The upper end of the interval."""
+        return self.mean + self.half
+
+    @cached_property
+    def p(self) -> float:
+        """The two-sided p-value of a mean of zero: one less the level whose interval ends at zero; NaN without one."""
+        if not self.over:
+            return math.nan
+        if self._half(LEVEL) == 0:
+            return 1.0 if self.mean == 0 else 0.0
+        excess = lambda log_p: self._half(-math.expm1(log_p)) - abs(self.mean)  # noqa: E731
+        least = math.log(LEAST_P)
+        if excess(least) <= 0:
+            return LEAST_P
+        return math.exp(optimize.brentq(excess, least, 0.0)) if excess(-1e-15) < 0 else 1.0
+
+    def _half(self, level: float) -> float:
+        own = math.hypot(*(spread.half_width(level) for spread in self.levels))
+        return max(own, self.floor.half_width(level) if self.floor else 0.0)
+
+
+def estimate(scenes: list[Values], *, generalise: bool = True) -> Estimate:
+    """Estimate the mean over scenes of the mean over seeds and views.
+
+    Args:
+        scenes: for each scene [seeds, views], every seed with the same views; one column where there are no views.
+        generalise: from three scenes on the interval is one of scenes like these, otherwise of these scenes.
+    """
+    if not scenes:
+        return Estimate(math.nan, 0, 0, "")
+    means = np.array([scene.mean() for scene in scenes])
+    mean, count, seeds = float(means.mean()), len(scenes), min(len(scene) for scene in scenes)
+    if seeds < 2:
+        return Estimate(mean, count, seeds, "")
+    if generalise and count >= LEAST_SCENES:
+        return Estimate(mean, count, seeds, "scenes", (Spread(float(means.var(ddof=1)) / count, count - 1),))
+    of_seeds = _combined([Spread(scene.mean(1).var(ddof=1) / len(scene), len(scene) - 1) for scene in scenes])
+    if min(scene.shape[1] for scene in scenes) < 2:
+        return Estimate(mean, count, seeds, "seeds", (of_seeds,))
+    own = _combined([_without_rest(scene) for scene in scenes])
+    of_views = _combined([Spread(s.mean(0).var(ddof=1) / s.shape[1], s.shape[1] - 1) for s in scenes])
+    return Estimate(mean, count, seeds, "seeds and views", (own, of_views), of_seeds)
+
+
+def _combined(scenes: list[Spread]) -> Spread:
+    """Return the spread of a mean over scenes, its degrees of freedom after Satterthwaite (1946)."""
+    total = sum(s.variance for s in scenes)
+    squares = sum(s.variance**2 / s.freedom for s in scenes)
+    freedom = total**2 / squares if squares else sum(s.freedom for s in scenes)
+    return Spread(total / len(scenes) ** 2, freedom)
+
+
+def _without_rest(scene: Values) -> Spread:
+    """Return the spread that seeds bring beside what varies from view to view in each of them (two-way ANOVA)."""
+    seeds, views = scene.shape
+    rest = scene - scene.mean(1, keepdims=True) - scene.mean(0, keepdims=True) + scene.mean()
+    of_rest = (rest**2).sum() / ((seeds - 1) * (views - 1)) / scene.size
+    return Spread(max(float(scene.mean(1).var(ddof=1) / seeds - of_rest), 0.0), seeds - 1)
+
+
+def holm(p: list[float]) -> list[float]:
+    """Adjust p-values for being shown together, after Holm (1979); NaN is not counted and stays."""
+    adjusted = [math.nan] * len(p)
+    tested = sorted((value, i) for i, value in enumerate(p) if not math.isnan(value))
+    largest = 0.0
+    for rank, (value, i) in enumerate(tested):
+        largest = max(largest, min(1.0, (len(tested) - rank) * value))
+        adjusted[i] = largest
+    return adjusted
