@@ -125,7 +125,7 @@ def _contrasts() -> list[tuple[str, dict[Cell, float]]]:
     for size in (1, 2, 3):
         for varied in itertools.combinations(range(3), size):
             held = [i for i in range(3) if i not in varied]
-            name = " x ".join(FACTORS[i] for i in varied)
+            name = " × ".join(FACTORS[i] for i in varied)
             given = list(itertools.product((False, True), repeat=len(held)))
             each = [(_given(name, held, values), _weights(varied, held, [values], 1.0)) for values in given]
             found += each
@@ -163,4 +163,4 @@ def _price(group: Group, cells: dict[Cell, Arm], name: str, weights: dict[Cell, 
     sign = {True: "+", False: "−"}
     share = "" if abs(sums[0][0]) == 1 else f"{abs(sums[0][0]):g} ("
     terms = " ".join(f"{sign[w > 0]} {arm.model}" for w, arm in sums).removeprefix("+ ")
-    return Price(name, name.count(" x ") + 1, f"{share}{terms}{')' if share else ''}", costs)
+    return Price(name, name.count(" × ") + 1, f"{share}{terms}{')' if share else ''}", costs)

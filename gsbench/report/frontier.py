@@ -51,10 +51,11 @@ def frontier(of: Sequence[Point], cost: str) -> list[Point]:
 def dominated(of: Sequence[Point], cost: str) -> list[Point]:
     """Return the points beside which another is at least as good and as cheap, and better in one of the two."""
     known = [p for p in of if not math.isnan(p.cost[cost])]
-    return [p for p in known if any(_dominates(q, p, cost) for q in known)]
+    return [p for p in known if any(dominates(q, p, cost) for q in known)]
 
 
-def _dominates(q: Point, p: Point, cost: str) -> bool:
+def dominates(q: Point, p: Point, cost: str) -> bool:
+    """Tell whether `q` is at least as good and as cheap as `p`, and better in one of the two."""
     as_good = q.psnr.mean >= p.psnr.mean and q.cost[cost] <= p.cost[cost]
     return as_good and (q.psnr.mean > p.psnr.mean or q.cost[cost] < p.cost[cost])
 

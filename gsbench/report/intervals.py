@@ -18,7 +18,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy import optimize, special
+from scipy import special
 
 Values = npt.NDArray[np.float64]
 LEVEL = 0.95
@@ -73,11 +73,14 @@ class Estimate:
             return math.nan
         if self._half(LEVEL) == 0:
             return 1.0 if self.mean == 0 else 0.0
-        excess = lambda log_p: self._half(-math.expm1(log_p)) - abs(self.mean)  # noqa: E731
-        least = math.log(LEAST_P)
-        if excess(least) <= 0:
-            return LEAST_P
-        return math.exp(optimize.brentq(excess, least, 0.0)) if excess(-1e-15) < 0 else 1.0
+        low, high = math.log(LEAST_P), 0.0  # halved in the logarithm; scipy.optimize would take a second to import
+        for _ in range(60):
+            middle = (low + high) / 2
+            if self._half(-math.expm1(middle)) > abs(self.mean):
+                low = middle
+            else:
+                high = middle
+        return math.exp(high)
 
     def _half(self, level: float) -> float:
         own = math.hypot(*(spread.half_width(level) for spread in self.levels))

@@ -109,9 +109,9 @@ def test_the_price_of_effects_by_hand():
     assert psnr["time, with direction"] == pytest.approx(6.0)
     assert psnr["AGR, with time and direction"] == pytest.approx(2.0)
     assert psnr["time, mean over the others"] == pytest.approx((4 + 6 + 4.5 + 7.5) / 4)
-    assert psnr["time x direction"] == pytest.approx(2.0)
-    assert psnr["time x direction, with AGR"] == pytest.approx(3.0)
-    assert psnr["time x direction x AGR"] == pytest.approx(1.0)
+    assert psnr["time × direction"] == pytest.approx(2.0)
+    assert psnr["time × direction, with AGR"] == pytest.approx(3.0)
+    assert psnr["time × direction × AGR"] == pytest.approx(1.0)
     seconds = {price.name: price.costs["seconds"].mean for price in full.prices}
     assert seconds["time alone"] == pytest.approx(40.0)
 
@@ -126,7 +126,7 @@ def test_missing_cells_are_said_and_not_guessed():
         "direction alone",
         "direction, with time",
         "AGR, with time and direction",
-        "time x direction",
+        "time × direction",
     ]
     assert found.prices[0].models == "4dgs − 3dgs"
     assert found.prices[-1].models == "3dgs + 7dgs_noagr − 4dgs − 6dgs"

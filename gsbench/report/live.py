@@ -1,0 +1,62 @@
+"""Write table and page of a folder again whenever a record in it arrives or changes."""
+
+import time
+from pathlib import Path
+
+from gsbench.errors import InputError
+from gsbench.measure import record as files
+from gsbench.report import tables
+from gsbench.report.page import build
+
+EVERY = 5.0  # seconds between two looks at the folder, and between two loads of the open page
+
+State = frozenset[tuple[Path, int]]
+
+
+def watch(folder: Path, *, train: bool = False, every: float = EVERY) -> int:
+    """Write ``table.md``, ``table.csv`` and ``report.html`` as records arrive, until Ctrl-C; return the exit code.
+
+    A folder without records, or with a damaged one, is said once and looked at again. The page loads itself again
+    while this runs; the last one that is written does not.
+
+    Args:
+        folder: where records are or will be.
+        train: as of `gsbench.report.tables.build`.
+        every: seconds between two looks.
+    """
+    seen, said = State(), ""
+    try:
+        while True:
+            state = _state(folder)
+            if state != seen or not said:
+                seen, text = state, _written(folder, train, reload=max(1, round(every)))
+                if text != said:
+                    said = text
+                    print(f"{time.strftime('%H:%M:%S')} {said}", flush=True)
+            time.sleep(every)
+    except KeyboardInterrupt:
+        print(f"\nStopped. {_written(folder, train, reload=0)}")
+        return 0
+
+
+def _state(folder: Path) -> State:
+    """Return the records and when they were written; one that is replaced meanwhile counts as gone."""
+    found = set()
+    for path in files.find(folder) if folder.is_dir() else []:
+        try:
+            found.add((path, path.stat().st_mtime_ns))
+        except FileNotFoundError:
+            continue
+    return frozenset(found)
+
+
+def _written(folder: Path, train: bool, reload: int) -> str:
+    """Write all files and say what there is; where that cannot be done, say why."""
+    try:
+        records = tables.load(folder)
+        tables.write(records, folder, train=train)
+        page = build.write(records, folder, reload=reload)
+    except InputError as error:
+        return str(error)
+    lost = sum(r.status != "ok" for r in records)
+    return f"{len(records)} records{f', {lost} not ok' if lost else ''}: {page}"

@@ -1,0 +1,113 @@
+"""Build the page of a folder of records: gather its sections, render the template, write report.html."""
+
+from dataclasses import asdict, dataclass
+from importlib import resources
+from pathlib import Path
+
+import jinja2
+from markupsafe import Markup
+
+from gsbench.measure.atomic import write_atomically
+from gsbench.measure.record import Record
+from gsbench.report import layout
+from gsbench.report.arms import Group, groups
+from gsbench.report.page import cost, evidence, time_to_quality, words, worth
+from gsbench.report.page.content import Runs, Section, Table
+from gsbench.report.page.gallery import View, gallery
+from gsbench.report.page.palette import DARK, LIGHT, STAGES_DARK, STAGES_LIGHT, Style, styles
+from gsbench.report.page.svg import marker
+
+FILE_NAME = "report.html"
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """What the page says of one experiment on one data set."""
+
+    key: str
+    title: str
+    summary: str
+    answers: list[cost.Answer]
+    basis: str
+    sections: list[Section]
+    views: list[View]
+    tables: list[layout.Table]
+    failures: Table | None
+    legend: list[tuple[str, Style]]
+
+
+def write(records: list[Record], folder: Path, *, reload: int = 0) -> Path:
+    """Write the page of `records`, which lie in `folder`, and return its path.
+
+    Args:
+        records: at least one.
+        folder: where the records and their pictures are, and where the page goes.
+        reload: seconds after which an open page loads itself again; 0: never.
+    """
+    path = folder / FILE_NAME
+    write_atomically(path, render(records, folder, reload=reload).encode())
+    return path
+
+
+def render(records: list[Record], folder: Path, *, reload: int = 0) -> str:
+    """Return the page as HTML; arguments as of `write`."""
+    found = groups(records)
+    look = styles(sorted({r.model for r in records}))
+    runs = Runs()
+    chapters = [_chapter(group, folder, runs, look, f"g{i}") for i, group in enumerate(found)]
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader(__package__, "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"safe_svg": Markup, "cut": words.cut, "asdict": asdict}
+    return environment.get_template("page.html.j2").render(
+        title=words.cut(folder.resolve().name, 80) or "results",
+        chapters=chapters,
+        runs=runs.entries,
+        reload=reload,
+        light=_variables(LIGHT, STAGES_LIGHT),
+        dark=_variables(DARK, STAGES_DARK),
+        css=_own("page.css"),
+        js=_own("page.js"),
+        marker=lambda style: Markup(marker(style.marker, style.colour)),
+    )
+
+
+def _own(name: str) -> Markup:
+    """Return a file beside this module, which is part of the page as it is."""
+    return Markup((resources.files(__package__) / name).read_text())
+
+
+def _variables(models: tuple[str, ...], stages: tuple[str, ...]) -> Markup:
+    """Return the colours as CSS variables."""
+    named = [f"--model-{i}:{c}" for i, c in enumerate(models)] + [f"--stage-{i}:{c}" for i, c in enumerate(stages)]
+    return Markup(";".join(named))
+
+
+def _chapter(group: Group, folder: Path, runs: Runs, look: dict[str, Style], key: str) -> Chapter:
+    own = {m: look[m] for m in group.models}
+    counts = [words.count(n, what) for n, what in ((len(group.records), "run"), (len(group.models), "model"))]
+    counts += [words.count(len(group.scenes), "scene"), words.count(len({r.seed for r in group.records}), "seed")]
+    return Chapter(
+        key=key,
+        title=f"experiment {group.experiment}, data {words.cut(group.dataset, 60)}",
+        summary=" · ".join([*counts, words.cut(group.machine, 80)]),
+        answers=cost.answers(group),
+        basis=cost.basis_words(group),
+        sections=[
+            cost.frontier_section(group, runs, own, key),
+            time_to_quality.quality_section(group, own, key),
+            worth.effects_section(group, key),
+            worth.stages_section(group, key),
+            time_to_quality.anytime_section(group, runs, own, key),
+            worth.pairs_section(group, key),
+            evidence.protocol_section(group),
+        ],
+        views=gallery([r for r in group.finished if r.variant == group.setting], folder),
+        tables=evidence.paper_tables(group),
+        failures=evidence.failures(group),
+        legend=list(own.items()),
+    )

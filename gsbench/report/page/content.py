@@ -1,0 +1,135 @@
+"""Define what the page is made of: sections with sentences, panels and tables, and the runs that points name."""
+
+import base64
+import csv
+import io
+from dataclasses import dataclass, field
+
+from gsbench.measure.record import Record
+from gsbench.report.arms import Arm, Group
+from gsbench.report.page import words
+
+Value = str | float | int | None
+MOST_ROWS = 60  # of a table on the page; its CSV has all
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table; `digits` after the point for numbers, None for text."""
+
+    title: str
+    digits: int | None = None
+
+
+@dataclass(frozen=True)
+class Table:
+    """Numbers behind a figure, on the page and as a file."""
+
+    name: str  # of the file
+    columns: list[Column]
+    rows: list[list[Value]]
+
+    @property
+    def shown(self) -> list[list[str]]:
+        """The first rows as text."""
+        return [
+            [show(value, column) for value, column in zip(row, self.columns, strict=True)]
+            for row in self.rows[:MOST_ROWS]
+        ]
+
+    @property
+    def hidden(self) -> int:
+        """The number of rows that only the file has."""
+        return max(0, len(self.rows) - MOST_ROWS)
+
+    @property
+    def href(self) -> str:
+        """The whole table as CSV in a data address."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([c.title for c in self.columns])
+        writer.writerows(self.rows)
+        return f"data:text/csv;base64,{base64.b64encode(text.getvalue().encode()).decode()}"
+
+
+def show(value: Value, column: Column) -> str:
+    """Write a cell as it is shown."""
+    if value is None:
+        return "–"
+    if isinstance(value, float):
+        return "never" if value == float("inf") else words.plain(value, 3 if column.digits is None else column.digits)
+    return f"{value:,}" if isinstance(value, int) else words.cut(value)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A panel with its caption."""
+
+    caption: str
+    svg: str
+
+
+@dataclass(frozen=True)
+class Tab:
+    """Drawings that are shown together."""
+
+    label: str
+    drawings: list[Drawing]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A figure of the page with what it says in words."""
+
+    key: str
+    title: str
+    sentences: list[str]
+    tabs: list[Tab] = field(default_factory=list)
+    table: Table | None = None
+    beside: bool = False  # the table stands open beside the drawings
+    legend: bool = False
+    notes: list[str] = field(default_factory=list)
+    stages: list[str] = field(default_factory=list)  # names for a legend of stages
+
+
+class Runs:
+    """Number the runs and arms that points stand for, with what is shown when one is pointed at."""
+
+    def __init__(self) -> None:
+        self.entries: list[dict[str, str]] = []
+        self._numbers: dict[tuple[str, ...], int] = {}
+
+    def of_record(self, group: Group, record: Record) -> int:
+        """Return the number of a single run."""
+        facts = _facts(*(group.value(record, q) for q in ("psnr", "seconds", "ms", "mb")))
+        return self._number((words.run_name(record),), facts, [record])
+
+    def of_arm(self, group: Group, arm: Arm, scenes: list[str]) -> int:
+        """Return the number of the runs of an arm on some scenes, by their means."""
+        runs = [r for s in scenes for r in arm.runs.get(s, [])]
+        seeds = words.count(len({r.seed for r in runs}), "seed")
+        where = scenes[0] if len(scenes) == 1 else f"mean of {words.count(len(scenes), 'scene')}"
+        name = f"{arm.name}, {where}, {seeds}"
+        means = [
+            [s.mean() if len(s := group.sample(arm, scene, q)) else float("nan") for scene in scenes]
+            for q in ("psnr", "seconds", "ms", "mb")
+        ]
+        facts = _facts(*(sum(m) / len(m) if m else float("nan") for m in means))
+        return self._number((group.experiment, group.dataset, name), facts, runs if len(scenes) == 1 else [])
+
+    def _number(self, key: tuple[str, ...], facts: str, records: list[Record]) -> int:
+        if key not in self._numbers:
+            self._numbers[key] = len(self.entries)
+            command = words.command(records) if records else ""
+            self.entries.append({"name": words.cut(key[-1], 160), "facts": facts, "command": command})
+        return self._numbers[key]
+
+
+def _facts(psnr: float, seconds: float, ms: float, mb: float) -> str:
+    """Write what a point has reached and cost, without what is not known."""
+    known = [
+        (psnr, f"{words.plain(psnr)} dB"),
+        (seconds, words.duration(seconds)),
+        (ms, f"{words.plain(ms)} ms a frame"),
+    ]
+    return " · ".join(text for value, text in [*known, (mb, f"{words.plain(mb, 1)} MB")] if value == value)

@@ -1,0 +1,50 @@
+"""Write the sections on evidence: the tables, the protocol, what failed, and every run with its command."""
+
+from gsbench.report import layout, tables
+from gsbench.report.arms import Group, iterations, machine
+from gsbench.report.conditions import conditions
+from gsbench.report.page import words
+from gsbench.report.page.content import Column, Section, Table, Value
+
+LONGEST_NOTE = 700
+
+
+def paper_tables(group: Group) -> list[layout.Table]:
+    """Return the table of the runs at the common setting, with the rows of the paper."""
+    shown = [r for r in group.records if r.variant == group.setting]
+    return tables.build(shown) if shown else []
+
+
+def protocol_section(group: Group) -> Section:
+    """List protocol, data, machine, commit, versions and seeds, warnings first, and every run."""
+    columns = [Column("run"), Column("status"), Column("PSNR dB", 2), Column("training s", 1), Column("ms a frame", 2)]
+    columns += [Column("MB", 2), Column("iterations"), Column("machine"), Column("commit"), Column("command")]
+    rows: list[list[Value]] = [
+        [
+            words.run_name(r),
+            r.status,
+            *(group.value(r, q) for q in ("psnr", "seconds", "ms", "mb")),
+            iterations(r),
+            machine(r),
+            r.provenance.git_commit,
+            words.command([r]) or "not in its record",
+        ]
+        for r in group.records
+    ]
+    notes = [words.cut(note, LONGEST_NOTE) for note in conditions(group.records)]
+    if group.elsewhere:
+        notes.insert(
+            0, f"Seconds and ms of {words.count(group.elsewhere, 'run')} on other machines are left out everywhere."
+        )
+    ended = words.count(len(group.finished), "run")
+    lost = len(group.records) - len(group.finished)
+    said = [f"{ended} finished, {words.count(lost, 'run')} did not (below)." if lost else f"All {ended} finished."]
+    return Section("protocol", "Protocol, machine, seeds", said, table=Table("runs.csv", columns, rows), notes=notes)
+
+
+def failures(group: Group) -> Table | None:
+    """List the runs that did not finish and why."""
+    lost = [r for r in group.records if r.status != "ok"]
+    columns = [Column("run"), Column("status"), Column("reason")]
+    rows: list[list[Value]] = [[words.run_name(r), r.status, words.cut(r.reason, 2000)] for r in lost]
+    return Table("not_finished.csv", columns, rows) if lost else None

@@ -1,0 +1,138 @@
+"""Cut the image strips beside the records into images small enough to be part of the page."""
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsbench.measure.record import Record
+from gsbench.report.page.words import cut
+from gsbench.report.pictures import GAP, HEADER, Pixels
+
+FILE_NAME = "pictures.png"
+BUDGET = 900_000  # bytes of all images as text, which leaves the page below 2 MB
+STEPS = ((400, 92, 3), (400, 85, 3), (320, 80, 3), (256, 75, 3), (256, 75, 1), (160, 70, 1), (96, 60, 1), (48, 50, 1))
+
+
+@dataclass(frozen=True)
+class View:
+    """The images of one view of a scene: the ground truth, and render and error by model, as data addresses."""
+
+    scene: str
+    name: str
+    truth: str
+    render: dict[str, str]
+    error: dict[str, str]
+    width: int
+    height: int
+
+
+Cut = tuple[Pixels, Pixels, Pixels]  # render, truth, error
+
+
+def gallery(records: list[Record], folder: Path) -> list[View]:
+    """Return the views of which there are images, of the first seed of each model, in less than BUDGET bytes.
+
+    Images that do not fit are first compressed more, then made smaller, then left out: all views but one a scene.
+    """
+    strips = _strips(records, folder)
+    for side, quality, views in STEPS:
+        shown = [view for scene, models in strips.items() for view in _views(scene, models, side, quality, views)]
+        if sum(_size(view) for view in shown) <= BUDGET:
+            return shown
+    while shown and sum(_size(view) for view in shown) > BUDGET:
+        shown.pop()
+    return shown
+
+
+def _strips(records: list[Record], folder: Path) -> dict[str, dict[str, tuple[Record, list[Cut]]]]:
+    """Find, by scene and model, the record and the cut strip of the first seed that has one."""
+    places = {path.parts[-5:-1]: path for path in sorted(folder.resolve().rglob(FILE_NAME))}
+    found: dict[str, dict[str, tuple[Record, list[Cut]]]] = {}
+    for r in sorted(records, key=lambda r: r.seed):
+        label = f"{r.model},{r.variant}" if r.variant else r.model
+        path = places.get((r.experiment, r.scene, label, f"seed{r.seed}"))
+        models = found.setdefault(r.scene, {})
+        if path and r.model not in models and (rows := cut_strip(path)):
+            models[r.model] = r, rows
+    return {scene: dict(sorted(models.items())) for scene, models in sorted(found.items()) if models}
+
+
+def cut_strip(path: Path) -> list[Cut]:
+    """Cut a strip into its rows of (render, truth, error), enlarged pixels made single again; nothing if it is none."""
+    data = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if data is None:
+        return []
+    image = np.asarray(data, np.uint8)
+    width = (image.shape[1] - 2 * GAP) // 3
+    body = image[HEADER:]
+    height = _row_height(body)
+    if width < 1 or height < 1 or 3 * width + 2 * GAP != image.shape[1]:
+        return []
+    rows = []
+    for top in range(0, len(body) - height + 1, height + GAP):
+        line = body[top : top + height]
+        parts = [line[:, left : left + width] for left in (0, width + GAP, 2 * (width + GAP))]
+        factor = _enlargement(parts)
+        rows.append((parts[0][::factor, ::factor], parts[1][::factor, ::factor], parts[2][::factor, ::factor]))
+    return rows
+
+
+def _row_height(body: Pixels) -> int:
+    """Return the height of a row: where the first line begins that is grey from side to side, as gaps are."""
+    grey = (body == body[:, :1, :1]).all((1, 2))
+    inside = [y for y in range(1, len(body) - GAP) if grey[y : y + GAP].all() and (body[y : y + GAP] == 200).all()]
+    return inside[0] if inside else len(body)
+
+
+def _enlargement(parts: list[Pixels]) -> int:
+    """Return the integer factor by which images were enlarged without smoothing."""
+    for factor in range(8, 1, -1):
+        if all(not (p.shape[0] % factor or p.shape[1] % factor) and _blocks(p, factor) for p in parts):
+            return factor
+    return 1
+
+
+def _blocks(image: Pixels, factor: int) -> bool:
+    small = image[::factor, ::factor]
+    return bool((small.repeat(factor, 0).repeat(factor, 1) == image).all())
+
+
+def _views(scene: str, models: dict[str, tuple[Record, list[Cut]]], side: int, quality: int, most: int) -> list[View]:
+    """Encode the views that every model's strip has."""
+    shown = []
+    shared = min(len(rows) for _, rows in models.values())
+    names = _names(next(iter(models.values()))[0], shared)
+    for i in range(min(shared, most)):
+        truth = next(iter(models.values()))[1][i][1]
+        encoded = {
+            m: (_encode(rows[i][0], side, quality), _encode(rows[i][2], side, quality))
+            for m, (_, rows) in models.items()
+        }
+        render, error = ({m: pair[k] for m, pair in encoded.items()} for k in (0, 1))
+        height, width = truth.shape[:2]
+        shown.append(View(scene, names[i], _encode(truth, side, quality), render, error, width, height))
+    return shown
+
+
+def _names(record: Record, rows: int) -> list[str]:
+    """Name the rows of a strip: it shows evenly spaced views of those that were evaluated."""
+    views = [view.name for view in record.per_view]
+    step = max(1, len(views) // max(1, rows))
+    spaced = [cut(name, 60) for name in views[::step][:rows]]
+    return [*spaced, *(f"view {i + 1}" for i in range(len(spaced), rows))]
+
+
+def _encode(image: Pixels, side: int, quality: int) -> str:
+    """Encode an image of at most `side` pixels a side as a data address."""
+    scale = side / max(image.shape[:2])
+    if scale < 1:
+        image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+    _, data = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    return f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode()}"
+
+
+def _size(view: View) -> int:
+    return len(view.truth) + sum(map(len, (*view.render.values(), *view.error.values())))

@@ -1,0 +1,31 @@
+"""Give every model its colour and its marker, the same in all figures, for eyes of every kind and for both themes.
+
+The hues are those of Okabe and Ito, which people with the common colour deficiencies tell apart, darkened for a white
+page and lightened for a black one to a contrast of at least 4.5:1. Markers tell the models apart without colour.
+"""
+
+from dataclasses import dataclass
+
+MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "3dgs_agr", "4dgs_agr", "6dgs_agr")
+LIGHT = ("#5c6066", "#0069a8", "#00734f", "#b34700", "#9c3d82", "#7d6608", "#1f6f78", "#4b4fa3", "#8c2d2d", "#3d6b1f")
+DARK = ("#b9bec6", "#5cbcf2", "#3ccb9f", "#ff9454", "#eb9fd0", "#e3cc4a", "#6fd0da", "#a9adff", "#ff9c9c", "#a8d672")
+MARKERS = ("^", "s", "h", "o", "D", "v", "P", "X", "<", ">")
+STAGES_LIGHT = ("#22476b", "#3b6b96", "#6390b8", "#8fb2d1", "#b7cfe3", "#d7e4ef", "#e8eef4")
+STAGES_DARK = ("#c9e0f5", "#a3c6e6", "#7ba8cf", "#588ab3", "#3f6e95", "#2c5373", "#223d54")
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a model is drawn: the number of its colour and its marker in matplotlib's letters."""
+
+    colour: int
+    marker: str
+
+
+def styles(models: list[str]) -> dict[str, Style]:
+    """Return the style of each model: a known one always has the same, others take what is left, in turn."""
+    others = sorted(set(models) - set(MODELS))
+    free = [i for i in range(len(LIGHT)) if i >= len(MODELS) or MODELS[i] not in models]
+    chosen = {m: MODELS.index(m) for m in models if m in MODELS}
+    chosen |= {m: free[i % len(free)] if free else i % len(LIGHT) for i, m in enumerate(others)}
+    return {m: Style(i, MARKERS[i]) for m, i in chosen.items()}

@@ -1,0 +1,124 @@
+"""Write when a quality is reached: the seconds each model needs for the targets, and the course of training."""
+
+import math
+from statistics import fmean
+
+from gsbench.report import frontier as f
+from gsbench.report.arms import Arm, Group
+from gsbench.report.page import charts, events, words
+from gsbench.report.page.content import Column, Drawing, Runs, Section, Tab, Table, Value
+from gsbench.report.page.cost import MOST_SCENES
+from gsbench.report.page.palette import Style
+
+
+def quality_section(group: Group, look: dict[str, Style], name: str) -> Section:
+    """Say how long each model needs for the targets, and draw the performance profile."""
+    targets = f.targets(group)
+    if not targets:
+        return Section("quality", "Time to quality", ["No finished run has PSNR on val and training seconds."])
+    ratios = f.profile(targets)
+    problems = len(next(iter(ratios.values()), []))
+    panel = charts.profile({m: (look[m], list(values)) for m, values in ratios.items()}, problems)
+    alt = f"Performance profile of {words.listing(list(ratios))} over {problems} targets"
+    models = [m for m in look if any(m in t.seconds for t in targets)]
+    columns = [Column("scene"), Column("target"), Column("PSNR dB", 2), *(Column(f"{m} s", 1) for m in models)]
+    rows: list[list[Value]] = [[t.scene, t.rule, t.psnr, *(t.seconds.get(m) for m in models)] for t in targets]
+    return Section(
+        "quality",
+        "Time to quality",
+        _quality_words(targets, models),
+        [Tab("", [Drawing("Targets reached within a factor of the fastest", panel.svg(f"{name}q", alt))])],
+        Table("time_to_quality.csv", columns, rows),
+        beside=True,
+        legend=True,
+        notes=[
+            "Targets on val, set by rule: what 3dgs, the weakest and the strongest model end with, and the paper's "
+            "number where the data are the paper's. Seconds are of the quickest finished run, not interpolated."
+        ],
+    )
+
+
+def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
+    """Say which model reaches most targets, which is quickest most often, and what only one reaches."""
+    reached = {m: sum(math.isfinite(t.seconds.get(m, math.inf)) for t in targets) for m in models}
+    fastest = {m: sum(t.seconds.get(m, math.inf) == min(t.seconds.values()) for t in targets) for m in models}
+    most = [m for m in models if reached[m] == max(reached.values())]
+    quick = [m for m in models if fastest[m] == max(fastest.values())]
+    alone = sum(sum(map(math.isfinite, t.seconds.values())) == 1 < len(t.seconds) for t in targets)
+    verb = "reaches" if len(most) == 1 else "reach"
+    text = f"{words.listing(most)} {verb} most targets ({reached[most[0]]} of {len(targets)}); "
+    text += (
+        f"{words.listing(quick)} {'is' if len(quick) == 1 else 'are'} the quickest most often ({fastest[quick[0]]})."
+    )
+    if alone:
+        text += f" {words.count(alone, 'target')} {'is' if alone == 1 else 'are'} reached by one model only."
+    return [text]
+
+
+def anytime_section(group: Group, runs: Runs, look: dict[str, Style], name: str) -> Section:
+    """Draw PSNR on val while training, for each scene, at the common setting."""
+    drawings: list[Drawing] = []
+    rows: list[list[Value]] = []
+    tails: dict[str, list[float]] = {}
+    seen: set[str] = set()
+    for i, scene in enumerate(group.scenes):
+        curves = []
+        for arm in group.main_arms:
+            if curve := _mean_curve(group, arm, scene):
+                steps, seconds, psnr = curve
+                marks = events.of(arm.runs[scene][0])
+                seen |= {letter for _, letters in marks for letter in letters}
+                at = [(_when(step, steps, seconds), letters) for step, letters in marks]
+                curves.append(charts.Anytime(look[arm.model], seconds, psnr, runs.of_arm(group, arm, [scene]), at))
+                rows += [[scene, arm.model, *point] for point in zip(steps, seconds, psnr, strict=True)]
+                tails.setdefault(arm.model, []).append(max(psnr) - psnr[-1])
+        if curves and i < MOST_SCENES:
+            alt = f"PSNR on val against training seconds on {scene}, one curve for each of {len(curves)} models"
+            drawings.append(Drawing(scene, charts.anytime(curves).svg(f"{name}a{i}", alt)))
+    if not rows:
+        return Section("anytime", "While training", ["No finished run has a curve of PSNR on val."])
+    columns = [Column("scene"), Column("model"), Column("iteration"), Column("seconds", 2), Column("PSNR val dB", 2)]
+    letters = [f"{letter}: {events.MEANING[letter]}" for letter in events.MEANING if letter in seen]
+    notes = [
+        "This is the course of runs of this length, not what shorter runs would give: rates and densification scale."
+    ]
+    notes += [f"Events in mean seconds: {'; '.join(letters)}."] if letters else []
+    table = Table("anytime.csv", columns, rows)
+    return Section(
+        "anytime", "While training", _anytime_words(tails), [Tab("", drawings)], table, legend=True, notes=notes
+    )
+
+
+def _mean_curve(group: Group, arm: Arm, scene: str) -> tuple[list[int], list[float], list[float]] | None:
+    """Return iterations, mean seconds and mean PSNR over the seeds, at the iterations that all of them measured."""
+    seeds = [
+        {p.iteration: p for p in r.curve if p.psnr_val is not None}
+        for r in arm.runs.get(scene, [])
+        if not math.isnan(group.value(r, "seconds"))
+    ]
+    steps = sorted(set.intersection(*map(set, seeds))) if seeds else []
+    if not steps:
+        return None
+    seconds = [fmean(s[step].seconds for s in seeds) for step in steps]
+    return steps, seconds, [fmean(s[step].psnr_val or 0.0 for s in seeds) for step in steps]
+
+
+def _when(step: int, steps: list[int], seconds: list[float]) -> float:
+    """Return the seconds at a step, from the measured points about it."""
+    steps, seconds = [0, *steps], [0.0, *seconds]
+    after = next((i for i, s in enumerate(steps) if s >= step), len(steps) - 1)
+    span = steps[after] - steps[after - 1] if after else 0
+    share = (step - steps[after - 1]) / span if span else 0.0
+    return seconds[after] if not after else seconds[after - 1] + min(1.0, share) * (seconds[after] - seconds[after - 1])
+
+
+def _anytime_words(tails: dict[str, list[float]]) -> list[str]:
+    """Say which models end below the best they had on val."""
+    lost = {m: fmean(losses) for m, losses in tails.items() if fmean(losses) >= 0.05}
+    if not lost:
+        return ["Every model ends within 0.05 dB of the best it had on val: none overfits visibly by its last step."]
+    worst = sorted(lost, key=lambda m: -lost[m])
+    parts = [f"{m} by {words.plain(lost[m])} dB" for m in worst]
+    rest = [m for m in tails if m not in lost]
+    text = f"On the mean of the scenes these end below the best they had on val: {words.listing(parts)}"
+    return [f"{text}; {words.listing(rest)} within 0.05 dB." if rest else f"{text}."]

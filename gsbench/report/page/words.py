@@ -1,0 +1,88 @@
+"""Put numbers and their intervals into words."""
+
+import math
+import shlex
+
+from gsbench.measure.record import Record
+from gsbench.report.conditions import printable
+from gsbench.report.intervals import Estimate
+
+NO_SPREAD = "no spread is known from one seed"
+LONGEST = 300  # characters of a text from a record
+
+
+def cut(text: object, longest: int = LONGEST) -> str:
+    """Put a text from a record on one line of at most `longest` characters."""
+    line = printable(str(text)[: 4 * longest])
+    return line if len(line) <= longest else f"{line[: longest - 1]}…"
+
+
+def listing(words: list[str], last: str = "and") -> str:
+    """Join words: "a", "a and b", "a, b and c"."""
+    return f"{', '.join(words[:-1])} {last} {words[-1]}" if len(words) > 1 else "".join(words)
+
+
+def count(number: int, what: str) -> str:
+    """Count things: "1 run", "2 runs"."""
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
+def plain(value: float, digits: int = 2) -> str:
+    """Write a number with a true minus sign; a dash where there is none."""
+    return "–" if math.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
+
+
+def probability(p: float) -> str:
+    """Write a p-value; one too small for three digits as a bound."""
+    return "< 0.001" if p < 0.001 else plain(p, 3)
+
+
+def signed(value: float, digits: int = 2) -> str:
+    """Write a difference with its sign; none where it rounds to zero."""
+    text = plain(value, digits)
+    return text if math.isnan(value) or text.startswith("−") or not float(text) else f"+{text}"
+
+
+def duration(seconds: float) -> str:
+    """Write a time in the unit that suits it: 8.3 s, 12 min, 2.5 h; "never" where it is infinite."""
+    if math.isnan(seconds):
+        return "–"
+    if math.isinf(seconds):
+        return "never"
+    if seconds < 100:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def budget(seconds: float) -> str:
+    """Write a budget: 10 s, 1 min, 10 min."""
+    return f"{seconds:g} s" if seconds < 60 else f"{seconds / 60:g} min"
+
+
+def interval(of: Estimate, digits: int = 2, *, sign: bool = False) -> str:
+    """Write the 95 % interval, or that no spread is known."""
+    write = signed if sign else plain
+    return f"95 % {write(of.low, digits)} to {write(of.high, digits)}" if of.over else NO_SPREAD
+
+
+def over(of: Estimate) -> str:
+    """Say what an interval generalises to."""
+    return {"scenes": "scenes like these", "": "–"}.get(of.over, f"{of.over}, on {count(of.scenes, 'scene')}")
+
+
+def run_name(record: Record) -> str:
+    """Name a run as its folder does."""
+    label = f"{record.model},{record.variant}" if record.variant else record.model
+    return f"{record.experiment}/{record.scene}/{label}/seed{record.seed}"
+
+
+def command(records: list[Record]) -> str:
+    """Return the command that repeats the runs, or the first of them where they differ in more than the seed."""
+    if not all(r.overrides for r in records):
+        return ""
+    rest = {tuple(o for o in r.overrides if not o.startswith("seed=")) for r in records}
+    if len(records) > 1 and len(rest) == 1:
+        words = ["-m", *rest.pop(), f"seed={','.join(str(r.seed) for r in records)}"]
+    else:
+        words = list(records[0].overrides)
+    return f"python -m gsbench {' '.join(shlex.quote(cut(word)) for word in words)}"

@@ -1,0 +1,197 @@
+"""Write the sections on worth: the price of each effect, where the seconds go, whether differences are real."""
+
+import math
+from statistics import fmean
+
+from gsbench.report import compare
+from gsbench.report.arms import Group
+from gsbench.report.compare import Cube, Pair, Price
+from gsbench.report.intervals import Estimate
+from gsbench.report.page import charts, words
+from gsbench.report.page.content import Column, Drawing, Section, Tab, Table, Value
+
+UNITS = (("psnr", "dB", 2), ("seconds", "training s", 1), ("ms", "ms a frame", 2), ("mb", "MB", 2))
+STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer")
+REST = "other"
+MOST_PAIRS = 28  # that are drawn: those of eight models
+PARAMETRISATION = (
+    "4dgs is another parametrisation of a Gaussian than 7dgs without direction, so direction given time is priced "
+    "across the two. The nested comparison, 7dgs with d frozen, needs runs that are not among these records."
+)
+
+
+def effects_section(group: Group, name: str) -> Section:
+    """Price time, direction, AGR and their interactions in every unit, as far as the cells were run."""
+    cube = compare.cube(group)
+    notes = []
+    if cube.missing:
+        notes.append(f"Not run, so not priced: models with {words.listing(cube.missing, 'or')}.")
+    if cube.left_out:
+        notes.append(f"Left out, as another model has the same effects: {words.listing(cube.left_out)}.")
+    if {"4dgs", "7dgs_noagr"} <= {arm.model for arm in cube.cells.values()}:
+        notes.append(PARAMETRISATION)
+    if not cube.prices:
+        text = "No two finished models differ in one effect alone, so no effect can be priced."
+        return Section("effects", "The price of each effect", [text], notes=notes)
+    drawings = []
+    for unit, title, digits in UNITS:
+        rows = [_row(price, price.costs[unit], digits) for price in cube.prices if price.costs[unit].scenes]
+        if rows:
+            alt = f"Change in {title} of {words.listing([row.label for row in rows])}"
+            drawings.append(Drawing(f"in {title}", charts.differences(rows, title).svg(f"{name}e{unit}", alt)))
+    columns = [Column("effect"), Column("computed from")]
+    for _, title, digits in UNITS:
+        columns += [Column(title, digits), Column(f"{title}: 95 % low", digits), Column(f"{title}: high", digits)]
+    priced: list[list[Value]] = [
+        [
+            p.name,
+            p.models,
+            *(v for unit, _, _ in UNITS for v in (p.costs[unit].mean, p.costs[unit].low, p.costs[unit].high)),
+        ]
+        for p in cube.prices
+    ]
+    table = Table("effects.csv", columns, priced)
+    return Section("effects", "The price of each effect", _effect_words(cube), [Tab("", drawings)], table, notes=notes)
+
+
+def _row(price: Price, of: Estimate, digits: int) -> charts.Row:
+    return charts.Row(price.name, of.mean, of.low, of.high, _is_real(of), words.signed(of.mean, digits))
+
+
+def _is_real(of: Estimate) -> bool:
+    """Whether the interval does not hold zero."""
+    return of.low > 0 or of.high < 0
+
+
+def _effect_words(cube: Cube) -> list[str]:
+    """Say which effect is worth most, what it costs, which are not told from nothing, and how they interact."""
+    single = [p for p in cube.prices if p.order == 1 and "mean over" not in p.name]
+    best = max(single, key=lambda p: p.costs["psnr"].mean)
+    gain, seconds = best.costs["psnr"], best.costs["seconds"]
+    text = f"Worth most: {best.name}, {words.signed(gain.mean)} dB ({words.interval(gain, sign=True)})"
+    text += f", for {words.signed(seconds.mean, 1)} s of training." if seconds.scenes else "."
+    if gain.mean <= 0:
+        text = f"No effect raises PSNR here; the least harm does {best.name}, {words.signed(gain.mean)} dB."
+    unclear = [p.name for p in single if p.costs["psnr"].over and not _is_real(p.costs["psnr"])]
+    said = [text, f"Not told from nothing in dB: {words.listing(unclear)}." if unclear else ""]
+    for price in cube.prices:
+        of = price.costs["psnr"]
+        if price.order == 2 and _is_real(of):
+            side = f"{words.plain(abs(of.mean))} dB {'less' if of.mean < 0 else 'more'} than apart"
+            said.append(f"{price.name.capitalize()}: together they bring {side} ({words.interval(of, sign=True)}).")
+    return [s for s in said[:4] if s]
+
+
+def stages_section(group: Group, name: str) -> Section:
+    """Draw where the seconds of training go, by stage."""
+    parts = {arm.model: found for arm in group.main_arms if (found := _stage_seconds(group, arm.model))}
+    if not parts:
+        return Section("stages", "Where the seconds go", ["No finished run tells its seconds by stage."])
+    every = {name for stages in parts.values() for name in stages}
+    names = [s for s in STAGES if s in every] + sorted(every - {*STAGES, REST}) + ([REST] if REST in every else [])
+    panel = charts.stages(list(parts.items()), names)
+    alt = f"Seconds of training by stage for {words.listing(list(parts))}"
+    rows: list[list[Value]] = [
+        [m, *(stages.get(s, 0.0) for s in names), sum(stages.values())] for m, stages in parts.items()
+    ]
+    columns = [Column("model"), *(Column(f"{s} s", 2) for s in names), Column("training s", 2)]
+    share = {s: fmean(stages.get(s, 0.0) / sum(stages.values()) for stages in parts.values()) for s in names}
+    first, *others = sorted(names, key=lambda s: -share[s])
+    text = f"{first.capitalize()} takes most, {100 * share[first]:.0f} % of training on the mean of the models"
+    text += f", then {others[0]} with {100 * share[others[0]]:.0f} %." if others else "."
+    slow, quick = (pick(parts, key=lambda m: sum(parts[m].values())) for pick in (max, min))
+    if slow != quick:
+        ratio = sum(parts[slow].values()) / sum(parts[quick].values())
+        most = max(names, key=lambda s: parts[slow].get(s, 0.0) - parts[quick].get(s, 0.0))
+        text += f" {slow} takes {ratio:.2g} times the seconds of {quick}, most of the difference in {most}."
+    table = Table("stages.csv", columns, rows)
+    drawing = Drawing("Seconds of training by stage", panel.svg(f"{name}s", alt))
+    return Section(
+        "stages",
+        "Where the seconds go",
+        [text],
+        [Tab("", [drawing])],
+        table,
+        beside=True,
+        stages=names,
+    )
+
+
+def _stage_seconds(group: Group, model: str) -> dict[str, float]:
+    """Return the mean seconds of each stage over scenes and seeds, and those that no stage has."""
+    (arm,) = (arm for arm in group.main_arms if arm.model == model)
+    scenes = [s for s in group.covered or arm.runs if s in arm.runs]
+    runs = [[r for r in arm.runs[s] if r.cost and not math.isnan(group.value(r, "seconds"))] for s in scenes]
+    if not runs or not all(runs):
+        return {}
+    costs = [[r.cost for r in seeds if r.cost] for seeds in runs]
+    names = sorted({name for seeds in costs for cost in seeds for name in cost.stage_s})
+    found = {words.cut(n, 40): fmean(fmean(c.stage_s.get(n, 0.0) for c in seeds) for seeds in costs) for n in names}
+    total = fmean(fmean(c.train_s for c in seeds) for seeds in costs)
+    rest = total - sum(found.values())
+    return found | ({REST: rest} if rest > 0.005 * total else {}) if total > 0 else {}
+
+
+def pairs_section(group: Group, name: str) -> Section:
+    """Draw the difference of every two models with its interval."""
+    found = compare.pairs(group)
+    if not found:
+        text = "Fewer than two models have finished the same scene, so there is no pair to compare."
+        return Section("pairs", "Is it a difference?", [text])
+    rows = [
+        charts.Row(
+            f"{p.better.model} − {p.other.model}", p.difference.mean, p.difference.low, p.difference.high,
+            p.differs, words.signed(p.difference.mean),
+        )
+        for p in found[:MOST_PAIRS]
+    ]  # fmt: skip
+    alt = f"Differences in PSNR of {words.count(len(rows), 'pair')} of models with 95 % intervals"
+    columns = [Column("pair"), Column("dB", 2), Column("95 % low", 2), Column("95 % high", 2)]
+    columns += [Column("ahead on % of views", 0), Column("p, Holm"), Column("told apart")]
+    table = Table("pairs.csv", columns, [_pair_row(p) for p in found])
+    drawing = Drawing("Difference in PSNR", charts.differences(rows, "dB").svg(f"{name}p", alt))
+    first = found[0].difference
+    notes = [
+        f"Paired over the seeds and views that both have; intervals are of {words.over(first)}. p is adjusted after "
+        f"Holm for {words.count(len(found), 'pair')}. Ahead: how likely a run of the first beats one of the second on "
+        "a view."
+        if first.over
+        else f"{words.NO_SPREAD.capitalize()}: no interval and no p-value is given."
+    ]
+    return Section(
+        "pairs", "Is it a difference?", _pair_words(found), [Tab("", [drawing])], table, beside=True, notes=notes
+    )
+
+
+def _pair_row(pair: Pair) -> list[Value]:
+    d = pair.difference
+    told = "not known" if math.isnan(pair.p_holm) else "yes" if pair.differs else "no"
+    return [
+        f"{pair.better.model} − {pair.other.model}",
+        d.mean,
+        d.low,
+        d.high,
+        100 * pair.improvement,
+        words.probability(pair.p_holm),
+        told,
+    ]
+
+
+def _pair_words(found: list[Pair]) -> list[str]:
+    """Say how many pairs are told apart, and name those that are not."""
+    if all(math.isnan(p.p_holm) for p in found):
+        first = found[0]
+        ahead = f"{first.better.model} is ahead of {first.other.model} by {words.plain(first.difference.mean)} dB"
+        return [f"{words.NO_SPREAD.capitalize()}. The largest difference: {ahead}."]
+    level = [f"{p.better.model} and {p.other.model}" for p in found if not p.differs and not math.isnan(p.p_holm)]
+    tested = sum(not math.isnan(p.p_holm) for p in found)
+    if not level:
+        return [
+            "The pair is told apart at 95 %."
+            if tested == 1
+            else f"All {tested} pairs are told apart at 95 %, after Holm."
+        ]
+    if tested == 1:
+        return ["The pair is not told apart at 95 %."]
+    named = words.listing(level[:4]) + (f" and {len(level) - 4} more" if len(level) > 4 else "")
+    return [f"{tested - len(level)} of {words.count(tested, 'pair')} are told apart at 95 %, after Holm. Not: {named}."]

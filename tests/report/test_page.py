@@ -1,0 +1,391 @@
+"""The page without a browser: its sentences, that texts stay texts, its size, the gallery, and writing it live."""
+
+import base64
+import dataclasses
+import json
+import re
+import time
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+from make_golden import make
+from many_records import HOSTILE, frontier, hostile, write_all
+
+from gsbench.measure.record import ViewScore
+from gsbench.report import live
+from gsbench.report.__main__ import main
+from gsbench.report.arms import groups
+from gsbench.report.page import build, cost, evidence, gallery, time_to_quality, words, worth
+from gsbench.report.page.content import Column, Runs, Table
+from gsbench.report.page.events import of as events_of
+from gsbench.report.page.palette import DARK, LIGHT, MARKERS, styles
+from gsbench.report.pictures import strip, write_png
+
+
+class Page(HTMLParser):
+    """The elements and the visible text of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.attributes, self.texts, self.inside = [], [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += attrs
+        self.inside = [*self.inside, tag] if tag in ("script", "style") else self.inside
+
+    def handle_endtag(self, tag):
+        self.inside = self.inside[:-1] if tag in ("script", "style") else self.inside
+
+    def handle_data(self, data):
+        if not self.inside:
+            self.texts.append(data)
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.texts).split())
+
+
+def group(records):
+    (only,) = groups(records)
+    return only
+
+
+def page(records, tmp_path):
+    return build.render(records, tmp_path)
+
+
+SMALL = {"models": ("3dgs", "4dgs"), "scenes": ("suzanne",), "seeds": 2, "lengths": (1000,)}
+
+
+def lost(record):
+    gone = {"metrics": None, "missing": {}, "cost": None, "per_view": [], "curve": []}
+    return dataclasses.replace(record, status="failed", reason="out of memory", **gone)
+
+
+def test_the_first_screen_answers(tmp_path):
+    """Catches answers over the budget, without an interval, or from another model than the best that fits."""
+    records = frontier()
+    ten, minute, _, frames = cost.answers(group(records))
+    assert ten.budget == "10 s of training"
+    assert minute.model == "7dgs"
+    assert re.fullmatch(r"[\d.]+ dB", minute.value)
+    assert re.fullmatch(r"95 % [\d.]+ to [\d.]+", minute.interval)
+    assert "2,000 iterations" in minute.detail
+    assert frames.budget == "60 frames a second"
+    text = Page(page(frontier(**SMALL), tmp_path)).text
+    assert text.index("10 s of training") < text.index("What accuracy costs")
+
+
+def test_sentences_where_models_tie():
+    """Catches a winner among equal models, and a pair that is called a difference."""
+    records = [dataclasses.replace(r, model=m) for m in ("a", "b") for r in frontier(("7dgs",), lengths=(1000,))]
+    (answer, *_) = cost.answers(group(records))
+    assert "not told apart from b" in answer.detail.lower() or answer.model == ""
+    assert "The pair is not told apart" in worth.pairs_section(group(records), "x").sentences[0]
+
+
+def test_sentences_of_one_seed():
+    """Catches an interval or a p-value that one seed cannot give."""
+    records = frontier(seeds=1)
+    (_, minute, *_) = cost.answers(group(records))
+    assert minute.interval == words.NO_SPREAD
+    assert "One seed: whether it is ahead is not known." in minute.detail
+    said = worth.pairs_section(group(records), "x")
+    assert said.sentences[0].startswith("No spread is known from one seed.")
+    assert "95 %" not in " ".join(worth.effects_section(group(records), "x").sentences)
+
+
+def test_sentences_where_nothing_finished(tmp_path):
+    """Catches a crash, and a page that says less than that nothing finished."""
+    records = [lost(r) for r in frontier(lengths=(1000,))]
+    assert all(a.model == "" for a in cost.answers(group(records)))
+    text = Page(page(records, tmp_path)).text
+    assert "No run has finished" in text
+    assert "What did not finish" in text
+    assert "out of memory" in text
+
+
+def test_sentences_where_models_are_missing(tmp_path):
+    """Catches effects that are priced from nothing, and a pair of one."""
+    text = Page(page(frontier(("7dgs",), ("suzanne",), 3, (1000,)), tmp_path)).text
+    assert "No two finished models differ in one effect alone" in text
+    assert "there is no pair to compare" in text
+    assert "All runs are of one length (1,000 iterations)" in text
+    assert "It is the only point." in text
+
+
+def test_a_failed_run_does_not_hide_what_finished(tmp_path):
+    """Catches one failure that empties the means over scenes."""
+    records = frontier(("3dgs", "7dgs"), lengths=(1000,))
+    text = Page(page([lost(records[0]), *records[1:]], tmp_path)).text
+    assert "11 runs finished, 1 run did not" in text
+    assert "On the mean of 2 scenes" in text
+
+
+def test_the_best_value_is_the_tables():
+    """Catches a page whose text and CSV tell different numbers."""
+    records = frontier(("3dgs", "7dgs"), lengths=(250, 1000))
+    look = styles(sorted({r.model for r in records}))
+    section = cost.frontier_section(group(records), Runs(), look, "x")
+    best = max(row[4] for row in section.table.rows if row[0] == "mean of 2 scenes")
+    assert words.plain(best) in section.sentences[0]
+    csv = base64.b64decode(section.table.href.partition(",")[2]).decode()
+    assert repr(best) in csv
+    assert len(csv.splitlines()) == len(section.table.rows) + 1
+
+
+def test_every_figure_has_its_numbers():
+    """Catches a figure without the table behind it or a text alternative."""
+    of = group(frontier(**SMALL))
+    look = styles(of.models)
+    runs = Runs()
+    sections = [
+        cost.frontier_section(of, runs, look, "x"),
+        time_to_quality.quality_section(of, look, "x"),
+        worth.effects_section(of, "x"),
+        worth.stages_section(of, "x"),
+        time_to_quality.anytime_section(of, runs, look, "x"),
+        worth.pairs_section(of, "x"),
+        evidence.protocol_section(of),
+    ]
+    for section in sections:
+        assert section.sentences
+        assert section.table
+        assert section.table.rows
+        for tab in section.tabs:
+            assert tab.drawings
+            assert all('role="img" aria-label="' in one.svg for one in tab.drawings)
+            assert all("<text" in one.svg for one in tab.drawings)
+
+
+def test_a_point_names_its_run_and_its_command():
+    """Catches a point that cannot be repeated, seeds that are lost, and words a shell would take apart."""
+    records = frontier(("7dgs",), ("suzanne",), 3, (1000,))
+    runs = Runs()
+    of = group(records)
+    entry = runs.entries[runs.of_record(of, records[1])]
+    assert entry["name"] == "mini/suzanne/7dgs/seed1"
+    assert entry["command"] == "python -m gsbench +exp=mini model=7dgs scene=suzanne seed=1 train.iterations=1000"
+    entry = runs.entries[runs.of_arm(of, of.arms[0], ["suzanne"])]
+    assert entry["command"].startswith("python -m gsbench -m +exp=mini ")
+    assert entry["command"].endswith(" seed=0,1,2")
+    odd = dataclasses.replace(records[0], overrides=["scene.name=a b;rm"])
+    assert words.command([odd]) == "python -m gsbench 'scene.name=a b;rm'"
+    assert words.command([make()]) == ""
+
+
+def test_hostile_texts_stay_text(tmp_path):
+    """Catches markup, quotes, directions and length from a record that reach the page as anything but text."""
+    text = page(hostile(), tmp_path)
+    seen = Page(text)
+    assert "alert(1)" in seen.text
+    assert len(text) < 2_000_000
+    assert not [name for name, _ in seen.attributes if name.startswith("on")]
+    assert seen.tags.count("script") == Page(page(frontier(**SMALL), tmp_path)).tags.count("script")
+    assert "x" * 800 not in seen.text
+    assert "\u202e" not in text
+    runs = re.search(r'id="runs">(.*?)</script>', text, re.S)[1]
+    assert "alert" in json.loads(runs)[0]["command"]
+
+
+def test_nothing_is_loaded_from_elsewhere(tmp_path):
+    """Catches an address of the network or of the disk: a font, a script, an image."""
+    write_all(frontier(**SMALL), tmp_path, pictures=1)
+    text = page(frontier(**SMALL), tmp_path / "mini")
+    seen = Page(text)
+    for name, value in seen.attributes:
+        if name in ("src", "href", "xlink:href", "action", "srcset", "poster", "data"):
+            assert value.startswith(("#", "data:")), (name, value[:80])
+    assert not re.search(r"url\((?!#)", text)
+    assert "data:image/webp" in text
+
+
+def test_equal_records_give_equal_pages(tmp_path):
+    """Catches a page that changes from one call to the next, so that a difference says nothing."""
+    records = frontier(**SMALL)
+    assert page(records, tmp_path) == page(records[::-1], tmp_path)
+
+
+def test_ids_are_unique(tmp_path):
+    """Catches drawings that share their clip paths and markers, so that one hides in another's frame."""
+    other = [dataclasses.replace(r, experiment="other") for r in frontier(**SMALL)]
+    ids = [value for name, value in Page(page([*frontier(**SMALL), *other], tmp_path)).attributes if name == "id"]
+    assert len(ids) == len(set(ids))
+
+
+def contrast(a, b):
+    """WCAG's ratio of two colours."""
+    light = []
+    for colour in (a, b):
+        parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
+        light.append(0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2])
+    return (max(light) + 0.05) / (min(light) + 0.05)
+
+
+def test_colours_are_readable_in_both_themes():
+    """Catches a colour of a model that disappears on its page."""
+    assert min(contrast(c, "#ffffff") for c in LIGHT) >= 4.5
+    assert min(contrast(c, "#141619") for c in DARK) >= 4.5
+    assert len(LIGHT) == len(DARK) == len(MARKERS) == len(set(MARKERS))
+
+
+def test_a_model_keeps_its_colour():
+    """Catches colours that depend on which other models are there, and two models that share one."""
+    assert styles(["3dgs", "7dgs"])["7dgs"] == styles(["7dgs"])["7dgs"]
+    many = styles(["3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "mine", "other"])
+    assert len({s.marker for s in many.values()}) == 7
+    assert len(styles([f"m{i}" for i in range(40)])) == 40
+
+
+def test_strips_are_cut_back_to_their_images(tmp_path):
+    """Catches a crop that is off by the gap or the header, and pixels that stay enlarged."""
+    random = np.random.default_rng(0)
+    pairs = [(random.random((30, 50, 3)), random.random((30, 50, 3))) for _ in range(3)]
+    write_png(strip(pairs), tmp_path / "pictures.png")
+    rows = gallery.cut_strip(tmp_path / "pictures.png")
+    assert len(rows) == 3
+    for (render, truth), found in zip(pairs, rows, strict=True):
+        for image, part in zip((render, truth), found[:2], strict=True):
+            assert np.array_equal(part[..., ::-1], (image * 255).round().astype(np.uint8))
+    large = [(random.random((300, 260, 3)), random.random((300, 260, 3)))]
+    write_png(strip(large), tmp_path / "large.png")
+    assert gallery.cut_strip(tmp_path / "large.png")[0][0].shape == (300, 260, 3)
+
+
+def test_a_file_that_is_no_strip_is_left_out(tmp_path):
+    """Catches a crash for a damaged or foreign image."""
+    (tmp_path / "pictures.png").write_bytes(b"no image")
+    assert gallery.cut_strip(tmp_path / "pictures.png") == []
+    write_png(np.zeros((20, 20, 3), np.uint8), tmp_path / "small.png")
+    assert gallery.cut_strip(tmp_path / "small.png") == []
+
+
+def test_the_gallery_has_every_model_on_the_same_view(tmp_path):
+    """Catches a view without a model, and names of views that are not those of the rows."""
+    records = frontier(("3dgs", "7dgs"), ("suzanne",), 1, (1000,))
+    folder = write_all(records, tmp_path, pictures=3)
+    views = gallery.gallery(records, folder)
+    assert [view.name for view in views] == ["test/r_000", "test/r_003", "test/r_006"]
+    assert list(views[0].render) == list(views[0].error) == ["3dgs", "7dgs"]
+    data = base64.b64decode(views[0].truth.partition(",")[2])
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == (40, 60, 3)
+    assert gallery.gallery(records, tmp_path / "nothing") == []
+
+
+def test_the_gallery_fits(tmp_path, monkeypatch):
+    """Catches images that make the page too large: noise compresses worst, and the budget is for one view of three."""
+    records = frontier(("3dgs", "7dgs"), ("suzanne",), 1, (1000,))
+    folder = write_all(records, tmp_path, pictures=3)
+    everything = sum(map(gallery._size, gallery.gallery(records, folder)))
+    monkeypatch.setattr(gallery, "BUDGET", everything // 5)
+    views = gallery.gallery(records, folder)
+    assert len(views) == 1
+    assert sum(map(gallery._size, views)) <= everything // 5
+    monkeypatch.setattr(gallery, "BUDGET", 10)
+    assert gallery.gallery(records, folder) == []
+
+
+def test_events_are_those_of_the_schedule():
+    """Catches marks at other steps than those at which training changes: the rule stands twice, for want of torch."""
+    train = pytest.importorskip("gsbench.train.schedule")
+    from gsbench.config import TrainConfig
+
+    for length in (250, 1000, 7000):
+        config = TrainConfig(iterations=length)
+        schedule = train.Schedule(config, 3, True)
+        plain = {**dataclasses.asdict(config)}
+        one = make()
+        model = {"lr": {"modulation": {}}}
+        one = dataclasses.replace(
+            one, provenance=dataclasses.replace(one.provenance, config={"train": plain, "model": model})
+        )
+        found = {letter: [s for s, letters in events_of(one) if letter in letters] for letter in "RDAL"}
+        resets = [step + 1 for step in range(length) if schedule.resets(step)]
+        assert found["R"] == resets[:4]
+        assert found["D"] == [schedule.densify_stop]
+        assert found["A"] == [next(s for s in range(length) if schedule.phase(s).refine)]
+        assert found["L"] == [next(s for s in range(length) if schedule.phase(s).tune_modulation)]
+    assert events_of(make()) == []
+
+
+def test_a_table_shows_its_first_rows_and_links_all():
+    """Catches a page that grows with every run, and a file that is cut like the page."""
+    table = Table("t.csv", [Column("a", 1), Column("b")], [[i / 3, f"run {i}"] for i in range(500)])
+    assert len(table.shown) == 60
+    assert table.hidden == 440
+    assert len(base64.b64decode(table.href.partition(",")[2]).decode().splitlines()) == 501
+    assert table.shown[1] == ["0.3", "run 1"]
+
+
+def test_the_command_writes_the_page(tmp_path, capsys):
+    """Catches a command that forgets the page, and a page that is not self-contained."""
+    folder = write_all(frontier(**SMALL), tmp_path, pictures=1)
+    assert main([str(folder)]) == 0
+    assert "report.html" in capsys.readouterr().out
+    assert (folder / "report.html").stat().st_size < 2_000_000
+
+
+def test_live_writes_again_when_a_record_arrives(tmp_path, capsys, monkeypatch):
+    """Catches a loop that draws once, one that stops at a missing folder, and one that has no end."""
+    records = frontier(("3dgs", "7dgs"), ("suzanne",), 1, (1000,))
+    folder = tmp_path / "mini"
+    steps = iter(
+        [
+            lambda: write_all(records[:1], tmp_path),
+            lambda: write_all(records[1:], tmp_path),
+            lambda: None,
+        ]
+    )
+    pages = []
+
+    def sleep(_):
+        written = folder / "report.html"
+        pages.append(written.read_text() if written.exists() else None)
+        try:
+            next(steps)()
+        except StopIteration:
+            raise KeyboardInterrupt from None
+
+    monkeypatch.setattr(time, "sleep", sleep)
+    assert live.watch(folder) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert "expected a folder of results" in printed[0]
+    assert "1 records" in printed[1]
+    assert "2 records" in printed[2]
+    assert printed[-1].startswith("Stopped. 2 records")
+    assert len(printed) == 5
+    assert pages[0] is None
+    assert 'data-reload="5"' in pages[1]
+    assert pages[2] == pages[3]
+    assert 'data-reload="0"' in (folder / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_five_thousand_records(tmp_path):
+    """Catches a page that takes longer than 20 s or grows beyond 10 MB with the number of runs."""
+    records = frontier(
+        scenes=tuple(f"scene{i}" for i in range(10)), seeds=10, lengths=tuple(250 * i for i in range(1, 11))
+    )
+    assert len(records) == 5000
+    start = time.process_time()
+    text = build.render(records, tmp_path)
+    assert time.process_time() - start < 20
+    assert len(text.encode()) < 10_000_000
+
+
+def test_a_view_without_a_number_is_left_out():
+    """Catches a null of one view that empties the whole page."""
+    records = frontier(**SMALL)
+    records[0] = dataclasses.replace(records[0], per_view=[ViewScore("test/r_000"), *records[0].per_view[1:]])
+    assert "told apart" in worth.pairs_section(group(records), "x").sentences[0]
+
+
+def test_hostile_is_hostile():
+    """Catches a text that lost what it is to test."""
+    assert len(HOSTILE) > 10_000
+    assert "<script>" in HOSTILE
