@@ -1,5 +1,6 @@
 """Write the sections on evidence: the tables, the protocol, what failed, and every run with its command."""
 
+from gsbench.measure.record import Record
 from gsbench.report import layout, tables
 from gsbench.report.arms import Group, iterations, machine
 from gsbench.report.conditions import conditions
@@ -11,8 +12,12 @@ LONGEST_NOTE = 700
 
 def paper_tables(group: Group) -> list[layout.Table]:
     """Return the table of the runs at the common setting, with the rows of the paper."""
-    shown = [r for r in group.records if r.variant == group.setting]
-    return tables.build(shown) if shown else []
+    return tables.build(_compared(group))
+
+
+def _compared(group: Group) -> list[Record]:
+    """Return the runs at the common setting; all where none has finished."""
+    return [r for r in group.records if r.variant == group.setting] or group.records
 
 
 def protocol_section(group: Group) -> Section:
@@ -31,7 +36,7 @@ def protocol_section(group: Group) -> Section:
         ]
         for r in group.records
     ]
-    notes = [words.cut(note, LONGEST_NOTE) for note in conditions(group.records)]
+    notes = [words.cut(note, LONGEST_NOTE) for note in conditions(_compared(group))]
     if group.elsewhere:
         notes.insert(
             0, f"Seconds and ms of {words.count(group.elsewhere, 'run')} on other machines are left out everywhere."
