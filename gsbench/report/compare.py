@@ -116,7 +116,7 @@ def _cell(arm: Arm) -> Cell:
 def _words(cell: Cell) -> str:
     """Say which effects a cell has."""
     on = [name for name, has in zip(FACTORS, cell, strict=True) if has]
-    return " + ".join(on) or "none of them"
+    return " + ".join(on) or "no effect"
 
 
 def _contrasts() -> list[tuple[str, dict[Cell, float]]]:

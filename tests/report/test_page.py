@@ -389,3 +389,14 @@ def test_hostile_is_hostile():
     """Catches a text that lost what it is to test."""
     assert len(HOSTILE) > 10_000
     assert "<script>" in HOSTILE
+
+
+def test_the_papers_points_are_marked_as_other_hardware(tmp_path):
+    """Catches the paper's seconds among ours without a word, and on a stand-in of the same name."""
+    for dataset, expected in (("D-NeRF", True), ("mini", False)):
+        protocol = {**make().protocol, "paper_dataset": "D-NeRF"}
+        runs = [make(scene="trex", seed=s, psnr=31.0 + s, dataset=dataset, protocol=protocol) for s in range(2)]
+        text = page(runs, tmp_path)
+        assert ("the paper's own number, which was measured on other hardware" in Page(text).text) == expected
+        names = [run["name"] for run in json.loads(re.search(r'id="runs">(.*?)</script>', text, re.S)[1])]
+        assert ("the paper's 7dgs on trex" in names) == expected

@@ -34,7 +34,7 @@ class Curve:
     best: Sequence[Mark]  # the frontier, joined
     beaten: Sequence[Mark] = ()  # finished, but not on the model's frontier
     runs: Sequence[Mark] = ()  # the single runs behind the means
-    paper: Sequence[tuple[float, float]] = ()  # the paper's own numbers, on other hardware
+    paper: Sequence[Mark] = ()  # the paper's own numbers, on other hardware
 
 
 def frontier(curves: list[Curve], x: str, y: str = "PSNR, dB") -> Panel:
@@ -57,10 +57,10 @@ def frontier(curves: list[Curve], x: str, y: str = "PSNR, dB") -> Panel:
         _dots(axes, curve.beaten, curve.style, 36, facecolors=PAPER, edgecolors=colour, linewidths=1.3)
         _dots(axes, curve.best, curve.style, 56, linewidths=0)
         if curve.paper:
-            xs, ys = [x for x, _ in curve.paper], [y for _, y in curve.paper]
-            axes.scatter(xs, ys, s=34, c=colour, marker="x", linewidths=1.3)
-        panel.hits += [(m.x, m.y, m.run) for m in (*curve.runs, *curve.beaten, *curve.best)]
-        across += [m.x for m in (*curve.runs, *curve.beaten, *curve.best)] + [x for x, _ in curve.paper]
+            axes.scatter([m.x for m in curve.paper], [m.y for m in curve.paper], s=34, c=colour, marker="x")
+        every = (*curve.runs, *curve.paper, *curve.beaten, *curve.best)
+        panel.hits += [(m.x, m.y, m.run) for m in every]
+        across += [m.x for m in every]
     _scale_x(axes, across)
     _margin_y(axes)
     panel.labels(x, y)
@@ -173,7 +173,7 @@ def stages(rows: list[tuple[str, dict[str, float]]], names: list[str]) -> Panel:
             share = parts.get(name, 0.0)
             axes.barh([y], [share], 0.42, [start], color=stage_colour(stage), edgecolor=PAPER, linewidth=0.8)
             start += share
-        panel.above(len(rows) - i - 0.06, label, f"{start:.3g} s")
+        panel.above(len(rows) - i - 0.06, label, f"{start:,.0f} s" if start >= 100 else f"{start:.3g} s")
     axes.set_xlim(0, longest)
     axes.set_ylim(0, len(rows))
     axes.yaxis.set_major_locator(NullLocator())

@@ -48,7 +48,9 @@ class Table:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([c.title for c in self.columns])
-        writer.writerows(self.rows)
+        writer.writerows(
+            [None if value != value else value for value in row] for row in self.rows
+        )  # NaN: an empty cell
         return f"data:text/csv;base64,{base64.b64encode(text.getvalue().encode()).decode()}"
 
 
@@ -116,6 +118,11 @@ class Runs:
         ]
         facts = _facts(*(sum(m) / len(m) if m else float("nan") for m in means))
         return self._number((group.experiment, group.dataset, name), facts, runs if len(scenes) == 1 else [])
+
+    def of_paper(self, record: Record) -> int:
+        """Return the number of the paper's row for the scene and model of a run."""
+        name = f"the paper's {record.model} on {record.scene}"
+        return self._number((record.dataset, name), "on one V100, its best on test while training", [])
 
     def _number(self, key: tuple[str, ...], facts: str, records: list[Record]) -> int:
         if key not in self._numbers:

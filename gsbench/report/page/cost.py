@@ -88,14 +88,21 @@ def frontier_section(group: Group, runs: Runs, look: dict[str, Style], name: str
     scenes = basis(group)
     points = f.points(group, scenes)
     tabs = [_frontier_tab(group, runs, look, f"{name}f0", _title(scenes), scenes)] if points else []
-    single = [s for s in group.scenes if [s] != scenes and any(s in arm.runs for arm in group.arms)][:MOST_SCENES]
-    tabs += [_frontier_tab(group, runs, look, f"{name}f{i}", s, [s]) for i, s in enumerate(single, 1)]
+    single = [s for s in group.scenes if [s] != scenes and any(s in arm.runs for arm in group.arms)]
+    drawn = enumerate(single[:MOST_SCENES], 1)
+    tabs += [_frontier_tab(group, runs, look, f"{name}f{i}", s, [s]) for i, s in drawn]
     columns = [Column("scene"), Column("model"), Column("setting"), Column("seeds"), Column("PSNR dB", 2)]
     columns += [Column("95 % low", 2), Column("95 % high", 2), Column("training s", 1), Column("ms a frame", 2)]
     columns += [Column("MB", 2), Column("dominated in seconds")]
     rows = [row for where in [scenes, *([s] for s in single)] for row in _rows(group, where)]
     table = Table("frontier.csv", columns, rows) if rows else None
-    return Section("frontier", "What accuracy costs", _frontier_words(group, points), tabs, table, legend=bool(tabs))
+    theirs = any(_paper(r, "ms") for r in group.finished)
+    notes = ["×: the paper's own number, which was measured on other hardware by another protocol."] if theirs else []
+    if len(single) > MOST_SCENES:
+        notes.append(f"Drawn are {MOST_SCENES} of {len(single)} scenes; the table has all.")
+    return Section(
+        "frontier", "What accuracy costs", _frontier_words(group, points), tabs, table, legend=bool(tabs), notes=notes
+    )
 
 
 def _title(scenes: list[str]) -> str:
@@ -146,13 +153,13 @@ def _curve(group: Group, runs: Runs, style: Style, points: list[Point], cost: st
     of = {id(p): runs.of_arm(group, p.arm, scenes) for p in points}
     mark = lambda p: charts.Mark(p.cost[cost], p.psnr.mean, of[id(p)], p.psnr.low, p.psnr.high)  # noqa: E731
     single: list[charts.Mark] = []
-    theirs: list[tuple[float, float]] = []
+    theirs: list[charts.Mark] = []
     if len(scenes) == 1:
         own = [r for p in points for r in p.arm.runs[scenes[0]]]
         if len(own) > len(points) and len(own) <= MOST_RUNS // max(1, len(group.models)):
             pairs = [(group.value(r, cost), group.value(r, "psnr"), runs.of_record(group, r)) for r in own]
             single = [charts.Mark(x, y, run) for x, y, run in pairs if not math.isnan(x + y)]
-        theirs = [at for r in own[:1] if (at := _paper(r, cost))]
+        theirs = [charts.Mark(*at, runs.of_paper(r)) for r in own[:1] if (at := _paper(r, cost))]
     return charts.Curve(style, [mark(p) for p in best], [mark(p) for p in beaten], single, theirs)
 
 

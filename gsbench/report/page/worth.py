@@ -183,7 +183,7 @@ def _pair_words(found: list[Pair]) -> list[str]:
         first = found[0]
         ahead = f"{first.better.model} is ahead of {first.other.model} by {words.plain(first.difference.mean)} dB"
         return [f"{words.NO_SPREAD.capitalize()}. The largest difference: {ahead}."]
-    level = [f"{p.better.model} and {p.other.model}" for p in found if not p.differs and not math.isnan(p.p_holm)]
+    level = [f"{p.better.model} from {p.other.model}" for p in found if not p.differs and not math.isnan(p.p_holm)]
     tested = sum(not math.isnan(p.p_holm) for p in found)
     if not level:
         return [
