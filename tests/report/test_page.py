@@ -295,7 +295,7 @@ def test_events_are_those_of_the_schedule():
     train = pytest.importorskip("gsbench.train.schedule")
     from gsbench.config import TrainConfig
 
-    for length in (250, 1000, 7000):
+    for length in (250, 2000, 7000):
         config = TrainConfig(iterations=length)
         schedule = train.Schedule(config, 3, True)
         plain = {**dataclasses.asdict(config)}

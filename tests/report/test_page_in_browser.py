@@ -142,17 +142,20 @@ def test_pointing_at_a_point_names_its_run(visit):
     page.locator("#g0-frontier [role=tab]").nth(1).click()
     card = page.locator("#card")
     assert card.is_hidden()
-    hit = page.locator("#g0-frontier [role=tabpanel]:not([hidden]) .hit").last
-    hit.scroll_into_view_if_needed()
-    hit.hover(force=True)
-    assert card.is_visible()
-    assert "seed" in card.locator(".name").inner_text()
-    assert card.locator("code").inner_text().startswith("python -m gsbench ")
-    box = card.bounding_box()
-    assert box["x"] >= 0
-    assert box["x"] + box["width"] <= 375
-    page.mouse.move(0, 0)
-    assert card.is_hidden()
+    hits = page.locator("#g0-frontier [role=tabpanel]:not([hidden]) .hit")
+    lefts = hits.evaluate_all("all => all.map((hit) => hit.getBoundingClientRect().left)")
+    for end in (min(lefts), max(lefts)):
+        hit = hits.nth(lefts.index(end))
+        hit.scroll_into_view_if_needed()
+        hit.hover(force=True)
+        assert card.is_visible()
+        assert "seed" in card.locator(".name").inner_text()
+        assert card.locator("code").inner_text().startswith("python -m gsbench ")
+        box = card.bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 375
+        page.mouse.move(0, 0)
+        assert card.is_hidden()
     hit.click(force=True)
     page.mouse.move(0, 0)
     assert card.is_visible()
@@ -229,3 +232,19 @@ def test_it_reads_without_script(visit):
     page = visit(java_script_enabled=False)
     assert page.locator("#g0-frontier svg").first.is_visible()
     assert page.locator("[role=tabpanel]").nth(2).is_visible()
+
+
+def test_a_live_page_loads_itself_again(browser, tmp_path):
+    """Catches a page that stays old while runs arrive, and one that takes the slider out of a reader's hand."""
+    records = frontier(("3dgs", "4dgs"), ("suzanne",), 2, (1000,))
+    folder = write_all(records, tmp_path, pictures=1)
+    page = browser.new_page()
+    page.goto(build.write(records[:2], folder, reload=1).as_uri())
+    assert "2 runs" in page.locator(".summary").inner_text()
+    page.locator(".stage input").focus()
+    build.write(records, folder, reload=1)
+    page.wait_for_timeout(2500)
+    assert "2 runs" in page.locator(".summary").inner_text()
+    page.locator(".stage input").evaluate("input => input.blur()")
+    page.get_by_text("4 runs").first.wait_for(timeout=10_000)
+    page.close()
