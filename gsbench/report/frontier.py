@@ -141,8 +141,12 @@ def profile(of: Sequence[Target]) -> dict[str, Values]:
     """
     models = sorted({m for target in of for m in target.seconds})
     solved = [t for t in of if math.isfinite(min(t.seconds.values()))]
-    ratios = {m: [t.seconds.get(m, math.inf) / min(t.seconds.values()) for t in solved] for m in models}
+    ratios = {m: [_ratio(t.seconds.get(m, math.inf), min(t.seconds.values())) for t in solved] for m in models}
     return {m: np.sort(np.array(values)) for m, values in ratios.items()}
+
+
+def _ratio(seconds: float, fastest: float) -> float:
+    return 1.0 if seconds == fastest else seconds / fastest if fastest else math.inf
 
 
 def _mean(scenes: list[Values]) -> float:

@@ -11,14 +11,15 @@ import cv2
 import numpy as np
 import pytest
 from make_golden import make
-from many_records import HOSTILE, frontier, hostile, write_all
+from many_records import EFFECTS, HOSTILE, frontier, hostile, write_all
 
+from gsbench.measure.curve import Point
 from gsbench.measure.record import ViewScore
 from gsbench.report import live
 from gsbench.report.__main__ import main
 from gsbench.report.arms import groups
 from gsbench.report.page import build, cost, evidence, gallery, time_to_quality, words, worth
-from gsbench.report.page.content import Column, Runs, Table
+from gsbench.report.page.content import Canvas, Column, Runs, Table
 from gsbench.report.page.events import of as events_of
 from gsbench.report.page.palette import DARK, LIGHT, MARKERS, styles
 from gsbench.report.pictures import strip, write_png
@@ -54,6 +55,10 @@ def group(records):
     return only
 
 
+def canvas():
+    return Canvas("x", Runs(), styles(list(EFFECTS)), 8)
+
+
 def page(records, tmp_path):
     return build.render(records, tmp_path)
 
@@ -85,7 +90,7 @@ def test_sentences_where_models_tie():
     records = [dataclasses.replace(r, model=m) for m in ("a", "b") for r in frontier(("7dgs",), lengths=(1000,))]
     (answer, *_) = cost.answers(group(records))
     assert "not told apart from b" in answer.detail.lower() or answer.model == ""
-    assert "The pair is not told apart" in worth.pairs_section(group(records), "x").sentences[0]
+    assert "The pair is not told apart" in worth.pairs_section(group(records), canvas()).sentences[0]
 
 
 def test_sentences_of_one_seed():
@@ -94,9 +99,9 @@ def test_sentences_of_one_seed():
     (_, minute, *_) = cost.answers(group(records))
     assert minute.interval == words.NO_SPREAD
     assert "One seed: whether it is ahead is not known." in minute.detail
-    said = worth.pairs_section(group(records), "x")
+    said = worth.pairs_section(group(records), canvas())
     assert said.sentences[0].startswith("No spread is known from one seed.")
-    assert "95 %" not in " ".join(worth.effects_section(group(records), "x").sentences)
+    assert "95 %" not in " ".join(worth.effects_section(group(records), canvas()).sentences)
 
 
 def test_sentences_where_nothing_finished(tmp_path):
@@ -129,8 +134,7 @@ def test_a_failed_run_does_not_hide_what_finished(tmp_path):
 def test_the_best_value_is_the_tables():
     """Catches a page whose text and CSV tell different numbers."""
     records = frontier(("3dgs", "7dgs"), lengths=(250, 1000))
-    look = styles(sorted({r.model for r in records}))
-    section = cost.frontier_section(group(records), Runs(), look, "x")
+    section = cost.frontier_section(group(records), canvas())
     best = max(row[4] for row in section.table.rows if row[0] == "mean of 2 scenes")
     assert words.plain(best) in section.sentences[0]
     csv = base64.b64decode(section.table.href.partition(",")[2]).decode()
@@ -141,15 +145,14 @@ def test_the_best_value_is_the_tables():
 def test_every_figure_has_its_numbers():
     """Catches a figure without the table behind it or a text alternative."""
     of = group(frontier(**SMALL))
-    look = styles(of.models)
-    runs = Runs()
+    on = canvas()
     sections = [
-        cost.frontier_section(of, runs, look, "x"),
-        time_to_quality.quality_section(of, look, "x"),
-        worth.effects_section(of, "x"),
-        worth.stages_section(of, "x"),
-        time_to_quality.anytime_section(of, runs, look, "x"),
-        worth.pairs_section(of, "x"),
+        cost.frontier_section(of, on),
+        time_to_quality.quality_section(of, on),
+        worth.effects_section(of, on),
+        worth.stages_section(of, on),
+        time_to_quality.anytime_section(of, on),
+        worth.pairs_section(of, on),
         evidence.protocol_section(of),
     ]
     for section in sections:
@@ -382,7 +385,7 @@ def test_a_view_without_a_number_is_left_out():
     """Catches a null of one view that empties the whole page."""
     records = frontier(**SMALL)
     records[0] = dataclasses.replace(records[0], per_view=[ViewScore("test/r_000"), *records[0].per_view[1:]])
-    assert "told apart" in worth.pairs_section(group(records), "x").sentences[0]
+    assert "told apart" in worth.pairs_section(group(records), canvas()).sentences[0]
 
 
 def test_hostile_is_hostile():
@@ -400,3 +403,22 @@ def test_the_papers_points_are_marked_as_other_hardware(tmp_path):
         assert ("the paper's own number, which was measured on other hardware" in Page(text).text) == expected
         names = [run["name"] for run in json.loads(re.search(r'id="runs">(.*?)</script>', text, re.S)[1])]
         assert ("the paper's 7dgs on trex" in names) == expected
+
+
+@pytest.mark.slow
+def test_many_experiments_share_one_page(tmp_path):
+    """Catches a page that grows with the experiments: single scenes are drawn only where there is room."""
+    records = [dataclasses.replace(r, experiment=f"e{i}") for i in range(9) for r in frontier(("3dgs",), seeds=1)]
+    text = page(records, tmp_path)
+    assert len(text) < 2_000_000
+    assert "none are drawn singly; the table has all" in Page(text).text
+
+
+def test_zeros_and_single_points_can_be_drawn(tmp_path):
+    """Catches a division by zero and a scale without extent: no seconds, no bytes, one view, one point of the curve."""
+    nothing = dataclasses.replace(
+        make().cost, train_s=0.0, stage_s={}, render_ms=dataclasses.replace(make().cost.render_ms, p50=0.0), bytes=0
+    )
+    runs = [make("3dgs"), make("4dgs")]
+    runs = [dataclasses.replace(r, cost=nothing, curve=[Point(1, 0.0, 5.0)]) for r in runs]
+    assert "never" not in Page(page(runs, tmp_path)).text

@@ -12,12 +12,13 @@ from gsbench.measure.record import Record
 from gsbench.report import layout
 from gsbench.report.arms import Group, groups
 from gsbench.report.page import cost, evidence, time_to_quality, words, worth
-from gsbench.report.page.content import Runs, Section, Table
+from gsbench.report.page.content import Canvas, Runs, Section, Table
 from gsbench.report.page.gallery import View, gallery
 from gsbench.report.page.palette import DARK, LIGHT, STAGES_DARK, STAGES_LIGHT, Style, styles
 from gsbench.report.page.svg import marker
 
 FILE_NAME = "report.html"
+MOST_SCENES = 8  # that have drawings of their own, over all experiments of the page
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,9 @@ def render(records: list[Record], folder: Path, *, reload: int = 0) -> str:
     """Return the page as HTML; arguments as of `write`."""
     found = groups(records)
     look = styles(sorted({r.model for r in records}))
-    runs = Runs()
-    chapters = [_chapter(group, folder, runs, look, f"g{i}") for i, group in enumerate(found)]
+    runs, scenes = Runs(), MOST_SCENES // len(found)
+    canvases = [Canvas(f"g{i}", runs, {m: look[m] for m in group.models}, scenes) for i, group in enumerate(found)]
+    chapters = [_chapter(group, folder, canvas) for group, canvas in zip(found, canvases, strict=True)]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader(__package__, "."),
         autoescape=True,
@@ -87,27 +89,26 @@ def _variables(models: tuple[str, ...], stages: tuple[str, ...]) -> Markup:
     return Markup(";".join(named))
 
 
-def _chapter(group: Group, folder: Path, runs: Runs, look: dict[str, Style], key: str) -> Chapter:
-    own = {m: look[m] for m in group.models}
+def _chapter(group: Group, folder: Path, canvas: Canvas) -> Chapter:
     counts = [words.count(n, what) for n, what in ((len(group.records), "run"), (len(group.models), "model"))]
     counts += [words.count(len(group.scenes), "scene"), words.count(len({r.seed for r in group.records}), "seed")]
     return Chapter(
-        key=key,
+        key=canvas.name,
         title=f"experiment {group.experiment}, data {words.cut(group.dataset, 60)}",
         summary=" · ".join([*counts, words.cut(group.machine, 80)]),
         answers=cost.answers(group),
         basis=cost.basis_words(group),
         sections=[
-            cost.frontier_section(group, runs, own, key),
-            time_to_quality.quality_section(group, own, key),
-            worth.effects_section(group, key),
-            worth.stages_section(group, key),
-            time_to_quality.anytime_section(group, runs, own, key),
-            worth.pairs_section(group, key),
+            cost.frontier_section(group, canvas),
+            time_to_quality.quality_section(group, canvas),
+            worth.effects_section(group, canvas),
+            worth.stages_section(group, canvas),
+            time_to_quality.anytime_section(group, canvas),
+            worth.pairs_section(group, canvas),
             evidence.protocol_section(group),
         ],
         views=gallery([r for r in group.finished if r.variant == group.setting], folder),
         tables=evidence.paper_tables(group),
         failures=evidence.failures(group),
-        legend=list(own.items()),
+        legend=list(canvas.look.items()),
     )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from gsbench.measure.record import Record
 from gsbench.report.arms import Arm, Group
 from gsbench.report.page import words
+from gsbench.report.page.palette import Style
 
 Value = str | float | int | None
 MOST_ROWS = 60  # of a table on the page; its CSV has all
@@ -130,6 +131,16 @@ class Runs:
             command = words.command(records) if records else ""
             self.entries.append({"name": words.cut(key[-1], 160), "facts": facts, "command": command})
         return self._numbers[key]
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """What the drawings of one experiment share."""
+
+    name: str  # keeps the ids of its drawings apart from those of others
+    runs: Runs
+    look: dict[str, Style]  # by model
+    scenes: int  # that have drawings of their own
 
 
 def _facts(psnr: float, seconds: float, ms: float, mb: float) -> str:

@@ -9,13 +9,12 @@ from gsbench.report import paper
 from gsbench.report.arms import Arm, Group
 from gsbench.report.frontier import Point
 from gsbench.report.page import charts, words
-from gsbench.report.page.content import Column, Drawing, Runs, Section, Tab, Table, Value
+from gsbench.report.page.content import Canvas, Column, Drawing, Runs, Section, Tab, Table, Value
 from gsbench.report.page.palette import Style
 
 BUDGETS = (10.0, 60.0, 600.0)  # seconds of training
 FRAMES = 60.0  # a second
 AXES = (("seconds", "training seconds"), ("ms", "ms a frame"), ("mb", "MB of the model"))
-MOST_SCENES = 8  # that have drawings of their own
 MOST_RUNS = 300  # that are drawn singly in a panel
 
 
@@ -83,14 +82,14 @@ def _setting(arm: Arm) -> str:
     return f"{arm.iterations:,} iterations, " if arm.iterations else f"{arm.variant}, " if arm.variant else ""
 
 
-def frontier_section(group: Group, runs: Runs, look: dict[str, Style], name: str) -> Section:
+def frontier_section(group: Group, canvas: Canvas) -> Section:
     """Draw quality against seconds, milliseconds and megabytes, for the mean of scenes and for each scene."""
     scenes = basis(group)
     points = f.points(group, scenes)
-    tabs = [_frontier_tab(group, runs, look, f"{name}f0", _title(scenes), scenes)] if points else []
+    tabs = [_frontier_tab(group, canvas, "f0", _title(scenes), scenes)] if points else []
     single = [s for s in group.scenes if [s] != scenes and any(s in arm.runs for arm in group.arms)]
-    drawn = enumerate(single[:MOST_SCENES], 1)
-    tabs += [_frontier_tab(group, runs, look, f"{name}f{i}", s, [s]) for i, s in drawn]
+    drawn = single[: canvas.scenes]
+    tabs += [_frontier_tab(group, canvas, f"f{i}", s, [s]) for i, s in enumerate(drawn, 1)]
     columns = [Column("scene"), Column("model"), Column("setting"), Column("seeds"), Column("PSNR dB", 2)]
     columns += [Column("95 % low", 2), Column("95 % high", 2), Column("training s", 1), Column("ms a frame", 2)]
     columns += [Column("MB", 2), Column("dominated in seconds")]
@@ -98,8 +97,8 @@ def frontier_section(group: Group, runs: Runs, look: dict[str, Style], name: str
     table = Table("frontier.csv", columns, rows) if rows else None
     theirs = any(_paper(r, "ms") for r in group.finished)
     notes = ["×: the paper's own number, which was measured on other hardware by another protocol."] if theirs else []
-    if len(single) > MOST_SCENES:
-        notes.append(f"Drawn are {MOST_SCENES} of {len(single)} scenes; the table has all.")
+    if len(drawn) < len(single):
+        notes.append(f"Of {len(single)} scenes {len(drawn) or 'none'} are drawn singly; the table has all.")
     return Section(
         "frontier", "What accuracy costs", _frontier_words(group, points), tabs, table, legend=bool(tabs), notes=notes
     )
@@ -131,18 +130,21 @@ def _rows(group: Group, scenes: list[str]) -> list[list[Value]]:
     ]
 
 
-def _frontier_tab(group: Group, runs: Runs, look: dict[str, Style], name: str, label: str, scenes: list[str]) -> Tab:
+def _frontier_tab(group: Group, canvas: Canvas, name: str, label: str, scenes: list[str]) -> Tab:
     """Draw the three panels of some scenes."""
     points = f.points(group, scenes)
     drawings = []
     for cost, title in AXES:
         curves = [
-            _curve(group, runs, style, [p for p in points if p.model == m], cost, scenes) for m, style in look.items()
+            _curve(group, canvas.runs, style, [p for p in points if p.model == m], cost, scenes)
+            for m, style in canvas.look.items()
         ]
         drawn = [c for c in curves if c.best]
         if drawn:
             alt = f"PSNR in dB against {title} of {words.listing([p.arm.name for p in points][:20])}, {label}"
-            drawings.append(Drawing(f"PSNR against {title}", charts.frontier(drawn, title).svg(name + cost, alt)))
+            drawings.append(
+                Drawing(f"PSNR against {title}", charts.frontier(drawn, title).svg(canvas.name + name + cost, alt))
+            )
     return Tab(label, drawings)
 
 

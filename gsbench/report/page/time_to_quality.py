@@ -6,28 +6,26 @@ from statistics import fmean
 from gsbench.report import frontier as f
 from gsbench.report.arms import Arm, Group
 from gsbench.report.page import charts, events, words
-from gsbench.report.page.content import Column, Drawing, Runs, Section, Tab, Table, Value
-from gsbench.report.page.cost import MOST_SCENES
-from gsbench.report.page.palette import Style
+from gsbench.report.page.content import Canvas, Column, Drawing, Section, Tab, Table, Value
 
 
-def quality_section(group: Group, look: dict[str, Style], name: str) -> Section:
+def quality_section(group: Group, canvas: Canvas) -> Section:
     """Say how long each model needs for the targets, and draw the performance profile."""
     targets = f.targets(group)
     if not targets:
         return Section("quality", "Time to quality", ["No finished run has PSNR on val and training seconds."])
     ratios = f.profile(targets)
     problems = len(next(iter(ratios.values()), []))
-    panel = charts.profile({m: (look[m], list(values)) for m, values in ratios.items()}, problems)
+    panel = charts.profile({m: (canvas.look[m], list(values)) for m, values in ratios.items()}, problems)
     alt = f"Performance profile of {words.listing(list(ratios))} over {problems} targets"
-    models = [m for m in look if any(m in t.seconds for t in targets)]
+    models = [m for m in canvas.look if any(m in t.seconds for t in targets)]
     columns = [Column("scene"), Column("target"), Column("PSNR dB", 2), *(Column(f"{m} s", 1) for m in models)]
     rows: list[list[Value]] = [[t.scene, t.rule, t.psnr, *(t.seconds.get(m) for m in models)] for t in targets]
     return Section(
         "quality",
         "Time to quality",
         _quality_words(targets, models),
-        [Tab("", [Drawing("Targets reached within a factor of the fastest", panel.svg(f"{name}q", alt))])],
+        [Tab("", [Drawing("Targets reached within a factor of the fastest", panel.svg(f"{canvas.name}q", alt))])],
         Table("time_to_quality.csv", columns, rows),
         beside=True,
         legend=True,
@@ -55,7 +53,7 @@ def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
     return [text]
 
 
-def anytime_section(group: Group, runs: Runs, look: dict[str, Style], name: str) -> Section:
+def anytime_section(group: Group, canvas: Canvas) -> Section:
     """Draw PSNR on val while training, for each scene, at the common setting."""
     drawings: list[Drawing] = []
     rows: list[list[Value]] = []
@@ -69,12 +67,14 @@ def anytime_section(group: Group, runs: Runs, look: dict[str, Style], name: str)
                 marks = events.of(arm.runs[scene][0])
                 seen |= {letter for _, letters in marks for letter in letters}
                 at = [(_when(step, steps, seconds), letters) for step, letters in marks]
-                curves.append(charts.Anytime(look[arm.model], seconds, psnr, runs.of_arm(group, arm, [scene]), at))
+                curves.append(
+                    charts.Anytime(canvas.look[arm.model], seconds, psnr, canvas.runs.of_arm(group, arm, [scene]), at)
+                )
                 rows += [[scene, arm.model, *point] for point in zip(steps, seconds, psnr, strict=True)]
                 tails.setdefault(arm.model, []).append(max(psnr) - psnr[-1])
-        if curves and i < MOST_SCENES:
+        if curves and i < max(1, canvas.scenes):
             alt = f"PSNR on val against training seconds on {scene}, one curve for each of {len(curves)} models"
-            drawings.append(Drawing(scene, charts.anytime(curves).svg(f"{name}a{i}", alt)))
+            drawings.append(Drawing(scene, charts.anytime(curves).svg(f"{canvas.name}a{i}", alt)))
     if not rows:
         return Section("anytime", "While training", ["No finished run has a curve of PSNR on val."])
     columns = [Column("scene"), Column("model"), Column("iteration"), Column("seconds", 2), Column("PSNR val dB", 2)]

@@ -8,7 +8,7 @@ from gsbench.report.arms import Group
 from gsbench.report.compare import Cube, Pair, Price
 from gsbench.report.intervals import Estimate
 from gsbench.report.page import charts, words
-from gsbench.report.page.content import Column, Drawing, Section, Tab, Table, Value
+from gsbench.report.page.content import Canvas, Column, Drawing, Section, Tab, Table, Value
 
 UNITS = (("psnr", "dB", 2), ("seconds", "training s", 1), ("ms", "ms a frame", 2), ("mb", "MB", 2))
 STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer")
@@ -20,7 +20,7 @@ PARAMETRISATION = (
 )
 
 
-def effects_section(group: Group, name: str) -> Section:
+def effects_section(group: Group, canvas: Canvas) -> Section:
     """Price time, direction, AGR and their interactions in every unit, as far as the cells were run."""
     cube = compare.cube(group)
     notes = []
@@ -38,7 +38,7 @@ def effects_section(group: Group, name: str) -> Section:
         rows = [_row(price, price.costs[unit], digits) for price in cube.prices if price.costs[unit].scenes]
         if rows:
             alt = f"Change in {title} of {words.listing([row.label for row in rows])}"
-            drawings.append(Drawing(f"in {title}", charts.differences(rows, title).svg(f"{name}e{unit}", alt)))
+            drawings.append(Drawing(f"in {title}", charts.differences(rows, title).svg(f"{canvas.name}e{unit}", alt)))
     columns = [Column("effect"), Column("computed from")]
     for _, title, digits in UNITS:
         columns += [Column(title, digits), Column(f"{title}: 95 % low", digits), Column(f"{title}: high", digits)]
@@ -82,7 +82,7 @@ def _effect_words(cube: Cube) -> list[str]:
     return [s for s in said[:4] if s]
 
 
-def stages_section(group: Group, name: str) -> Section:
+def stages_section(group: Group, canvas: Canvas) -> Section:
     """Draw where the seconds of training go, by stage."""
     parts = {arm.model: found for arm in group.main_arms if (found := _stage_seconds(group, arm.model))}
     if not parts:
@@ -105,7 +105,7 @@ def stages_section(group: Group, name: str) -> Section:
         most = max(names, key=lambda s: parts[slow].get(s, 0.0) - parts[quick].get(s, 0.0))
         text += f" {slow} takes {ratio:.2g} times the seconds of {quick}, most of the difference in {most}."
     table = Table("stages.csv", columns, rows)
-    drawing = Drawing("Seconds of training by stage", panel.svg(f"{name}s", alt))
+    drawing = Drawing("Seconds of training by stage", panel.svg(f"{canvas.name}s", alt))
     return Section(
         "stages",
         "Where the seconds go",
@@ -132,7 +132,7 @@ def _stage_seconds(group: Group, model: str) -> dict[str, float]:
     return found | ({REST: rest} if rest > 0.005 * total else {}) if total > 0 else {}
 
 
-def pairs_section(group: Group, name: str) -> Section:
+def pairs_section(group: Group, canvas: Canvas) -> Section:
     """Draw the difference of every two models with its interval."""
     found = compare.pairs(group)
     if not found:
@@ -149,7 +149,7 @@ def pairs_section(group: Group, name: str) -> Section:
     columns = [Column("pair"), Column("dB", 2), Column("95 % low", 2), Column("95 % high", 2)]
     columns += [Column("ahead on % of views", 0), Column("p, Holm"), Column("told apart")]
     table = Table("pairs.csv", columns, [_pair_row(p) for p in found])
-    drawing = Drawing("Difference in PSNR", charts.differences(rows, "dB").svg(f"{name}p", alt))
+    drawing = Drawing("Difference in PSNR", charts.differences(rows, "dB").svg(f"{canvas.name}p", alt))
     first = found[0].difference
     notes = [
         f"Paired over the seeds and views that both have; intervals are of {words.over(first)}. p is adjusted after "
