@@ -1,6 +1,6 @@
-"""Group the records of an experiment by model, setting and scene, and read quantities from them.
+"""Group the records of an experiment by model, variant and scene, and read quantities from them.
 
-An arm is a model with a setting (a length of training, a capacity): what its seeds repeat, and one point of a frontier.
+An arm is a model with a variant (another length, another capacity): what its seeds repeat, and one point of a frontier.
 """
 
 import math
@@ -36,16 +36,12 @@ OF_THE_MACHINE = ("seconds", "ms")  # quantities that compare only between runs 
 
 @dataclass(frozen=True)
 class Arm:
-    """The finished runs of a model at one setting."""
+    """The finished runs of a model at one variant."""
 
     model: str
-    variant: str  # empty: the experiment's own setting
+    variant: str  # empty: as the experiment has it
     runs: dict[str, list[Record]]  # by scene, in order of the seeds
-
-    @property
-    def name(self) -> str:
-        """The model and its setting."""
-        return f"{self.model}, {self.variant}" if self.variant else self.model
+    name: str  # the model, and its variant where not all runs have the same
 
     @property
     def iterations(self) -> int | None:
@@ -87,26 +83,28 @@ class Group:
 
     @cached_property
     def arms(self) -> list[Arm]:
-        """The models with their settings that finished somewhere, the experiment's own setting first."""
+        """The models with their variants that finished somewhere, by name; without a variant first."""
         runs: dict[tuple[str, str], dict[str, list[Record]]] = {}
         for r in self.finished:
             runs.setdefault((r.model, r.variant), {}).setdefault(r.scene, []).append(r)
-        return [Arm(model, variant, scenes) for (model, variant), scenes in sorted(runs.items())]
+        several = len({variant for _, variant in runs}) > 1
+        names = {(m, v): f"{m}, {v}" if v and several else m for m, v in runs}
+        return [Arm(m, v, scenes, names[m, v]) for (m, v), scenes in sorted(runs.items())]
 
     @cached_property
-    def setting(self) -> str:
-        """The setting at which models are compared: the one that most of them share, first the experiment's own."""
+    def variant(self) -> str:
+        """The variant at which models are compared: the one that most of them share, first none."""
         shared = Counter(arm.variant for arm in self.arms)
         return min(shared, key=lambda variant: (-shared[variant], variant), default="")
 
     @cached_property
     def main_arms(self) -> list[Arm]:
-        """The arm of every model at the common setting."""
-        return [arm for arm in self.arms if arm.variant == self.setting]
+        """The arm of every model at the common variant."""
+        return [arm for arm in self.arms if arm.variant == self.variant]
 
     @cached_property
     def covered(self) -> list[str]:
-        """The scenes that every model has finished at the common setting, over which averages are taken."""
+        """The scenes that every model has finished at the common variant, over which averages are taken."""
         return [s for s in self.scenes if self.main_arms and all(s in arm.runs for arm in self.main_arms)]
 
     @cached_property

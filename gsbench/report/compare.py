@@ -17,7 +17,7 @@ PUBLISHED = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")  # first where two mo
 
 @dataclass(frozen=True)
 class Pair:
-    """How much better one model is than another at the common setting."""
+    """How much better one model is than another at the common variant."""
 
     better: Arm  # by its mean; by name where they tie
     other: Arm
@@ -32,7 +32,7 @@ class Pair:
 
 
 def pairs(group: Group) -> list[Pair]:
-    """Compare every two models at the common setting, on what both have finished; the largest difference first."""
+    """Compare every two models at the common variant, on what both have finished; the largest difference first."""
     found = []
     for a, b in itertools.combinations(group.main_arms, 2):
         difference = estimate(group.contrast([(1.0, a), (-1.0, b)], "psnr"))
@@ -91,7 +91,7 @@ class Cube:
 
 
 def cube(group: Group) -> Cube:
-    """Price every effect whose cells were run at the common setting.
+    """Price every effect whose cells were run at the common variant.
 
     An effect is priced given that the other two are on or off (12 differences), an interaction is the difference of
     two such prices (6), that of all three the difference of two interactions; the mean effects need all eight cells.

@@ -86,7 +86,7 @@ def choose(group: Group, of: Sequence[Point], cost: str, budget: float) -> Choic
     return Choice(first, level, any(math.isnan(d.low) for _, d in differences))
 
 
-_NOTHING = Point(Arm("", "", {}), Estimate(-math.inf, 0, 0, ""), {})
+_NOTHING = Point(Arm("", "", {}, ""), Estimate(-math.inf, 0, 0, ""), {})
 
 
 @dataclass(frozen=True)

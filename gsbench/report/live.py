@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, one_line
 from gsbench.measure import record as files
 from gsbench.report import tables
 from gsbench.report.page import build
@@ -53,10 +53,13 @@ def _state(folder: Path) -> State:
 def _written(folder: Path, train: bool, reload: int) -> str:
     """Write all files and say what there is; where that cannot be done, say why."""
     try:
-        records = tables.load(folder)
+        records, faults = tables.load(folder)
+        if not records:
+            return f"no record can be read: {faults[0]}"
         tables.write(records, folder, train=train)
-        page = build.write(records, folder, reload=reload)
-    except InputError as error:
-        return str(error)
+        page = build.write(records, folder, faults, reload=reload)
+    except (InputError, OSError) as error:
+        return one_line(error)
     lost = sum(r.status != "ok" for r in records)
-    return f"{len(records)} records{f', {lost} not ok' if lost else ''}: {page}"
+    counts = [(len(records), "records"), (lost, "not ok"), (len(faults), "left out")]
+    return f"{', '.join(f'{n} {what}' for n, what in counts if n)}: {page}"

@@ -42,7 +42,7 @@ def test_a_pair_is_compared_on_common_seeds_and_views():
     assert not pair.differs
 
 
-def test_only_the_common_setting_is_compared():
+def test_only_the_common_variant_is_compared():
     """Catches a short run of one model that meets a long run of another."""
     runs = [run(m, s, (v, v + s / 10)) for m, v in (("a", 20.0), ("b", 21.0)) for s in range(3)]
     found = compare.pairs(group(*runs, run("a", 0, (99.0, 99.0), variant="iterations=9000")))

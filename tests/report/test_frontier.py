@@ -14,7 +14,7 @@ from gsbench.report.frontier import Target
 
 
 def arm(model, variant, psnr, seconds, seeds=(0,), scene="suzanne"):
-    """Runs of a model at a setting whose PSNR on val is half a dB above that on test."""
+    """Runs of a model at a variant whose PSNR on val is half a dB above that on test."""
     return [
         run(
             model,

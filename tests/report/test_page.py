@@ -422,3 +422,22 @@ def test_zeros_and_single_points_can_be_drawn(tmp_path):
     runs = [make("3dgs"), make("4dgs")]
     runs = [dataclasses.replace(r, cost=nothing, curve=[Point(1, 0.0, 5.0)]) for r in runs]
     assert "never" not in Page(page(runs, tmp_path)).text
+
+
+def test_records_that_are_left_out_are_named_on_the_page(tmp_path):
+    """Catches a damaged record of which only the terminal knows."""
+    folder = write_all(frontier(**SMALL), tmp_path)
+    (folder / "damaged").mkdir()
+    (folder / "damaged" / "record.json").write_text("{<script>")
+    assert main([str(folder)]) == 1
+    text = Page((folder / "report.html").read_text()).text
+    assert "Left out" in text
+    assert "damaged/record.json: expected JSON" in text
+
+
+def test_a_variant_that_all_runs_share_is_said_once(tmp_path):
+    """Catches names of models that all carry the same words."""
+    records = [dataclasses.replace(r, variant="iterations=7") for r in frontier(**SMALL)]
+    text = Page(page(records, tmp_path)).text
+    assert "Every run with iterations=7." in text
+    assert "4dgs, iterations=7" not in text

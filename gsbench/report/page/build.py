@@ -1,5 +1,6 @@
 """Build the page of a folder of records: gather its sections, render the template, write report.html."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
@@ -18,6 +19,7 @@ from gsbench.report.page.palette import DARK, LIGHT, STAGES_DARK, STAGES_LIGHT, 
 from gsbench.report.page.svg import marker
 
 FILE_NAME = "report.html"
+MOST_FAULTS = 20  # that are listed
 MOST_SCENES = 8  # that have drawings of their own, over all experiments of the page
 
 
@@ -37,20 +39,21 @@ class Chapter:
     legend: list[tuple[str, Style]]
 
 
-def write(records: list[Record], folder: Path, *, reload: int = 0) -> Path:
+def write(records: list[Record], folder: Path, faults: Sequence[str] = (), *, reload: int = 0) -> Path:
     """Write the page of `records`, which lie in `folder`, and return its path.
 
     Args:
         records: at least one.
         folder: where the records and their pictures are, and where the page goes.
+        faults: the records that are left out, and why.
         reload: seconds after which an open page loads itself again; 0: never.
     """
     path = folder / FILE_NAME
-    write_atomically(path, render(records, folder, reload=reload).encode())
+    write_atomically(path, render(records, folder, faults, reload=reload).encode())
     return path
 
 
-def render(records: list[Record], folder: Path, *, reload: int = 0) -> str:
+def render(records: list[Record], folder: Path, faults: Sequence[str] = (), *, reload: int = 0) -> str:
     """Return the page as HTML; arguments as of `write`."""
     found = groups(records)
     look = styles(sorted({r.model for r in records}))
@@ -69,6 +72,8 @@ def render(records: list[Record], folder: Path, *, reload: int = 0) -> str:
         title=words.cut(folder.resolve().name, 80) or "results",
         chapters=chapters,
         runs=runs.entries,
+        faults=[words.cut(fault) for fault in faults[:MOST_FAULTS]],
+        more_faults=max(0, len(faults) - MOST_FAULTS),
         reload=reload,
         light=_variables(LIGHT, STAGES_LIGHT),
         dark=_variables(DARK, STAGES_DARK),
@@ -107,7 +112,7 @@ def _chapter(group: Group, folder: Path, canvas: Canvas) -> Chapter:
             worth.pairs_section(group, canvas),
             evidence.protocol_section(group),
         ],
-        views=gallery([r for r in group.finished if r.variant == group.setting], folder),
+        views=gallery([r for r in group.finished if r.variant == group.variant], folder),
         tables=evidence.paper_tables(group),
         failures=evidence.failures(group),
         legend=list(canvas.look.items()),

@@ -50,6 +50,8 @@ def basis_words(group: Group) -> str:
         return "Nothing has finished yet."
     where = scenes[0] if len(scenes) == 1 else f"the mean of {len(scenes)} scenes"
     text = f"Highest PSNR on {where} among the finished runs that fit, with the 95 % interval of seeds. "
+    alone = group.variant if len({arm.variant for arm in group.arms}) == 1 else ""
+    text += f"Every run with {alone}. " if alone else ""
     return text + _lengths(f.points(group, scenes))
 
 
@@ -62,7 +64,7 @@ def _answer(group: Group, points: list[Point], cost: str, budget: float, title: 
     if choice is None:
         return Answer(title, "", "none fits", "", f"The quickest took {write(min(known))}.")
     point = choice.point
-    detail = f"{_setting(point.arm)}{write(point.cost[cost])}. "
+    detail = f"{_length(point.arm)}{write(point.cost[cost])}. "
     others = {p.model for p in points if p.cost[cost] <= budget} - {point.model}
     if choice.level:
         detail += f"Not told apart from {words.listing([p.model for p in choice.level])}."
@@ -78,7 +80,7 @@ def _answer(group: Group, points: list[Point], cost: str, budget: float, title: 
     return Answer(title, point.model, value, words.interval(point.psnr), detail)
 
 
-def _setting(arm: Arm) -> str:
+def _length(arm: Arm) -> str:
     return f"{arm.iterations:,} iterations, " if arm.iterations else f"{arm.variant}, " if arm.variant else ""
 
 
@@ -90,7 +92,7 @@ def frontier_section(group: Group, canvas: Canvas) -> Section:
     single = [s for s in group.scenes if [s] != scenes and any(s in arm.runs for arm in group.arms)]
     drawn = single[: canvas.scenes]
     tabs += [_frontier_tab(group, canvas, f"f{i}", s, [s]) for i, s in enumerate(drawn, 1)]
-    columns = [Column("scene"), Column("model"), Column("setting"), Column("seeds"), Column("PSNR dB", 2)]
+    columns = [Column("scene"), Column("model"), Column("variant"), Column("seeds"), Column("PSNR dB", 2)]
     columns += [Column("95 % low", 2), Column("95 % high", 2), Column("training s", 1), Column("ms a frame", 2)]
     columns += [Column("MB", 2), Column("dominated in seconds")]
     rows = [row for where in [scenes, *([s] for s in single)] for row in _rows(group, where)]
@@ -116,7 +118,7 @@ def _rows(group: Group, scenes: list[str]) -> list[list[Value]]:
         [
             _title(scenes),
             p.model,
-            p.arm.variant or "the experiment's",
+            p.arm.variant or "none",
             p.psnr.seeds,
             p.psnr.mean,
             p.psnr.low,

@@ -11,13 +11,13 @@ LONGEST_NOTE = 700
 
 
 def paper_tables(group: Group) -> list[layout.Table]:
-    """Return the table of the runs at the common setting, with the rows of the paper."""
+    """Return the table of the runs at the common variant, with the rows of the paper."""
     return tables.build(_compared(group))
 
 
 def _compared(group: Group) -> list[Record]:
-    """Return the runs at the common setting; all where none has finished."""
-    return [r for r in group.records if r.variant == group.setting] or group.records
+    """Return the runs at the common variant; all where none has finished."""
+    return [r for r in group.records if r.variant == group.variant] or group.records
 
 
 def protocol_section(group: Group) -> Section:

@@ -54,7 +54,7 @@ def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
 
 
 def anytime_section(group: Group, canvas: Canvas) -> Section:
-    """Draw PSNR on val while training, for each scene, at the common setting."""
+    """Draw PSNR on val while training, for each scene, at the common variant."""
     drawings: list[Drawing] = []
     rows: list[list[Value]] = []
     tails: dict[str, list[float]] = {}
