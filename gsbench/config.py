@@ -114,6 +114,22 @@ class ProtocolConfig:
 
 
 @dataclass
+class LaunchConfig:
+    """Where and how the runs of a sweep are done: +launch=local, parallel or slurm. It changes no number of a run."""
+
+    at_once: int = -1  # runs at a time; -1: parallel takes one for each CPU, slurm as many as the cluster gives
+    partition: str | None = None  # of Slurm, as all below
+    minutes: int = 240  # the time limit of a job; a run that needs longer is saved and requeued
+    cpus: int = 4
+    gpus: int | None = None  # they are used with device=cuda
+    memory: str = "8G"  # as sbatch has it
+    setup: str = ":"  # a shell line before the run, such as `module load cuda`
+    requeues: int = 20  # how often a job that reached its time limit goes on in another one
+    signal_seconds: int = 120  # how long before its time limit a job is told to save
+    sbatch: dict[str, Any] = field(default_factory=dict)  # any other option of sbatch: +launch.sbatch.account=NAME
+
+
+@dataclass
 class Config:
     """A run, or for scene=all a run for each scene of the data set."""
 
@@ -130,6 +146,7 @@ class Config:
     train: TrainConfig = field(default_factory=TrainConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    launch: LaunchConfig = field(default_factory=LaunchConfig)
 
 
 def register_schema() -> None:

@@ -1,0 +1,80 @@
+"""Take notes while Hydra sweeps: the plan when it starts, and what became of each run when that ends.
+
+Hydra calls `Note` (conf/config.yaml: hydra.callbacks); on Slurm and with joblib it is pickled into every job.
+"""
+
+import copy
+import os
+import socket
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.utils import JobReturn
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig, open_dict, read_write
+
+from gsbench.errors import InputError
+from gsbench.measure.record import FILE_NAME
+from gsbench.sweep import plan
+from gsbench.sweep.plan import Ended, Plan
+
+
+class Note(Callback):
+    """Write plan.json when a multirun starts, and `ended/<number>.json` beside it as each of its runs ends."""
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Write the plan and say where it is."""
+        asked = plan_of(expand(config), config)
+        folder = Path(config.hydra.sweep.dir)
+        plan.write(asked, folder)
+        experiment = folder.parents[1]
+        print(f"{len(asked.runs)} runs; how far they are: python -m gsbench.sweep status {experiment}", file=sys.stderr)
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """Write down which record the run has; two commands may ask for one run in other words."""
+        if config.hydra.mode == RunMode.MULTIRUN:
+            folder = Path(config.hydra.sweep.dir)
+            plan.write_ended(folder, config.hydra.job.num, ended(config, folder.parents[2]))
+
+
+def expand(config: DictConfig) -> list[list[str]]:
+    """List the overrides of each run of a composed multirun, as Hydra's own sweeper expands them."""
+    params = [f"{key}={value}" for key, value in (config.hydra.sweeper.params or {}).items()]
+    overrides = OverridesParser.create().parse_overrides([*params, *config.hydra.overrides.task])
+    (runs,) = BasicSweeper.split_arguments(overrides, None)
+    return runs
+
+
+def plan_of(runs: Sequence[Sequence[str]], config: DictConfig) -> Plan:
+    """Describe a list of runs that this process launches under a composed config."""
+    return Plan(
+        launcher=config.hydra.runtime.choices["hydra/launcher"],
+        runs=[list(run) for run in runs],
+        hydra=list(config.hydra.overrides.hydra),
+        cwd=os.getcwd(),
+        host=socket.gethostname(),
+        pid=os.getpid(),
+        started=time.time(),
+    )
+
+
+def ended(config: DictConfig, results: Path) -> Ended:
+    """Find the record of a run that ended in this process."""
+    from gsbench.run.identity import identify  # torch is loaded where a run was done
+
+    composed = copy.deepcopy(config)
+    with read_write(composed), open_dict(composed):
+        del composed["hydra"]
+    try:
+        path = identify(composed).folder / FILE_NAME
+    except InputError as error:
+        return Ended(None, str(error))
+    if not path.exists():
+        return Ended(None, "it ended without a record")
+    return Ended(os.path.relpath(path, results), None)

@@ -1,0 +1,92 @@
+"""Write down which runs a sweep asks for, in `results/<experiment>/.sweep/<time>/plan.json`, and find such plans.
+
+A run is known by its overrides, less those that change none of its numbers (`identity`). What a run leaves (record,
+progress) has the same overrides in it, so that the two are matched without composing a config, which takes 0.1 s.
+"""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from gsbench.errors import InputError
+from gsbench.measure.atomic import write_atomically
+from gsbench.measure.schema import parse
+
+FOLDER, FILE_NAME, ENDED, JOBS = ".sweep", "plan.json", "ended", ".submitit"
+NO_NUMBER = re.compile(r"[+~]*(results|resume|launch)\b")  # overrides of them change no number of a run
+
+Identity = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The runs that one command asked for, and who launches them."""
+
+    launcher: str  # of Hydra: basic, joblib or submitit_slurm
+    runs: list[list[str]]  # the overrides of each run, in the order of the tasks of a job array
+    hydra: list[str]  # overrides of Hydra's own config
+    cwd: str  # where the command was given: relative paths in overrides start there
+    host: str
+    pid: int  # of the process that launches
+    started: float  # unix seconds
+
+
+@dataclass(frozen=True)
+class Ended:
+    """What became of one run of a plan, as the process that did it left it."""
+
+    record: str | None  # the path of its record from the folder of all results; None where there is none
+    reason: str | None  # why there is none
+
+
+def identity(overrides: Sequence[str]) -> Identity:
+    """Reduce the overrides of a run to those that decide its numbers, sorted."""
+    return tuple(sorted(one for one in overrides if not NO_NUMBER.match(one)))
+
+
+def write(plan: Plan, folder: Path) -> Path:
+    """Write a plan into the folder of its sweep and return the file's path."""
+    path = folder / FILE_NAME
+    write_atomically(path, (json.dumps(asdict(plan), indent=1) + "\n").encode())
+    return path
+
+
+def read(path: Path) -> Plan:
+    """Read a plan; raises InputError that names the file and the field."""
+    try:
+        return parse(Plan, json.loads(path.read_bytes()), str(path))
+    except (OSError, ValueError, RecursionError) as error:
+        raise error if isinstance(error, InputError) else InputError(f"{path}: expected a plan: {error}") from None
+
+
+def find(experiment: Path) -> list[Path]:
+    """List the plans of an experiment, the oldest first."""
+    return sorted((experiment / FOLDER).glob(f"*/{FILE_NAME}"))
+
+
+def write_ended(folder: Path, number: int, ended: Ended) -> None:
+    """Write down what became of run `number` of the plan in `folder`."""
+    write_atomically(folder / ENDED / f"{number}.json", json.dumps(asdict(ended)).encode())
+
+
+def read_ended(folder: Path) -> dict[int, Ended]:
+    """Read what became of the runs of the plan in `folder`, by their numbers; a damaged file says nothing."""
+    found = {}
+    for path in (folder / ENDED).glob("*.json"):
+        try:
+            found[int(path.stem)] = parse(Ended, json.loads(path.read_bytes()), str(path))
+        except (OSError, ValueError):
+            continue
+    return found
+
+
+def jobs(folder: Path) -> dict[int, str]:
+    """List the Slurm jobs of the plan in `folder` by the numbers of their runs: submitit makes a folder for each."""
+    found = {}
+    for path in (folder / JOBS).glob("[0-9]*"):
+        match = re.fullmatch(r"\d+(?:_(\d+))?", path.name)
+        if match:
+            found[int(match[1] or 0)] = path.name  # a plan of one run is a job without an array
+    return found

@@ -1,0 +1,84 @@
+"""Put the runs of an experiment back that failed, were lost or never started, by the launcher they had."""
+
+import os
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra._internal.callbacks import Callbacks
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+from hydra.types import HydraContext, RunMode
+from omegaconf import DictConfig, open_dict
+
+from gsbench.config import CONF, register_schema
+from gsbench.errors import InputError
+from gsbench.sweep import plan
+from gsbench.sweep.hooks import plan_of
+from gsbench.sweep.plan import NO_NUMBER, identity
+from gsbench.sweep.status import BROKEN, Asked, Experiment, status
+
+CONFIG_NAME = "config"
+
+
+def broken(experiment: Experiment) -> list[Asked]:
+    """List the runs that a sweep asked for and that have ended without a result."""
+    states = {identity(run.overrides): run.state for run in status(experiment)}
+    return [asked for one, asked in experiment.asked.items() if states[one] in BROKEN]
+
+
+def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfig], Any]) -> int:
+    """Launch the runs that are `broken` again and wait for them, as the first command did; return how many they were.
+
+    Args:
+        experiment: as it was read just now.
+        more: overrides of `launch`, such as more memory.
+        task: does a run of a composed config.
+
+    Raises:
+        InputError: `more` would change what is run.
+    """
+    for one in more:
+        if not NO_NUMBER.match(one) or "launch" not in one:
+            raise InputError(f"retry: expected overrides of launch, such as launch.memory=16G, got '{one}'")
+    groups: dict[tuple[str, ...], list[Asked]] = defaultdict(list)
+    for asked in broken(experiment):
+        groups[(asked.plan.cwd, *_launch(asked), *asked.plan.hydra)].append(asked)
+    for group in groups.values():
+        _relaunch(experiment, group, more, task)
+    return sum(map(len, groups.values()))
+
+
+def _launch(asked: Asked) -> list[str]:
+    """The overrides of a run that say how it is launched."""
+    return [one for one in asked.overrides if NO_NUMBER.match(one) and "launch" in one.partition("=")[0]]
+
+
+def _relaunch(
+    experiment: Experiment, group: list[Asked], more: Sequence[str], task: Callable[[DictConfig], Any]
+) -> None:
+    """Launch runs that one command asked for: their lists are no grid, so the launcher is called without a sweeper."""
+    first = group[0]
+    results = str(experiment.folder.parent.resolve())
+    os.chdir(first.plan.cwd)
+    register_schema()
+    runs = [[*(one for one in asked.overrides if not one.startswith("results=")), f"results={results}", *more]
+            for asked in group]  # fmt: skip
+    with initialize_config_dir(str(CONF), job_name="gsbench", version_base="1.3"):
+        config = compose(CONFIG_NAME, [*first.plan.hydra, *_common(runs)], return_hydra_config=True)
+        with open_dict(config):
+            config.hydra.mode = RunMode.MULTIRUN
+            config.hydra.runtime.output_dir = config.hydra.sweep.dir
+        plan.write(plan_of(runs, config), Path(config.hydra.sweep.dir))
+        print(f"{len(runs)} runs again, by {config.hydra.runtime.choices['hydra/launcher']}", file=sys.stderr)
+        context = HydraContext(config_loader=GlobalHydra.instance().config_loader(), callbacks=Callbacks(config))
+        launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=task, config=config)
+        launcher.launch(runs, 0)
+
+
+def _common(runs: list[list[str]]) -> list[str]:
+    """The overrides that all runs have, in their order: what the config of the whole is composed of."""
+    return [one for one in runs[0] if all(one in run for run in runs)]

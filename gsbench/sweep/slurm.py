@@ -1,0 +1,63 @@
+"""Ask Slurm about jobs: what is in its queue, and how jobs ended that are no longer in it."""
+
+import shutil
+import subprocess
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from gsbench.errors import one_line
+
+SECONDS = 30  # a Slurm that does not answer within them is down
+
+
+@dataclass(frozen=True)
+class Queue:
+    """The jobs that Slurm has queued or runs, by `<array>_<task>` or `<job>`; `silent` says why it did not answer."""
+
+    states: dict[str, str]  # state and, for a job that waits, what for
+    silent: str | None = None
+
+
+def queue(jobs: Iterable[str]) -> Queue:
+    """Ask squeue once for the queue's part of `jobs`; for no jobs Slurm is not asked."""
+    arrays = sorted({job.partition("_")[0] for job in jobs})
+    if not arrays:
+        return Queue({})
+    done = _ask("squeue", "--noheader", "--array", "--jobs", ",".join(arrays), "--format=%F %K %T %r")
+    if isinstance(done, str):
+        return Queue({}, done)
+    if done.returncode and "Invalid job id" not in done.stderr:  # none of the jobs is known any more
+        return Queue({}, f"squeue: {' '.join(done.stderr.split())}")
+    states = {}
+    for line in done.stdout.splitlines():
+        job, task, state, reason = line.split(maxsplit=3)
+        states[job if task == "N/A" else f"{job}_{task}"] = f"{state} {reason}" if state == "PENDING" else state
+    return Queue(states)
+
+
+def endings(jobs: Iterable[str]) -> dict[str, str]:
+    """Ask sacct once how jobs ended, such as `OUT_OF_MEMORY` or `FAILED 9:0`; empty where there is no accounting."""
+    asked = set(jobs)
+    arrays = ",".join(sorted({job.partition("_")[0] for job in asked}))
+    if not arrays:
+        return {}
+    done = _ask("sacct", "--noheader", "--parsable2", "--jobs", arrays, "--format=JobID,State,ExitCode")
+    if isinstance(done, str) or done.returncode:
+        return {}
+    found: dict[str, str] = {}
+    for line in done.stdout.splitlines():
+        name, state, code = line.split("|")
+        job, _, step = name.partition(".")
+        if job in asked and (not step or state == "OUT_OF_MEMORY"):  # the step knows of memory what its job does not
+            found[job] = state if state == "OUT_OF_MEMORY" or code == "0:0" else f"{state}, exit {code}"
+    return found
+
+
+def _ask(*command: str) -> subprocess.CompletedProcess[str] | str:
+    """Run a command of Slurm; a string says why there is no answer."""
+    if shutil.which(command[0]) is None:
+        return f"{command[0]} is not on this machine"
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return one_line(error)

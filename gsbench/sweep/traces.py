@@ -1,0 +1,108 @@
+"""Read the traces that runs left in a folder, records and progress files, without composing a config."""
+
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsbench.errors import InputError, one_line
+from gsbench.measure.record import FILE_NAME as RECORD
+from gsbench.run import progress
+from gsbench.run.progress import Progress
+from gsbench.sweep.plan import Identity, identity
+
+STALE = 600.0  # seconds after which a run on a machine that cannot be asked is taken for lost
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The end of a run, by its record."""
+
+    path: Path
+    status: str  # as in the record; `failed` where the record is damaged
+    reason: str | None
+    psnr: float | None
+    written: float  # unix seconds
+
+
+@dataclass
+class Traces:
+    """The runs that left a trace."""
+
+    outcomes: dict[Identity, Outcome] = field(default_factory=dict)
+    by_path: dict[Path, Outcome] = field(default_factory=dict)
+    progress: dict[Identity, tuple[Path, Progress]] = field(default_factory=dict)
+
+
+def read(folders: list[Path]) -> Traces:
+    """Read every record and every progress file in some folders; of two for one run, the newer one counts."""
+    found = Traces()
+    for path in _files(folders):
+        if path.name == RECORD:
+            overrides, outcome = _outcome(path)
+            of = identity(overrides) or (f"the run in {path.parent}",)  # an old record does not name its overrides
+            found.by_path[path] = outcome
+            if of not in found.outcomes or found.outcomes[of].written < outcome.written:
+                found.outcomes[of] = outcome
+        else:
+            try:
+                one = progress.read(path)
+            except InputError:
+                continue  # it was removed just now, for the run has ended; or it is damaged, and the run looks lost
+            of = identity(one.overrides)
+            if of not in found.progress or found.progress[of][1].updated < one.updated:
+                found.progress[of] = path, one
+    return found
+
+
+def _files(folders: list[Path]) -> Iterator[Path]:
+    """Find the records and progress files; hidden folders hold those of sweeps and have none."""
+    for folder in folders:
+        for at, below, names in os.walk(folder):
+            below[:] = sorted(name for name in below if not name.startswith("."))
+            for name in (RECORD, progress.FILE_NAME):
+                path = Path(at, name)
+                if name in names and path.is_file():  # a pipe would keep its reader waiting
+                    yield path
+
+
+def _outcome(path: Path) -> tuple[list[str], Outcome]:
+    """Read what a status needs of a record, which is much faster than to validate all of it."""
+    written = path.stat().st_mtime
+    try:
+        plain: Any = json.loads(path.read_bytes())
+        status, reason, metrics = plain["status"], plain["reason"], plain["metrics"] or {}
+        overrides = [str(one) for one in plain.get("overrides", [])]
+        return overrides, Outcome(path, str(status), reason and str(reason), metrics.get("psnr"), written)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        return [], Outcome(path, "failed", f"{path} is damaged ({one_line(error)}): delete it", None, written)
+
+
+def lives(pid: int, host: str, since: float) -> bool | None:
+    """Tell whether a process that lived at `since` (unix seconds) lives still; None where it is not of this machine."""
+    if host != socket.gethostname():
+        return None
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text()
+        uptime = float(Path("/proc/uptime").read_text().split()[0])
+    except OSError:
+        return _signalled(pid) if not Path("/proc/self/stat").exists() else False
+    fields = stat.rpartition(")")[2].split()  # the name before it may contain anything
+    state, started = fields[0], time.time() - uptime + int(fields[19]) / TICKS
+    return state not in "ZX" and started <= since + 1  # a later process has only got the same number
+
+
+def _signalled(pid: int) -> bool:
+    """Tell whether a process exists, where there is no /proc."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
