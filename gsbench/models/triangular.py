@@ -40,6 +40,7 @@ class TriangularModel(GaussianModel):
         scheme: str = "square_root",
         off_diagonal: str = "relative",
         directional_half: bool = True,
+        split_in_time: bool = True,
         **options: Any,
     ) -> None:
         """Make an empty model.
@@ -50,6 +51,7 @@ class TriangularModel(GaussianModel):
             scheme: of `slice_gaussians`.
             off_diagonal: the `form` of `Triangle`, which says what the parameters below the diagonal mean.
             directional_half: whether f_dir has the 1/2 of 7DGS eq. 12, which 6DGS lacks.
+            split_in_time: whether Gaussians that move are also split because of their extent in time.
             options: as `GaussianModel`.
 
         Raises:
@@ -63,6 +65,7 @@ class TriangularModel(GaussianModel):
         self.factor_order = factor_order
         self.scheme = scheme
         self.directional_half = directional_half
+        self.split_in_time = split_in_time
         # Row numbers of p, d and t in the triangular factor, and the order that sorts its rows to (p, d, t).
         letters = "".join(x * WIDTH[x] for x in FACTOR_ORDERS[factor_order] if x != "t" or "time" in self.observes)
         self.rows = {x: [i for i, letter in enumerate(letters) if letter == x] for x in "pdt"}
@@ -192,7 +195,7 @@ class TriangularModel(GaussianModel):
 
     def moves_long(self, factor: Tensor) -> Tensor:
         """Tell whether Gaussians move with time and are long in it, [N, n, n] -> [N] bool (7DGS, section 4.4)."""
-        if "time" not in self.observes:
+        if "time" not in self.observes or not self.split_in_time:
             return torch.zeros(len(factor), dtype=torch.bool, device=factor.device)
         S_pt = (factor[:, :3] @ factor[:, 6:].mT)[..., 0]
         return (S_pt.norm(dim=-1) > TIME_CORRELATION * self.extent) & (factor[:, 6].norm(dim=-1) > TIME_SCALE)

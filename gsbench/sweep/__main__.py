@@ -1,7 +1,7 @@
 """Show how far the runs of an experiment are, or put back those that did not end.
 
-    python -m gsbench.sweep status results/EXP [--watch] [--json]
-    python -m gsbench.sweep retry results/EXP [launch.memory=16G ...]
+python -m gsbench.sweep status results/EXP [--watch] [--json]
+python -m gsbench.sweep retry results/EXP [launch.memory=16G ...]
 """
 
 import argparse

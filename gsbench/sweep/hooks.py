@@ -21,8 +21,11 @@ from omegaconf import DictConfig, open_dict, read_write
 
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME
+from gsbench.run.progress import born
 from gsbench.sweep import plan
 from gsbench.sweep.plan import Ended, Plan
+
+started: list[Path] = []  # the folders of the plans of this process
 
 
 class Note(Callback):
@@ -33,6 +36,7 @@ class Note(Callback):
         asked = plan_of(expand(config), config)
         folder = Path(config.hydra.sweep.dir)
         plan.write(asked, folder)
+        started.append(folder)
         experiment = folder.parents[1]
         print(f"{len(asked.runs)} runs; how far they are: python -m gsbench.sweep status {experiment}", file=sys.stderr)
 
@@ -60,6 +64,7 @@ def plan_of(runs: Sequence[Sequence[str]], config: DictConfig) -> Plan:
         cwd=os.getcwd(),
         host=socket.gethostname(),
         pid=os.getpid(),
+        born=born(os.getpid()),
         started=time.time(),
     )
 
@@ -72,7 +77,7 @@ def ended(config: DictConfig, results: Path) -> Ended:
     with read_write(composed), open_dict(composed):
         del composed["hydra"]
     try:
-        path = identify(composed).folder / FILE_NAME
+        path = identify(composed, config.hydra.runtime.choices).folder / FILE_NAME
     except InputError as error:
         return Ended(None, str(error))
     if not path.exists():

@@ -30,6 +30,7 @@ class Plan:
     cwd: str  # where the command was given: relative paths in overrides start there
     host: str
     pid: int  # of the process that launches
+    born: int | None  # when that process started: gsbench.run.progress.born
     started: float  # unix seconds
 
 
@@ -83,10 +84,11 @@ def read_ended(folder: Path) -> dict[int, Ended]:
 
 
 def jobs(folder: Path) -> dict[int, str]:
-    """List the Slurm jobs of the plan in `folder` by the numbers of their runs: submitit makes a folder for each."""
-    found = {}
-    for path in (folder / JOBS).glob("[0-9]*"):
-        match = re.fullmatch(r"\d+(?:_(\d+))?", path.name)
-        if match:
-            found[int(match[1] or 0)] = path.name  # a plan of one run is a job without an array
-    return found
+    """List the Slurm jobs of the plan in `folder` by the numbers of their runs: submitit makes a folder for each.
+
+    An array has a folder of its own, `<array>`, beside those of its tasks, `<array>_<task>`; a single run has no array.
+    """
+    names = [path.name for path in (folder / JOBS).glob("[0-9]*")]
+    tasks = {int(name.partition("_")[2]): name for name in names if re.fullmatch(r"\d+_\d+", name)}
+    single = [name for name in names if name.isdecimal()]
+    return tasks or ({0: single[0]} if single else {})

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, open_dict
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
 from gsbench.sweep import plan
+from gsbench.sweep.finish import see_through
 from gsbench.sweep.hooks import plan_of
 from gsbench.sweep.plan import NO_NUMBER, identity
 from gsbench.sweep.status import BROKEN, Asked, Experiment, status
@@ -72,11 +73,12 @@ def _relaunch(
         with open_dict(config):
             config.hydra.mode = RunMode.MULTIRUN
             config.hydra.runtime.output_dir = config.hydra.sweep.dir
-        plan.write(plan_of(runs, config), Path(config.hydra.sweep.dir))
+        folder = Path(config.hydra.sweep.dir)
+        plan.write(plan_of(runs, config), folder)
         print(f"{len(runs)} runs again, by {config.hydra.runtime.choices['hydra/launcher']}", file=sys.stderr)
         context = HydraContext(config_loader=GlobalHydra.instance().config_loader(), callbacks=Callbacks(config))
         launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=task, config=config)
-        launcher.launch(runs, 0)
+        see_through(lambda: launcher.launch(runs, 0), [folder])
 
 
 def _common(runs: list[list[str]]) -> list[str]:

@@ -1,13 +1,15 @@
 """Decide what became of every run of an experiment, by its plans, the traces of its runs and Slurm's queue."""
 
+import socket
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gsbench.run.progress import SILENT, Progress, born, is_alive
 from gsbench.sweep import plan, slurm, traces
 from gsbench.sweep.plan import JOBS, Ended, Identity, Plan, identity
 from gsbench.sweep.slurm import Queue
-from gsbench.sweep.traces import STALE, Outcome, Progress, Traces, lives
+from gsbench.sweep.traces import Outcome, Traces
 
 STATES = ("done", "running", "queued", "planned", "failed", "lost")
 GOING = ("running", "queued", "planned")
@@ -120,11 +122,11 @@ def _kept(experiment: Experiment, asked: Asked | None) -> Outcome | None:
 
 def _alive(progress: Progress, queue: Queue) -> str | None:
     """Tell how a run with a progress file goes on: `RUNNING`, `PENDING` and what for; None where it does not."""
-    fresh = "RUNNING" if time.time() - progress.updated < STALE else None
-    if progress.job is not None:
-        return fresh if queue.silent else queue.states.get(progress.job)
-    alive = lives(progress.pid, progress.host, progress.started)
-    return fresh if alive is None else "RUNNING" if alive else None
+    if progress.job is None:
+        return "RUNNING" if is_alive(progress) else None
+    if queue.silent:
+        return "RUNNING" if time.time() - progress.updated < SILENT else None
+    return queue.states.get(progress.job)
 
 
 def _running(one: Identity, progress: Progress, alive: str) -> Run:
@@ -138,10 +140,11 @@ def _running(one: Identity, progress: Progress, alive: str) -> Run:
 
 def _launching(asked: Asked, queue: Queue) -> bool:
     """Tell whether the command that asked for a run can still start it."""
-    alive = lives(asked.plan.pid, asked.plan.host, asked.plan.started)
     if asked.job is not None:  # it is Slurm's now
         return queue.silent is not None
-    return time.time() - asked.plan.started < STALE if alive is None else alive
+    if asked.plan.host == socket.gethostname():
+        return asked.plan.born is not None and born(asked.plan.pid) == asked.plan.born
+    return time.time() - asked.plan.started < SILENT
 
 
 def _explained(experiment: Experiment, one: Identity, run: Run, endings: dict[str, str]) -> Run:

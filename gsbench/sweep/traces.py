@@ -2,8 +2,6 @@
 
 import json
 import os
-import socket
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,9 +12,6 @@ from gsbench.measure.record import FILE_NAME as RECORD
 from gsbench.run import progress
 from gsbench.run.progress import Progress
 from gsbench.sweep.plan import Identity, identity
-
-STALE = 600.0  # seconds after which a run on a machine that cannot be asked is taken for lost
-TICKS = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True)
@@ -81,28 +76,3 @@ def _outcome(path: Path) -> tuple[list[str], Outcome]:
         return overrides, Outcome(path, str(status), reason and str(reason), metrics.get("psnr"), written)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         return [], Outcome(path, "failed", f"{path} is damaged ({one_line(error)}): delete it", None, written)
-
-
-def lives(pid: int, host: str, since: float) -> bool | None:
-    """Tell whether a process that lived at `since` (unix seconds) lives still; None where it is not of this machine."""
-    if host != socket.gethostname():
-        return None
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text()
-        uptime = float(Path("/proc/uptime").read_text().split()[0])
-    except OSError:
-        return _signalled(pid) if not Path("/proc/self/stat").exists() else False
-    fields = stat.rpartition(")")[2].split()  # the name before it may contain anything
-    state, started = fields[0], time.time() - uptime + int(fields[19]) / TICKS
-    return state not in "ZX" and started <= since + 1  # a later process has only got the same number
-
-
-def _signalled(pid: int) -> bool:
-    """Tell whether a process exists, where there is no /proc."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True

@@ -7,6 +7,8 @@ Accounting (slurmdbd with MariaDB) is what real clusters have: without it, submi
 process was killed, and nobody can say why a job ended.
 """
 
+import contextlib
+import ctypes
 import getpass
 import os
 import secrets
@@ -21,6 +23,7 @@ from types import TracebackType
 
 PROGRAMS = ("munged", "mariadbd", "mariadb-install-db", "slurmdbd", "slurmctld", "slurmd", "sbatch", "sacctmgr")
 NODES = ("n1", "n2")
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
 PATH = f"{os.environ['PATH']}:/usr/sbin:/sbin"
 
 SLURM_CONF = """
@@ -56,7 +59,7 @@ SchedulerParameters=sched_interval=2,bf_interval=2,batch_sched_delay=0
 SlurmdParameters=config_overrides
 NodeName=n1 NodeHostname={host} NodeAddr=127.0.0.1 Port={n1_port} CPUs=1 RealMemory=4000
 NodeName=n2 NodeHostname={host} NodeAddr=127.0.0.1 Port={n2_port} CPUs=1 RealMemory=4000
-PartitionName=main Nodes=n1,n2 Default=YES MaxTime=60 State=UP
+PartitionName=main Nodes=n1,n2 Default=YES MaxTime=INFINITE State=UP
 """
 
 SLURMDBD_CONF = """
@@ -118,8 +121,9 @@ class Cluster:
         """Start a daemon in the foreground of a process group of its own; its output goes to NAME.out."""
         with (self.folder / f"{name}.out").open("ab") as out:
             self.daemons[name] = subprocess.Popen(
-                command, env=self.environment, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True
-            )
+                command, env=self.environment, stdin=subprocess.DEVNULL, stdout=out, stderr=out,
+                start_new_session=True, preexec_fn=end_with_parent,
+            )  # fmt: skip
 
     def start_node(self, node: str) -> None:
         """Start the slurmd of a node."""
@@ -148,8 +152,9 @@ class Cluster:
 
     def stop(self) -> None:
         """Stop every daemon, the ones that were started last first."""
-        if "slurmctld" in self.daemons:
-            self.ok("scancel", "--state=RUNNING", "--state=PENDING", "--user", getpass.getuser())
+        self.ok("scancel", "--user", getpass.getuser())
+        for pid in [pid for node in NODES for pid in self._shepherds(node)]:
+            kill(pid)
         for name, daemon in reversed(self.daemons.items()):
             daemon.send_signal(signal.SIGTERM)
             try:
@@ -188,13 +193,22 @@ class Cluster:
         key = self.folder / "munge.key"
         key.write_bytes(secrets.token_bytes(128))
         key.chmod(0o400)
-        at = [f"--{what}={self.folder}/munge.{what.removesuffix('-file')}" for what in ("key-file", "socket", "pid-file", "log-file", "seed-file")]
+        at = [
+            f"--{what}={self.folder}/munge.{what.removesuffix('-file')}"
+            for what in ("key-file", "socket", "pid-file", "log-file", "seed-file")
+        ]
         self.start("munged", "munged", "--foreground", "--force", *at)
         self._until("munged answers", (self.folder / "munge.socket").exists)
 
     def _database(self) -> None:
         data, sock = self.folder / "sql", self.folder / "sql.socket"
-        self.run("mariadb-install-db", "--no-defaults", "--user=root", f"--datadir={data}", "--auth-root-authentication-method=socket")
+        self.run(
+            "mariadb-install-db",
+            "--no-defaults",
+            "--user=root",
+            f"--datadir={data}",
+            "--auth-root-authentication-method=socket",
+        )
         self.start("mariadbd", "mariadbd", "--no-defaults", "--user=root", f"--datadir={data}", f"--socket={sock}",
                    "--bind-address=127.0.0.1", f"--port={self.sql['sql_port']}", f"--pid-file={self.folder}/sql.pid",
                    "--innodb-buffer-pool-size=64M", "--innodb-lock-wait-timeout=900")  # fmt: skip
@@ -208,6 +222,11 @@ class Cluster:
     def _dead(self) -> str | None:
         dead = [name for name, daemon in self.daemons.items() if daemon.poll() is not None]
         return f"{', '.join(dead)} ended, see {self.folder}/{dead[0]}.out" if dead else None
+
+
+def end_with_parent() -> None:
+    """Have this process told to stop (SIGTERM) when the one that started it ends, even by SIGKILL."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def wait_until(
@@ -235,13 +254,13 @@ def free_ports(count: int) -> list[int]:
 
 def descendants(pid: int) -> list[int]:
     """The children of a process, theirs, and so on."""
-    children = [int(child) for path in Path(f"/proc/{pid}/task").glob("*/children") for child in path.read_text().split()]
+    children = [
+        int(child) for path in Path(f"/proc/{pid}/task").glob("*/children") for child in path.read_text().split()
+    ]
     return [one for child in children for one in (child, *descendants(child))]
 
 
 def kill(pid: int) -> None:
     """Kill a process, if it still lives."""
-    try:
+    with contextlib.suppress(ProcessLookupError):
         os.kill(pid, signal.SIGKILL)
-    except ProcessLookupError:
-        pass

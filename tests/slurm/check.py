@@ -1,0 +1,326 @@
+"""Break a sweep on a real Slurm in every way we know, and check that nothing is lost, forgotten or different.
+
+    make slurm-check
+
+A sweep of 2 scenes x 2 models x 2 seeds is done on this machine without Slurm; that is what every number is compared
+with. Then it is done on the Slurm of cluster.py while jobs, nodes, memory, disk and data fail under it. What fails must
+be named by `python -m gsbench.sweep status` with its reason, `... retry` must complete it, and every record that comes
+out must equal the one of this machine: metrics, the curve's PSNR, and the bits of the checkpoint's tensors.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from cluster import Cluster, kill, missing, wait_until
+
+ROOT = Path(__file__).resolve().parents[2]
+SCENES, MODELS, SEEDS = ("moving-matte", "suzanne"), ("3dgs", "7dgs"), ("0", "1")
+# Runs of some ten seconds; a job that is killed loses at most one or two of them.
+TINY = ("+exp=mini", "scene.downscale=4", "data.initial_points=1000", "train.curve_points=5",
+        "train.checkpoint_minutes=0.02")  # fmt: skip
+STEPS = 400
+SHORT = (*TINY, f"train.iterations={STEPS}")
+ALL = (*SHORT, f"scene={','.join(SCENES)}", f"model={','.join(MODELS)}", f"seed={','.join(SEEDS)}")
+ONE = (*SHORT, "scene=suzanne", "model=3dgs", "seed=0")  # one of the eight, where a fault needs no more
+LONG_SECONDS = 50  # of training, for a run that is longer than the time limit of its job
+SLURM = ("+launch=slurm", "launch.cpus=1", "launch.memory=2G")
+
+
+class Sweep:
+    """A sweep in a results folder of its own, submitted to Slurm; `wait` ends when its command does."""
+
+    def __init__(self, cluster: Cluster, results: Path, *overrides: str) -> None:
+        self.cluster = cluster
+        self.results = results
+        self.log = cluster.folder / f"{results.name}.log"
+        self._start("gsbench", "-m", *SLURM, f"results={results}", *overrides)
+
+    def retry(self, *launch: str) -> None:
+        """Put back what broke, and wait for it."""
+        self._start("gsbench.sweep", "retry", str(self.results / "mini"), *launch)
+        self.wait()
+
+    def wait(self, seconds: float = 300) -> None:
+        """Wait until the command has ended, whatever became of its runs."""
+        wait_until(f"{self.log}: the end of the command", lambda: self.command.poll() is not None, seconds)
+
+    def status(self) -> list[dict[str, Any]]:
+        """What `python -m gsbench.sweep status` says of each run."""
+        done = self._run("gsbench.sweep", "status", str(self.results / "mini"), "--json")
+        return json.loads(done.stdout) if done.stdout else []
+
+    def states(self) -> list[str]:
+        """The state of each run, sorted."""
+        return sorted(run["state"] for run in self.status())
+
+    def running(self, beyond: int = 0) -> list[dict[str, Any]]:
+        """The runs that are training and beyond a step."""
+        return [run for run in self.status() if run["state"] == "running" and (run["step"] or 0) > beyond]
+
+    def until_running(self, count: int = 1, beyond: int = 0) -> list[dict[str, Any]]:
+        """Wait until so many runs are training and beyond a step."""
+        wait_until(f"{count} runs beyond step {beyond}", lambda: len(self.running(beyond)) >= count, 180, self._over)
+        return self.running(beyond)
+
+    def broken(self) -> list[str]:
+        """The reasons of the runs that failed or are lost."""
+        return [f"{run['state']}: {run['reason']}" for run in self.status() if run["state"] in ("failed", "lost")]
+
+    def trained(self, job: str) -> int:
+        """The process that trains in a Slurm job."""
+        found = [json.loads(path.read_text()) for path in self.results.rglob("progress.json")]
+        return next(one["pid"] for one in found if one["job"] == job)
+
+    def _over(self) -> str | None:
+        return f"the command has ended, see {self.log}" if self.command.poll() is not None else None
+
+    def _start(self, *module: str) -> None:
+        with self.log.open("ab") as log:
+            self.command = subprocess.Popen(
+                [sys.executable, "-m", *module], env=self.cluster.environment, cwd=ROOT, stdout=log, stderr=log
+            )
+
+    def _run(self, *module: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", *module], env=self.cluster.environment, cwd=ROOT, capture_output=True, text=True,
+            timeout=120, check=False,
+        )  # fmt: skip
+
+
+class Check:
+    """The injections, each with a line of what came of it; `reference` holds the results of this machine."""
+
+    def __init__(self, folder: Path, cluster: Cluster) -> None:
+        self.folder = folder
+        self.cluster = cluster
+        self.reference = folder / "reference"
+        self.faults: list[str] = []
+
+    def sweep(self, name: str, *overrides: str) -> Sweep:
+        """Submit a sweep into the results folder `name`."""
+        return Sweep(self.cluster, self.folder / name, *overrides)
+
+    def say(self, name: str, wanted: str, holds: bool, got: object, since: float) -> None:
+        """Print a line of an injection, and remember it if what is wanted does not hold."""
+        line = f"{name}: {wanted}: {'yes' if holds else 'NO'} ({got}; {time.monotonic() - since:.0f} s)"
+        print(("ok    " if holds else "FAULT ") + line, flush=True)
+        if not holds:
+            self.faults.append(line)
+
+    def completed(self, name: str, sweep: Sweep, runs: int, since: float) -> None:
+        """Say whether every run of a sweep is done and equals that of this machine."""
+        states = sweep.states()
+        differing = differences(self.reference, sweep.results)
+        self.say(name, f"{runs} of {runs} done, equal to this machine's", states == ["done"] * runs and not differing,
+                 differing or f"{states.count('done')} done", since)  # fmt: skip
+
+
+def killed_jobs_and_nodes(check: Check) -> None:
+    """SIGKILL of a job's process, requeue of a job, loss of a node, in one sweep of eight runs."""
+    begin = time.monotonic()
+    sweep = check.sweep("killed", *ALL)
+
+    first, second = sweep.until_running(2)[:2]
+    kill(sweep.trained(first["job"]))
+    wait_until("the killed run is lost", lambda: sweep.broken() != [], 60)
+    reasons = sweep.broken()
+    check.say("SIGKILL of a job's process", "named with its job and its end",
+              len(reasons) == 1 and f"job {first['job']} ended: FAILED" in reasons[0], reasons[0], begin)  # fmt: skip
+
+    begin = time.monotonic()
+    check.cluster.run("scontrol", "requeue", second["job"])
+    wait_until(
+        "the requeued run waits",
+        lambda: "PENDING" in check.cluster.run("squeue", "-h", "--array", "-o", "%T", "-j", second["job"]),
+        60,
+    )
+    found = [run for run in sweep.status() if run["job"] == second["job"]]
+    check.say("requeue of a running job", "queued, not lost", [run["state"] for run in found] == ["queued"],
+              f"{found[0]['state']} at step {found[0]['step']}: {found[0]['reason']}", begin)  # fmt: skip
+
+    begin = time.monotonic()
+    sweep.until_running(2)
+    check.cluster.kill_node("n2")
+    wait_until("n2 is down", lambda: check.cluster.states()["n2"].startswith("down"), 120)
+    check.cluster.start_node("n2")
+    check.say("SIGKILL of a slurmd and its jobs", "only the first injection is lost", len(sweep.broken()) == 1,
+              ", ".join(sweep.states()), begin)  # fmt: skip
+
+    wait_until("the rest is done", lambda: sweep.states() == ["done"] * 7 + ["lost"], 400)
+    sweep.wait()
+    begin = time.monotonic()
+    sweep.retry()
+    check.completed("retry after the kills", sweep, 8, begin)
+
+
+def time_limit(check: Check) -> None:
+    """A time limit that comes before the run's end: at 2 minutes less 60 s, Slurm's signal comes after 30 to 60 s."""
+    begin = time.monotonic()
+    (quick,) = check.reference.glob("mini/suzanne/7dgs*/seed0/record.json")
+    seconds = json.loads(quick.read_text())["cost"]["train_s"]
+    long = (*TINY, "scene=suzanne", "model=7dgs", "seed=0", f"train.iterations={round(STEPS * LONG_SECONDS / seconds)}")
+    do_here(check.reference, long)
+    sweep = check.sweep("limit", *long, "launch.minutes=2", "launch.signal_seconds=60")
+    sweep.wait(600)
+    log = "".join(path.read_text() for path in sweep.results.rglob("*_log.err"))
+    check.say("time limit", "saved and requeued at Slurm's signal", "goes on from step" in log,
+              f"{log.count('goes on from step')} times", begin)  # fmt: skip
+    check.completed("time limit", sweep, 1, begin)
+
+
+def out_of_memory(check: Check) -> None:
+    """A job that takes more memory than it asked for is killed by Slurm."""
+    begin = time.monotonic()
+    sweep = check.sweep("memory", *ONE, "launch.memory=100M")
+    sweep.wait()
+    reasons = sweep.broken()
+    check.say("out of memory", "named", "memory" in " ".join(reasons).lower(), reasons, begin)
+    sweep.retry("launch.memory=2G")
+    check.completed("retry with more memory", sweep, 1, begin)
+
+
+def full_disk(check: Check) -> None:
+    """The disk of the results, a tmpfs of 64 MiB, fills up while a run trains."""
+    begin = time.monotonic()
+    disk = check.folder / "disk"
+    disk.mkdir()
+    if not check.cluster.ok("mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(disk)):
+        print("full disk: not checked, mount of a tmpfs is not allowed here", flush=True)
+        return
+    try:
+        sweep = check.sweep("disk/full", *ONE)
+        sweep.until_running()
+        fill = disk / "fill"
+        with fill.open("wb", buffering=0) as file:
+            while True:
+                try:
+                    file.write(bytes(1 << 16))
+                except OSError:
+                    break
+        wait_until("the run has ended", lambda: sweep.broken() != [], 120)
+        reasons = sweep.broken()
+        check.say("full disk", "named", "No space left" in reasons[0], reasons, begin)
+        fill.unlink()
+        sweep.wait()
+        sweep.retry()
+        check.completed("retry with room", sweep, 1, begin)
+    finally:
+        check.cluster.ok("umount", str(disk))
+
+
+def corrupt_scene(check: Check) -> None:
+    """One of two scenes has a broken image."""
+    begin = time.monotonic()
+    data = check.folder / "data"
+    shutil.copytree(ROOT / "gsbench" / "scenes" / "sample", data)
+    image = sorted((data / "suzanne").rglob("*.png"))[0]
+    whole = image.read_bytes()
+    image.write_bytes(whole[: len(whole) // 2])
+    sweep = check.sweep("corrupt", *SHORT, "model=3dgs", "seed=0", f"scene={','.join(SCENES)}", f"data.root={data}")
+    sweep.wait()
+    reasons = sweep.broken()
+    check.say("corrupt scene", "the image is named, the other scene is done",
+              sweep.states() == ["done", "failed"] and image.name in reasons[0], reasons, begin)  # fmt: skip
+    image.write_bytes(whole)
+    sweep.retry()
+    check.completed("retry with the scene repaired", sweep, 2, begin)
+
+
+def two_sweeps(check: Check) -> None:
+    """Two commands ask for the same runs in the same folder at the same time."""
+    begin = time.monotonic()
+    words = [*SHORT, "scene=suzanne", "model=3dgs", "seed=0,1"]
+    sweeps = [check.sweep("twice", *words), check.sweep("twice", *words)]
+    for sweep in sweeps:
+        sweep.wait()
+    check.completed("two sweeps on one folder", sweeps[0], 2, begin)
+
+
+INJECTIONS: tuple[Callable[[Check], None], ...] = (
+    killed_jobs_and_nodes, time_limit, out_of_memory, full_disk, corrupt_scene, two_sweeps,
+)  # fmt: skip
+
+
+def differences(reference: Path, results: Path) -> list[str]:
+    """What differs between the finished runs of a folder and the same runs of the reference."""
+    found = []
+    for path in sorted(results.rglob("record.json")):
+        run = path.parent.relative_to(results)
+        ours, theirs = (json.loads((root / run / "record.json").read_text()) for root in (results, reference))
+        if ours["status"] != "ok":
+            continue
+        if ours["metrics"] != theirs["metrics"]:
+            found.append(f"{run}: metrics")
+        if [(i, psnr) for i, _, psnr in ours["curve"]] != [(i, psnr) for i, _, psnr in theirs["curve"]]:
+            found.append(f"{run}: curve")
+        if not equal(*(checkpoint(root / run / "checkpoint.pt") for root in (results, reference))):
+            found.append(f"{run}: checkpoint")
+    return found
+
+
+def checkpoint(path: Path) -> dict[str, Any]:
+    """The state in a checkpoint, less its seconds."""
+    from gsbench.train.checkpoint import read
+
+    state = read(path)[1]
+    return {key: value for key, value in state.items() if key not in ("stages", "curve")}
+
+
+def equal(one: Any, other: Any) -> bool:
+    """Whether two states are equal to the bit."""
+    if isinstance(one, torch.Tensor):
+        return isinstance(other, torch.Tensor) and one.dtype == other.dtype and torch.equal(one, other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(map(equal, one, other))
+    return bool(one == other)
+
+
+def do_here(folder: Path, overrides: tuple[str, ...]) -> None:
+    """Do runs on this machine, without Slurm, two at a time."""
+    command = [sys.executable, "-m", "gsbench", "-m", "+launch=parallel", "launch.at_once=2", *overrides,
+               f"results={folder}"]  # fmt: skip
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+
+def main(chosen: list[str]) -> int:
+    """Return 0 if every injection ended as it should, 1 if one did not, 77 where no Slurm can be brought up."""
+    reason = missing()
+    if reason:
+        print(f"slurm-check: skipped: {reason}")
+        return 77
+    begin = time.monotonic()
+    folder = Path(tempfile.mkdtemp(prefix="slurm-check-", dir="/tmp"))  # short: sockets have paths of 107 characters
+    do_here(folder / "reference", ALL)
+    print(f"the sweep on this machine: {time.monotonic() - begin:.0f} s", flush=True)
+    start = time.monotonic()
+    with Cluster(folder / "slurm") as cluster:
+        print(f"Slurm is up: {cluster.run('sinfo', '-V')}, 2 nodes, {time.monotonic() - start:.0f} s", flush=True)
+        check = Check(folder, cluster)
+        for injection in INJECTIONS:
+            if chosen and injection.__name__ not in chosen:
+                continue
+            try:
+                injection(check)
+            except RuntimeError as error:  # a wait that took too long; the others are still worth a look
+                check.faults.append(f"{injection.__name__}: {error}")
+                print(f"FAULT {check.faults[-1]}", flush=True)
+    minutes = (time.monotonic() - begin) / 60
+    print(f"{len(check.faults)} faults in {minutes:.1f} minutes" + (f"; logs: {folder}" if check.faults else ""))
+    if not check.faults:
+        shutil.rmtree(folder)
+    return 1 if check.faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,221 @@
+"""What became of each run of a sweep: by its plan, the record or progress it left, its process, and Slurm's queue."""
+
+import dataclasses
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import crowd
+import pytest
+from tiny_run import ROOT
+
+from gsbench.run import progress
+from gsbench.run.progress import Progress, born
+from gsbench.sweep import plan, show, status
+from gsbench.sweep.plan import Ended, Plan
+from gsbench.sweep.slurm import Queue
+from gsbench.sweep.status import Run
+
+RUN = ("7dgs", "lego", 0)
+WORDS = crowd.overrides(*RUN)
+HERE = {"host": socket.gethostname(), "pid": os.getpid(), "born": born(os.getpid())}
+GONE = {**HERE, "born": 1}  # a later process that was given the number of one that is gone
+FIRST, SECOND = "2026-11-22_00-00-00.000000", "2026-11-22_00-00-01.000000"
+
+
+def planned(experiment: Path, name: str = FIRST, **of: object) -> Path:
+    """Write the plan of one run, launched by this process unless told otherwise, and return its folder."""
+    one = Plan("basic", [[*WORDS, "results=somewhere"]], [], "/", **HERE, started=time.time())  # type: ignore[arg-type]
+    folder = experiment / plan.FOLDER / name
+    plan.write(dataclasses.replace(one, **of), folder)  # type: ignore[arg-type]
+    return folder
+
+
+def run_folder(experiment: Path) -> Path:
+    folder = experiment / "lego" / "7dgs" / "seed0"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def recorded(experiment: Path, **changed: object) -> Path:
+    path = run_folder(experiment) / "record.json"
+    path.write_text(json.dumps(crowd.record(*RUN) | changed, default=str))
+    return path
+
+
+def trains(experiment: Path, **of: object) -> None:
+    at = Progress(WORDS, **HERE, job=None, step=100, steps=400, seconds=50.0, psnr_val=21.5)  # type: ignore[arg-type]
+    progress.write(run_folder(experiment), dataclasses.replace(at, **of))  # type: ignore[arg-type]
+
+
+def only(experiment: Path, queue: Queue | None = None) -> Run:
+    """The status of the only run there is, with Slurm's queue as given."""
+    read = status.read(experiment)
+    if queue:
+        read.queue = queue
+    (run,) = status.status(read)
+    return run
+
+
+def test_a_run_is_planned_then_running_then_done(tmp_path: Path) -> None:
+    """Catches a plan, a progress or a record that is not matched to its run, and an ETA of nonsense."""
+    planned(tmp_path)
+    assert only(tmp_path).state == "planned"
+    trains(tmp_path)
+    run = only(tmp_path)
+    assert (run.state, run.step, run.steps, run.psnr, run.seconds_left) == ("running", 100, 400, 21.5, 150.0)
+    recorded(tmp_path)
+    os.utime(run_folder(tmp_path) / "record.json", (time.time() + 1, time.time() + 1))  # a left-over progress is older
+    run = only(tmp_path)
+    assert (run.state, run.psnr) == ("done", crowd.record(*RUN)["metrics"]["psnr"])
+
+
+@pytest.mark.parametrize(
+    ("of", "state"),
+    [
+        (HERE, "running"),
+        (GONE, "lost"),
+        ({"host": "elsewhere"}, "running"),
+        ({"host": "elsewhere", "updated": time.time() - 660}, "lost"),
+    ],
+)
+def test_a_run_is_lost_when_its_process_is_gone(tmp_path: Path, of: dict[str, object], state: str) -> None:
+    """Catches a hard death that is taken for running for ever, and a living run that is taken for lost."""
+    trains(tmp_path, **of)
+    assert only(tmp_path).state == state
+
+
+def test_a_process_that_was_killed_is_gone(tmp_path: Path) -> None:
+    """Catches a check that asks only whether the process number is in use, zombies included."""
+    sleeper = subprocess.Popen(["sleep", "60"])
+    trains(tmp_path, pid=sleeper.pid, born=born(sleeper.pid))
+    assert only(tmp_path).state == "running"
+    sleeper.kill()
+    time.sleep(0.2)
+    run = only(tmp_path)
+    sleeper.wait()
+    assert run.state == "lost"
+    assert f"process {sleeper.pid}" in str(run.reason)
+    assert "step 100 of 400" in str(run.reason)
+
+
+@pytest.mark.parametrize(
+    ("states", "state", "reason"),
+    [
+        ({"7_0": "PENDING Resources"}, "queued", "Resources"),
+        ({"7_0": "RUNNING"}, "running", None),
+        ({"7_1": "RUNNING"}, "lost", "at step 100 of 400"),
+    ],
+)
+def test_slurm_decides_about_its_jobs(tmp_path: Path, states: dict[str, str], state: str, reason: str | None) -> None:
+    """Catches a requeued job that is taken for running, and a job that Slurm forgot for anything but lost."""
+    (planned(tmp_path) / plan.JOBS / "7_0").mkdir(parents=True)
+    (tmp_path / plan.FOLDER / FIRST / plan.JOBS / "7").mkdir()  # submitit's folder of the array
+    trains(tmp_path, job="7_0", **GONE)
+    run = only(tmp_path, Queue(states))
+    assert run.state == state
+    assert run.job == "7_0"
+    assert reason is None or reason in str(run.reason)
+
+
+def test_a_job_without_a_trace_is_queued_or_lost(tmp_path: Path) -> None:
+    """Catches a submitted run that is planned for ever after its job was cancelled in the queue."""
+    (planned(tmp_path) / plan.JOBS / "7").mkdir(parents=True)  # one run: a job without an array
+    assert only(tmp_path, Queue({"7": "PENDING Priority"})).state == "queued"
+    run = only(tmp_path, Queue({}))
+    assert (run.state, run.job) == ("lost", "7")
+    assert "never started" in str(run.reason)
+
+
+def test_a_slurm_that_is_silent_is_said(tmp_path: Path) -> None:
+    """Catches runs that are lost because squeue did not answer."""
+    (planned(tmp_path) / plan.JOBS / "7").mkdir(parents=True)
+    down = Queue({}, "squeue is not on this machine")
+    assert only(tmp_path, down).state == "planned"
+    trains(tmp_path, job="7")
+    run = only(tmp_path, down)
+    assert run.state == "running"
+    assert "squeue is not on this machine" in "\n".join(show.lines(tmp_path, [run], down.silent))
+
+
+def test_a_run_that_never_started_is_lost_with_its_sweep(tmp_path: Path) -> None:
+    """Catches runs of a killed sweep that are planned for ever."""
+    planned(tmp_path, **GONE)
+    assert (only(tmp_path).state, only(tmp_path).reason) == ("lost", "never started")
+
+
+def test_failures_keep_their_reason_until_they_are_tried_again(tmp_path: Path) -> None:
+    """Catches a reason that is not shown, and a retried run that still looks failed."""
+    planned(tmp_path, started=time.time() - 100)
+    recorded(tmp_path, status="diverged", reason="step 7: loss is nan", metrics=None, cost=None)
+    run = only(tmp_path)
+    assert (run.state, run.reason) == ("failed", "diverged: step 7: loss is nan")
+    time.sleep(0.05)
+    planned(tmp_path, SECOND)
+    assert only(tmp_path).state == "planned"
+
+
+def test_one_run_in_other_words_is_one_run(tmp_path: Path) -> None:
+    """Catches a kept run that looks lost because the record names the overrides of the command that made it."""
+    recorded(tmp_path, overrides=["+exp=crowd", "model=7dgs", "scene=lego"])  # seed 0 is the default
+    folder = planned(tmp_path, **GONE)
+    plan.write_ended(folder, 0, Ended(f"{tmp_path.name}/lego/7dgs/seed0/record.json", None))
+    assert only(tmp_path).state == "done"
+
+
+def test_a_run_that_ended_without_a_record_is_failed(tmp_path: Path) -> None:
+    """Catches a refused run that is lost: nothing broke down, it was refused."""
+    plan.write_ended(planned(tmp_path), 0, Ended(None, "seed: expected >= 0, got -1"))
+    run = only(tmp_path)
+    assert (run.state, run.reason) == ("failed", "seed: expected >= 0, got -1")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"status": "ok"}', '{"status": 1, "reason": 2, "metrics": 3}', "\0"])
+def test_a_damaged_record_is_named(tmp_path: Path, text: str) -> None:
+    """Catches a record that stops the status of all others."""
+    path = recorded(tmp_path)
+    path.write_text(text)
+    run = only(tmp_path)
+    assert run.state == "failed"
+    assert str(path) in str(run.reason)
+
+
+def test_old_records_are_done(tmp_path: Path) -> None:
+    """Catches records from before overrides were kept that are dropped, or taken for one another."""
+    for seed in (0, 1):
+        path = tmp_path / "lego" / "7dgs" / f"seed{seed}" / "record.json"
+        path.parent.mkdir(parents=True)
+        plain = crowd.record("7dgs", "lego", seed)
+        del plain["overrides"]
+        path.write_text(json.dumps(plain, default=str))
+    assert [run.state for run in status.status(status.read(tmp_path))] == ["done", "done"]
+
+
+def test_only_what_differs_names_a_run() -> None:
+    """Catches a status that repeats what all runs have in common, or hides which run failed."""
+    runs = [Run(crowd.overrides("7dgs", "lego", seed), state, "why" if state == "failed" else None)
+            for seed, state in enumerate(["done", "failed", "done"])]  # fmt: skip
+    assert show.lines(Path("results/crowd"), runs) == [
+        "results/crowd: 3 runs: 2 done, 1 failed", "  failed   seed=1  why",
+    ]  # fmt: skip
+
+
+def test_a_large_sweep_is_read_in_no_time_without_torch_or_hydra(tmp_path: Path) -> None:
+    """Catches a status that composes configs, validates records, or imports what it does not need."""
+    experiment = crowd.write(500, tmp_path)
+    code = (
+        "import sys, time\n"
+        "from gsbench.sweep.__main__ import main\n"
+        "code = main(sys.argv[1:])\n"
+        "assert time.process_time() < 3, time.process_time()\n"
+        "assert not {'torch', 'hydra', 'pandas'} & sys.modules.keys()\n"
+        "sys.exit(code)"
+    )
+    command = [sys.executable, "-c", code, "status", str(experiment)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "500 runs: 490 done, 10 running" in done.stdout
