@@ -10,7 +10,7 @@ ARGS ?=
 # The CUDA kernels, compiled for five architectures, take minutes: made where a GPU is to run them. CUDA=on|auto|off.
 CUDA := $(if $(shell nvidia-smi -L 2> /dev/null),auto,off)
 
-.PHONY: help table1 test test-all stability stability-long bench gpu-check sanitize lint format setup clean
+.PHONY: help table1 test test-all stability stability-long bench gpu-check slurm-check sanitize lint format setup clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
@@ -52,6 +52,9 @@ bench: setup  ## time every kernel against the machine's own limits; results/ben
 
 gpu-check:  ## on a machine with a GPU, offline: build, test, train, sanitize and time the CUDA kernels; results/benchmarks/
 	$(PYTHON) benchmarks/gpu_check.py $(ARGS)
+
+slurm-check: setup  ## as root, with Slurm from Debian's packages: sweep on a real Slurm, break it, compare with this machine's numbers
+	$(BIN)/python tests/slurm/check.py $(ARGS)
 
 sanitize: setup  ## build the kernels with the address and undefined-behaviour sanitizers and run their tests
 	tests/kernels/sanitize.sh $(BIN)/python

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -15,6 +14,9 @@ from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError, did_you_mean
 from gsbench.run.stop import Stopped, stop_at_once
 from gsbench.sweep.axes import expand
+from gsbench.sweep.finish import see_through
+from gsbench.sweep.hooks import started
+from gsbench.sweep.task import do
 
 _failures: list[str] = []  # one line for each run that did not end well; a Hydra sweep goes on after it
 
@@ -35,17 +37,9 @@ def entry(composed: DictConfig) -> None:
                          f"{composed.data.dataset} ({', '.join(composed.data.scenes)}), each with "
                          f"transforms_{{train,val,test}}.json and the images they name. "
                          f"Published at: {composed.data.published}")  # fmt: skip
-    from gsbench.run.run import run  # imports torch
-
-    chosen = HydraConfig.get()
-    try:
-        record = run(composed, chosen.runtime.choices, chosen.overrides.task)
-        problem = None if record is None or record.status == "ok" else f"{record.status}: {record.reason}"
-    except InputError as error:
-        problem = str(error)
+    problem = do(composed)
     if problem:
         _failures.append(problem)
-        print(f"gsbench: error: {composed.scene.name}: {problem}", file=sys.stderr)
 
 
 def main() -> None:
@@ -57,7 +51,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, stop_at_once)
     try:
         sys.argv[1:] = expand(sys.argv[1:])
-        entry()
+        broken = see_through(entry, started)
     except InputError as error:
         sys.exit(f"gsbench: error: {error}")
     except (HydraException, OmegaConfBaseException) as error:
@@ -67,7 +61,10 @@ def main() -> None:
     except (Stopped, KeyboardInterrupt) as stopped:
         print(f"gsbench: {str(stopped) or 'stopped by SIGINT'}", file=sys.stderr)
         sys.exit(stopped.code if isinstance(stopped, Stopped) else 128 + signal.SIGINT)
-    sys.exit(1 if _failures else 0)
+    if broken:
+        print(f"gsbench: {len(broken)} runs did not end well: python -m gsbench.sweep status "
+              f"{started[0].parents[1]}", file=sys.stderr)  # fmt: skip
+    sys.exit(1 if _failures or broken else 0)
 
 
 def _group(name: str) -> list[str]:
@@ -78,6 +75,8 @@ def _explain(error: Exception) -> str:
     """Explain an error of Hydra or OmegaConf in one line that names the key and the nearest valid one."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
+        if group == "hydra/launcher":
+            return "+launch=slurm and +launch=parallel need packages of their own: pip install 'gsbench[cluster]'"
         return f"{group} '{name}' is not known. {did_you_mean(name, error.options)}"
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     if isinstance(cause, OmegaConfBaseException) and cause.key is not None and cause.parent_node is not None:

@@ -21,13 +21,13 @@ Plain = dict[str, Any]  # a resolved config in plain JSON
 # What is measured after a training, and where data and results lie, changes no training. `best_on_test` and
 # `eval_split` are not here: the best iteration is looked for while the model trains.
 MEASURING = (
-    "experiment", "results", "resume", "data.dataset", "data.paper_dataset", "data.published", "data.root",
+    "experiment", "results", "resume", "launch", "data.dataset", "data.paper_dataset", "data.published", "data.root",
     "data.scenes", "train.checkpoint_minutes", "protocol.name", "protocol.quantise", "protocol.lpips_alex",
     "protocol.lpips_vgg", "protocol.renders", "protocol.pictures",
 )  # fmt: skip
 OWN_NAMES = ("exp", "model", "scene")  # the groups that have a place in a run's path
 DEFAULTS = {"train": "default", "raster": "default", "protocol": "gsbench"}  # groups of conf/config.yaml
-UNNAMED = ("results", "resume")  # where results lie and whether they are kept identifies nothing
+UNNAMED = ("results", "resume", "launch")  # where results lie, whether they are kept and who runs identify nothing
 LONGEST_VARIANT = 80  # characters: several such folders must fit into a path of 255
 
 
@@ -71,7 +71,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
     for key in UNNAMED:
         del plain[key]
     plain = _storable(plain)
-    repeating = sorted(word for word in overrides if word.partition("=")[0].lstrip("+") not in (*UNNAMED, "launch"))
+    repeating = sorted(word for word in overrides if re.split("[=.]", word.lstrip("+"))[0] not in UNNAMED)
     return Run(config, plain, folder, label, variant, repeating)
 
 

@@ -1,5 +1,6 @@
 """Decide what became of every run of an experiment, by its plans, the traces of its runs and Slurm's queue."""
 
+import re
 import socket
 import time
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from gsbench.sweep.traces import Outcome, Traces
 STATES = ("done", "running", "queued", "planned", "failed", "lost")
 GOING = ("running", "queued", "planned")
 BROKEN = ("failed", "lost")
+ERROR = re.compile(r"([\w.-]+: )*\w*error\b.*", re.IGNORECASE)  # of a line of a log; a bar of progress may be before it
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,8 @@ def _last_line(log: Path) -> str:
             lines = [line.strip() for line in file.read().decode(errors="replace").splitlines() if line.strip()]
     except OSError:
         return "(no log)"
-    return ([line for line in lines if "error" in line.lower()] or lines or ["(empty)"])[-1][:200]
+    told = [match[0] for line in lines if (match := ERROR.search(line))]
+    return (told or lines or ["(empty)"])[-1][:200]
 
 
 def _ago(then: float) -> str:

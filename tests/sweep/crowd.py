@@ -8,7 +8,7 @@ Records are as long as real ones: the whole config, 20 points of curve, 20 views
 import json
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,10 +50,10 @@ def record(model: str, scene: str, seed: int) -> dict[str, Any]:
         provenance=Provenance("0" * 40, versions, "EPYC", 4, config, "c" * 64, "d" * 64, "2026-11-22T00:00:00+00:00"),
         metrics=metrics, missing={"lpips_vgg": "no trunk weights", "psnr_best_on_test": "it leaks"},
         per_view=[ViewScore(f"r_{i}", 28 + noise + i / 10, 28.0, 0.9, 0.1) for i in range(20)],
-        cost=Cost(600 + noise, {"slice": 300.0, "raster": 300.0}, RenderTimes(1.0, 2.0, 3.0), 500.0, 10**5, 10**7, 10**9),
+        cost=Cost(600 + noise, {"slice": 300, "raster": 300}, RenderTimes(1.0, 2.0, 3.0), 500.0, 10**5, 10**7, 10**8),
         curve=[Point(1500 * (i + 1), 30.0 * i, 20 + i / 3) for i in range(20)],
     )  # fmt: skip
-    return asdict(made) | {"overrides": overrides(model, scene, seed)}
+    return asdict(replace(made, overrides=overrides(model, scene, seed)))
 
 
 def write(count: int, results: Path, started: float | None = None) -> Path:
