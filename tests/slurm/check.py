@@ -11,6 +11,7 @@ out must equal the one of this machine: metrics, the curve's PSNR, and the bits 
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from cluster import Cluster, kill, missing, wait_until
+from cluster import Cluster, missing, send, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENES, MODELS, SEEDS = ("moving-matte", "suzanne"), ("3dgs", "7dgs"), ("0", "1")
@@ -130,7 +131,7 @@ def killed_jobs_and_nodes(check: Check) -> None:
     sweep = check.sweep("killed", *ALL)
 
     first, second = sweep.until_running(2)[:2]
-    kill(sweep.trained(first["job"]))
+    send(sweep.trained(first["job"]), signal.SIGKILL)
     wait_until("the killed run is lost", lambda: sweep.broken() != [], 60)
     reasons = sweep.broken()
     check.say("SIGKILL of a job's process", "named with its job and its end",

@@ -132,29 +132,29 @@ class Cluster:
     def kill_node(self, node: str) -> None:
         """Kill the slurmd of a node and everything that it started, as a power cut does."""
         slurmd = self.daemons.pop(node)
-        for process in [*descendants(slurmd.pid), *self._shepherds(node)]:
-            for one in [*descendants(process), process]:
-                kill(one)
-        kill(slurmd.pid)
+        pids = [slurmd.pid, *self._of_node(node)]
+        for number in (signal.SIGSTOP, signal.SIGKILL):  # all stand still first: one that lives would report the others
+            for pid in pids:
+                send(pid, number)
         slurmd.wait()
 
-    def _shepherds(self, node: str) -> list[int]:
-        """The slurmstepds of a node: slurmd starts them as daemons, so they are not among its children."""
-        found = []
+    def _of_node(self, node: str) -> set[int]:
+        """The processes of a node's jobs and the slurmstepds above them, which do not have the node in their names."""
+        found = set()
         for path in Path("/proc").glob("[0-9]*/environ"):
-            try:
-                mine = f"SLURMD_NODENAME={node}".encode() in path.read_bytes().split(b"\0")
-            except OSError:
-                continue
-            if mine:
-                found.append(int(path.parent.name))
+            with contextlib.suppress(OSError):
+                if f"SLURMD_NODENAME={node}".encode() in path.read_bytes().split(b"\0"):
+                    found.add(int(path.parent.name))
+                    parent = path.with_name("stat").read_text().rpartition(")")[2].split()[1]
+                    if Path(f"/proc/{parent}/cmdline").read_bytes().startswith(b"slurmstepd"):
+                        found.add(int(parent))
         return found
 
     def stop(self) -> None:
         """Stop every daemon, the ones that were started last first."""
         self.ok("scancel", "--user", getpass.getuser())
-        for pid in [pid for node in NODES for pid in self._shepherds(node)]:
-            kill(pid)
+        for pid in [pid for node in NODES for pid in self._of_node(node)]:
+            send(pid, signal.SIGKILL)
         for name, daemon in reversed(self.daemons.items()):
             daemon.send_signal(signal.SIGTERM)
             try:
@@ -252,15 +252,7 @@ def free_ports(count: int) -> list[int]:
     return ports
 
 
-def descendants(pid: int) -> list[int]:
-    """The children of a process, theirs, and so on."""
-    children = [
-        int(child) for path in Path(f"/proc/{pid}/task").glob("*/children") for child in path.read_text().split()
-    ]
-    return [one for child in children for one in (child, *descendants(child))]
-
-
-def kill(pid: int) -> None:
-    """Kill a process, if it still lives."""
+def send(pid: int, number: int) -> None:
+    """Send a signal to a process, if it still lives."""
     with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)
+        os.kill(pid, number)
