@@ -28,7 +28,7 @@ SCENES, MODELS, SEEDS = ("moving-matte", "suzanne"), ("3dgs", "7dgs"), ("0", "1"
 # Runs of some ten seconds; a job that is killed loses at most one or two of them.
 TINY = ("+exp=mini", "scene.downscale=4", "data.initial_points=1000", "train.curve_points=5",
         "train.checkpoint_minutes=0.02")  # fmt: skip
-STEPS = 400
+STEPS = 600
 SHORT = (*TINY, f"train.iterations={STEPS}")
 ALL = (*SHORT, f"scene={','.join(SCENES)}", f"model={','.join(MODELS)}", f"seed={','.join(SEEDS)}")
 ONE = (*SHORT, "scene=suzanne", "model=3dgs", "seed=0")  # one of the eight, where a fault needs no more
@@ -63,23 +63,21 @@ class Sweep:
         """The state of each run, sorted."""
         return sorted(run["state"] for run in self.status())
 
-    def running(self, beyond: int = 0) -> list[dict[str, Any]]:
-        """The runs that are training and beyond a step."""
-        return [run for run in self.status() if run["state"] == "running" and (run["step"] or 0) > beyond]
+    def training(self, count: int = 1) -> list[dict[str, Any]]:
+        """Wait until so many runs are training and have a checkpoint; return their progress, the newest last."""
+        found: list[dict[str, Any]] = []
 
-    def until_running(self, count: int = 1, beyond: int = 0) -> list[dict[str, Any]]:
-        """Wait until so many runs are training and beyond a step."""
-        wait_until(f"{count} runs beyond step {beyond}", lambda: len(self.running(beyond)) >= count, 180, self._over)
-        return self.running(beyond)
+        def trained() -> bool:
+            found[:] = [json.loads(path.read_text()) for path in self.results.rglob("progress.json")
+                        if path.with_name("checkpoint.pt").exists()]  # fmt: skip
+            return len(found) >= count
+
+        wait_until(f"{count} runs with a checkpoint", trained, 240, self._over)
+        return sorted(found, key=lambda one: one["started"])
 
     def broken(self) -> list[str]:
         """The reasons of the runs that failed or are lost."""
         return [f"{run['state']}: {run['reason']}" for run in self.status() if run["state"] in ("failed", "lost")]
-
-    def trained(self, job: str) -> int:
-        """The process that trains in a Slurm job."""
-        found = [json.loads(path.read_text()) for path in self.results.rglob("progress.json")]
-        return next(one["pid"] for one in found if one["job"] == job)
 
     def _over(self) -> str | None:
         return f"the command has ended, see {self.log}" if self.command.poll() is not None else None
@@ -130,14 +128,15 @@ def killed_jobs_and_nodes(check: Check) -> None:
     begin = time.monotonic()
     sweep = check.sweep("killed", *ALL)
 
-    first, second = sweep.until_running(2)[:2]
-    send(sweep.trained(first["job"]), signal.SIGKILL)
+    first = sweep.training()[0]
+    send(first["pid"], signal.SIGKILL)
     wait_until("the killed run is lost", lambda: sweep.broken() != [], 60)
     reasons = sweep.broken()
     check.say("SIGKILL of a job's process", "named with its job and its end",
               len(reasons) == 1 and f"job {first['job']} ended: FAILED" in reasons[0], reasons[0], begin)  # fmt: skip
 
     begin = time.monotonic()
+    second = sweep.training()[-1]
     check.cluster.run("scontrol", "requeue", second["job"])
     wait_until(
         "the requeued run waits",
@@ -149,7 +148,8 @@ def killed_jobs_and_nodes(check: Check) -> None:
               f"{found[0]['state']} at step {found[0]['step']}: {found[0]['reason']}", begin)  # fmt: skip
 
     begin = time.monotonic()
-    sweep.until_running(2)
+    wait_until("a job on n2", lambda: check.cluster.states()["n2"] == "alloc", 120)
+    sweep.training()
     check.cluster.kill_node("n2")
     wait_until("n2 is down", lambda: check.cluster.states()["n2"].startswith("down"), 120)
     check.cluster.start_node("n2")
@@ -199,7 +199,7 @@ def full_disk(check: Check) -> None:
         return
     try:
         sweep = check.sweep("disk/full", *ONE)
-        sweep.until_running()
+        sweep.training()
         fill = disk / "fill"
         with fill.open("wb", buffering=0) as file:
             while True:
@@ -272,7 +272,7 @@ def checkpoint(path: Path) -> dict[str, Any]:
     """The state in a checkpoint, less its seconds."""
     from gsbench.train.checkpoint import read
 
-    state = read(path)[1]
+    state = read(path).state
     return {key: value for key, value in state.items() if key not in ("stages", "curve")}
 
 
