@@ -8,6 +8,7 @@ be named by `python -m gsbench.sweep status` with its reason, `... retry` must c
 out must equal the one of this machine: metrics, the curve's PSNR, and the bits of the checkpoint's tensors.
 """
 
+import contextlib
 import json
 import os
 import shutil
@@ -16,12 +17,18 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from cluster import Cluster, missing, send, wait_until
+
+from gsbench.errors import InputError
+from gsbench.run.progress import FILE_NAME as PROGRESS
+from gsbench.run.progress import Progress, is_alive
+from gsbench.run.progress import read as read_progress
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENES, MODELS, SEEDS = ("moving-matte", "suzanne"), ("3dgs", "7dgs"), ("0", "1")
@@ -63,17 +70,26 @@ class Sweep:
         """The state of each run, sorted."""
         return sorted(run["state"] for run in self.status())
 
-    def training(self, count: int = 1) -> list[dict[str, Any]]:
-        """Wait until so many runs are training and have a checkpoint; return their progress, the newest last."""
-        found: list[dict[str, Any]] = []
+    def training(self) -> list[Progress]:
+        """The runs that train at this moment and have a checkpoint, the newest last."""
+        found = []
+        for path in self.results.rglob(PROGRESS):
+            with contextlib.suppress(InputError):  # it ended just now
+                if path.with_name("checkpoint.pt").exists() and is_alive(one := read_progress(path)):
+                    found.append(one)
+        return sorted(found, key=lambda one: one.started)
 
-        def trained() -> bool:
-            found[:] = [json.loads(path.read_text()) for path in self.results.rglob("progress.json")
-                        if path.with_name("checkpoint.pt").exists()]  # fmt: skip
-            return len(found) >= count
+    def one_training(self, node: str = "n1,n2") -> Progress:
+        """Wait until a run trains on a node and has a checkpoint; return the newest."""
+        found: list[Progress] = []
 
-        wait_until(f"{count} runs with a checkpoint", trained, 240, self._over)
-        return sorted(found, key=lambda one: one["started"])
+        def trains() -> bool:
+            jobs = self.cluster.run("squeue", "-h", "--array", "--states=RUNNING", "-w", node, "-o", "%F_%K").split()
+            found[:] = [one for one in self.training() if one.job in jobs or f"{one.job}_N/A" in jobs]
+            return bool(found)
+
+        wait_until(f"a run with a checkpoint on {node}", trains, 240, self._over)
+        return found[-1]
 
     def broken(self) -> list[str]:
         """The reasons of the runs that failed or are lost."""
@@ -128,36 +144,37 @@ def killed_jobs_and_nodes(check: Check) -> None:
     begin = time.monotonic()
     sweep = check.sweep("killed", *ALL)
 
-    first = sweep.training()[0]
-    send(first["pid"], signal.SIGKILL)
+    killed = sweep.one_training()
+    send(killed.pid, signal.SIGKILL)
     wait_until("the killed run is lost", lambda: sweep.broken() != [], 60)
     reasons = sweep.broken()
     check.say("SIGKILL of a job's process", "named with its job and its end",
-              len(reasons) == 1 and f"job {first['job']} ended: FAILED" in reasons[0], reasons[0], begin)  # fmt: skip
+              len(reasons) == 1 and f"job {killed.job} ended: FAILED" in reasons[0], reasons[0], begin)  # fmt: skip
 
     begin = time.monotonic()
-    second = sweep.training()[-1]
-    check.cluster.run("scontrol", "requeue", second["job"])
+    job = str(sweep.one_training().job)
+    check.cluster.run("scontrol", "requeue", job)
     wait_until(
         "the requeued run waits",
-        lambda: "PENDING" in check.cluster.run("squeue", "-h", "--array", "-o", "%T", "-j", second["job"]),
+        lambda: "PENDING" in check.cluster.run("squeue", "-h", "--array", "-o", "%T", "-j", job),
         60,
     )
-    found = [run for run in sweep.status() if run["job"] == second["job"]]
+    found = [run for run in sweep.status() if run["job"] == job]
     check.say("requeue of a running job", "queued, not lost", [run["state"] for run in found] == ["queued"],
               f"{found[0]['state']} at step {found[0]['step']}: {found[0]['reason']}", begin)  # fmt: skip
 
     begin = time.monotonic()
-    wait_until("a job on n2", lambda: check.cluster.states()["n2"] == "alloc", 120)
-    sweep.training()
+    sweep.one_training("n2")
     check.cluster.kill_node("n2")
     wait_until("n2 is down", lambda: check.cluster.states()["n2"].startswith("down"), 120)
     check.cluster.start_node("n2")
     check.say("SIGKILL of a slurmd and its jobs", "only the first injection is lost", len(sweep.broken()) == 1,
               ", ".join(sweep.states()), begin)  # fmt: skip
 
-    wait_until("the rest is done", lambda: sweep.states() == ["done"] * 7 + ["lost"], 400)
-    sweep.wait()
+    begin = time.monotonic()
+    sweep.wait(400)
+    check.say("the other seven", "done", sweep.states() == ["done"] * 7 + ["lost"], ", ".join(sweep.states()), begin)
+
     begin = time.monotonic()
     sweep.retry()
     check.completed("retry after the kills", sweep, 8, begin)
@@ -199,7 +216,7 @@ def full_disk(check: Check) -> None:
         return
     try:
         sweep = check.sweep("disk/full", *ONE)
-        sweep.training()
+        sweep.one_training()
         fill = disk / "fill"
         with fill.open("wb", buffering=0) as file:
             while True:
@@ -313,7 +330,8 @@ def main(chosen: list[str]) -> int:
                 continue
             try:
                 injection(check)
-            except RuntimeError as error:  # a wait that took too long; the others are still worth a look
+            except Exception as error:  # the others are still worth a look
+                traceback.print_exc()
                 check.faults.append(f"{injection.__name__}: {error}")
                 print(f"FAULT {check.faults[-1]}", flush=True)
     minutes = (time.monotonic() - begin) / 60
