@@ -6,6 +6,7 @@ python -m gsbench.sweep retry results/EXP [launch.memory=16G ...]
 
 import argparse
 import json
+import os
 import sys
 import time
 from dataclasses import asdict
@@ -41,6 +42,9 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
+    except BrokenPipeError:  # who read it has seen enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
 
 
 def _show(folder: Path, as_json: bool) -> list[Run]:

@@ -15,7 +15,9 @@ from gsbench.sweep.traces import Outcome, Traces
 STATES = ("done", "running", "queued", "planned", "failed", "lost")
 GOING = ("running", "queued", "planned")
 BROKEN = ("failed", "lost")
-ERROR = re.compile(r"([\w.-]+: )*\w*error\b.*", re.IGNORECASE)  # of a line of a log; a bar of progress may be before it
+# Of a log's lines, those that name a cause, and those that speak of an error: a bar of progress may stand before it.
+CAUSE = re.compile(r"exceeded.* memory|oom.kill|out of memory|no space left", re.IGNORECASE)
+ERROR = re.compile(r"([\w.-]+: )*\w*error\b.*", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,13 @@ def read(folder: Path) -> Experiment:
     found = Experiment(folder)
     for path in plan.find(folder):
         whole, at = plan.read(path), path.parent
-        ended, jobs = plan.read_ended(at), plan.jobs(at)
+        ended, jobs_of = plan.read_ended(at), plan.jobs(at)
         for number, overrides in enumerate(whole.runs):
-            found.asked[identity(overrides)] = Asked(overrides, whole, at, jobs.get(number), ended.get(number))
+            found.asked[identity(overrides)] = Asked(overrides, whole, at, jobs_of.get(number), ended.get(number))
     found.traces = traces.read(parts)
-    jobs_of_plans = {one.job for one in found.asked.values() if one.job}
-    found.queue = slurm.queue(jobs_of_plans | {one.job for _, one in found.traces.progress.values() if one.job})
+    done = {one for one, outcome in found.traces.outcomes.items() if outcome.status == "ok"}
+    jobs = {asked.job for one, asked in found.asked.items() if asked.job and one not in done}
+    found.queue = slurm.queue(jobs | {one.job for _, one in found.traces.progress.values() if one.job})
     return found
 
 
@@ -157,20 +160,21 @@ def _explained(experiment: Experiment, one: Identity, run: Run, endings: dict[st
     asked = experiment.asked.get(one)
     if asked and asked.job == run.job:
         log = asked.folder / JOBS / run.job / f"{run.job}_0_log.err"
-        parts.append(f"its log ends: {_last_line(log)}; {log}")
+        parts.append(f"its log ends: {_told(log)}; {log}")
     return Run(**{**vars(run), "reason": "; ".join(parts)})
 
 
-def _last_line(log: Path) -> str:
-    """Return the last line of a log that speaks of an error, else its last line."""
+def _told(log: Path) -> str:
+    """Return the last line of a log that names a cause, else that speaks of an error, else its last line."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, log.stat().st_size - 8192))
             lines = [line.strip() for line in file.read().decode(errors="replace").splitlines() if line.strip()]
     except OSError:
         return "(no log)"
-    told = [match[0] for line in lines if (match := ERROR.search(line))]
-    return (told or lines or ["(empty)"])[-1][:200]
+    errors = [match[0] for line in lines if (match := ERROR.search(line))]
+    causes = [line for line in errors if CAUSE.search(line)]
+    return (causes or errors or lines or ["(empty)"])[-1][:200]
 
 
 def _ago(then: float) -> str:

@@ -19,7 +19,7 @@ from gsbench.measure.speed import RenderTimes
 from gsbench.run.progress import FILE_NAME as PROGRESS
 from gsbench.run.progress import Progress
 from gsbench.sweep import plan
-from gsbench.sweep.plan import Plan
+from gsbench.sweep.plan import Ended, Plan
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr")
 SCENES = ("bouncingballs", "hellwarrior", "hook", "jumpingjacks", "lego", "mutant", "standup", "trex")
@@ -60,13 +60,17 @@ def write(count: int, results: Path, started: float | None = None) -> Path:
     """Write the sweep into `results`/crowd and return that folder."""
     experiment = results / "crowd"
     asked = Plan("basic", [overrides(*run) for run in runs(count)], [], "/", "elsewhere", 1, 1, started or time.time())
-    plan.write(asked, experiment / plan.FOLDER / "2026-11-22_00-00-00.000000")
+    at_plan = experiment / plan.FOLDER / "2026-11-22_00-00-00.000000"
+    plan.write(asked, at_plan)
+    (at_plan / plan.ENDED).mkdir()
     for number, run in enumerate(runs(count)):
         model, scene, seed = run
         folder = experiment / scene / model / f"seed{seed}"
         folder.mkdir(parents=True)
         if number % UNFINISHED:
             (folder / "record.json").write_text(json.dumps(record(*run), default=str))
+            ended = Ended(str(folder.relative_to(results) / "record.json"), None)
+            (at_plan / plan.ENDED / f"{number}.json").write_text(json.dumps(asdict(ended)))
         else:
             at = Progress(
                 overrides(*run), host="elsewhere", pid=1, born=1, job=None, step=100, steps=30_000, seconds=9.0
