@@ -126,7 +126,8 @@ class Check:
 
     def say(self, name: str, wanted: str, holds: bool, got: object, since: float) -> None:
         """Print a line of an injection, and remember it if what is wanted does not hold."""
-        line = f"{name}: {wanted}: {'yes' if holds else 'NO'} ({got}; {time.monotonic() - since:.0f} s)"
+        shown = str(got).replace(f"{self.folder}/", "")
+        line = f"{name}: {wanted}: {'yes' if holds else 'NO'} ({shown}; {time.monotonic() - since:.0f} s)"
         print(("ok    " if holds else "FAULT ") + line, flush=True)
         if not holds:
             self.faults.append(line)
@@ -201,7 +202,7 @@ def out_of_memory(check: Check) -> None:
     sweep = check.sweep("memory", *ONE, "launch.memory=100M")
     sweep.wait()
     reasons = sweep.broken()
-    check.say("out of memory", "named", "memory limit" in reasons[0], reasons, begin)
+    check.say("out of memory", "named", "memory limit" in reasons[0], reasons[0], begin)
     sweep.retry("launch.memory=2G")
     check.completed("retry with more memory", sweep, 1, begin)
 
@@ -226,7 +227,7 @@ def full_disk(check: Check) -> None:
                     break
         wait_until("the run has ended", lambda: sweep.broken() != [], 120)
         reasons = sweep.broken()
-        check.say("full disk", "named", "No space left" in reasons[0], reasons, begin)
+        check.say("full disk", "named", "No space left" in reasons[0], reasons[0], begin)
         fill.unlink()
         sweep.wait()
         sweep.retry()
@@ -247,7 +248,7 @@ def corrupt_scene(check: Check) -> None:
     sweep.wait()
     reasons = sweep.broken()
     check.say("corrupt scene", "the image is named, the other scene is done",
-              sweep.states() == ["done", "failed"] and image.name in reasons[0], reasons, begin)  # fmt: skip
+              sweep.states() == ["done", "failed"] and image.name in reasons[0], reasons[0], begin)  # fmt: skip
     image.write_bytes(whole)
     sweep.retry()
     check.completed("retry with the scene repaired", sweep, 2, begin)
