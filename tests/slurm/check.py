@@ -233,7 +233,7 @@ def full_disk(check: Check) -> None:
         sweep.retry()
         check.completed("retry with room", sweep, 1, begin)
     finally:
-        check.cluster.ok("umount", str(disk))
+        check.cluster.ok("umount", "--lazy", str(disk))  # a log may still be open
 
 
 def corrupt_scene(check: Check) -> None:
