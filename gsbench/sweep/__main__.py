@@ -75,6 +75,7 @@ def _retry(folder: Path, launch: list[str]) -> int:
     from gsbench.sweep.retry import retry  # imports Hydra, which a status does not need
     from gsbench.sweep.task import do
 
+    folder = folder.resolve()  # runs are launched from the folder that the first command was given in
     count = retry(read(folder), launch, do)
     if not count:
         print(f"{folder}: nothing failed, is lost or was never started", file=sys.stderr)

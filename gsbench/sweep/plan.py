@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.schema import parse
+from gsbench.reading import MAX_JSON, parse_json, read_file
 
 FOLDER, FILE_NAME, ENDED, JOBS = ".sweep", "plan.json", "ended", ".submitit"
 NO_NUMBER = re.compile(r"[+~]*(results|resume|launch)\b")  # overrides of them change no number of a run
@@ -56,10 +56,7 @@ def write(plan: Plan, folder: Path) -> Path:
 
 def read(path: Path) -> Plan:
     """Read a plan; raises InputError that names the file and the field."""
-    try:
-        return parse(Plan, json.loads(path.read_bytes()), str(path))
-    except (OSError, ValueError, RecursionError) as error:
-        raise error if isinstance(error, InputError) else InputError(f"{path}: expected a plan: {error}") from None
+    return parse(Plan, parse_json(read_file(path, str(path), MAX_JSON), str(path)), str(path))
 
 
 def find(experiment: Path) -> list[Path]:
@@ -77,8 +74,8 @@ def read_ended(folder: Path) -> dict[int, Ended]:
     found = {}
     for path in (folder / ENDED).glob("*.json"):
         try:
-            found[int(path.stem)] = parse(Ended, json.loads(path.read_bytes()), str(path))
-        except (OSError, ValueError):
+            found[int(path.stem)] = parse(Ended, json.loads(read_file(path, str(path), MAX_JSON)), str(path))
+        except ValueError:  # InputError too
             continue
     return found
 

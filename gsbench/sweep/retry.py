@@ -17,6 +17,7 @@ from omegaconf import DictConfig, open_dict
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
 from gsbench.sweep import plan
+from gsbench.sweep.axes import SCENES_DEPEND_ON, scenes_of
 from gsbench.sweep.finish import see_through
 from gsbench.sweep.hooks import plan_of
 from gsbench.sweep.plan import NO_NUMBER, identity
@@ -66,6 +67,8 @@ def _relaunch(
     results = str(experiment.folder.parent.resolve())
     os.chdir(first.plan.cwd)
     register_schema()
+    # Scenes that have no file in conf/ become choices of the group `scene`, as when the command was given.
+    scenes_of([one for one in first.overrides if one.partition("=")[0].lstrip("+") in SCENES_DEPEND_ON])
     runs = [[*(one for one in asked.overrides if not one.startswith("results=")), f"results={results}", *more]
             for asked in group]  # fmt: skip
     with initialize_config_dir(str(CONF), job_name="gsbench", version_base="1.3"):

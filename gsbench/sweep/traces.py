@@ -9,6 +9,7 @@ from typing import Any
 
 from gsbench.errors import InputError, one_line
 from gsbench.measure.record import FILE_NAME as RECORD
+from gsbench.reading import MAX_JSON, read_file
 from gsbench.run import progress
 from gsbench.run.progress import Progress
 from gsbench.sweep.plan import Identity, identity
@@ -70,7 +71,7 @@ def _outcome(path: Path) -> tuple[list[str], Outcome]:
     """Read what a status needs of a record, which is much faster than to validate all of it."""
     written = path.stat().st_mtime
     try:
-        plain: Any = json.loads(path.read_bytes())
+        plain: Any = json.loads(read_file(path, str(path), MAX_JSON))
         status, reason, metrics = plain["status"], plain["reason"], plain["metrics"] or {}
         overrides = [str(one) for one in plain.get("overrides", [])]
         return overrides, Outcome(path, str(status), reason and str(reason), metrics.get("psnr"), written)
