@@ -122,12 +122,14 @@ def test_slurm_decides_about_its_jobs(tmp_path: Path, states: dict[str, str], st
     assert reason is None or reason in str(run.reason)
 
 
-def test_a_job_without_a_trace_is_queued_or_lost(tmp_path: Path) -> None:
-    """Catches a submitted run that is planned for ever after its job was cancelled in the queue."""
-    (planned(tmp_path) / plan.JOBS / "7").mkdir(parents=True)  # one run: a job without an array
-    assert only(tmp_path, Queue({"7": "PENDING Priority"})).state == "queued"
+@pytest.mark.parametrize(("folders", "job"), [(["7"], "7"), (["7", "7_0"], "7_0")])
+def test_a_job_without_a_trace_is_queued_or_lost(tmp_path: Path, folders: list[str], job: str) -> None:
+    """Catches a submitted run that is planned for ever after its job was cancelled, and an array taken for its task."""
+    for name in folders:
+        (planned(tmp_path) / plan.JOBS / name).mkdir(parents=True)
+    assert only(tmp_path, Queue({job: "PENDING Priority"})).state == "queued"
     run = only(tmp_path, Queue({}))
-    assert (run.state, run.job) == ("lost", "7")
+    assert (run.state, run.job) == ("lost", job)
     assert "never started" in str(run.reason)
 
 
