@@ -10,7 +10,7 @@ ARGS ?=
 # The CUDA kernels, compiled for five architectures, take minutes: made where a GPU is to run them. CUDA=on|auto|off.
 CUDA := $(if $(shell nvidia-smi -L 2> /dev/null),auto,off)
 
-.PHONY: help table1 test test-all stability stability-long bench gpu-check slurm-check sanitize lint format setup clean
+.PHONY: help table1 frontier test test-all stability stability-long bench gpu-check slurm-check sanitize lint format setup clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
@@ -32,6 +32,14 @@ table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR on the em
 	@status=0; \
 	$(BIN)/python -m gsbench --multirun +exp=mini model=$(MODELS) $(ARGS) || status=$$?; \
 	$(BIN)/python -m gsbench.report results/mini || status=$$?; \
+	exit $$status
+
+frontier: setup  ## train the five models at five lengths and three capacities, three seeds each, two runs at a time; about 30 minutes
+	@status=0; for axis in train.iterations=250,500,1000,2000,4000 train.densify.grad_threshold=1e-4,4e-4; do \
+		$(BIN)/python -m gsbench --multirun +exp=frontier +launch=parallel launch.at_once=2 \
+			model=$(MODELS) seed=0,1,2 $$axis $(ARGS) || status=$$?; \
+	done; \
+	$(BIN)/python -m gsbench.report results/frontier || status=$$?; \
 	exit $$status
 
 test: lint  ## lint, types and all tests but the slow ones
