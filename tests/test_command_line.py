@@ -44,7 +44,7 @@ def test_help_lists_what_there_is_without_torch() -> None:
         (["+exp=mini", "model.options.schem=schur"], ["model.options.schem", "Did you mean 'scheme'"]),
         (["+exp=mini", "model.options.scheme=shur"], ["scheme 'shur'", "Did you mean 'schur'"]),
         (["+exp=mini", "scene.downscale=7"], ["downscale", "7"]),
-        (["model=7dgs"], ["+exp=NAME", "dnerf, mini, pbr, stability"]),
+        (["model=7dgs"], ["+exp=NAME", "ablation, dnerf, frontier, mini, pbr, stability"]),
         (["+exp=dnerf"], ["data.root", "transforms_", "albertpumarola/D-NeRF"]),
         (["+exp=dnerf", "scene=trex", "data.root=/nowhere"], ["/nowhere/trex", "transforms_", "D-NeRF"]),
         (["+exp=mini", "scene=custom", "scene.name=../sample"], ["scene: expected a name", "../sample"]),

@@ -56,8 +56,9 @@ def requested() -> Iterator[Request]:
         yield request
         return
     for number in SIGNALS:
-        if number == signal.SIGUSR2 and signal.getsignal(number) == signal.SIG_DFL:
-            continue  # nobody here means it as a request
+        before = signal.getsignal(number)
+        if before == signal.SIG_IGN or (number == signal.SIGUSR2 and before == signal.SIG_DFL):
+            continue  # a shell's background process ignores SIGINT; SIGUSR2 is a request only where submitit listens
         request._before[number] = signal.signal(number, request._ask)
     try:
         yield request

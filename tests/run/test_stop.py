@@ -26,8 +26,9 @@ def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def started(*arguments: str, results: Path) -> subprocess.Popen[str]:
     """A run in a process of its own, once it trains."""
     process = subprocess.Popen(
-        command(*arguments), cwd=ROOT, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+        command(*arguments), cwd=ROOT, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests in the background ignore it
+    )  # fmt: skip
     deadline = time.monotonic() + 120
     while not list(results.rglob(progress.FILE_NAME)) and time.monotonic() < deadline:
         assert process.poll() is None, process.communicate()
@@ -87,10 +88,25 @@ def test_the_handler_of_before_acts_once_the_run_has_saved() -> None:
 
 def test_a_second_signal_ends_at_once() -> None:
     """Catches a process that cannot be stopped while it saves to a disk that hangs."""
-    with stop.requested():
-        os.kill(os.getpid(), signal.SIGINT)
-        with pytest.raises(KeyboardInterrupt):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with stop.requested():
             signal.raise_signal(signal.SIGINT)
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_signal_that_is_ignored_stays_ignored() -> None:
+    """Catches a sweep in the background of a script that ends when its terminal is told Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stop.requested() as request:
+            signal.raise_signal(signal.SIGINT)
+            assert request.signal is None
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_leftovers_of_killed_processes_go(square: Path, tmp_path: Path) -> None:
