@@ -44,6 +44,8 @@ def test_help_lists_what_there_is_without_torch() -> None:
         (["+exp=mini", "model.options.schem=schur"], ["model.options.schem", "Did you mean 'scheme'"]),
         (["+exp=mini", "model.options.scheme=shur"], ["scheme 'shur'", "Did you mean 'schur'"]),
         (["+exp=mini", "scene.downscale=7"], ["downscale", "7"]),
+        (["+exp=mini", "data.scenes=[]"], ["data.scenes", "empty list"]),
+        (["+exp=mini", "model=1e400"], ["model '1e400'", "Valid: 3dgs"]),
         (["model=7dgs"], ["+exp=NAME", "ablation, dnerf, frontier, mini, pbr, stability"]),
         (["+exp=dnerf"], ["data.root", "transforms_", "albertpumarola/D-NeRF"]),
         (["+exp=dnerf", "scene=trex", "data.root=/nowhere"], ["/nowhere/trex", "transforms_", "D-NeRF"]),
@@ -104,6 +106,30 @@ def test_other_numbers_are_another_run(square: Path, tmp_path: Path) -> None:
         assert f"iterations={one.curve[-1].iteration}" in one.variant.split(",")
     assert len(record.find(tmp_path)) == 2
     assert gsbench(*sweep).stdout.count("finished before, kept") == 2
+
+
+def test_a_finished_run_outlives_a_later_attempt_that_fails(tmp_path: Path) -> None:
+    """Catches a finished record that a refused attempt overwrites, a table that still shows it as the run's result, and
+    a training that is repeated once its data is back."""
+    data = write_moving_square(tmp_path / "data")
+    arguments = overrides(data, tmp_path / "r", "model=3dgs")
+    assert gsbench(*arguments).returncode == 0
+    (path,) = record.find(tmp_path / "r")
+    first = path.read_bytes()
+    image = data / "square" / "test" / "r_0.png"
+    kept = image.read_bytes()
+    image.write_bytes(kept[:60])
+    assert gsbench(*arguments).returncode == 1
+    refused = record.read(path)
+    assert refused.status == "failed"
+    assert refused.reason is not None
+    assert "truncated" in refused.reason
+    assert refused.reason.endswith("(what an earlier run measured is kept in record.stale.json)")
+    assert path.with_name("record.stale.json").read_bytes() == first
+    image.write_bytes(kept)
+    assert "finished before, kept" in gsbench(*arguments).stdout
+    assert path.read_bytes() == first
+    assert not path.with_name("record.stale.json").exists()
 
 
 def test_what_is_measured_trains_nothing_again(square: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -136,6 +137,8 @@ def write(record: Record, folder: Path) -> None:
             path.replace(stale)
     except InputError:
         pass  # no record, or a damaged one
+    if stale.exists():
+        record = replace(record, reason=f"{record.reason} (what an earlier run measured is kept in {STALE})")
     records.write(record, path)
 
 
