@@ -34,7 +34,7 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
         The record, which is on disk whatever its status is; None where another process is at this run.
 
     Raises:
-        InputError: the run has no name that can be a folder, or its folder cannot be written.
+        InputError: the run has no name that can be a folder, or its folder or its record cannot be written.
         Stopped: the process was told to end; the checkpoint is saved.
     """
     this = identify(composed, choices, overrides)
@@ -56,7 +56,10 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
         record = attempt.describe("diverged", reason)
     except (InputError, MemoryError, OSError, RuntimeError) as error:
         record = attempt.describe("failed", reason_of(error))
-    write(record, this.folder)
+    try:
+        write(record, this.folder)
+    except OSError as error:  # the other runs of the sweep go on; this one's checkpoint is what it was
+        raise InputError(f"{summary(record)}; its record cannot be written: {error.strerror}") from None
     (this.folder / progress.FILE_NAME).unlink(missing_ok=True)
     print(f"{this.name}: {summary(record)}; {this.folder / records.FILE_NAME}")
     attempt.draw()

@@ -3,6 +3,7 @@
 Every case is a run of three steps in this process with one to three random overrides. It may end well, or be refused.
 """
 
+import errno
 import io
 import random
 import re
@@ -25,6 +26,7 @@ from gsbench.measure import record
 from gsbench.run.identity import flat
 from gsbench.run.run import run
 from gsbench.sweep.axes import expand
+from gsbench.train import checkpoint
 
 SAMPLE, ALL = 30, 700
 NUMBERS = ("0", "1", "-1", "2", "0.5", "1e-3", "1e39", "-1e-9", "nan", "inf", "-inf", "1.5", "9223372036854775807",
@@ -128,6 +130,29 @@ def test_a_sample_of_hostile_overrides_is_refused_or_runs(square: Path, tmp_path
 def test_all_hostile_overrides_are_refused_or_run(square: Path, tmp_path: Path) -> None:
     """The same for many more."""
     check(range(SAMPLE, ALL), square, tmp_path)
+
+
+def test_a_full_disk_is_one_runs_end(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a disk without room for a record that ends the whole sweep in a stack trace, or loses the training."""
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    composed = hydra.compose("config", overrides(square, tmp_path, "model=3dgs", "train.iterations=3"))
+    with monkeypatch.context() as patched:
+        patched.setattr(record, "write", full)
+        with pytest.raises(InputError, match="its record cannot be written: No space left on device"):
+            run(composed)
+        assert len(list(tmp_path.rglob("checkpoint.pt"))) == 1
+    done = run(composed)
+    assert done is not None
+    assert done.status == "ok"
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoint, "save", full)
+        composed.seed = 1
+        done = run(composed)
+    assert done is not None
+    assert (done.status, done.reason) == ("failed", "a file: No space left on device")
 
 
 @pytest.mark.parametrize(
