@@ -242,15 +242,16 @@ class GaussianModel(nn.Module, ABC):
         """
         means = state.get("splats.means")
         N = len(means) if isinstance(means, Tensor) and means.dim() else 0
-        own = {name: list(value.shape) for name, value in self.state_dict().items()}
-        expected = {name: [N, *shape[1:]] if name.startswith("splats.") else shape for name, shape in own.items()}
+        own = self.state_dict()
+        shapes = {name: list(value.shape) for name, value in own.items()}
+        expected = {name: [N, *shape[1:]] if name.startswith("splats.") else shape for name, shape in shapes.items()}
         got = {name: list(value.shape) if isinstance(value, Tensor) else value for name, value in state.items()}
         for name in sorted(expected.keys() | got.keys()):
             if name not in expected or expected[name] != got.get(name):
                 raise InputError(f"checkpoint: not of this model: expected {name} of shape "
                                  f"{expected.get(name, 'none')}, got {got.get(name, 'none')!s:.60}")  # fmt: skip
-            if state[name].dtype != self.state_dict()[name].dtype or state[name].layout != torch.strided:
-                raise InputError(f"checkpoint: not of this model: expected {name} of {self.state_dict()[name].dtype}, "
+            if state[name].dtype != own[name].dtype or state[name].layout != torch.strided:
+                raise InputError(f"checkpoint: not of this model: expected {name} of {own[name].dtype}, "
                                  f"got {state[name].dtype}, {state[name].layout}")  # fmt: skip
         for name, parameter in self.splats.items():
             parameter.data = torch.empty(state[f"splats.{name}"].shape, dtype=parameter.dtype, device=parameter.device)

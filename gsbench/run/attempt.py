@@ -46,8 +46,8 @@ class Attempt:
         self.scene: Scene | None = None
         self._shown: list[tuple[npt.ArrayLike, npt.ArrayLike]] = []
 
-    def prepare(self) -> Trainer:
-        """Check everything that can be refused before step 0, load the scene and build the trainer.
+    def prepare(self) -> tuple[GaussianModel, Scene]:
+        """Check everything that can be refused before step 0, build the model and load the scene.
 
         Raises:
             InputError: the config, the device or the data has a fault.
@@ -56,23 +56,23 @@ class Attempt:
         self.model = build(self.config)
         self.scene = scene = load_scene(self.config)
         check_scene(self.model, scene, self.config)
-        views = evaluated_views(scene, self.config.scene.eval_split)
+        evaluated_views(scene, self.config.scene.eval_split)
         records.check(self.describe("failed", "not run"), "planned record")
-        random = generator(self.config.seed)
-        points = scene.points or initial_points(self.config.data, scene, random)
-        self.model.initialise(points, scene.extent, random)
-        self.model.to(self.config.device)
-        return Trainer(self.model, scene, views, self.config)
+        return self.model, scene
 
-    def fit(self, trainer: Trainer) -> None:
+    def fit(self, model: GaussianModel, scene: Scene) -> Trainer:
         """Train to the end, from the checkpoint in the run's folder if there is one of this training.
 
         Raises:
-            InputError: the checkpoint is damaged.
+            InputError: a training image or the checkpoint is damaged, or a parameter has no learning rate.
             DivergedError: a loss or gradient was not finite.
             Stopped: the process was told to end; the checkpoint is saved.
         """
-        this, scene = self.this, trainer.scene
+        this, random = self.this, generator(self.config.seed)
+        points = scene.points or initial_points(self.config.data, scene, random)
+        model.initialise(points, scene.extent, random)
+        model.to(self.config.device)
+        trainer = Trainer(model, scene, evaluated_views(scene, self.config.scene.eval_split), self.config)
         reset_peak_memory(self.config.device)
         path, hashes = this.folder / checkpoint.FILE_NAME, (training_hash(this.plain), scene.fingerprint)
         state = checkpoint.load(path, *hashes, self.config.device) if self.config.resume else None
@@ -84,7 +84,8 @@ class Attempt:
             report = progress.Reporter(this.folder, this.overrides, self.config.train.iterations)
 
             def goes_on() -> bool:
-                report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
+                if report.is_due():
+                    report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
                 return request.signal is None
 
             trainer.run(lambda state: checkpoint.save(path, Checkpoint(*hashes, state, *about)), this.name, goes_on)
@@ -100,6 +101,7 @@ class Attempt:
         if not len(trainer.model):
             raise InputError("no Gaussian is left: the training pruned all of them; look at train.densify, "
                              "model.min_opacity and data.initial_half_width")  # fmt: skip
+        return trainer
 
     def measure(self, trainer: Trainer) -> Record:
         """Measure the images, the speed and the size of a fitted model."""

@@ -43,7 +43,7 @@ def write(folder: Path, progress: Progress) -> None:
 
 
 class Reporter:
-    """Writes the progress of a run from inside its training, at most every EVERY seconds."""
+    """Writes the progress of a run from inside its training, when it is due."""
 
     def __init__(self, folder: Path, overrides: list[str], steps: int) -> None:
         """Say at once that the run in `folder`, of so many steps, has started."""
@@ -52,10 +52,12 @@ class Reporter:
         write(folder, self.progress)
         self._written = time.monotonic()
 
+    def is_due(self) -> bool:
+        """Tell whether the last report is EVERY seconds old; what is reported may cost a wait for the GPU."""
+        return time.monotonic() - self._written >= EVERY
+
     def __call__(self, step: int, seconds: float, last: Point | None) -> None:
         """Report finished steps, seconds of training and the last point of the curve."""
-        if time.monotonic() - self._written < EVERY:
-            return
         psnr = last.psnr_val if last else None
         self.progress = dataclasses.replace(
             self.progress, step=step, seconds=seconds, psnr_val=psnr, updated=time.time()

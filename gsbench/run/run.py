@@ -44,13 +44,12 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
     remove_leftovers(this.folder)
     attempt = Attempt(this)
     try:
-        trainer = attempt.prepare()
-        done = finished(this, trainer.scene.fingerprint)
+        model, scene = attempt.prepare()
+        done = finished(this, scene.fingerprint)
         if done is not None:
             print(f"{this.name}: finished before, kept: {summary(done)}; {this.folder / records.FILE_NAME}")
             return done
-        attempt.fit(trainer)
-        record = attempt.measure(trainer)
+        record = attempt.measure(attempt.fit(model, scene))
     except DivergedError as error:
         reason = f"{error}; {explain(attempt.model)}" if attempt.model else str(error)
         record = attempt.describe("diverged", reason)

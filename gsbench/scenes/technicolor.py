@@ -154,9 +154,6 @@ def _read_views(
     first, last = listed[0].frame, listed[-1].frame
     where = str(listed[0].path)
     size = images.png_size(images.read_png(listed[0].path, where), where)
-    if size[0] % downscale or size[1] % downscale:
-        raise InputError(f"{where}: expected a downscale that divides the image, got downscale={downscale} for "
-                         f"{size[0]}x{size[1]}")  # fmt: skip
     cameras = [_camera(row, size[0] // downscale, size[1] // downscale, downscale) for row in rows]
 
     def read(image: _Image) -> tuple[View, str]:
