@@ -12,6 +12,7 @@ from gsbench.measure import record as files
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import METRICS, Record
 from gsbench.report import layout, paper
+from gsbench.report.arms import groups
 from gsbench.report.conditions import conditions, printable
 from gsbench.report.layout import EMPTY, Column, Row, Section, Table
 
@@ -93,10 +94,7 @@ def _quantities(r: Record) -> dict[str, Any]:
 
 def build(records: list[Record], *, train: bool = False) -> list[Table]:
     """Make a table for every experiment and data set in `records`, sorted by name; `train` adds `psnr_train`."""
-    groups: dict[tuple[str, str], list[Record]] = {}
-    for record in sorted(records, key=lambda r: (r.experiment, r.dataset, r.scene, r.model, r.variant, r.seed)):
-        groups.setdefault((record.experiment, record.dataset), []).append(record)
-    return [_Builder(group, train).table() for group in groups.values()]
+    return [_Builder(group.records, train).table() for group in groups(records)]
 
 
 class _Builder:

@@ -4,7 +4,6 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy.typing as npt
 import torch
@@ -22,7 +21,7 @@ from gsbench.models import GaussianModel
 from gsbench.models.replay import Replay
 from gsbench.report.pictures import strip, write_png
 from gsbench.run import progress, stop
-from gsbench.run.checks import check_config, check_scene, evaluated_views
+from gsbench.run.checks import check_config, check_scene, evaluated_views, lpips_weights
 from gsbench.run.identity import Run, training_hash
 from gsbench.run.load import plain_description
 from gsbench.run.setup import build, load_scene
@@ -106,8 +105,6 @@ class Attempt:
     def measure(self, trainer: Trainer) -> Record:
         """Measure the images, the speed and the size of a fitted model."""
         config, views = self.config, trainer.views
-        given = {"alex": config.protocol.lpips_alex, "vgg": config.protocol.lpips_vgg}
-        weights = {backbone: Path(file).expanduser() for backbone, file in given.items() if file}
         pictures = config.protocol.pictures
         chosen = range(0, len(views), max(1, len(views) // max(1, pictures)))[:pictures]
 
@@ -119,7 +116,10 @@ class Attempt:
                 yield view.name, render, truth
 
         quality = evaluate(
-            images(), background=trainer.scene.background, quantised=config.protocol.quantise, weights=weights
+            images(),
+            background=trainer.scene.background,
+            quantised=config.protocol.quantise,
+            weights=lpips_weights(config),
         )
         frame, made = frames(trainer, views[0])
         times = time_renders(

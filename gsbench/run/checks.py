@@ -65,9 +65,14 @@ def check_config(config: Config) -> None:
         _check_rate(f"model.lr.{name}", rate)
     check_device(config.device)
     resolve(config.raster.backend, torch.device(config.device).type)
-    for backbone, file in (("alex", config.protocol.lpips_alex), ("vgg", config.protocol.lpips_vgg)):
-        if file:
-            perceptual.load(backbone, Path(file).expanduser(), config.device)
+    for backbone, file in lpips_weights(config).items():
+        perceptual.load(backbone, file, config.device)
+
+
+def lpips_weights(config: Config) -> dict[str, Path]:
+    """Return the files of LPIPS' trunks that the config names, by backbone."""
+    given = {"alex": config.protocol.lpips_alex, "vgg": config.protocol.lpips_vgg}
+    return {backbone: Path(file).expanduser() for backbone, file in given.items() if file}
 
 
 def check_keys(value: Any, kind: Any, place: str) -> None:
