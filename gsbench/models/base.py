@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -39,6 +40,14 @@ class Conditioned(NamedTuple):
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
     gate: Tensor  # [N] f_temp f_dir in [0, 1], a factor of the opacity
+
+
+class Classes(NamedTuple):
+    """Which rows of a model pay for which effect: rows are ordered refined (AGR) | sliced | still."""
+
+    refined: int  # this many first rows are moved by AGR
+    sliced: int  # this many first rows (refined <= sliced) change with the query; the others are still
+    levels: Tensor | None  # [N] int32: the harmonics of a row's colours, degree + 4 (waves - 1); None: all of them
 
 
 @dataclass(frozen=True)
@@ -116,6 +125,32 @@ class GaussianModel(nn.Module, ABC):
         """Return the raw appearance that has the colour dc [N, 3] (degree 0) in every direction and at every time."""
         rest = dc.new_zeros(len(dc), (self.sh_degree + 1) ** 2 - 1, 3)
         return {"sh0": dc[:, None], "shN": rest}
+
+    def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
+        """Freeze effects at their weighted mean over queries: raw parameters that change, by the name of what is frozen.
+
+        The last, `still`, changes with no query. A model whose slice never changes has nothing to freeze.
+
+        Args:
+            raw: parameters without AGR.
+            queries: V of them.
+            weights: [V, N], of which each Gaussian's sum to 1.
+        """
+        return {}
+
+    def full_level(self) -> int:
+        """Return the level of colour (see `Classes.levels`) in use."""
+        return self.phase.sh_degree
+
+    def lower_levels(self) -> list[int]:
+        """List the levels of colour (see `Classes.levels`) below the one in use."""
+        return list(range(self.phase.sh_degree))
+
+    def cut(self, raw: Raw, levels: Tensor) -> Raw:
+        """Zero the coefficients of `shN` above the level [N] of each Gaussian."""
+        degrees = torch.tensor([math.isqrt(k) for k in range(1, (self.sh_degree + 1) ** 2)], dtype=levels.dtype)
+        keep = degrees.to(levels.device) <= levels[:, None] % 4
+        return {"sh0": raw["sh0"], "shN": raw["shN"] * keep[..., None]}
 
     def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
         """Compute the colours [N, 3] of a slice; a model whose colours are not these harmonics overrides it.

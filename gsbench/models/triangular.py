@@ -1,6 +1,7 @@
 """Slice 6D and 7D Gaussians by their triangular factor, for 6DGS and 7DGS."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from gsbench.kernels.slices import observe_triangular
 from gsbench.kernels.thresholds import EXPONENT_MAX
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle
+from gsbench.models.freezing import freeze
 from gsbench.models.query import Query, unit
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.scene import Points
@@ -166,8 +168,13 @@ class TriangularModel(GaussianModel):
             T_qq = torch.cat([T_qq[:, :-1], torch.where(in_time[..., None], T_qq[:, -1:] / SHRINK, T_qq[:, -1:])], 1)
         p_rows = torch.cat([gain @ T_qq, T_pp], -1)
         q_rows = torch.cat([T_qq, T_pp.new_zeros(len(T_qq), T_qq.shape[1], 3)], -1)
-        factor = torch.cat([p_rows, q_rows], 1)[:, self._own_order()]
+        factor = torch.cat([p_rows, q_rows], 1)[:, self.own_order()]
         return children | self.triangle.parameters(factor)
+
+    @torch.no_grad()
+    def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
+        """Freeze t, d and both, by `gsbench.models.freezing.freeze`."""
+        return freeze(self, raw, queries, weights)
 
     def factors(self, raw: Raw) -> Tensor:
         """Compute the triangular factor with its rows sorted to (p, d, t), [N, n, n]."""
@@ -188,7 +195,7 @@ class TriangularModel(GaussianModel):
         k = factor.shape[-1] - 3
         return Reduced(factor[:, 3:, :k], factor[:, :3, :k], factor[:, :3, k:])
 
-    def _own_order(self) -> list[int]:
+    def own_order(self) -> list[int]:
         """Return the place in (p, d, t) of each row of the triangular factor."""
         sorted_rows = self.rows["p"] + self.rows["d"] + self.rows["t"]
         return sorted(range(len(sorted_rows)), key=sorted_rows.__getitem__)

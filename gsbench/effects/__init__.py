@@ -1,0 +1,1 @@
+"""Choose the effects that a scene, and each of its Gaussians, calls for: time, direction, AGR, harmonics."""

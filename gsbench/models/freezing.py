@@ -1,0 +1,98 @@
+"""Freeze time, direction or both in Gaussians with triangular factors (6DGS, 7DGS)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from gsbench.kernels.thresholds import LOG_SIZE_MAX
+from gsbench.models.base import Raw
+from gsbench.models.query import Query, unit
+from gsbench.models.slicing import Reduced, gain_of, reduce, whiten
+
+if TYPE_CHECKING:
+    from gsbench.models.triangular import TriangularModel
+
+OPACITY_MARGIN = 1e-6  # between an opacity and 0 or 1, whose logits are infinite
+
+
+def freeze(
+    model: TriangularModel,
+    raw: Raw,
+    queries: Sequence[Query],
+    weights: Tensor,  # [V, N], of which each Gaussian's sum to 1
+) -> dict[str, Raw]:
+    """Freeze t, d and both at their weighted means over queries; return the raw parameters that each changes.
+
+    The slice of (T_qq, K, T_pp) is mu_p + K (q - mu_q) with the factor T_pp. Freezing a variable zeroes its column of
+    K; the mean keeps what the column did to it on average, and the opacity what f_temp or f_dir did. Its standard
+    deviation becomes exp(LOG_SIZE_MAX), so that no query is far from its mean.
+
+    Args:
+        model: has the layout of the factor, lambda_t and lambda_d.
+        raw: parameters, AGR already in them.
+        queries: V of them.
+        weights: of the queries, for each Gaussian.
+    """
+    blocks = Reduced(*(block.double() for block in reduce(model.factors(raw))))
+    gain = gain_of(blocks.T_pq, blocks.T_qq)
+    by_name = {"time": [3], "direction": [0, 1, 2], "still": [0, 1, 2, 3]}
+    if "time" not in model.observes:
+        by_name = {"still": [0, 1, 2]}
+    shift = sum(w[:, None].double() * _delta(model, raw, q) for q, w in zip(queries, weights, strict=True))
+    changed = {}
+    for name, columns in by_name.items():
+        gate = sum(w.double() * _gate(model, blocks, _delta(model, raw, q), columns)
+                   for q, w in zip(queries, weights, strict=True))  # fmt: skip
+        assert isinstance(shift, Tensor) and isinstance(gate, Tensor)
+        moved = raw["means"] + (gain[..., columns] @ shift[:, columns, None])[..., 0]
+        opacity = (torch.sigmoid(raw["opacities"].double()) * gate).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+        new = model.triangle.parameters(_without(model, blocks, gain, columns)) | {"means": moved}
+        new["opacities"] = torch.logit(opacity)
+        for center, own in (("times", 3), ("directions", 0)):
+            if own in columns and center in raw:
+                new[center] = torch.zeros_like(raw[center])
+        changed[name] = {key: value.to(raw["means"].dtype) for key, value in new.items()}
+    return changed
+
+
+def _delta(model: TriangularModel, raw: Raw, query: Query) -> Tensor:
+    """Compute q - mu_q, [N, k], ordered (d, t)."""
+    delta = unit(raw["means"] - query.center) - raw["directions"]
+    if "time" in model.observes:
+        assert query.time is not None
+        delta = torch.cat([delta, query.time - raw["times"]], -1)
+    return delta.double()
+
+
+def _gate(model: TriangularModel, blocks: Reduced, delta: Tensor, columns: list[int]) -> Tensor:
+    """Compute the product of f_dir and f_temp [N], of those whose variable is frozen (7DGS eq. 11 and 12)."""
+    exponent = torch.zeros_like(delta[:, 0])
+    if 0 in columns:
+        half = 0.5 if model.directional_half else 1.0
+        white = whiten(blocks.T_qq[:, :3, :3], delta[:, :3])
+        exponent = exponent + half * model.modulation("direction").double() * white.square().sum(-1)
+    if 3 in columns:
+        distance = delta[:, 3] / blocks.T_qq[:, 3].norm(dim=-1)
+        exponent = exponent + 0.5 * model.modulation("time").double() * distance.square()
+    return torch.exp(-exponent)
+
+
+def _without(model: TriangularModel, blocks: Reduced, gain: Tensor, columns: list[int]) -> Tensor:
+    """Compute the factor [N, n, n] in the model's own order whose slices depend on no frozen variable."""
+    T_qq, kept = blocks.T_qq.clone(), gain.clone()
+    if 0 in columns and T_qq.shape[-1] > 3:  # t is no longer measured by d: its own deviation becomes its whole one
+        deviation = T_qq[:, 3].norm(dim=-1)
+        T_qq[:, 3] = 0
+        T_qq[:, 3, 3] = deviation
+    for column in columns:
+        T_qq[:, column] = 0
+        T_qq[:, column, column] = math.exp(LOG_SIZE_MAX)
+        kept[..., column] = 0
+    p_rows = torch.cat([kept @ T_qq, blocks.T_pp], -1)
+    q_rows = torch.cat([T_qq, torch.zeros_like(T_qq[..., :3])], -1)
+    return torch.cat([p_rows, q_rows], 1)[:, model.own_order()]
