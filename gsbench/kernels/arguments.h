@@ -21,7 +21,7 @@ namespace gsb {
 
 // Gaussians with a triangular factor over (p, d) or (p, t, d), observed from a place and at a time (6DGS, 7DGS).
 struct TriangularArgs {
-    int64_t N;
+    int64_t N, sliced;  // rows from `sliced` on are still: no query changes them
     bool conditioned_first;
     OffDiagonal form;
     bool subtracts;  // by the scheme that forms S, for comparison; on the CPU only
@@ -32,8 +32,8 @@ struct TriangularArgs {
     const float *time, *log_lambda_d, *log_lambda_t;          // [] [] []
     int threads;
 };
-GSB_FIELDS(TriangularArgs, INPUTS, N, conditioned_first, form, subtracts, half, means, directions, times, log_diagonal,
-           shape, motion, coupling, opacities, center, time, log_lambda_d, log_lambda_t, threads)
+GSB_FIELDS(TriangularArgs, INPUTS, N, sliced, conditioned_first, form, subtracts, half, means, directions, times,
+           log_diagonal, shape, motion, coupling, opacities, center, time, log_lambda_d, log_lambda_t, threads)
 
 struct TriangularGrads {
     float *means, *directions, *times, *log_diagonal, *shape, *motion, *coupling, *opacities;
@@ -44,12 +44,12 @@ GSB_FIELDS(TriangularGrads, GRADS, means, directions, times, log_diagonal, shape
 
 // Gaussians over (x, y, z, t) with the factor M_left M_right diag(exp scales), observed at a time (4DGS).
 struct RotatedArgs {
-    int64_t N;
+    int64_t N, sliced;  // rows from `sliced` on are still
     const float *means, *times, *scales, *left_quats, *right_quats;  // [N, 3] [N, 1] [N, 4] [N, 4] [N, 4]
     const float *opacities, *clock, *time, *log_lambda_t;            // [N] logits, [] [] []
     int threads;
 };
-GSB_FIELDS(RotatedArgs, INPUTS, N, means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
+GSB_FIELDS(RotatedArgs, INPUTS, N, sliced, means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
            threads)
 
 struct RotatedGrads {
@@ -102,9 +102,10 @@ struct ColorArgs {
     const float *means, *opacities;  // [N, 3] [N]: one below 1/255 is not drawn, and has no colour
     const float* times;              // [N, 1], null: colours do not change
     const float *center, *time;      // [3] []
+    const int32_t* levels;           // [N] what a row has at most, degree + 4 (waves - 1); null: all of them have all
     int threads;
 };
-GSB_FIELDS(ColorArgs, INPUTS, N, degree, bases, waves, sh0, shN, means, opacities, times, center, time, threads)
+GSB_FIELDS(ColorArgs, INPUTS, N, degree, bases, waves, sh0, shN, means, opacities, times, center, time, levels, threads)
 
 struct Colors {
     float* colors;  // [N, 3]
@@ -129,7 +130,7 @@ constexpr int MAX_NETWORKS = 4, MAX_VALUES = 12;
 // Perceptrons features x 64 x width, one for each of `networks`, on every Gaussian (AGR). They read the values of the
 // first `networks - 1` arrays, each of which one of them moves; the last moves all the others.
 struct RefineArgs {
-    int64_t N;
+    int64_t N, refined;  // rows from `refined` on stay where they are
     int features, networks, arrays, outputs;  // features: numbers that are read; outputs: the sum of widths
     int widths[MAX_NETWORKS], value_widths[MAX_VALUES];
     const float* values[MAX_VALUES];     // [arrays] of [N, value_widths]
@@ -137,8 +138,8 @@ struct RefineArgs {
     const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
     int threads;
 };
-GSB_FIELDS(RefineArgs, INPUTS, N, features, networks, arrays, outputs, widths, value_widths, values, weight_in, bias_in,
-           weight_out, bias_out, threads)
+GSB_FIELDS(RefineArgs, INPUTS, N, refined, features, networks, arrays, outputs, widths, value_widths, values, weight_in,
+           bias_in, weight_out, bias_out, threads)
 
 struct Refined {
     float* values[MAX_VALUES];  // [arrays] of [N, value_widths]
@@ -153,7 +154,7 @@ GSB_FIELDS(RefinedGrads, GIVEN, values)
 struct RefineGrads {
     float* values[MAX_VALUES];                           // of the features: [networks - 1] of [N, value_widths]
     float *weight_in, *bias_in, *weight_out, *bias_out;  // zero on entry
-    float* scratch;                                      // [networks, N, features], on a GPU
+    float* scratch;                                      // [networks, refined, features], on a GPU
 };
 GSB_FIELDS(RefineGrads, GRADS, values, weight_in, bias_in, weight_out, bias_out, scratch)
 

@@ -28,12 +28,13 @@ def _bases(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
 _show = Operation(
     "show_colors",
     inputs={"sh0": "N 1 3", "shN": "N rest 3", "means": "N 3", "opacities": "N", "times": "N 1", "center": "3",
-            "time": ""},
+            "time": "", "levels": "N"},
     outputs={"colors": "N 3"},
     numbers={"degree": int, "waves": int},
-    constant=["center", "time"],
+    constant=["center", "time", "levels"],
     passive=["opacities"],
-    optional=["times", "time"],
+    optional=["times time", "levels"],
+    integers=["levels"],
     adds=["sh0", "shN"],
     derive=_bases,
     memory="colours",
@@ -50,6 +51,7 @@ def show_colors(
     times: Tensor | None = None,  # [N, 1]
     time: Tensor | None = None,  # []
     waves: int = 1,
+    levels: Tensor | None = None,  # [N] int32
 ) -> Tensor:  # [N, 3]
     """Colours max(0, sum beta_nlm cos(2 pi n (t - mu_t)) Y_lm(d) + 0.5), d the direction from `center` to the mean.
 
@@ -66,6 +68,8 @@ def show_colors(
         times: mu_t, where colours change with time.
         time: clips.
         waves: frequencies of time, the constant one included.
+        levels: what each colour has at most, its degree + 4 (waves - 1); the coefficients above that are not read, and
+            their gradient is zero. None: all colours have `degree` and `waves`.
 
     Raises:
         InputError: not float32 on one device, or shapes that do not fit.
@@ -75,4 +79,4 @@ def show_colors(
                          f"degree={degree!r:.40} and waves={waves!r:.40}")  # fmt: skip
     if waves == 1:
         times = time = None
-    return _show(sh0, shN, means, opacities, times, center, time, degree, waves)[0]
+    return _show(sh0, shN, means, opacities, times, center, time, levels, degree, waves)[0]

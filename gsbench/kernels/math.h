@@ -14,4 +14,5 @@
 #include "math/similarity.h"
 #include "math/slicing.h"
 #include "math/still.h"
+#include "math/still_triangular.h"
 #include "math/triangular.h"

@@ -24,6 +24,9 @@ _SCHEMA = {int: "int", float: "float", bool: "bool"}
 _KINDS: dict[type, tuple[type, ...]] = {int: (int,), float: (float, int), bool: (bool,)}  # what is accepted for each
 
 
+EVERY_ROW = 2**62  # for a number of rows: as many as there are
+
+
 class Operation:
     """One operation: its name is that of its kernel, NAME_backward that of the kernel of its gradient."""
 
@@ -55,7 +58,7 @@ class Operation:
             numbers: what is no tensor, by type; an int is a size too.
             constant: inputs by which there is no gradient, and asking for one is an error.
             passive: inputs and outputs that no gradient goes through, in silence.
-            optional: inputs that may be left out, all of them or none.
+            optional: inputs that may be left out; of those named together, as in "times time", all or none.
             adds: inputs to whose gradient the kernel adds, so that those of several views need one memory.
             zeroed: inputs whose gradient is a sum over Gaussians, of which a GPU's blocks each add a part.
             on_request: inputs whose gradient costs something, and is computed where it is wanted only.
@@ -72,7 +75,9 @@ class Operation:
         self.adds = {i for i, key in enumerate(inputs) if key in adds}
         self._differentiable = [key not in {*constant, *passive} for key in inputs]
         self._carries = [key not in passive for key in outputs]
-        self._optional = {i for i, key in enumerate(inputs) if key in optional}
+        places = {key: i for i, key in enumerate(inputs)}
+        self._left_out_together = [[places[key] for key in names.split()] for names in optional]
+        self._optional = {i for group in self._left_out_together for i in group}
         self._on_request = {f"grad.{key}" for key in on_request}
         self._zeroed = {f"grad.{key}" for key in (*adds, *zeroed, *on_request)}
         self._dtypes = [torch.int32 if key in integers else torch.float32 for key in self.inputs]
@@ -84,7 +89,9 @@ class Operation:
         self._given = [f"given.{key}" for key in outputs]
         self._needed = {f"given.{key}" for key in outputs if key not in passive} - _MAY_BE_NULL
         self._grad = [f"grad.{key}" if own else None for key, own in zip(inputs, self._differentiable, strict=True)]
-        self._kinds: list[tuple[type, ...]] = [(Tensor, NoneType) if key in optional else (Tensor,) for key in inputs]
+        self._kinds: list[tuple[type, ...]] = [
+            (Tensor, NoneType) if i in self._optional else (Tensor,) for i in range(len(inputs))
+        ]
         self._kinds += [_KINDS[kind] for kind in self.numbers.values()]
         self._last: tuple[list[Any] | None, Slots] = None, {}
         self.backward_kernel = f"{name}_backward"  # of the same arguments as any other that is put here
@@ -222,9 +229,10 @@ class Operation:
     def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
         slots: Slots = dict(zip(self.numbers, numbers, strict=True))
         there = [not self._is_left_out(i, x) for i, x in enumerate(tensors)]
-        if len({there[i] for i in self._optional}) > 1:  # a kernel takes the address of each for that of a number
-            names = ", ".join(key for i, key in enumerate(self.inputs) if i in self._optional)
-            raise InputError(f"{self.name}: expected all of {names}, or none of them")
+        for group in self._left_out_together:
+            if len({there[i] for i in group}) > 1:  # a kernel takes the address of each for that of a number
+                names = ", ".join(key for i, key in enumerate(self.inputs) if i in group)
+                raise InputError(f"{self.name}: expected all of {names}, or none of them")
         for key, x, dtype, own in zip(self.inputs, tensors, self._dtypes, there, strict=True):
             if own:
                 check_tensor(x, f"{self.name}: {key}", (dtype,))
@@ -279,6 +287,18 @@ _NOTHING = torch.Size([0])
 def address(x: Tensor | None) -> int:
     """Of a tensor's first number; 0 for None. The tensor must live until the call that it is passed to returns."""
     return 0 if x is None else x.data_ptr()
+
+
+def first_rows(name: str, count: int, x: Tensor) -> int:
+    """How many of a tensor's first rows something is done to; EVERY_ROW stands for all.
+
+    Raises:
+        InputError: there are not so many.
+    """
+    N = x.shape[0] if x.dim() else 0
+    if count != EVERY_ROW and not 0 <= count <= N:
+        raise InputError(f"{name}: expected a number of rows from 0 to {N}, as there are, got {count}")
+    return min(count, N)
 
 
 def in_rows(tensors: Tensors) -> Tensors:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.library import Slots, allocate, library_of
-from gsbench.kernels.operation import Operation, Tensors, address, in_rows
+from gsbench.kernels.operation import EVERY_ROW, Operation, Tensors, address, first_rows, in_rows
 from gsbench.tensors import check_tensor
 
 HIDDEN = 64
@@ -24,11 +24,12 @@ class _Refine(Operation):
     """
 
     def __init__(self) -> None:
-        super().__init__("refine", inputs={}, outputs={}, numbers={"networks": int}, memory="refinements")
+        super().__init__("refine", inputs={}, outputs={}, numbers={"networks": int, "refined": int},
+                         memory="refinements")  # fmt: skip
 
     def split(self, arguments: Sequence[Any]) -> tuple[Tensors, tuple[Any, ...]]:
-        *tensors, networks = arguments
-        return list(tensors), (networks,)
+        *tensors, networks, refined = arguments
+        return list(tensors), (networks, refined)
 
     def differentiable(self, tensors: Tensors) -> list[bool]:
         return [True] * (len(tensors) - 2) + [False] * 2
@@ -39,14 +40,14 @@ class _Refine(Operation):
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
         values, weights = self._layers(tensors, numbers[0])
         out = [allocate(self._memory, x, x.shape) for x in values]
-        slots = self._slots(values, weights)
+        slots = self._slots(values, weights, numbers[1])
         slots["rows"] = values, weights
         library_of(values[0].device.type).call("refine", slots | {"out.values": _addresses(out)}, values[0])
         return out, slots
 
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
         values, weights = self._layers(tensors, numbers[0])
-        return self._slots(values, weights) | {"rows": (values, weights)}
+        return self._slots(values, weights, numbers[1]) | {"rows": (values, weights)}
 
     def backward(
         self, tensors: Tensors, slots: Slots, outputs: Tensors, given: Sequence[Tensor | None],
@@ -60,7 +61,7 @@ class _Refine(Operation):
         g_weights = {key: torch.zeros_like(x) for key, x in weights.items()}
         scratch = None
         if library.needs_scratch:
-            shape = networks, slots["N"], slots["features"]
+            shape = networks, slots["refined"], slots["features"]
             scratch = allocate("gradients of AGR's features", like, shape)
         slots |= {"given.values": _addresses(dense), "grad.values": _addresses(moved), "grad.scratch": address(scratch)}
         slots |= {f"grad.{key}": g.data_ptr() for key, g in g_weights.items()}
@@ -90,13 +91,14 @@ class _Refine(Operation):
         g_out, g_bias = g["weight_out"] * units[:, None], g["bias_out"] * units
         return [g_in, g["bias_in"], *g_out.split(widths), *g_bias.split(widths)]
 
-    def _slots(self, values: Tensors, weights: dict[str, Tensor]) -> Slots:
+    def _slots(self, values: Tensors, weights: dict[str, Tensor], refined: int) -> Slots:
         widths = tuple(x.shape[1] for x in values)
         networks, features = weights["bias_in"].shape[0] // HIDDEN, weights["weight_in"].shape[1]
         own = widths[: networks - 1]
-        sizes: Slots = {"N": values[0].shape[0], "features": features, "networks": networks, "arrays": len(values),
-                        "outputs": sum(widths), "widths": (*own, sum(widths) - sum(own)), "value_widths": widths,
-                        "values": _addresses(values)}  # fmt: skip
+        moved = first_rows("refine: rows", refined, values[0])
+        sizes: Slots = {"N": values[0].shape[0], "refined": moved, "features": features, "networks": networks,
+                        "arrays": len(values), "outputs": sum(widths), "widths": (*own, sum(widths) - sum(own)),
+                        "value_widths": widths, "values": _addresses(values)}  # fmt: skip
         return sizes | {key: x.data_ptr() for key, x in weights.items()}
 
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
@@ -118,6 +120,8 @@ def refine(
     biases_out: Tensors,  # P of [c]
     units: Tensor,  # [sum of c]
     gamma: Tensor,  # [G]
+    *,
+    rows: int | None = None,
 ) -> Tensors:  # of [N, c], as `values`
     """Values moved by P perceptrons (F + G) x 64 x c with ReLU, x + phi(features, gamma) (7DGS eq. 14 and 15).
 
@@ -131,9 +135,10 @@ def refine(
         biases_out: theirs.
         units: what the perceptrons measure each number in.
         gamma: what is the same for all Gaussians, the encoded time.
+        rows: how many of the first are moved, all by default; the others are copied.
 
     Raises:
-        InputError: not float32 on one device, or shapes that do not fit.
+        InputError: not float32 on one device, shapes that do not fit, or there are not so many rows.
     """
     given = {"values": values, "weight_in": [weight_in], "bias_in": [bias_in], "weights_out": weights_out,
              "biases_out": biases_out, "units": [units], "gamma": [gamma]}  # fmt: skip
@@ -143,7 +148,7 @@ def refine(
             if x.dim() == 0:
                 raise InputError(f"refine: {name}: expected at least one dimension, got none")
     widths, moved = [w.shape[0] for w in weights_out], [x.shape[-1] for x in values]
-    last, rows = len(widths) - 1, HIDDEN * len(widths)
+    last, hidden = len(widths) - 1, HIDDEN * len(widths)
     if last < 1 or [*moved[:last], sum(moved[last:])] != widths:
         raise InputError(f"refine: expected a perceptron for each feature and one for all other values, got outputs "
                          f"of {widths} numbers for values of {moved}")  # fmt: skip
@@ -153,7 +158,7 @@ def refine(
     N, G = values[0].shape[0], gamma.shape[0]
     shapes: list[tuple[str, Tensor, tuple[int, ...]]] = []
     shapes += [("values", x, (N, c)) for x, c in zip(values, moved, strict=True)]
-    shapes += [("weight_in", weight_in, (rows, sum(widths[:last]) + G)), ("bias_in", bias_in, (rows,))]
+    shapes += [("weight_in", weight_in, (hidden, sum(widths[:last]) + G)), ("bias_in", bias_in, (hidden,))]
     shapes += [("weights_out", w, (c, HIDDEN)) for w, c in zip(weights_out, widths, strict=True)]
     shapes += [("biases_out", b, (c,)) for b, c in zip(biases_out, widths, strict=True)]
     shapes += [("units", units, (sum(widths),)), ("gamma", gamma, (G,))]
@@ -161,4 +166,5 @@ def refine(
         if tuple(x.shape) != shape or x.device != values[0].device:
             raise InputError(f"refine: expected {name} of shape {list(shape)} on {values[0].device}, got "
                              f"{list(x.shape)} on {x.device}")  # fmt: skip
-    return _refine(*values, weight_in, bias_in, *weights_out, *biases_out, units, gamma, len(widths))
+    return _refine(*values, weight_in, bias_in, *weights_out, *biases_out, units, gamma, len(widths),
+                   EVERY_ROW if rows is None else rows)  # fmt: skip

@@ -1,8 +1,10 @@
 """Slice the geometry of a model: Gaussians with triangular and with rotated factors, or none to condition on."""
 
+from typing import Any
+
 from torch import Tensor
 
-from gsbench.kernels.operation import Operation
+from gsbench.kernels.operation import EVERY_ROW, Operation, first_rows
 
 _SLICE = {"means": "N 3", "factors": "N 3 3", "opacities": "N"}
 
@@ -12,13 +14,18 @@ _triangular = Operation(
             "motion": "N moves", "coupling": "N couplings", "opacities": "N", "center": "3", "time": "",
             "log_lambda_d": "", "log_lambda_t": ""},
     outputs=_SLICE,
-    numbers={"half": float, "conditioned_first": bool, "form": int, "subtracts": bool},
+    numbers={"half": float, "conditioned_first": bool, "form": int, "subtracts": bool, "sliced": int},
     constant=["center", "time"],
-    optional=["times", "time", "log_lambda_t"],
+    optional=["times time log_lambda_t"],
     zeroed=["log_lambda_d", "log_lambda_t"],
-    derive=lambda given, _: _entries(4 if "times" in given else 3),
+    derive=lambda given, numbers: _entries(4 if "times" in given else 3) | _sliced(given, numbers),
     memory="a slice's Gaussians",
 )  # fmt: skip
+
+
+def _sliced(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
+    """How many rows change with the query."""
+    return {"sliced": first_rows("sliced", numbers["sliced"], given["means"])}
 
 
 def _entries(k: int) -> dict[str, int]:
@@ -44,12 +51,16 @@ def observe_triangular(
     form: int = 0,
     directional_half: bool = True,
     subtracts: bool = False,
+    sliced: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Slice 6D or 7D Gaussians as seen from `center` at `time`: means [N, 3], factors [N, 3, 3], opacities [N].
 
     The square-root scheme of `gsbench.models.slicing` for the parameters of `gsbench.models.triangular`, with
     f_temp and f_dir (7DGS eq. 9 to 12) in the opacities. With `subtracts` by the scheme `cholesky` instead, which is
     there on the CPU only.
+
+    Rows from `sliced` on are still: no query changes their mean, their factor is L_pp alone, and their opacity has no
+    f_temp and no f_dir. By all that they do not depend on their gradient is zero.
 
     Args:
         means: mu_p, world units.
@@ -68,14 +79,17 @@ def observe_triangular(
         form: what entries below the diagonal are, a place in `gsbench.models.factors.OFF_DIAGONALS`.
         directional_half: whether f_dir has the 1/2 of 7DGS eq. 12.
         subtracts: by the scheme that forms S.
+        sliced: how many rows change with the query; all by default.
 
     Raises:
-        InputError: not float32 on one device, shapes that do not fit, or a gradient by `center` or `time` is asked for.
+        InputError: not float32 on one device, shapes that do not fit, a gradient by `center` or `time` is asked for, or
+            more rows are sliced than there are.
     """
     observed = times is not None
     seen = _triangular(means, directions, times, log_diagonal, shape, motion, coupling, opacities, center,
                        time if observed else None, log_lambda_d, log_lambda_t if observed else None,
-                       0.5 if directional_half else 1.0, conditioned_first, form, subtracts)  # fmt: skip
+                       0.5 if directional_half else 1.0, conditioned_first, form, subtracts,
+                       EVERY_ROW if sliced is None else sliced)  # fmt: skip
     return seen[0], seen[1], seen[2]
 
 
@@ -84,8 +98,10 @@ _rotated = Operation(
     inputs={"means": "N 3", "times": "N 1", "scales": "N 4", "left_quats": "N 4", "right_quats": "N 4",
             "opacities": "N", "clock": "", "time": "", "log_lambda_t": ""},
     outputs=_SLICE,
+    numbers={"sliced": int},
     constant=["clock", "time"],
     zeroed=["log_lambda_t"],
+    derive=lambda given, numbers: _sliced(given, numbers),
     memory="a slice's Gaussians",
 )  # fmt: skip
 
@@ -100,11 +116,16 @@ def observe_rotated(
     clock: Tensor,  # []
     time: Tensor,  # []
     log_lambda_t: Tensor,  # []
+    *,
+    sliced: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Slice 4D Gaussians F = M_left M_right diag(exp scales) at `time`: means [N, 3], factors [N, 3, 3], opacities [N].
 
     The square-root scheme of `gsbench.models.slicing` for the parameters of `gsbench.models.gaussians4d`, with f_temp
     in the opacities, zero where it is not above 0.05 (4DGS).
+
+    Rows from `sliced` on are still: their factor is R diag(exp scales) over (x, y, z) as in 3DGS, with the rotation of
+    `gsbench.models.factors.turn_of_space`, and their opacity has no f_temp. Their gradient by all else is zero.
 
     Args:
         means: world units.
@@ -116,11 +137,13 @@ def observe_rotated(
         clock: world units a clip.
         time: clips.
         log_lambda_t: ln lambda_t, the sensitivity of f_temp.
+        sliced: how many rows change with the time; all by default.
 
     Raises:
-        InputError: not float32 on one device, or shapes that do not fit.
+        InputError: not float32 on one device, shapes that do not fit, or more rows are sliced than there are.
     """
-    seen = _rotated(means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t)
+    seen = _rotated(means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
+                    EVERY_ROW if sliced is None else sliced)  # fmt: skip
     return seen[0], seen[1], seen[2]
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels import refine as refining
 from gsbench.kernels.colors import show_colors
+from gsbench.kernels.operation import EVERY_ROW
 from gsbench.kernels.refine import refine
 from gsbench.kernels.slices import observe_rotated, observe_still, observe_triangular
 from gsbench.models import Query
@@ -253,7 +254,7 @@ def backward_of_refinement(values: list[Tensor], weights: list[Tensor], g_out: l
     """By the kernel: gradients of the two features, then of the weights."""
     weight_in, bias_in, weight_out, bias_out = weights
     tensors = [*values, weight_in, bias_in, *weight_out.split([3, 1, 12]), *bias_out.split([3, 1, 12]), *COMMON]
-    outputs, slots = refining._refine.run(tensors, (3,))
+    outputs, slots = refining._refine.run(tensors, (3, EVERY_ROW))
     found = refining._refine.backward(tensors, slots, outputs, g_out, [True] * len(tensors))
     gradients = [g for g in found if g is not None]
     return [*gradients[:2], *gradients[4:6], torch.cat(gradients[6:9]), torch.cat(gradients[9:12])]

@@ -1,7 +1,8 @@
 // Colours of Gaussians, sixteen at a time; the mathematics is math/harmonics.h. What cannot be drawn costs nothing.
 //
 // A 4D Gaussian has 144 coefficients and is drawn for part of the time, so memory is what counts here: those with
-// something to do are packed first, and the rows of all others are neither read nor worked on.
+// something to do are packed first, and the rows of all others are neither read nor worked on. Where rows have levels,
+// the packed are sorted by level: a vector is of one, and no coefficient above it is read.
 #include "../math/projection.h"
 #include "../math/harmonics.h"
 
@@ -45,9 +46,9 @@ struct Rows {
     int count;
     alignas(64) int32_t ones[LANES] = {}, threes[LANES] = {}, all[LANES] = {};
 
-    GSB_HD Rows(const Picked& picked, int first, int stride) : count(lanes_from(first, picked.count)) {
+    GSB_HD Rows(const uint32_t* which, int count, int stride) : count(count) {
         for (int k = 0; k < count; ++k) {
-            ones[k] = static_cast<int32_t>(picked.which[first + k]);
+            ones[k] = static_cast<int32_t>(which[k]);
             threes[k] = ones[k] * 3;
             all[k] = ones[k] * stride;
         }
@@ -184,6 +185,7 @@ GSB_HD inline ColorArgs chunk_of(ColorArgs a, int64_t first) {
     a.means += first * 3;
     a.opacities += first;
     if (a.times) a.times += first;
+    if (a.levels) a.levels += first;
     return a;
 }
 GSB_HD inline ColorGrads chunk_of(ColorGrads g, const ColorArgs& a, int64_t first) {
@@ -202,9 +204,61 @@ GSB_HD inline Mask learns(const ColorArgs& a, const float* g_colors, int i, int 
     return drawn(a, i, n) & !((color[0] == Vec(0.0f)) & (color[1] == Vec(0.0f)) & (color[2] == Vec(0.0f)));
 }
 
-GSB_HD inline void fill_zero(float* rows, int width, int first, int end) {
-    __builtin_memset(rows + static_cast<int64_t>(first) * width, 0,
-                     sizeof(float) * static_cast<size_t>(end - first) * static_cast<size_t>(width));
+GSB_HD inline ColorArgs at_level(ColorArgs a, Level level) {
+    a.degree = level.degree;
+    a.waves = level.waves;
+    return a;
+}
+
+// Where the rows of each level begin among those picked, once they are sorted by level.
+struct Sorted {
+    static constexpr int LEVELS = 4 * MAX_WAVES;
+    int begin[LEVELS + 1] = {};
+
+    GSB_HD Sorted(const ColorArgs& a, Picked& picked) {
+        const Level most{a.degree, a.waves};
+        uint8_t level[CHUNK];
+        int next[LEVELS] = {};
+        if (a.levels) {
+            for (int k = 0; k < picked.count; ++k) {
+                const Level own = Level::of(static_cast<uint32_t>(a.levels[picked.which[k]]));
+                ++next[level[k] = static_cast<uint8_t>(own.at_most(most).number())];
+            }
+        } else {
+            next[most.number()] = picked.count;
+        }
+        bool mixed = false;
+        for (int l = 0; l < LEVELS; ++l) {
+            mixed |= next[l] > 0 && next[l] < picked.count;
+            begin[l + 1] = begin[l] + next[l];
+            next[l] = begin[l];
+        }
+        if (!mixed) return;
+        uint32_t before[CHUNK];
+        __builtin_memcpy(before, picked.which, sizeof(before));
+        for (int k = 0; k < picked.count; ++k) picked.which[next[level[k]]++] = before[k];
+    }
+};
+
+// Calls f(arguments, picked) for the rows of each level, whose arguments have its degree and waves.
+template <class F>
+GSB_HD inline void each_level(const ColorArgs& a, Picked& picked, F f) {
+    const Sorted sorted(a, picked);
+    for (int level = 0; level < Sorted::LEVELS; ++level) {
+        const int begin = sorted.begin[level], count = sorted.begin[level + 1] - begin;
+        if (count > 0) f(at_level(a, Level::of(static_cast<uint32_t>(level))), picked.which + begin, count);
+    }
+}
+
+// Not inlined: what the compiler then knows of a level's range would change what it rounds.
+__attribute__((noinline)) void show_rows(const ColorArgs& a, const uint32_t* which, int count, int stride, float* out) {
+    for (int k = 0; k < count; k += LANES) {
+        const Rows rows(which + k, lanes_from(k, count), stride);
+        Vec color[3];
+        Shades(a, rows).sum(a, rows, color);
+        for (auto& channel : color) channel = max(channel, Vec(0.0f));
+        rows.store3(color, out);
+    }
 }
 
 GSB_HD inline void backward_rows(const ColorArgs& a, const float* g_colors, const ColorGrads& out, const Rows& rows) {
@@ -246,15 +300,11 @@ void show_colors(const ColorArgs& all, const Colors& shown) {
         const ColorArgs a = chunk_of(all, first);
         const int size = static_cast<int>(a.N);
         float* out = shown.colors + first * 3;
-        const Picked picked(size, [&](int i, int n) { return drawn(a, i, n); });
+        Picked picked(size, [&](int i, int n) { return drawn(a, i, n); });
         picked.each_gap(size, [&](int from, int end) { fill_zero(out, 3, from, end); });
-        for (int k = 0; k < picked.count; k += LANES) {
-            const Rows rows(picked, k, stride_of(a));
-            Vec color[3];
-            Shades(a, rows).sum(a, rows, color);
-            for (auto& channel : color) channel = max(channel, Vec(0.0f));
-            rows.store3(color, out);
-        }
+        each_level(a, picked, [&](const ColorArgs& own, const uint32_t* which, int count) {
+            show_rows(own, which, count, stride_of(a), out);
+        });
     }
 }
 
@@ -265,12 +315,16 @@ void show_colors_backward(const ColorArgs& all, const GivenColors& given, const 
         const ColorGrads out = chunk_of(grads, all, first);
         const float* g_colors = given.colors + first * 3;
         const int size = static_cast<int>(a.N);
-        const Picked picked(size, [&](int i, int n) { return learns(a, g_colors, i, n); });
+        Picked picked(size, [&](int i, int n) { return learns(a, g_colors, i, n); });
         picked.each_gap(size, [&](int from, int end) {
             fill_zero(out.means, 3, from, end);
             if (a.times) fill_zero(out.times, 1, from, end);
         });
-        for (int k = 0; k < picked.count; k += LANES) backward_rows(a, g_colors, out, Rows(picked, k, stride_of(a)));
+        each_level(a, picked, [&](const ColorArgs& own, const uint32_t* which, int count) {
+            for (int k = 0; k < count; k += LANES) {
+                backward_rows(own, g_colors, out, Rows(which + k, lanes_from(k, count), stride_of(a)));
+            }
+        });
     }
 }
 

@@ -5,7 +5,7 @@
 // gradient into blocks: many are not seen in a view.
 #include "buffer.h"
 #include "isa.h"
-#include "simd.h"
+#include "rows.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
@@ -165,6 +165,11 @@ void store_blocks(const RefineArgs& a, const Block& block, const float* moved, c
     }
 }
 
+// The first `count` of several arrays, of the rows that stay where they are.
+void copy_rest(const RefineArgs& a, const float* const* arrays, int count, float* const* out) {
+    for (int i = 0; i < count; ++i) copy_rows(arrays[i], out[i], a.value_widths[i], a.refined, a.N);
+}
+
 constexpr auto as_it_is = [](Vec x, int) { return x; };
 
 void hidden_layer(const RefineArgs& a, int network, const float* X, float* H) {
@@ -261,10 +266,10 @@ void refine(const RefineArgs& a, const Refined& out) {
     Buffer<float> scratch(scratch_size * static_cast<size_t>(a.threads));
     int32_t rows[BLOCK];
     for (int i = 0; i < BLOCK; ++i) rows[i] = i;
-#pragma omp parallel for num_threads(a.threads) schedule(dynamic, 8) if (a.N > CHUNK)
-    for (int64_t first = 0; first < a.N; first += BLOCK) {
+#pragma omp parallel for num_threads(a.threads) schedule(dynamic, 8) if (a.refined > CHUNK)
+    for (int64_t first = 0; first < a.refined; first += BLOCK) {
         const Scratch s(a, scratch.data() + scratch_size * static_cast<size_t>(thread_index()));
-        const Block block{first, rows, static_cast<int>(a.N - first < BLOCK ? a.N - first : BLOCK)};
+        const Block block{first, rows, static_cast<int>(a.refined - first < BLOCK ? a.refined - first : BLOCK)};
         load_blocks(a, block, a.values, a.networks - 1, s.X);
         int output = 0;
         for (int network = 0; network < a.networks; ++network) {
@@ -275,6 +280,7 @@ void refine(const RefineArgs& a, const Refined& out) {
         }
         store_blocks(a, block, s.G, a.values, a.arrays, out.values);
     }
+    copy_rest(a, a.values, a.arrays, out.values);
 }
 
 void refine_backward(const RefineArgs& a, const RefinedGrads& grads, const RefineGrads& out) {
@@ -286,7 +292,7 @@ void refine_backward(const RefineArgs& a, const RefinedGrads& grads, const Refin
                   weight_in_T.data() + network * HIDDEN * a.features);
         transpose(a.weight_out + output * HIDDEN, a.widths[network], HIDDEN, weight_out_T.data() + output * HIDDEN);
     }
-    const int64_t chunks = (a.N + CHUNK - 1) / CHUNK;
+    const int64_t chunks = (a.refined + CHUNK - 1) / CHUNK;
     const size_t scratch_size = Scratch::size(a), weights = static_cast<size_t>(layout.size);
     Buffer<float> scratch(scratch_size * static_cast<size_t>(a.threads));
     Buffer<float> partial(weights * static_cast<size_t>(chunks));
@@ -295,7 +301,7 @@ void refine_backward(const RefineArgs& a, const RefinedGrads& grads, const Refin
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
         const Scratch s(a, scratch.data() + scratch_size * static_cast<size_t>(thread_index()));
         int32_t packed[CHUNK];
-        const int64_t first = chunk * CHUNK, last = first + CHUNK < a.N ? first + CHUNK : a.N;
+        const int64_t first = chunk * CHUNK, last = first + CHUNK < a.refined ? first + CHUNK : a.refined;
         const int count = rows_with_gradient(a, grads.values, first, last, out.values, packed);
         for (int i = 0; i < count; i += BLOCK) {
             const Block block{first, packed + i, count - i < BLOCK ? count - i : BLOCK};
@@ -303,6 +309,7 @@ void refine_backward(const RefineArgs& a, const RefinedGrads& grads, const Refin
                            partial.data() + weights * static_cast<size_t>(chunk), s);
         }
     }
+    copy_rest(a, grads.values, a.networks - 1, out.values);
     Buffer<float> total(weights);
     total.zero();
     for (size_t chunk = 0; chunk < static_cast<size_t>(chunks); ++chunk) {

@@ -1,4 +1,6 @@
-// Slices of Gaussians with triangular factors, sixteen at a time; the mathematics is math/triangular.h.
+// Slices of Gaussians with triangular factors, sixteen at a time; the mathematics is math/triangular.h, and that of rows
+// that are still math/still_triangular.h.
+#include "../math/still_triangular.h"
 #include "../math/triangular.h"
 
 #include "buffer.h"
@@ -37,9 +39,9 @@ GSB_HD inline void load(const ObservationGrads& o, int64_t i, int n, Observed<Ve
 template <bool TIME, template <class, int> class Reduction>
 void observe(const TriangularArgs& a, const Observation& out) {
     const TriangularModel model = model_of(a);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
-    for (int64_t i = 0; i < a.N; i += LANES) {
-        const int n = lanes_from(i, a.N);
+#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.sliced > CHUNK)
+    for (int64_t i = 0; i < a.sliced; i += LANES) {
+        const int n = lanes_from(i, a.sliced);
         TriangularParameters<Vec, TIME> raw;
         load<TIME>(a, i, n, raw);
         TriangularGaussian<Vec, TIME, Reduction> gaussian(model, raw);
@@ -53,11 +55,11 @@ void observe(const TriangularArgs& a, const Observation& out) {
 template <bool TIME, template <class, int> class Reduction>
 void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     const TriangularModel model = model_of(a);
-    const int64_t chunks = (a.N + CHUNK - 1) / CHUNK;
+    const int64_t chunks = (a.sliced + CHUNK - 1) / CHUNK;
     Buffer<float> lambdas(static_cast<size_t>(chunks) * 2);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (chunks > 1)
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-        const int64_t end = (chunk + 1) * CHUNK < a.N ? (chunk + 1) * CHUNK : a.N;
+        const int64_t end = (chunk + 1) * CHUNK < a.sliced ? (chunk + 1) * CHUNK : a.sliced;
         Vec lambda_d(0.0f), lambda_t(0.0f);
         for (int64_t i = chunk * CHUNK; i < end; i += LANES) {
             const int n = lanes_from(i, end);
@@ -88,9 +90,73 @@ void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, co
     if constexpr (TIME) *out.log_lambda_t = static_cast<float>(totals[1]) * model.lambda_t;
 }
 
+// What a still row is made of: of its log_diagonal, the columns of p only.
+struct StillRows {
+    const TriangularArgs& a;
+    int width, space;  // of log_diagonal; where the columns of p begin
+
+    GSB_HD explicit StillRows(const TriangularArgs& a)
+        : a(a), width(a.times ? 7 : 6), space(a.conditioned_first ? width - 3 : 0) {}
+
+    GSB_HD void load(int64_t i, int n, StillTriangularParameters<Vec>& p) const {
+        gather_columns(a.log_diagonal, width, space, i, n, p.log_diagonal);
+        gather_row(a.shape, i, n, p.shape);
+        p.opacity = load_first(a.opacities + i, n);
+    }
+
+    // Calls f(first, end) for tasks of CHUNK rows at most.
+    template <class F>
+    void each_chunk(F f) const {
+#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.sliced > CHUNK)
+        for (int64_t first = a.sliced; first < a.N; first += CHUNK) {
+            f(first, first + CHUNK < a.N ? first + CHUNK : a.N);
+        }
+    }
+};
+
+void observe_still_rows(const TriangularArgs& a, const Observation& out) {
+    const StillRows rows(a);
+    rows.each_chunk([&](int64_t first, int64_t end) {
+        copy_rows(a.means, out.means, 3, first, end);
+        for (int64_t i = first; i < end; i += LANES) {
+            const int n = lanes_from(i, end);
+            StillTriangularParameters<Vec> raw;
+            rows.load(i, n, raw);
+            const StillTriangularGaussian<Vec> seen(raw, a.form);
+            scatter_matrix(seen.factor, out.factors, i, n);
+            store_first(seen.opacity, out.opacities + i, n);
+        }
+    });
+}
+
+void observe_still_rows_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
+    const StillRows rows(a);
+    const int k = rows.width - 3;
+    rows.each_chunk([&](int64_t first, int64_t end) {
+        copy_rows(grads.means, out.means, 3, first, end);
+        fill_zero(out.directions, 3, first, end);
+        if (a.times) fill_zero(out.times, 1, first, end);
+        fill_zero(out.log_diagonal, rows.width, first, end);
+        fill_zero(out.motion, 3 * k, first, end);
+        fill_zero(out.coupling, k * (k - 1) / 2, first, end);
+        for (int64_t i = first; i < end; i += LANES) {
+            const int n = lanes_from(i, end);
+            StillTriangularParameters<Vec> raw, g;
+            Vec g_factor[3][3];
+            rows.load(i, n, raw);
+            gather_matrix(grads.factors, i, n, g_factor);
+            StillTriangularGaussian<Vec>(raw, a.form).vjp(g_factor, load_first(grads.opacities + i, n), g);
+            scatter_columns(g.log_diagonal, out.log_diagonal, rows.width, rows.space, i, n);
+            scatter_row(g.shape, out.shape, i, n);
+            store_first(g.opacity, out.opacities + i, n);
+        }
+    });
+}
+
 }  // namespace
 
 void observe_triangular(const TriangularArgs& a, const Observation& out) {
+    observe_still_rows(a, out);
     if (a.subtracts) {
         a.times ? observe<true, Subtraction>(a, out) : observe<false, Subtraction>(a, out);
     } else {
@@ -99,6 +165,7 @@ void observe_triangular(const TriangularArgs& a, const Observation& out) {
 }
 
 void observe_triangular_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
+    observe_still_rows_backward(a, grads, out);
     if (a.subtracts) {
         a.times ? observe_backward<true, Subtraction>(a, grads, out) : observe_backward<false, Subtraction>(a, grads, out);
     } else {

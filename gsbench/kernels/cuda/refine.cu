@@ -23,7 +23,7 @@ struct Column {
 
 // All networks, as the kernels find the columns of the values.
 struct Networks {
-    int64_t N;
+    int64_t N;  // Gaussians that are moved
     int features, count, widths[MAX_NETWORKS];
     Column read[MAX_FEATURES];              // what the networks read
     Column moved[MAX_NETWORKS][MAX_WIDTH];  // what each network moves; backward: the gradient of what it was moved to
@@ -203,6 +203,32 @@ __global__ void feature_kernel(const __grid_constant__ Networks a, const __grid_
     }
 }
 
+// Arrays of numbers that are copied as they are, a row of blocks each.
+struct Copies {
+    const float* from[MAX_VALUES];
+    float* to[MAX_VALUES];
+    int64_t size[MAX_VALUES];
+};
+
+__global__ void copy_kernel(const __grid_constant__ Copies all) {
+    const int64_t k = global_thread();
+    if (k < all.size[blockIdx.y]) all.to[blockIdx.y][k] = all.from[blockIdx.y][k];
+}
+
+// Of the first `count` arrays the rows that are not moved.
+void copy_rest(const RefineArgs& a, const float* const* from, int count, float* const* to, Stream stream) {
+    Copies all{};
+    int64_t most = 0;
+    for (int i = 0; i < count; ++i) {
+        const int64_t moved = a.refined * a.value_widths[i];
+        all.from[i] = from[i] + moved;
+        all.to[i] = to[i] + moved;
+        all.size[i] = (a.N - a.refined) * a.value_widths[i];
+        most = std::max(most, all.size[i]);
+    }
+    if (most > 0) launch(copy_kernel, dim3(blocks_for(most), static_cast<unsigned>(count)), THREADS, stream, all);
+}
+
 // Column `c` of arrays [N, value_widths], counted through one array after the other. `to` may be null.
 Column column_of(const RefineArgs& a, const float* const* from, float* const* to, int c) {
     int array = 0;
@@ -212,7 +238,7 @@ Column column_of(const RefineArgs& a, const float* const* from, float* const* to
 
 // `from` and `to` are what the networks move. Each moves the columns that follow those of the network before it.
 Networks networks_of(const RefineArgs& a, const float* const* from, float* const* to) {
-    Networks all{a.N, a.features, a.networks, {}, {}, {}, a.weight_in, a.bias_in, a.weight_out, a.bias_out};
+    Networks all{a.refined, a.features, a.networks, {}, {}, {}, a.weight_in, a.bias_in, a.weight_out, a.bias_out};
     const int widest = *std::max_element(a.widths, a.widths + MAX_NETWORKS);
     if (a.features > MAX_FEATURES || widest > MAX_WIDTH) {
         throw std::invalid_argument("refine: expected on a GPU at most " + std::to_string(MAX_FEATURES) +
@@ -236,22 +262,24 @@ Networks networks_of(const RefineArgs& a, const float* const* from, float* const
 
 void refine(const RefineArgs& a, const Refined& out, Stream stream) {
     const Networks networks = networks_of(a, a.values, out.values);
-    if (a.N == 0) return;
-    const auto blocks = static_cast<unsigned>((a.N + MOVERS * AT_ONCE - 1) / (MOVERS * AT_ONCE));
+    copy_rest(a, a.values, a.arrays, out.values, stream);
+    if (a.refined == 0) return;
+    const auto blocks = static_cast<unsigned>((a.refined + MOVERS * AT_ONCE - 1) / (MOVERS * AT_ONCE));
     launch(refine_kernel, dim3(blocks, static_cast<unsigned>(a.networks)), MOVERS, stream, networks);
 }
 
 void refine_backward(const RefineArgs& a, const RefinedGrads& grads, const RefineGrads& out, Stream stream) {
     const Networks networks = networks_of(a, grads.values, nullptr);
-    if (a.N == 0) return;
+    copy_rest(a, grads.values, a.networks - 1, out.values, stream);
+    if (a.refined == 0) return;
     FeatureGrads features{};
     for (int f = 0; f < a.features; ++f) features.column[f] = column_of(a, grads.values, out.values, f);
     // Each block adds its sums by atomics once: few blocks, but enough to fill the largest GPUs.
     constexpr unsigned MOST_BLOCKS = 512;
-    const auto batches = static_cast<unsigned>((a.N + BATCH - 1) / BATCH);
+    const auto batches = static_cast<unsigned>((a.refined + BATCH - 1) / BATCH);
     const dim3 grid(batches < MOST_BLOCKS ? batches : MOST_BLOCKS, static_cast<unsigned>(a.networks));
     launch(refine_backward_kernel, grid, BATCH * PARTS, stream, networks, out);
-    launch(feature_kernel, blocks_for(a.N), THREADS, stream, networks, features, out.scratch);
+    launch(feature_kernel, blocks_for(a.refined), THREADS, stream, networks, features, out.scratch);
 }
 
 }  // namespace gsb::cuda

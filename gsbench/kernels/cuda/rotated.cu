@@ -1,5 +1,7 @@
-// Slices of 4D Gaussians with rotated factors and their derivative, one a thread; the mathematics is math/rotated.h.
+// Slices of 4D Gaussians with rotated factors and their derivative, one a thread; the mathematics is math/rotated.h, and
+// that of rows that are still math/still.h.
 #include "../math/rotated.h"
+#include "../math/still.h"
 
 #include "rows.h"
 
@@ -18,21 +20,49 @@ __device__ RotatedParameters<float> parameters(const RotatedArgs& a, int64_t i) 
     return p;
 }
 
+__device__ StillParameters<float> still_parameters(const RotatedArgs& a, int64_t i) {
+    StillParameters<float> p{};
+    float left[4];
+    GSB_UNROLL for (int k = 0; k < 3; ++k) p.scales[k] = a.scales[i * 4 + k];
+    load_row(a.left_quats, i, left);
+    turn_of_space(left, p.quat);
+    p.opacity = a.opacities[i];
+    return p;
+}
+
 __global__ void observe_kernel(RotatedArgs a, Observation out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
+    if (i >= a.sliced) {
+        const StillParameters<float> raw = still_parameters(a, i);
+        store_still(StillGaussian<float>(raw), a.means, out, i);
+        return;
+    }
     const RotatedParameters<float> raw = parameters(a, i);
     store_observed(RotatedGaussian<float>(raw, expf(*a.log_lambda_t), *a.time * *a.clock).observe(), out, i);
 }
 
 __global__ void observe_backward_kernel(RotatedArgs a, ObservationGrads grads, RotatedGrads out) {
     const int64_t i = global_thread();
-    RotatedParameters<float> g{};
-    if (i < a.N) {
+    RotatedParameters<float> g{};  // of a still row mostly zero
+    if (i >= a.sliced && i < a.N) {
+        const StillParameters<float> raw = still_parameters(a, i);
+        StillParameters<float> g_still{};
+        const Observed<float> given = load_observed(grads, i);
+        StillGaussian<float>(raw).vjp(given.factor, given.opacity, g_still);
+        GSB_UNROLL for (int k = 0; k < 3; ++k) {
+            g.mean[k] = given.mean[k];
+            g.scales[k] = g_still.scales[k];
+        }
+        turn_of_space(g_still.quat, g.left);
+        g.opacity = g_still.opacity;
+    } else if (i < a.N) {
         const RotatedParameters<float> raw = parameters(a, i);
         RotatedGaussian<float> gaussian(raw, expf(*a.log_lambda_t), *a.time * *a.clock);
         gaussian.observe();
         gaussian.vjp(load_observed(grads, i), g);
+    }
+    if (i < a.N) {
         store_row(g.mean, out.means, i);
         out.times[i] = g.time * *a.clock;
         store_row(g.scales, out.scales, i);

@@ -33,6 +33,16 @@ __device__ inline void store_observed(const Observed<float>& seen, const Observa
     out.opacities[i] = seen.opacity;
 }
 
+// A Gaussian that is its own slice, but for its mean.
+template <class Gaussian>
+__device__ void store_still(const Gaussian& gaussian, const float* means, const Observation& out, int64_t i) {
+    float mean[3];
+    load_row(means, i, mean);
+    store_row(mean, out.means, i);
+    store_matrix(gaussian.factor, out.factors, i);
+    out.opacities[i] = gaussian.opacity;
+}
+
 __device__ inline Observed<float> load_observed(const ObservationGrads& o, int64_t i) {
     Observed<float> out;
     load_row(o.means, i, out.mean);

@@ -1,4 +1,6 @@
-// Slices of Gaussians with triangular factors and their derivative, one a thread; the mathematics is math/triangular.h.
+// Slices of Gaussians with triangular factors and their derivative, one a thread; the mathematics is math/triangular.h,
+// and that of rows that are still math/still_triangular.h.
+#include "../math/still_triangular.h"
 #include "../math/triangular.h"
 
 #include <stdexcept>
@@ -29,10 +31,30 @@ __device__ TriangularParameters<float, TIME> parameters(const TriangularArgs& a,
     return p;
 }
 
+// The rows of p in log_diagonal.
+template <bool TIME, bool CONDITIONED>
+constexpr int SPACE = CONDITIONED ? TriangularParameters<float, TIME>::K : 0;
+
+template <bool TIME, bool CONDITIONED>
+__device__ StillTriangularParameters<float> still_parameters(const TriangularArgs& a, int64_t i) {
+    StillTriangularParameters<float> p{};
+    const float* log_diagonal = a.log_diagonal + i * TriangularParameters<float, TIME>::N + SPACE<TIME, CONDITIONED>;
+    GSB_UNROLL for (int k = 0; k < 3; ++k) p.log_diagonal[k] = log_diagonal[k];
+    load_row(a.shape, i, p.shape);
+    p.opacity = a.opacities[i];
+    return p;
+}
+
 template <bool TIME, bool CONDITIONED>
 __global__ void observe_kernel(TriangularArgs a, Observation out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
+    if (i >= a.sliced) {
+        const auto raw = still_parameters<TIME, CONDITIONED>(a, i);
+        const StillTriangularGaussian<float> gaussian(raw, a.form);
+        store_still(gaussian, a.means, out, i);
+        return;
+    }
     const TriangularModel model = model_of<TIME, CONDITIONED>(a);
     const auto raw = parameters<TIME>(a, i);
     const Observed<float> seen = TriangularGaussian<float, TIME>(model, raw).observe();
@@ -42,13 +64,26 @@ __global__ void observe_kernel(TriangularArgs a, Observation out) {
 template <bool TIME, bool CONDITIONED>
 __global__ void observe_backward_kernel(TriangularArgs a, ObservationGrads grads, TriangularGrads out) {
     const int64_t i = global_thread();
-    TriangularParameters<float, TIME> g{};
-    if (i < a.N) {
+    TriangularParameters<float, TIME> g{};  // of a still row mostly zero
+    if (i >= a.sliced && i < a.N) {
+        const auto raw = still_parameters<TIME, CONDITIONED>(a, i);
+        StillTriangularParameters<float> g_still{};
+        const Observed<float> given = load_observed(grads, i);
+        StillTriangularGaussian<float>(raw, a.form).vjp(given.factor, given.opacity, g_still);
+        GSB_UNROLL for (int k = 0; k < 3; ++k) {
+            g.mean[k] = given.mean[k];
+            g.log_diagonal[SPACE<TIME, CONDITIONED> + k] = g_still.log_diagonal[k];
+            g.shape[k] = g_still.shape[k];
+        }
+        g.opacity = g_still.opacity;
+    } else if (i < a.N) {
         const TriangularModel model = model_of<TIME, CONDITIONED>(a);
         const auto raw = parameters<TIME>(a, i);
         TriangularGaussian<float, TIME> gaussian(model, raw);
         gaussian.observe();
         gaussian.vjp(load_observed(grads, i), g);
+    }
+    if (i < a.N) {
         store_row(g.mean, out.means, i);
         store_row(g.direction, out.directions, i);
         if constexpr (TIME) out.times[i] = g.time;

@@ -1,6 +1,8 @@
 // Colours from real spherical harmonics of the viewing direction (3DGS), times a Fourier series of time (4DGS eq. 12).
 #pragma once
 
+#include <cstdint>
+
 #include "scalar.h"
 
 namespace gsb {
@@ -76,6 +78,19 @@ GSB_HD inline Vec3<T> harmonics_vjp(const Vec3<T>& d, int degree, const T (&g)[M
     }
     return out;
 }
+
+// How much of a colour there is: harmonics up to a degree, and frequencies of time. As a number: degree + 4 (waves - 1).
+struct Level {
+    int degree, waves;
+
+    GSB_HD static Level of(uint32_t number) {
+        return {static_cast<int>(number % 4), static_cast<int>(number / 4) + 1};
+    }
+    GSB_HD int number() const { return degree + 4 * (waves - 1); }
+    GSB_HD Level at_most(Level o) const {
+        return {degree < o.degree ? degree : o.degree, waves < o.waves ? waves : o.waves};
+    }
+};
 
 // A vector at length 1, and zero where it is too short to have a direction (as its gradient then is).
 template <class T>

@@ -1,6 +1,7 @@
-// What raw parameters of every model mean: sizes by exp, rotations by quaternions.
+// What raw parameters of every model mean: sizes by exp, rotations by quaternions, entries below a factor's diagonal.
 #pragma once
 
+#include "off_diagonal.h"
 #include "scalar.h"
 #include "thresholds.h"
 
@@ -16,6 +17,27 @@ GSB_HD inline T size_of(T log) {
 template <class T>
 GSB_HD inline T size_vjp(T log, T size, T g) {
     return select(max(log, T(0.0f) - log) <= T(LOG_SIZE_MAX), g * size, T(0.0f));
+}
+
+// An entry below the diagonal of a triangular factor, from its parameter; `relative`: it is stated in units of its row's
+// diagonal.
+template <class T>
+GSB_HD inline T entry_of(T x, T diagonal, OffDiagonal form, bool relative) {
+    const T bounded = form == OffDiagonal::row_scaled ? sigmoid(x) * 2.0f - 1.0f : x;
+    return relative ? bounded * diagonal : bounded;
+}
+
+// The gradient of the parameter from that of the entry; adds to that of the diagonal.
+template <class T>
+GSB_HD inline T entry_vjp(T x, T diagonal, OffDiagonal form, bool relative, T g, T& g_diagonal) {
+    if (form == OffDiagonal::row_scaled) {
+        const T s = sigmoid(x);
+        g_diagonal = g_diagonal + g * (s * 2.0f - 1.0f);
+        return g * diagonal * s * (T(1.0f) - s) * 2.0f;
+    }
+    if (!relative) return g;
+    g_diagonal = g_diagonal + g * x;
+    return g * diagonal;
 }
 
 // A quaternion at length 1, as torch normalises it.

@@ -25,6 +25,17 @@ GSB_HD constexpr float RIGHT_SIGN(int i, int j) {
     return table[i][j];
 }
 
+// The quaternion of a still Gaussian's rotation from its left one. M_left(l) M_right(r) keeps the axis of t where it is
+// for one right quaternion only, r = (l0, -l1, -l2, l3), and then turns space by this one. Twice, nothing is changed: it
+// is the inverse too, and what takes a gradient back.
+template <class T>
+GSB_HD inline void turn_of_space(const T (&left)[4], T (&quat)[4]) {
+    quat[0] = left[0];
+    quat[1] = left[3];
+    quat[2] = T(0.0f) - left[2];
+    quat[3] = left[1];
+}
+
 template <class T>
 struct RotatedGaussian {
     const RotatedParameters<T>& raw;

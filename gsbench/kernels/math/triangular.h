@@ -2,7 +2,6 @@
 #pragma once
 
 #include "harmonics.h"
-#include "off_diagonal.h"
 #include "parameters.h"
 #include "subtraction.h"
 
@@ -170,9 +169,7 @@ private:
         GSB_UNROLL for (int i = 0; i < N; ++i) {
             L[i][i] = size_of(raw.log_diagonal[i]);
             GSB_UNROLL for (int j = 0; j < i; ++j) {
-                const T x = entry<FIRST>(raw, i, j);
-                const T bounded = model.form == OffDiagonal::row_scaled ? sigmoid(x) * 2.0f - 1.0f : x;
-                L[i][j] = is_relative<FIRST>(i, j) ? bounded * L[i][i] : bounded;
+                L[i][j] = entry_of(entry<FIRST>(raw, i, j), L[i][i], model.form, is_relative<FIRST>(i, j));
             }
         }
     }
@@ -202,17 +199,8 @@ private:
         GSB_UNROLL for (int i = 0; i < N; ++i) {
             T g_diagonal = g_L[i][i];
             GSB_UNROLL for (int j = 0; j < i; ++j) {
-                const T x = entry<FIRST>(raw, i, j);
-                T g = g_L[i][j];
-                if (model.form == OffDiagonal::row_scaled) {
-                    const T s = sigmoid(x);
-                    g_diagonal = g_diagonal + g * (s * 2.0f - 1.0f);
-                    g = g * L[i][i] * s * (T(1.0f) - s) * 2.0f;
-                } else if (is_relative<FIRST>(i, j)) {
-                    g_diagonal = g_diagonal + g * x;
-                    g = g * L[i][i];
-                }
-                entry<FIRST>(out, i, j) = g;
+                entry<FIRST>(out, i, j) = entry_vjp(entry<FIRST>(raw, i, j), L[i][i], model.form,
+                                                    is_relative<FIRST>(i, j), g_L[i][j], g_diagonal);
             }
             out.log_diagonal[i] = size_vjp(raw.log_diagonal[i], L[i][i], g_diagonal);
         }
