@@ -32,14 +32,19 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(basis, -1)
 
 
-def sh_colors(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """Compute colours max(0, sum beta_lm Y_lm + 0.5), [N, K, 3] and [N, 3] -> [N, 3] (3DGS; 7DGS eq. 2)."""
-    basis = sh_basis(directions, degree)
+def sh_colors(coefficients: Tensor, directions: Tensor, degree: int, levels: Tensor | None = None) -> Tensor:
+    """Compute colours max(0, sum beta_lm Y_lm + 0.5), [N, K, 3] and [N, 3] -> [N, 3] (3DGS; 7DGS eq. 2).
+
+    Levels [N] int32 leave out what is above a row's own degree, as `gsbench.models.base.Classes` has it.
+    """
+    basis = _basis_within(directions, degree, levels)
     used = coefficients[:, : basis.shape[-1]]
     return ((basis[..., None] * used).sum(1) + 0.5).clamp(min=0)
 
 
-def sh_time_colors(coefficients: Tensor, directions: Tensor, degree: int, time_offset: Tensor) -> Tensor:
+def sh_time_colors(
+    coefficients: Tensor, directions: Tensor, degree: int, time_offset: Tensor, levels: Tensor | None = None
+) -> Tensor:
     """Compute colours by 4DSH: Y_lm(d) cos(2 pi n (t - mu_t) / T), T = 1 (4DGS, eq. 12).
 
     Args:
@@ -47,9 +52,21 @@ def sh_time_colors(coefficients: Tensor, directions: Tensor, degree: int, time_o
         directions: [N, 3] unit vectors.
         degree: of the spherical harmonics in use.
         time_offset: [N] t - mu_t.
+        levels: [N] int32, each row's degree + 4 (M - 1) at most, as `gsbench.models.base.Classes` has it.
     """
     frequencies = torch.arange(coefficients.shape[1], device=time_offset.device, dtype=time_offset.dtype)
     waves = torch.cos(2 * math.pi * frequencies * time_offset[:, None])  # [N, M]
-    basis = sh_basis(directions, degree)
+    if levels is not None:
+        waves = torch.where(frequencies <= (levels // 4)[:, None], waves, 0.0)
+    basis = _basis_within(directions, degree, levels)
     used = (coefficients[:, :, : basis.shape[-1]] * waves[..., None, None]).sum(1)
     return ((basis[..., None] * used).sum(1) + 0.5).clamp(min=0)
+
+
+def _basis_within(directions: Tensor, degree: int, levels: Tensor | None) -> Tensor:
+    """Compute `sh_basis`, zero above the degree of each row's level."""
+    basis = sh_basis(directions, degree)
+    if levels is None:
+        return basis
+    degrees = [own for own in range(degree + 1) for _ in range(2 * own + 1)]
+    return torch.where(torch.tensor(degrees, device=levels.device) <= (levels % 4)[:, None], basis, 0.0)

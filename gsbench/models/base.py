@@ -92,6 +92,7 @@ class GaussianModel(nn.Module, ABC):
         self.agr_octaves = agr_octaves
         self.sh_degree = sh_degree
         self.backend = backend
+        self.classes: Classes | None = None  # None: every row has every effect
         self.extent = 1.0  # of the scene, world units
         self.phase = Phase(sh_degree, agr, False)
 
@@ -104,6 +105,13 @@ class GaussianModel(nn.Module, ABC):
     @abstractmethod
     def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Slice Gaussians with raw parameters `raw` at a query."""
+
+    def still(self, raw: Raw) -> Conditioned:
+        """Return Gaussians that no query changes, with a gate of one; a model that observes something overrides it.
+
+        They are what `condition` tends to where Gaussians grow long in all that is observed, and move with none of it.
+        """
+        raise NotImplementedError(f"{type(self).__name__}.still")
 
     @abstractmethod
     def scales(self) -> Tensor:
@@ -159,8 +167,8 @@ class GaussianModel(nn.Module, ABC):
         """
         degree = self.phase.sh_degree
         if self.backend.serves(means):
-            return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, degree)
-        return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), unit(means - query.center), degree)
+            return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, degree, levels=self.levels)
+        return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), unit(means - query.center), degree, self.levels)
 
     # ---- what every model does
 
@@ -204,17 +212,37 @@ class GaussianModel(nn.Module, ABC):
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """Compute the means, factors and opacities of a slice; models that have a kernel for it call the kernel."""
-        means, factors, gate = self.condition(raw, query)
+        means, factors, gate = self._sliced_and_still(raw, query)
         return means, factors, torch.sigmoid(raw["opacities"]) * gate
+
+    def _sliced_and_still(self, raw: Raw, query: Query) -> Conditioned:
+        """Slice the rows that change with the query, and leave the others as they are."""
+        if self.sliced is None:
+            return self.condition(raw, query)
+        changing = {name: x[: self.sliced] for name, x in raw.items()}
+        others = {name: x[self.sliced :] for name, x in raw.items()}
+        parts = zip(self.condition(changing, query), self.still(others), strict=True)
+        return Conditioned(*map(torch.cat, parts))
+
+    @property
+    def sliced(self) -> int | None:
+        """How many of the first rows change with the query; None: all that a slice is made of."""
+        return None if self.classes is None or not self.observes else self.classes.sliced
+
+    @property
+    def levels(self) -> Tensor | None:
+        """The harmonics of each row's colours, [N] int32 as in `Classes`; None: all of them."""
+        return None if self.classes is None else self.classes.levels
 
     def refined(self, query: Query) -> Raw:
         """Apply AGR to the raw parameters: raw + phi(f) (7DGS eq. 15), to log-diagonals before the exp."""
         raw: Raw = dict(self.splats.items())
-        if self.refinement is None or not self.phase.refine or query.time is None:
+        rows = None if self.classes is None else self.classes.refined
+        if self.refinement is None or not self.phase.refine or query.time is None or rows == 0:
             return raw
         names = (*self.centers, *self.geometry)
         by_kernel = self.backend.serves(raw["means"])
-        moved = self.refinement([raw[name] for name in names], query.time, by_kernel=by_kernel)
+        moved = self.refinement([raw[name] for name in names], query.time, by_kernel=by_kernel, rows=rows)
         return raw | dict(zip(names, moved, strict=True))
 
     def modulate(self, name: str, value: float) -> None:

@@ -105,6 +105,17 @@ def rotation(quaternions: Tensor) -> Tensor:
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
+def turn_of_space(quaternions: Tensor) -> Tensor:
+    """Compute the quaternion of the rotation of space that a left one makes with its partner, [N, 4] -> [N, 4].
+
+    M_left(l) M_right(r) keeps the axis of t where it is for r = (l0, -l1, -l2, l3) alone, up to its length, and then
+    rotates space as `rotation` does by (l0, l3, -l2, l1): in these matrices x comes first and t last. Twice, nothing is
+    changed, so this computes the left quaternion of a rotation of space too.
+    """
+    w, x, y, z = quaternions.unbind(-1)
+    return torch.stack([w, z, -y, x], -1)
+
+
 def rotation4d(left: Tensor, right: Tensor) -> Tensor:
     """Compute the 4D rotation M_left(l) M_right(r) of two quaternions, [N, 4] and [N, 4] -> [N, 4, 4] (4DGS, eq. 7)."""
     a, b, c, d = F.normalize(left, dim=-1).unbind(-1)

@@ -12,7 +12,7 @@ from gsbench.kernels.slices import observe_rotated
 from gsbench.kernels.thresholds import TIME_GATE_MIN
 from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
-from gsbench.models.factors import rotation4d, sizes
+from gsbench.models.factors import rotation, rotation4d, sizes, turn_of_space
 from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
 from gsbench.models.slicing import check_scheme, mahalanobis, slice_gaussians
@@ -86,6 +86,11 @@ class Gaussians4DModel(GaussianModel):
         gate = self._gate(factor, torch.where(seen[:, None], delta, 0.0))
         return Conditioned(means, factors, torch.where(seen, gate, 0.0))
 
+    def still(self, raw: Raw) -> Conditioned:
+        """Return Gaussians that the left quaternion rotates in space only, whatever their times and sizes in time."""
+        factors = rotation(turn_of_space(raw["left_quats"])) * sizes(raw["scales"][:, :3])[:, None, :]
+        return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
+
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """Slice by the kernel where the backend has one, in the square-root scheme."""
         if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
@@ -101,6 +106,7 @@ class Gaussians4DModel(GaussianModel):
             self.clock,
             query.time,
             self.log_modulation["time"],
+            sliced=self.sliced,
         )
 
     def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
@@ -108,10 +114,11 @@ class Gaussians4DModel(GaussianModel):
         assert query.time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.phase.sh_degree, self.time_degree + 1
         if waves <= MAX_WAVES and self.backend.serves(means):
-            return show_colors(sh0, raw["shN"], means, opacities, query.center, degree, raw["times"], query.time, waves)
+            return show_colors(sh0, raw["shN"], means, opacities, query.center, degree, raw["times"], query.time, waves,
+                               self.levels)  # fmt: skip
         coefficients = torch.cat([sh0, raw["shN"]], 1).unflatten(1, (waves, -1))
         directions = unit(means - query.center)
-        return sh_time_colors(coefficients, directions, degree, query.time - raw["times"][:, 0])
+        return sh_time_colors(coefficients, directions, degree, query.time - raw["times"][:, 0], self.levels)
 
     def initial_colors(self, dc: Tensor) -> Raw:
         """Return 4DSH coefficients [N, time_degree + 1, K, 3], of which only the constant one is not zero."""

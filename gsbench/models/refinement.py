@@ -60,15 +60,20 @@ class Refinement(nn.Module):
         self.weights_out = nn.ParameterList([nn.Parameter(torch.zeros(width, HIDDEN)) for width in outputs])
         self.biases_out = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in outputs])
 
-    def forward(self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False) -> list[Tensor]:
+    def forward(
+        self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False, rows: int | None = None
+    ) -> list[Tensor]:
         """Move raw parameters [N, c], those that are read and then the others, to a time [].
 
-        The kernel (float32) writes no hidden layer to memory.
+        The kernel (float32) writes no hidden layer to memory. With `rows` only so many first Gaussians are moved.
         """
         if by_kernel:
             gamma = encode_time(time, self.octaves)
             return refine(values, self.weight_in, self.bias_in, list(self.weights_out), list(self.biases_out),
-                          self.units, gamma)  # fmt: skip
+                          self.units, gamma, rows=rows)  # fmt: skip
+        if rows is not None:
+            moved = self([x[:rows] for x in values], time)
+            return [torch.cat([x, rest[rows:]]) for x, rest in zip(moved, values, strict=True)]
         # The units scale rows and columns of the layers instead of the parameters of every Gaussian.
         weight_in, bias_in = self.weight_in[:, : self.features] / self.units[: self.features], self.at_time(time)
         units = self.units.split([len(w) for w in self.weights_out])

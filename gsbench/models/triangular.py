@@ -111,6 +111,13 @@ class TriangularModel(GaussianModel):
             means, factors, _ = slice_gaussians(mean, factor, at, scheme=self.scheme)
         return Conditioned(means, factors, gate)
 
+    def still(self, raw: Raw) -> Conditioned:
+        """Return Gaussians of the block L_pp alone."""
+        space = self.rows["p"]
+        kinds = {"shape": raw["shape"], "motion": raw["motion"][:, :0], "coupling": raw["coupling"][:, :0]}
+        factors = Triangle("ppp", self.triangle.form).factor(raw["log_diagonal"][:, space], kinds)
+        return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
+
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """Slice by the kernel where there is one: in the square-root scheme, and on the CPU also for `cholesky`."""
         has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
@@ -133,6 +140,7 @@ class TriangularModel(GaussianModel):
             form=OFF_DIAGONALS.index(self.triangle.form),
             directional_half=self.directional_half,
             subtracts=self.scheme == "cholesky",
+            sliced=self.sliced,
         )
 
     def scales(self) -> Tensor:

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 import test_tape
 import torch
-from test_observe import VARIANTS, assert_same, color_inputs, gradients, model_and_raw, rotated, still
+from test_observe import VARIANTS, assert_same, color_inputs, model_and_raw, rotated, still
+from test_prefixes import SHARES, gradients, kept
 from torch import Tensor
 
 from gsbench.backends import AUTO, REFERENCE, Backend
@@ -16,6 +17,7 @@ from gsbench.kernels import colors, refine
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.appearance import sh_colors, sh_time_colors
+from gsbench.models.base import Classes
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement
@@ -66,6 +68,40 @@ def test_still_slice(move: Move) -> None:
     assert_slices_agree(Gaussians3DModel(), raw, move)
 
 
+@pytest.mark.parametrize("share", SHARES)
+@pytest.mark.parametrize(("timed", "options"), VARIANTS)
+def test_still_rows(timed: bool, options: dict[str, Any], share: float, move: Move) -> None:
+    """Catches a still row that reads a column of time or direction, or leaves a gradient unwritten."""
+    exact, raw = model_and_raw(timed, options, torch.float64)
+    exact.classes = Classes(0, round(share * 37), None)
+    assert_slices_agree(exact, raw, move)
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_still_rows_of_rotated_factors(share: float, move: Move) -> None:
+    """Catches a still row that is turned otherwise than by its left quaternion, or fades."""
+    exact, raw = rotated(torch.float64)
+    exact.classes = Classes(0, round(share * 45), None)
+    assert_slices_agree(exact, raw, move)
+
+
+@pytest.mark.parametrize("waves", [1, 3])
+def test_levels(waves: int, move: Move) -> None:
+    """Catches a thread that reads another row's level, and a gradient above a row's own."""
+    N, g = 300, torch.Generator().manual_seed(waves)
+    levels = torch.randint(0, 20, (N,), generator=g, dtype=torch.int32)
+    sh0, shN, means, times = exact = color_inputs(waves, torch.float64, N)
+    center = torch.tensor([0.1, 0.2, -2.0])
+    used = torch.cat([sh0, shN], 1).unflatten(1, (waves, 16)) * kept(levels, waves)
+    expected = sh_time_colors(used, unit(means - center.double()), 2, 0.7 - times[:, 0])
+    single, count = [move(x) for x in exact], 4 if waves > 1 else 3
+    timed = (single[3], move(torch.tensor(0.7))) if waves > 1 else (None, None)
+    actual = colors.show_colors(*single[:3], move(torch.ones(N)), move(center), 2, *timed, waves,
+                                levels.to(single[0].device))  # fmt: skip
+    assert_same([actual.cpu()], [expected])
+    assert_same(back(gradients([actual], single[:count])), gradients([expected], list(exact[:count])))
+
+
 @pytest.mark.parametrize("waves", [1, 3])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_colors(degree: int, waves: int, move: Move) -> None:
@@ -110,6 +146,24 @@ def test_refinement(N: int, widths: list[int], move: Move) -> None:
                 gradients(expected, [*values, *exact.parameters()]))  # fmt: skip
 
 
+@pytest.mark.parametrize("share", SHARES)
+def test_rows_that_agr_does_not_move(share: float, move: Move) -> None:
+    """Catches a row past the prefix that is moved, or counted in a weight's gradient, or not copied, forth or back."""
+    g, count = torch.Generator().manual_seed(1), round(share * 300)
+    exact = Refinement([3, 1, 9], g, units=0.5 + torch.rand(13, generator=g)).double()
+    with torch.no_grad():
+        for parameter in exact.parameters():
+            parameter.add_(0.2 * torch.randn(parameter.shape, generator=g))
+    values = [torch.randn(300, c, generator=g, dtype=torch.float64).requires_grad_() for c in (3, 1, 2, 7)]
+    expected = exact(values, torch.tensor(0.37, dtype=torch.float64), rows=count)
+    single, inputs = deepcopy(exact).to(move(values[0])), [move(x) for x in values]
+    actual = single(inputs, move(torch.tensor(0.37)), by_kernel=True, rows=count)
+    assert_same(back(actual), expected)
+    assert all(torch.equal(x[count:], y[count:]) for x, y in zip(actual, inputs, strict=True))
+    assert_same(back(gradients(actual, [*inputs, *single.parameters()])),
+                gradients(expected, [*values, *exact.parameters()]))  # fmt: skip
+
+
 def test_networks_too_large_are_refused(move: Move) -> None:
     """Catches a network that would not fit the kernel's arrays, and would be read past their end."""
     one, units = move(torch.ones(1)), move(torch.ones(32))
@@ -120,14 +174,17 @@ def test_networks_too_large_are_refused(move: Move) -> None:
 
 
 @pytest.mark.usefixtures("threads")
-@pytest.mark.parametrize(("name", "agr"), [("7dgs", True), ("4dgs", False)])
-def test_a_training_step_s_gradients_are_the_reference_s(name: str, agr: bool, cuda_device: str) -> None:
+@pytest.mark.parametrize(("name", "agr", "classed"), [("7dgs", True, False), ("4dgs", False, False),
+                                                      ("7dgs", True, True), ("4dgs", True, True)])  # fmt: skip
+def test_a_training_step_s_gradients_are_the_reference_s(name: str, agr: bool, classed: bool, cuda_device: str) -> None:
     """Catches what no kernel shows alone: a gradient that is lost, or taken twice, on its way from the loss through
     blending, projection, colours and slices to the parameters, or in the sum over views."""
     torch.set_num_threads(1)  # the shim runs in one
 
     def step(backend: Backend, device: str) -> dict[str, Tensor]:
-        made = test_tape.fitted(name, agr=agr).to(device)
+        made = test_tape.fitted(name, agr=agr, classed=classed).to(device)
+        if classed:
+            made.classes = made.classes._replace(levels=made.classes.levels.to(device))
         made.backend = backend
         background = torch.tensor([0.1, 0.5, 0.9], device=device)
         Step(made, background, 0.2, False, StageClock(device))([view.to(device) for view in test_tape.views(2)])

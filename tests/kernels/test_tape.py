@@ -14,6 +14,7 @@ from gsbench.kernels.slices import observe_still
 from gsbench.kernels.tape import Tape
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
+from gsbench.models.base import Classes
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes.scene import Camera, View
 from gsbench.train.step import Step, fitting_threads
@@ -33,13 +34,16 @@ def views(count: int, size: int = 40) -> list[View]:
     return made
 
 
-def fitted(name: str, N: int = 300, *, agr: bool = False) -> GaussianModel:
-    """A model all of whose parts learn, and whose Gaussians cover each other."""
+def fitted(name: str, N: int = 300, *, agr: bool = False, classed: bool = False) -> GaussianModel:
+    """A model all of whose parts learn, and whose Gaussians cover each other; or not all of them in every row."""
     made = model(name, N, agr=agr, sigma=0.2, backend=CPU)
     with torch.no_grad():
         for parameter in made.refinement.parameters() if made.refinement is not None else ():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
     made.set_phase(replace(made.phase, tune_modulation=True))
+    if classed:
+        levels = torch.randint(0, 12, (N,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
+        made.classes = Classes(N // 3, N // 2 + 1, levels)
     return made
 
 
@@ -50,11 +54,14 @@ def gradients(made: GaussianModel) -> dict[str, Tensor]:
 
 
 @pytest.mark.usefixtures("threads")
-@pytest.mark.parametrize(("name", "agr"), [("3dgs", False), ("4dgs", False), ("6dgs", False), ("7dgs", False),
-                                           ("7dgs", True), ("4dgs", True)])  # fmt: skip
-def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool) -> None:
+@pytest.mark.parametrize(
+    ("name", "agr", "classed"),
+    [("3dgs", False, False), ("4dgs", False, False), ("6dgs", False, False), ("7dgs", False, False),
+     ("7dgs", True, False), ("4dgs", True, False), ("7dgs", True, True), ("4dgs", True, True), ("3dgs", True, True)],
+)  # fmt: skip
+def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool, classed: bool) -> None:
     """Catches an operation left out of the chain, a gradient given twice, or to another tensor."""
-    made, batch = fitted(name, agr=agr), views(3)
+    made, batch = fitted(name, agr=agr, classed=classed), views(3)
     expected: dict[str, Tensor] = {}
     for view in batch:
         seen = made.slice(Query.of(view.camera, view.time))
@@ -75,10 +82,10 @@ def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool) -> None:
 
 
 @pytest.mark.usefixtures("threads", "instruction_set")
-@pytest.mark.parametrize("name", ["4dgs", "7dgs"])
-def test_the_same_bits_for_any_number_of_threads(name: str) -> None:
+@pytest.mark.parametrize(("name", "N", "classed"), [("4dgs", 300, False), ("7dgs", 300, False), ("7dgs", 2500, True)])
+def test_the_same_bits_for_any_number_of_threads(name: str, N: int, classed: bool) -> None:
     """Catches views whose gradients are added in the order that threads come by."""
-    made, batch = fitted(name, agr=True), views(5)
+    made, batch = fitted(name, N, agr=True, classed=classed), views(5)
     found = []
     for count in (1, 2, 3, 8):
         torch.set_num_threads(count)

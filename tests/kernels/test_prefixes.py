@@ -1,0 +1,212 @@
+"""Kernels that leave out what a row does without: a query, AGR, or some of its harmonics."""
+
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_observe import SUBTRACTING, VARIANTS, assert_same, color_inputs, model_and_raw, nan_memory, rotated
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.kernels import operation
+from gsbench.kernels import refine as refining
+from gsbench.kernels.colors import show_colors
+from gsbench.kernels.slices import observe_rotated
+from gsbench.models import Query
+from gsbench.models.appearance import sh_time_colors
+from gsbench.models.base import Classes, GaussianModel, Raw
+from gsbench.models.query import unit
+from gsbench.models.refinement import Refinement
+
+CENTER, TIME = torch.tensor([0.3, -0.2, -3.0]), torch.tensor(0.4)
+SHARES = (0.0, 0.03, 0.5, 0.98, 1.0)  # of the rows that change: of 37 rows 0, 1, 18, 36 and all
+
+
+def weights_of(outputs: list[Tensor]) -> list[Tensor]:
+    g = torch.Generator().manual_seed(2)
+    return [torch.randn(x.shape, generator=g).to(x) for x in outputs]
+
+
+def gradients(outputs: list[Tensor], inputs: list[Tensor]) -> list[Tensor]:
+    return list(torch.autograd.grad(outputs, inputs, weights_of(outputs), materialize_grads=True))
+
+
+def assert_still_rows(exact: GaussianModel, raw: Raw, model: GaussianModel, single: Raw, share: float) -> None:
+    """The kernel's slice and gradients with still rows are the reference's, and its sliced rows are as without them."""
+    count = round(share * len(raw["means"]))
+    query = Query(CENTER, TIME)
+    everything = list(model.observe(single, query))
+    exact.classes = model.classes = Classes(0, count, None)
+    expected = list(exact.observe(raw, Query(CENTER.double(), TIME.double())))
+    actual = list(model.observe(single, query))
+    for x, y in zip(actual, everything, strict=True):
+        assert torch.equal(x[:count], y[:count])
+    assert count == len(actual[0]) or not torch.equal(actual[0][count:], everything[0][count:])
+    want = gradients(expected, [*raw.values(), *exact.log_modulation.parameters()])
+    got = gradients(actual, [*single.values(), *model.log_modulation.parameters()])
+    assert_same(actual, expected)
+    assert_same(got, want)
+    for x, y in zip(got[: len(raw)], want, strict=False):
+        assert not x[count:][y[count:] == 0].any(), "what a still row does not depend on has a gradient"
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("share", SHARES)
+@pytest.mark.parametrize(("timed", "options"), VARIANTS + SUBTRACTING)
+def test_still_rows_of_triangular_factors(timed: bool, options: dict[str, Any], share: float) -> None:
+    """Catches a still row that reads a column of time or direction, skews otherwise, or leaves a gradient unwritten."""
+    assert_still_rows(
+        *model_and_raw(timed, options, torch.float64), *model_and_raw(timed, options, torch.float32), share
+    )
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("share", SHARES)
+def test_still_rows_of_rotated_factors(share: float) -> None:
+    """Catches a still row that is turned otherwise than by its left quaternion, or fades, or has a gradient by time."""
+    assert_still_rows(*rotated(torch.float64), *rotated(torch.float32), share)
+
+
+def test_a_still_row_has_no_other_gradient() -> None:
+    """Catches a gradient by what is a still row's no more, in kernel and reference alike."""
+    model, raw = model_and_raw(True, {}, torch.float32)
+    model.classes = Classes(0, 10, None)
+    got = dict(zip(raw, gradients(list(model.observe(raw, Query(CENTER, TIME))), list(raw.values())), strict=True))
+    for name in ("directions", "times", "motion", "coupling"):
+        assert not got[name][10:].any(), name
+        assert got[name][:10].any(), name
+    assert not got["log_diagonal"][10:, :4].any()
+    assert got["log_diagonal"][10:, 4:].any()
+
+
+# ---- colours
+
+
+def kept(levels: Tensor, waves: int) -> Tensor:
+    """Which of 16 coefficients of each frequency a row of such a level has, [N, waves, 16, 1]."""
+    degrees = torch.arange(16).sqrt().floor()
+    by_wave = torch.arange(waves) <= (levels // 4)[:, None]
+    return (by_wave[:, :, None] & (degrees <= (levels % 4)[:, None, None]))[..., None]
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("waves", [1, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("N", [1, 37, 1100])
+def test_levels_leave_coefficients_out(N: int, degree: int, waves: int) -> None:
+    """Catches a row that is sorted to another's place, a vector of two levels, and a gradient above a row's level."""
+    g = torch.Generator().manual_seed(N)
+    levels = torch.randint(0, 20, (N,), generator=g, dtype=torch.int32)  # some with more frequencies than there are
+    drawn = torch.rand(N, generator=g) < 0.8
+    center = torch.tensor([0.1, 0.2, -2.0])
+    sh0, shN, means, times = exact = color_inputs(waves, torch.float64, N)
+    used = torch.cat([sh0, shN], 1).unflatten(1, (waves, 16)) * kept(levels, waves)
+    expected = sh_time_colors(used, unit(means - center), degree, 0.7 - times[:, 0]) * drawn[:, None]
+    single = color_inputs(waves, torch.float32, N)
+    timed = (single[3], torch.tensor(0.7)) if waves > 1 else (None, None)
+    actual = show_colors(*single[:3], drawn.float(), center, degree, *timed, waves, levels)
+    assert_same([actual], [expected])
+    inputs = 4 if waves > 1 else 3
+    got, want = gradients([actual], single[:inputs]), gradients([expected], exact[:inputs])
+    assert_same(got, want)
+    left_out = ~kept(levels, waves).expand(-1, -1, -1, 3).flatten(1, 2)
+    assert not torch.cat(got[:2], 1)[left_out].any()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 600), st.integers(0, 3), st.integers(1, 4), st.integers(0, 2**31))
+def test_levels_that_leave_nothing_out_change_no_bit(N: int, degree: int, waves: int, seed: int) -> None:
+    """Catches rows that are worked on in another order, or by other arithmetic, where they have levels."""
+    g = torch.Generator().manual_seed(seed)
+    own_degree = torch.randint(degree, 4, (N,), generator=g)
+    levels = (own_degree + 4 * torch.randint(waves - 1, 9, (N,), generator=g)).int()
+    drawn, inputs = (torch.rand(N, generator=g) < 0.7).float(), color_inputs(waves, torch.float32, N)
+    timed = (inputs[3], torch.tensor(0.7)) if waves > 1 else (None, None)
+    found = []
+    for given_levels in (None, levels):
+        colors = show_colors(*inputs[:3], drawn, torch.zeros(3), degree, *timed, waves, given_levels)
+        found.append([colors, *gradients([colors], inputs[: 4 if waves > 1 else 3])])
+    assert all(torch.equal(x, y) for x, y in zip(*found, strict=True))
+
+
+# ---- AGR
+
+
+@pytest.mark.usefixtures("instruction_set", "threads")
+@pytest.mark.parametrize("N", [1, 127, 5000])
+@pytest.mark.parametrize("share", SHARES)
+def test_rows_that_agr_does_not_move(N: int, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a row past the prefix that is moved, or counted in a weight's gradient, or not copied, forth or back."""
+    monkeypatch.setattr(refining, "allocate", nan_memory)
+    widths, parts, count, g = [3, 1, 9], [3, 1, 2, 7], round(share * N), torch.Generator().manual_seed(N)
+    exact = Refinement(widths, g, units=0.5 + torch.rand(sum(widths), generator=g)).double()
+    with torch.no_grad():
+        for parameter in exact.parameters():
+            parameter.add_(0.2 * torch.randn(parameter.shape, generator=g))
+    values = [torch.randn(N, c, generator=g, dtype=torch.float64).requires_grad_() for c in parts]
+    time = torch.tensor(0.37)
+    expected = exact(values, time.double(), rows=count)
+    want = gradients(expected, [*values, *exact.parameters()])
+    single = Refinement(widths, g)
+    single.load_state_dict(exact.state_dict())
+    inputs = [x.detach().float().requires_grad_() for x in values]
+    found = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        moved = single(inputs, time, by_kernel=True, rows=count)
+        found.append([*moved, *gradients(moved, [*inputs, *single.parameters()])])
+    moved, got = found[0][: len(parts)], found[0][len(parts) :]
+    assert_same(moved, expected)
+    assert_same(got, want)
+    for x, y, gradient, weight in zip(inputs, moved, got, weights_of(moved), strict=False):
+        assert torch.equal(x[count:], y[count:])
+        assert torch.equal(gradient[count:], weight[count:])
+    assert all(torch.equal(x, y) for other in found[1:] for x, y in zip(found[0], other, strict=True))
+    if share == 1:
+        assert all(torch.equal(x, y) for x, y in zip(moved, single(inputs, time, by_kernel=True), strict=True))
+
+
+# ---- the door
+
+
+def test_rows_that_there_are_not() -> None:
+    """Catches a prefix longer than the arrays, which a kernel would read past their end, and levels of another kind."""
+    model, raw = model_and_raw(True, {}, torch.float32)
+    for count in (38, -1):
+        model.classes = Classes(0, count, None)
+        with pytest.raises(InputError, match="sliced: expected a number of rows from 0 to 37"):
+            model.observe(raw, Query(CENTER, TIME))
+    rotating, single = rotated(torch.float32)
+    with pytest.raises(InputError, match="sliced"):
+        observe_rotated(*single.values(), rotating.clock, TIME, rotating.log_modulation["time"], sliced=46)
+    with pytest.raises(InputError, match="refine: rows"):
+        Refinement([3, 4], torch.Generator())([torch.ones(2, 3), torch.ones(2, 4)], TIME, by_kernel=True, rows=3)
+    sh0, shN, means, _ = color_inputs(1, torch.float32)
+    for levels in (torch.zeros(21), torch.zeros(20, dtype=torch.int32), torch.zeros(21, dtype=torch.int64)):
+        with pytest.raises(InputError, match="levels"):
+            show_colors(sh0, shN, means, torch.ones(21), torch.zeros(3), 3, levels=levels)
+
+
+def test_any_number_is_a_level() -> None:
+    """Catches a level that is read as a place in memory: nonsense may have any colour, and ends no process."""
+    sh0, shN, means, _ = color_inputs(1, torch.float32)
+    levels = torch.tensor([-1, -(2**31), 2**31 - 1], dtype=torch.int32).repeat(7)
+    show_colors(sh0, shN, means, torch.ones(21), torch.zeros(3), 3, levels=levels).sum().backward()
+
+
+def test_torch_is_told_the_truth() -> None:
+    """Catches an operation with prefixes or levels whose fake has other shapes than it has."""
+    checks = "test_schema", "test_faketensor"
+    nothing, ops = torch.empty(0), torch.ops.gsbench
+    inputs = color_inputs(1, torch.float32)
+    torch.library.opcheck(
+        ops.show_colors,
+        ([*inputs[:3], torch.ones(21), nothing, CENTER, nothing, torch.zeros(21).int()], 2, 1),
+        test_utils=checks,
+    )
+    model, raw = rotated(torch.float32)
+    given_raw = [*raw.values(), model.clock, TIME, model.log_modulation["time"]]
+    for count in (7, operation.EVERY_ROW):
+        torch.library.opcheck(ops.observe_rotated, (given_raw, count), test_utils=checks)
