@@ -59,6 +59,8 @@ class ModelConfig:
     agr_octaves: int = 4  # K of AGR's time encoding; the paper's 10 memorise every frame: docs/tuning.md
     sh_degree: int = 3
     min_opacity: float = 0.005  # a Gaussian below it is pruned
+    gate: str = "off"  # the default of effects.gate
+    candidates: dict[str, Any] = field(default_factory=dict)  # of model=auto: other models, of which a run chooses one
     lr: dict[str, LearningRate] = field(default_factory=dict)  # by parameter group
     options: dict[str, Any] = field(default_factory=dict)  # keyword arguments of the model's class
 
@@ -114,6 +116,14 @@ class ProtocolConfig:
 
 
 @dataclass
+class EffectsConfig:
+    """Effects on demand: each Gaussian keeps those that pay (docs/effects.md)."""
+
+    gate: str = "${model.gate}"  # off, end: after the training, or both: once densification is over too
+    budget_db: float = 0.05  # PSNR on val that the gate at the end may cost
+
+
+@dataclass
 class LaunchConfig:
     """Where and how the runs of a sweep are done: +launch=local, parallel or slurm. It changes no number of a run."""
 
@@ -146,6 +156,7 @@ class Config:
     train: TrainConfig = field(default_factory=TrainConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    effects: EffectsConfig = field(default_factory=EffectsConfig)
     launch: LaunchConfig = field(default_factory=LaunchConfig)
 
 

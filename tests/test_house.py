@@ -18,6 +18,7 @@ FLOORS: tuple[set[str], ...] = (
     {"backends"},
     {"raster"},
     {"models", "measure"},
+    {"effects"},
     {"train", "report"},
     {"run"},
     {"stability", "sweep"},
@@ -81,8 +82,8 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
 
 
 def room(module: str) -> str:
-    """The first part of a module's name below the package; the package itself has none."""
-    return [*module.split("."), ""][1]
+    """The first part of a module's name below the package, which has none; a room's command stands above all rooms."""
+    return "__main__" if module.endswith(".__main__") else [*module.split("."), ""][1]
 
 
 def upward(graph: dict[str, set[str]]) -> list[str]:

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from gsbench.backends import resolve
 from gsbench.errors import InputError
+from gsbench.measure.record import TimeScreen
 from gsbench.models.appearance import sh_basis
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.query import Query, unit
@@ -41,30 +42,15 @@ PERMUTATIONS = 999
 LEVEL = 0.01  # time is on where p is at most this
 LEAST_FREE = 0.5  # share of the waves' variance that the camera must leave free
 LEAST_VIEWS = 12
-NEAR_AXES = 0.5  # a point nearest to all optical axes is the scene's centre if they pass it within this part of its depth
+NEAR_AXES = (
+    0.5  # a point nearest to all optical axes is the scene's centre if they pass it within this part of its depth
+)
 RADIUS = 0.4  # of the points around the centre, in distances of the cameras
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Screen:
-    """What the screen found out about time in a scene."""
-
-    decision: str  # on, off or undecided
-    reason: str  # in words
-    p: float | None  # share of permutations with as much energy in the waves of time; None: not tested
-    z: float | None  # the energy's distance from that of permutations, in their standard deviations
-    free: float | None  # share of the waves' variance that the camera leaves free
-    seconds: float  # that the screen took
-
-    @property
-    def simulates_time(self) -> bool:
-        """Whether the model observes time: what is undecided is simulated."""
-        return self.decision != "off"
-
-
-def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> Screen:
+def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
     """Decide from its training views whether a scene changes with time.
 
     Args:
@@ -79,9 +65,9 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> Screen:
     if not scene.train:
         raise InputError(f"{scene.name}: expected training views to look at, there are none")
 
-    def conclude(decision: str, reason: str, found: "Evidence | None" = None) -> Screen:
+    def conclude(decision: str, reason: str, found: "Evidence | None" = None) -> TimeScreen:
         p, z, free = (found.p, found.z, found.free) if found else (None, None, None)
-        return Screen(decision, reason, p, z, free, time.perf_counter() - started)
+        return TimeScreen(decision, reason, p, z, free, time.perf_counter() - started)
 
     if not scene.has_time:
         return conclude("off", "the views have no times")

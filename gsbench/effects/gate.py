@@ -12,31 +12,27 @@ from torch import Tensor
 
 from gsbench.effects.strength import Strength
 from gsbench.models import GaussianModel
-from gsbench.models.base import Classes
+from gsbench.models.classes import DIRECTION, MOST_LEVEL, TIME, Classes, count
 from gsbench.models.variants import LIVE, REMOVED, SLICED, STILL
 
 # Nanoseconds that a Gaussian adds to a frame (EPYC Zen 4, AVX-512, one thread; benchmarks/effects.py). They are
 # constants, and not measured anew, so that the same seed chooses the same Gaussians on every machine.
 REFINING = 195.0
-SLICING, SLICING_STILL = 28.0, 8.0
-COLORING = {0: 13.0, 1: 19.0, 2: 23.0, 3: 28.0}  # by degree, for each frequency of time
-RASTERIZING = 60.0
+SLICING = 28.0
+COSTS = {SLICED: SLICING, STILL: 8.0, REMOVED: -60.0}  # beyond what a Gaussian takes in the rasterizer, 60
+COLORING = (13.0, 19.0, 23.0, 28.0)  # by degree, for each frequency of time
 LESS_TO_READ = 1.0  # a frozen variable among others saves no arithmetic, only parameters
-BISECTIONS = 60
+BITS = {"time": TIME, "direction": DIRECTION}
+BISECTIONS = 32
 
 
 @dataclass(frozen=True)
 class Choice:
     """The variant of each Gaussian."""
 
-    names: list[str]  # of the variants of geometry
-    geometry: Tensor  # [N] int64, a place in `names`
+    geometry: dict[str, Tensor]  # [N] bool by the name of a variant: which Gaussians become it
     levels: Tensor  # [N] int32 of colours, see Classes.levels
     predicted: float  # error that the choice adds, as a share of the model's own
-
-    def rows(self, name: str) -> Tensor:
-        """Tell which Gaussians became this variant, [N] bool."""
-        return self.geometry == self.names.index(name) if name in self.names else torch.zeros_like(self.geometry).bool()
 
 
 def choose(strength: Strength, model: GaussianModel, budget: float) -> Choice:
@@ -44,78 +40,102 @@ def choose(strength: Strength, model: GaussianModel, budget: float) -> Choice:
 
     Args:
         strength: of the model's variants.
-        model: whose they are.
+        model: whose they are; it may have classes already.
         budget: a share, such as 0.01, which is 0.043 dB.
     """
-    like = model.splats["opacities"].detach()
-    nothing = torch.zeros_like(like)
-    refines = model.refinement is not None and model.phase.refine
-    geometry = {LIVE: nothing} | {v.name: strength.errors[v.name] for v in strength.variants if v.level is None}
-    full = model.full_level()
-    colors = {full: nothing} | {v.level: strength.errors[v.name] for v in strength.variants if v.level is not None}
-    costs = {name: cost_of(name, refines) for name in geometry}
-    repaint = {level: COLORING[level % 4] * (level // 4 + 1) for level in colors}
+    now = classes_of(model)
+    live = _live_cost(model, now)
+    none = torch.zeros_like(live)
+    geometry = {LIVE: none} | {v.name: strength.errors[v.name] for v in strength.variants if v.level is None}
+    costs = torch.stack([live if name == LIVE else torch.minimum(live, none + COSTS.get(name, SLICING - LESS_TO_READ))
+                         for name in geometry])  # fmt: skip
+    forms = torch.stack(list(geometry.values()))
+    removes = torch.tensor([name == REMOVED for name in geometry], device=live.device)[:, None]
+    assert now.levels is not None
+    levels = torch.stack([now.levels] + [_lower(now.levels, v.level) for v in strength.variants if v.level is not None])
+    hues = torch.stack([none] + [strength.errors[v.name] for v in strength.variants if v.level is not None])
+    painting = torch.tensor(COLORING, device=live.device)[levels % 4] * (levels // 4 + 1)
 
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Choose for a price of error; return the two choices and the error of each Gaussian, [N]."""
-        hue = torch.stack([repaint[level] + price * error for level, error in colors.items()])
-        best_hue, level = hue.min(0)
-        form = torch.stack([costs[name] + price * error + (0.0 if name == REMOVED else best_hue)
-                            for name, error in geometry.items()])  # fmt: skip
-        shape = form.argmin(0)
-        error = torch.stack(list(geometry.values())).gather(0, shape[None])[0]
-        painted = torch.stack(list(colors.values())).gather(0, level[None])[0]
-        removed = shape == list(geometry).index(REMOVED)
-        return shape, level, error + torch.where(removed, 0.0, painted)
+        """Choose for a price of error; return both choices, and the error of each Gaussian."""
+        paint, hue = (painting + price * hues).min(0)
+        form = (costs + price * forms + torch.where(removes, 0.0, paint)).argmin(0)
+        error = forms.gather(0, form[None])[0] + hues.gather(0, hue[None])[0] * ~removes[form, 0]
+        return form, hue, error
 
-    limit = budget * strength.total
     low, high = -60.0, 60.0  # of log2 of the price
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        low, high = (low, middle) if float(decide(2.0**middle)[2].sum()) <= limit else (middle, high)
-    shape, level, error = decide(2.0**high)
-    levels = torch.tensor(list(colors), dtype=torch.int32, device=like.device)[level]
-    return Choice(list(geometry), shape, levels, float(error.sum()) / max(strength.total, 1e-300))
+        within = float(decide(2.0**middle)[2].sum()) <= budget * strength.total
+        low, high = (low, middle) if within else (middle, high)
+    form, hue, error = decide(2.0**high)
+    chosen = {name: form == i for i, name in enumerate(geometry)}
+    return Choice(chosen, levels.gather(0, hue[None])[0], float(error.sum()) / max(strength.total, 1e-300))
 
 
-def cost_of(name: str, refines: bool) -> float:
-    """Return the nanoseconds of a variant of geometry in a frame, colours not counted."""
-    own = {
-        LIVE: SLICING + (REFINING if refines else 0.0),
-        SLICED: SLICING,
-        STILL: SLICING_STILL,
-        REMOVED: -RASTERIZING,
-    }
-    return RASTERIZING + own.get(name, SLICING - LESS_TO_READ)
+def _live_cost(model: GaussianModel, now: Classes) -> Tensor:
+    """Return the nanoseconds that each Gaussian takes as it is, colours not counted, [N]."""
+    like = model.splats["opacities"].detach()
+    cost = torch.full_like(like, COSTS[STILL])
+    cost[: now.sliced] = SLICING
+    assert now.frozen is not None
+    cost -= LESS_TO_READ * (now.frozen > 0)
+    cost[: now.refined] += REFINING
+    return cost
+
+
+def _lower(levels: Tensor, most: int) -> Tensor:
+    """Return levels [N] with at most the degree and the waves of another level."""
+    return (levels % 4).clamp(max=most % 4) + 4 * (levels // 4).clamp(max=most // 4)
+
+
+def classes_of(model: GaussianModel) -> Classes:
+    """Return the classes of a model, or those that say what each row of one without classes pays for."""
+    if model.classes is not None:
+        return model.classes
+    rows = count(model)
+    sliced = rows["refined"] + rows["sliced"]
+    device = model.splats["opacities"].device
+    levels = torch.full((len(model),), model.full_level(), dtype=torch.int32, device=device)
+    return Classes(rows["refined"], sliced, levels, torch.zeros(len(model), dtype=torch.uint8, device=device))
 
 
 @torch.no_grad()
-def apply(model: GaussianModel, strength: Strength, choice: Choice) -> Tensor:
+def apply(model: GaussianModel, strength: Strength, choice: Choice) -> tuple[Tensor, Tensor]:
     """Turn each Gaussian of a model into its variant, drop the removed ones, sort the others by class.
 
-    Returns the rows [M] that the model's Gaussians had before.
+    Returns:
+        The rows [M] that the Gaussians which are left had before, and which of them were changed, [M] bool.
     """
-    by_name = {variant.name: variant for variant in strength.variants}
-    for name in choice.names:
-        raw, rows = by_name[name].raw if name in by_name else None, choice.rows(name)
-        for key, value in (raw or {}).items():
-            model.splats[key].data[rows] = value[rows]
-    full = model.full_level()
+    now = classes_of(model)
+    assert now.levels is not None
+    assert now.frozen is not None
     for variant in strength.variants:
-        rows = choice.levels == variant.level if variant.level is not None else None
-        if rows is not None and variant.raw is not None:
-            for key, value in variant.raw.items():
-                model.splats[key].data[rows] = value[rows]
-    refines = model.refinement is not None and model.phase.refine
-    kind = torch.ones_like(choice.geometry)
-    kind[choice.rows(LIVE)] = 0 if refines else 1
-    kind[choice.rows(STILL)] = 2
-    # The order within a class is by level and then as before, so that equal work lies together.
-    rank = kind * 64 + (full - choice.levels)
-    rank[choice.rows(REMOVED)] = -1
+        if variant.raw is None:
+            continue
+        rows = choice.geometry[variant.name] if variant.level is None else (
+            (choice.levels != now.levels) & (choice.levels == _lower(now.levels, variant.level)))  # fmt: skip
+        for key, value in variant.raw.items():
+            model.splats[key].data[rows] = value[rows]
+    place = torch.arange(len(model), device=now.levels.device)
+    refined, still = place < now.refined, place >= now.sliced
+    frozen = now.frozen.clone()
+    for name, rows in choice.geometry.items():
+        if name != LIVE:
+            refined = refined & ~rows
+        if name in BITS:
+            frozen[rows] |= BITS[name]
+    frozen[now.sliced :] = 0
+    still = still | choice.geometry.get(STILL, torch.zeros_like(still)) | (frozen == sum(BITS.values()))
+    frozen[still] = 0
+    kind = torch.where(refined, 0, torch.where(still, 2, 1))
+    # Rows of a class are sorted by what is frozen and by level, and otherwise stay in order: equal work lies together.
+    rank = (kind * 4 + frozen) * (MOST_LEVEL + 1) + MOST_LEVEL - choice.levels
     order = rank.argsort(stable=True)
-    rows = order[rank[order] >= 0]
+    rows = order[~choice.geometry[REMOVED][order]]
+    changed = (~choice.geometry[LIVE] | (choice.levels != now.levels))[rows]
     model.select(rows)
-    counts = kind[rows]
-    model.classes = Classes(int((counts == 0).sum()), int((counts < 2).sum()), choice.levels[rows])
-    return rows
+    counts = [int((kind[rows] <= most).sum()) for most in (0, 1)]
+    model.classes = Classes(counts[0], counts[1], choice.levels[rows].contiguous(), frozen[rows].contiguous())
+    model.fill(model.classes)
+    return rows, changed

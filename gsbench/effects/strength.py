@@ -4,10 +4,10 @@ A variant of a Gaussian (AGR baked in, time or direction frozen, fewer harmonics
 by delta_v. With J the derivative of the image by slices, halfway between the model and the variant, and r the image
 minus the truth, the squared error of all views grows by about
 
-    E = sum over v of max(0, 2 <r, J delta_v>) + mean over random signs g of <g, J delta_v>^2,
+    E = sum over v of max(0, 2 <r, J delta_v>) + <g, J delta_v>^2,
 
-since <g, x>^2 is |x|^2 on average. One product of g (or r) with J, backwards, has this for every Gaussian. The linear
-term is cut at zero: what would improve the training views is not counted on.
+with random signs g, for <g, x>^2 is |x|^2 on average. One product of r and one of g with J, backwards, have this for
+every Gaussian. The linear term is cut at zero: what would improve the training views is not counted on.
 """
 
 import math
@@ -22,9 +22,6 @@ from gsbench.models.base import Gaussians3D, Raw
 from gsbench.models.render import rasterize_slice
 from gsbench.models.variants import REMOVED, Variant, variants_of
 from gsbench.scenes import Camera, View
-
-SIGNS = 2  # draws of g for each view
-MOST_VIEWS = 60  # evenly spaced ones stand for more
 
 
 @dataclass(frozen=True)
@@ -43,9 +40,9 @@ def probe(
     background: Tensor,
     *,
     seed: int = 0,
+    most: int = 60,
     antialias: bool = False,
-    most: int = MOST_VIEWS,
-    signs: int = SIGNS,
+    by_halves: bool = True,
 ) -> Strength:
     """Predict the error of every variant of every Gaussian.
 
@@ -54,14 +51,14 @@ def probe(
         views: training views.
         background: colour [3].
         seed: of the random signs.
+        most: this many views, evenly spaced, stand for more.
         antialias: see `gsbench.raster.rasterize`.
-        most: of the views are looked at.
-        signs: draws of g for each view.
+        by_halves: whether time or direction alone may be frozen.
     """
     looked_at = evenly_spaced(views, most)
     queries = [Query.of(view.camera, view.time) for view in looked_at]
     seen = [model.slice(query) for query in queries]
-    variants = variants_of(model, queries, [one.opacities for one in seen])
+    variants = variants_of(model, queries, [one.opacities for one in seen], by_halves)
     errors = {variant.name: torch.zeros_like(seen[0].opacities) for variant in variants}
     random = torch.Generator().manual_seed(seed)
     total = 0.0
@@ -69,12 +66,12 @@ def probe(
         image = rasterize_slice(live, view.camera, background, model.backend, antialias).image[0]
         residual = image - view.image
         total += float(residual.square().sum())
-        draws = [torch.randint(0, 2, residual.shape, generator=random).to(residual) * 2 - 1 for _ in range(signs)]
+        signs = torch.randint(0, 2, residual.shape, generator=random).to(residual) * 2 - 1
         for at, group in _by_midpoint(model, variants, query, live):
-            products = _products(at, view.camera, background, model, antialias, [residual, *draws])
+            products = _products(at, view.camera, background, model, antialias, [residual, signs])
             for name, changed in group:
-                along = [_dot(product, live, changed) for product in products]
-                errors[name] += (2 * along[0]).clamp(min=0) + torch.stack(along[1:]).square().mean(0)
+                first, second = (_dot(product, live, changed) for product in products)
+                errors[name] += (2 * first).clamp(min=0) + second.square()
     if len(looked_at) < len(views):  # of a Gaussian in none of these views nothing is known, so nothing is taken
         unknown = errors[REMOVED] == 0
         errors = {name: torch.where(unknown, math.inf, error) for name, error in errors.items()}
@@ -131,4 +128,3 @@ def _dot(product: Gaussians3D, live: Gaussians3D, changed: Gaussians3D) -> Tenso
     parts = [(p * (b - a)).flatten(1).sum(1) if p.dim() > 1 else p * (b - a)
              for p, a, b in zip(product, live, changed, strict=True)]  # fmt: skip
     return torch.stack(parts).sum(0)
-

@@ -71,6 +71,46 @@ class Cost:
 
 
 @dataclass(frozen=True)
+class TimeScreen:
+    """What a test before the training said about time in the scene: gsbench.effects.choose.Screen."""
+
+    decision: str  # on, off or undecided
+    reason: str
+    p: float | None  # share of permutations with as much energy in slow waves of time; None: not tested
+    z: float | None  # the energy's distance from that of permutations, in their standard deviations
+    free: float | None  # share of the waves' variance that the camera leaves free
+    seconds: float  # that the test took
+
+
+@dataclass(frozen=True)
+class Gate:
+    """What a gate decided, by gsbench.effects."""
+
+    share: float  # of the squared error, the budget of the prediction
+    predicted_db: float
+    measured_db: float  # PSNR lost on the views that it was checked on
+    rows: dict[str, int]  # Gaussians by class: gsbench.models.classes.NAMES, and removed
+    levels: dict[str, int]  # Gaussians by the harmonics of their colours
+    bytes_before: int
+    bytes: int
+    step: int | None = None  # of the training, before which it acted; None: at the end
+    checked_on: str = "val"  # or "held-out training views"
+    seconds: float = 0.0
+    eval_loss_db: float | None = None  # PSNR lost on the evaluated split, where that was measured
+    frame_ms_before: float | None = None  # medians of frames, rendered in turns with those after
+    frame_ms: float | None = None
+
+
+@dataclass(frozen=True)
+class OnDemand:
+    """Which effects were chosen for the scene and for each Gaussian."""
+
+    screen: TimeScreen | None = None
+    gates: list[Gate] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # what could not be decided, and why
+
+
+@dataclass(frozen=True)
 class Provenance:
     """Where the numbers come from; `gsbench.measure.provenance.provenance` fills it in."""
 
@@ -106,6 +146,7 @@ class Record:
     version: int = VERSION
     variant: str = ""  # what its training read that differs from the experiment's own, such as "iterations=10"
     overrides: list[str] = field(default_factory=list)  # `python -m gsbench` and these words repeat the run
+    on_demand: OnDemand | None = None  # None: every Gaussian paid for every effect of the model
 
 
 def write(record: Record, path: Path) -> None:

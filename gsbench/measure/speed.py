@@ -8,7 +8,7 @@ import statistics
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,6 +81,31 @@ def time_renders(
     return RenderTimes(p10=deciles[0], p50=deciles[4], p90=deciles[8])
 
 
+def time_in_turns(
+    renders: Sequence[Callable[[int], object]],
+    count: int = LEAST_RENDERS,
+    synchronise: Callable[[], None] = nothing_to_wait_for,
+) -> list[RenderTimes]:
+    """Time several functions frame by frame in turns, so that what else the machine does meets all alike.
+
+    Args:
+        renders: each renders frame i, as in `time_renders`.
+        count: of timed calls of each.
+        synchronise: waits for the device.
+    """
+    times: list[list[float]] = [[] for _ in renders]
+    for i in range(-2, count):
+        for own, render in zip(times, renders, strict=True):
+            synchronise()
+            start = time.perf_counter()
+            render(max(i, 0))
+            synchronise()
+            if i >= 0:
+                own.append(1000.0 * (time.perf_counter() - start))
+    deciles = [statistics.quantiles(own, n=10, method="inclusive") for own in times]
+    return [RenderTimes(p10=own[0], p50=own[4], p90=own[8]) for own in deciles]
+
+
 class StageClock:
     """Sums the seconds of each stage of training: ``with stages("slice"): ...`` adds to the sum of that stage.
 
@@ -115,6 +140,10 @@ class StageClock:
         for seconds in lanes:
             for name, own in seconds.items():
                 self._seconds[name] = self._seconds.get(name, 0.0) + wall * own / total
+
+    def add(self, name: str, seconds: float) -> None:
+        """Add seconds that were measured elsewhere to a stage."""
+        self._seconds[name] = self._seconds.get(name, 0.0) + seconds
 
     @property
     def seconds(self) -> dict[str, float]:

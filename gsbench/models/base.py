@@ -13,6 +13,7 @@ from gsbench.backends import AUTO, Backend
 from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.models.appearance import sh_colors
+from gsbench.models.classes import Classes, unpack
 from gsbench.models.query import Query, unit
 from gsbench.models.refinement import OCTAVES, Refinement
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
@@ -40,14 +41,6 @@ class Conditioned(NamedTuple):
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
     gate: Tensor  # [N] f_temp f_dir in [0, 1], a factor of the opacity
-
-
-class Classes(NamedTuple):
-    """Which rows of a model pay for which effect: rows are ordered refined (AGR) | sliced | still."""
-
-    refined: int  # this many first rows are moved by AGR
-    sliced: int  # this many first rows (refined <= sliced) change with the query; the others are still
-    levels: Tensor | None  # [N] int32: the harmonics of a row's colours, degree + 4 (waves - 1); None: all of them
 
 
 @dataclass(frozen=True)
@@ -135,7 +128,7 @@ class GaussianModel(nn.Module, ABC):
         return {"sh0": dc[:, None], "shN": rest}
 
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Freeze effects at their weighted mean over queries: raw parameters that change, by the name of what is frozen.
+        """Freeze effects at their weighted mean over queries; return the raw parameters that each changes.
 
         The last, `still`, changes with no query. A model whose slice never changes has nothing to freeze.
 
@@ -151,14 +144,28 @@ class GaussianModel(nn.Module, ABC):
         return self.phase.sh_degree
 
     def lower_levels(self) -> list[int]:
-        """List the levels of colour (see `Classes.levels`) below the one in use."""
+        """List the levels of colour below the one in use."""
         return list(range(self.phase.sh_degree))
 
-    def cut(self, raw: Raw, levels: Tensor) -> Raw:
-        """Zero the coefficients of `shN` above the level [N] of each Gaussian."""
-        degrees = torch.tensor([math.isqrt(k) for k in range(1, (self.sh_degree + 1) ** 2)], dtype=levels.dtype)
-        keep = degrees.to(levels.device) <= levels[:, None] % 4
-        return {"sh0": raw["sh0"], "shN": raw["shN"] * keep[..., None]}
+    def kept(self, classes: Classes) -> dict[str, Tensor]:
+        """Tell which entries of the parameters matter to rows of these classes; those not named matter all.
+
+        The masks are bool, broadcastable to the parameters. Entries that do not matter have the constants of `fill`.
+        """
+        if classes.levels is None:
+            return {}
+        degrees = [math.isqrt(k) for k in range(1, (self.sh_degree + 1) ** 2)]
+        return {"shN": (torch.tensor(degrees, device=classes.levels.device) <= classes.levels[:, None] % 4)[..., None]}
+
+    @torch.no_grad()
+    def fill(self, classes: Classes) -> None:
+        """Set the entries that do not matter to rows of these classes to constants."""
+        for name, mask in self.kept(classes).items():
+            self.splats[name].data.masked_fill_(~mask, self.constant(name))
+
+    def constant(self, name: str) -> float:
+        """Return what the entries of a parameter are that do not matter."""
+        return 0.0
 
     def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
         """Compute the colours [N, 3] of a slice; a model whose colours are not these harmonics overrides it.
@@ -298,11 +305,12 @@ class GaussianModel(nn.Module, ABC):
         self.splats["opacities"].data.clamp_(max=math.log(ceiling / (1 - ceiling)))
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Load a `state_dict` with any number of Gaussians.
+        """Load what `gsbench.models.classes.pack` returned, of any number of Gaussians.
 
         Raises:
             InputError: the state is that of another model.
         """
+        state, classes = unpack(self, state)
         means = state.get("splats.means")
         N = len(means) if isinstance(means, Tensor) and means.dim() else 0
         own = self.state_dict()
@@ -319,3 +327,6 @@ class GaussianModel(nn.Module, ABC):
         for name, parameter in self.splats.items():
             parameter.data = torch.empty(state[f"splats.{name}"].shape, dtype=parameter.dtype, device=parameter.device)
         self.load_state_dict(state)
+        self.classes = classes
+        if classes is not None:
+            self.fill(classes)

@@ -2,6 +2,7 @@
 
 import torch
 import torch.nn.functional as F
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
@@ -41,6 +42,7 @@ class Triangle:
         if form not in OFF_DIAGONALS:
             raise InputError(f"off_diagonal '{form}' is not known. {did_you_mean(form, OFF_DIAGONALS)}")
         self.form = form
+        self.letters = letters
         below = [(i, j) for i in range(len(letters)) for j in range(i)]  # row by row, as `split` takes them
         places: dict[str, list[int]] = {"shape": [], "motion": [], "coupling": []}
         for place, (i, j) in enumerate(below):
@@ -52,6 +54,11 @@ class Triangle:
         self.columns = sorted(range(len(order)), key=order.__getitem__)  # of (shape, motion, coupling), for each place
         relative = {"relative": places["shape"], "raw": [], "row_scaled": range(len(below))}[form]
         self.is_relative = torch.tensor([place in relative for place in range(len(below))])
+
+    def pair(self, place: int) -> tuple[str, str]:
+        """Return the variables of the row and of the column of an entry below the diagonal."""
+        row = self.rows[place]
+        return self.letters[row], self.letters[place - row * (row - 1) // 2]
 
     def factor(self, log_diagonal: Tensor, kinds: dict[str, Tensor]) -> Tensor:
         """Compute the lower triangular L, whose diagonal is positive by exp (7DGS, section 4.1).
@@ -114,6 +121,17 @@ def turn_of_space(quaternions: Tensor) -> Tensor:
     """
     w, x, y, z = quaternions.unbind(-1)
     return torch.stack([w, z, -y, x], -1)
+
+
+def partner(left: Tensor) -> Tensor:
+    """Return the right quaternion with which a left one rotates space alone, [N, 4]; see `turn_of_space`."""
+    return left * left.new_tensor([1, -1, -1, 1])
+
+
+def quaternion(rotations: Tensor) -> Tensor:
+    """Compute the quaternions wxyz of rotation matrices [N, 3, 3], [N, 4], by scipy."""
+    xyzw = Rotation.from_matrix(rotations.double().cpu().numpy()).as_quat()
+    return torch.from_numpy(xyzw).roll(1, -1).to(rotations)
 
 
 def rotation4d(left: Tensor, right: Tensor) -> Tensor:

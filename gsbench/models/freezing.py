@@ -1,4 +1,4 @@
-"""Freeze time, direction or both in Gaussians with triangular factors (6DGS, 7DGS)."""
+"""Freeze time, direction or both in Gaussians with triangular factors (6DGS, 7DGS), and time in those of 4DGS."""
 
 from __future__ import annotations
 
@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from gsbench.kernels.thresholds import LOG_SIZE_MAX
-from gsbench.models.base import Raw
+from gsbench.kernels.thresholds import LOG_SIZE_MAX, TIME_GATE_MIN
+from gsbench.models.factors import partner, quaternion, turn_of_space
 from gsbench.models.query import Query, unit
 from gsbench.models.slicing import Reduced, gain_of, reduce, whiten
 
 if TYPE_CHECKING:
+    from gsbench.models.base import Raw
+    from gsbench.models.gaussians4d import Gaussians4DModel
     from gsbench.models.triangular import TriangularModel
 
 OPACITY_MARGIN = 1e-6  # between an opacity and 0 or 1, whose logits are infinite
 
 
-def freeze(
+def freeze_triangular(
     model: TriangularModel,
     raw: Raw,
     queries: Sequence[Query],
@@ -48,7 +50,8 @@ def freeze(
     for name, columns in by_name.items():
         gate = sum(w.double() * _gate(model, blocks, _delta(model, raw, q), columns)
                    for q, w in zip(queries, weights, strict=True))  # fmt: skip
-        assert isinstance(shift, Tensor) and isinstance(gate, Tensor)
+        assert isinstance(shift, Tensor)
+        assert isinstance(gate, Tensor)
         moved = raw["means"] + (gain[..., columns] @ shift[:, columns, None])[..., 0]
         opacity = (torch.sigmoid(raw["opacities"].double()) * gate).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
         new = model.triangle.parameters(_without(model, blocks, gain, columns)) | {"means": moved}
@@ -96,3 +99,38 @@ def _without(model: TriangularModel, blocks: Reduced, gain: Tensor, columns: lis
     p_rows = torch.cat([kept @ T_qq, blocks.T_pp], -1)
     q_rows = torch.cat([T_qq, torch.zeros_like(T_qq[..., :3])], -1)
     return torch.cat([p_rows, q_rows], 1)[:, model.own_order()]
+
+
+def freeze_rotated(
+    model: Gaussians4DModel,
+    raw: Raw,
+    queries: Sequence[Query],
+    weights: Tensor,  # [V, N], of which each Gaussian's sum to 1
+) -> Raw:
+    """Freeze t in 4DGS: the mean stays where it is on average, the opacity keeps f_temp's mean, the factor the slice's.
+
+    Args:
+        model: has the unit of time and lambda_t.
+        raw: parameters.
+        queries: V of them.
+        weights: of the queries, for each Gaussian.
+    """
+    factor = model.factors(raw).double()
+    blocks = reduce(factor)
+    shift, opacity = torch.zeros_like(factor[:, 3:, 0]), torch.zeros_like(factor[:, 0, 0])
+    for query, weight in zip(queries, weights.double(), strict=True):
+        assert query.time is not None
+        delta = (query.time - raw["times"]).double()
+        gate = model.gate(factor, delta)
+        shift += weight[:, None] * delta
+        opacity += weight * torch.where(gate > TIME_GATE_MIN, gate, 0.0) * torch.sigmoid(raw["opacities"].double())
+    turn, lengths, _ = torch.linalg.svd(blocks.T_pp)
+    left = turn_of_space(quaternion(turn * torch.linalg.det(turn)[:, None, None]))
+    new = {
+        "means": raw["means"] + (gain_of(blocks.T_pq, blocks.T_qq) @ shift[..., None])[..., 0],
+        "scales": torch.cat([lengths.log(), torch.full_like(shift, LOG_SIZE_MAX)], -1),
+        "left_quats": left,
+        "right_quats": partner(left),
+        "opacities": torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)),
+    }
+    return {name: value.to(raw[name].dtype) for name, value in new.items()}

@@ -1,6 +1,7 @@
 """Model a moving scene by 4DGS: Gaussians in space and time, whose colours change with time (Yang et al. 2023)."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -9,10 +10,12 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.colors import MAX_WAVES, show_colors
 from gsbench.kernels.slices import observe_rotated
-from gsbench.kernels.thresholds import TIME_GATE_MIN
+from gsbench.kernels.thresholds import LOG_SIZE_MAX, TIME_GATE_MIN
 from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
-from gsbench.models.factors import rotation, rotation4d, sizes, turn_of_space
+from gsbench.models.classes import Classes
+from gsbench.models.factors import partner, rotation, rotation4d, sizes, turn_of_space
+from gsbench.models.freezing import freeze_rotated
 from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
 from gsbench.models.slicing import check_scheme, mahalanobis, slice_gaussians
@@ -79,17 +82,60 @@ class Gaussians4DModel(GaussianModel):
         # A Gaussian that is culled at this time is sliced at its own time and so stays at mu_p. Otherwise the huge
         # numbers of a Gaussian that is thin in time would reach its gradient as 0 x inf.
         with torch.no_grad():
-            seen = self._gate(factor, delta) > TIME_GATE_MIN
+            seen = self.gate(factor, delta) > TIME_GATE_MIN
         mean = torch.cat([raw["means"], raw["times"]], -1)
         at = torch.where(seen[:, None], time, raw["times"])
         means, factors, _ = slice_gaussians(mean, factor, at, scheme=self.scheme)
-        gate = self._gate(factor, torch.where(seen[:, None], delta, 0.0))
+        gate = self.gate(factor, torch.where(seen[:, None], delta, 0.0))
         return Conditioned(means, factors, torch.where(seen, gate, 0.0))
 
     def still(self, raw: Raw) -> Conditioned:
         """Return Gaussians that the left quaternion rotates in space only, whatever their times and sizes in time."""
         factors = rotation(turn_of_space(raw["left_quats"])) * sizes(raw["scales"][:, :3])[:, None, :]
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
+
+    @torch.no_grad()
+    def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
+        """Freeze t, by `gsbench.models.freezing.freeze_rotated`."""
+        return {"still": freeze_rotated(self, raw, queries, weights)}
+
+    def full_level(self) -> int:
+        """The degree in use with all waves."""
+        return self.phase.sh_degree + 4 * self.time_degree
+
+    def lower_levels(self) -> list[int]:
+        """List every degree up to the one in use, with all waves and with the constant one alone."""
+        levels = [degree + 4 * waves for waves in (0, self.time_degree) for degree in range(self.phase.sh_degree + 1)]
+        return sorted(set(levels) - {self.full_level()})
+
+    def kept(self, classes: Classes) -> dict[str, Tensor]:
+        """Tell which entries matter: a still row has no right quaternion, and a time where its colour has waves."""
+        masks = {}
+        if classes.levels is not None:
+            K = (self.sh_degree + 1) ** 2
+            places = range(1, (self.time_degree + 1) * K)
+            degrees = classes.levels.new_tensor([math.isqrt(place % K) for place in places])
+            waves = classes.levels.new_tensor([place // K for place in places])
+            levels = classes.levels[:, None]
+            masks["shN"] = ((degrees <= levels % 4) & (waves <= levels // 4))[..., None]
+        if classes.frozen is not None:
+            changes = torch.arange(len(classes.frozen), device=classes.frozen.device)[:, None] < classes.sliced
+            space = torch.tensor([[True, True, True, False]], device=changes.device)
+            assert classes.levels is not None
+            timed = changes | (classes.levels[:, None] >= 4)
+            masks |= {"times": timed, "right_quats": changes.expand(-1, 4), "scales": changes | space}
+        return masks
+
+    def constant(self, name: str) -> float:
+        """A still row is as long in time as it can be."""
+        return LOG_SIZE_MAX if name == "scales" else 0.0
+
+    @torch.no_grad()
+    def fill(self, classes: Classes) -> None:
+        """Give each left quaternion of a still row the right one that leaves the axis of t alone."""
+        super().fill(classes)
+        left = self.splats["left_quats"].data[classes.sliced :]
+        self.splats["right_quats"].data[classes.sliced :] = partner(left)
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """Slice by the kernel where the backend has one, in the square-root scheme."""
@@ -144,7 +190,7 @@ class Gaussians4DModel(GaussianModel):
             "scales": raw["scales"] - math.log(SHRINK),
         }
 
-    def _gate(self, factor: Tensor, delta: Tensor) -> Tensor:
+    def gate(self, factor: Tensor, delta: Tensor) -> Tensor:
         """Compute f_temp [N] of factors [N, 4, 4] at a distance delta [N, 1] in time."""
         return torch.exp(-0.5 * self.modulation("time") * mahalanobis(factor[:, 3:], delta))
 

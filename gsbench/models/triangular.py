@@ -10,10 +10,11 @@ from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.slices import observe_triangular
-from gsbench.kernels.thresholds import EXPONENT_MAX
+from gsbench.kernels.thresholds import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
+from gsbench.models.classes import DIRECTION, TIME, Classes
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle
-from gsbench.models.freezing import freeze
+from gsbench.models.freezing import freeze_triangular
 from gsbench.models.query import Query, unit
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.scene import Points
@@ -179,10 +180,31 @@ class TriangularModel(GaussianModel):
         factor = torch.cat([p_rows, q_rows], 1)[:, self.own_order()]
         return children | self.triangle.parameters(factor)
 
+    def kept(self, classes: Classes) -> dict[str, Tensor]:
+        """Tell which entries matter: none of a variable that is frozen, or of any where the row is still."""
+        masks = super().kept(classes)
+        if classes.frozen is None:
+            return masks
+        still = torch.arange(len(classes.frozen), device=classes.frozen.device) >= classes.sliced
+        gone = {"p": torch.zeros_like(still), "t": still | (classes.frozen & TIME > 0),
+                "d": still | (classes.frozen & DIRECTION > 0)}  # fmt: skip
+        masks["log_diagonal"] = ~torch.stack([gone[x] for x in self.triangle.letters], -1)
+        for kind in ("motion", "coupling"):
+            pairs = [self.triangle.pair(place) for place in self.triangle.places[kind]]
+            masks[kind] = ~torch.stack([gone[a] | gone[b] for a, b in pairs], -1)
+        masks["directions"] = ~gone["d"][:, None]
+        if "time" in self.observes:
+            masks["times"] = ~gone["t"][:, None]
+        return masks
+
+    def constant(self, name: str) -> float:
+        """A frozen variable is as long as it can be, and moves nothing."""
+        return LOG_SIZE_MAX if name == "log_diagonal" else 0.0
+
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Freeze t, d and both, by `gsbench.models.freezing.freeze`."""
-        return freeze(self, raw, queries, weights)
+        """Freeze t, d and both, by `gsbench.models.freezing.freeze_triangular`."""
+        return freeze_triangular(self, raw, queries, weights)
 
     def factors(self, raw: Raw) -> Tensor:
         """Compute the triangular factor with its rows sorted to (p, d, t), [N, n, n]."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsbench.models.base import GaussianModel, Raw
+from gsbench.models.classes import Classes
 from gsbench.models.query import Query
 from gsbench.scenes.points import SH_C0
 
@@ -27,13 +28,16 @@ class Variant:
     level: int | None = None  # of the harmonics that are left (see Classes.levels), where only the colour changes
 
 
-def variants_of(model: GaussianModel, queries: Sequence[Query], opacities: Sequence[Tensor]) -> list[Variant]:
+def variants_of(
+    model: GaussianModel, queries: Sequence[Query], opacities: Sequence[Tensor], by_halves: bool = True
+) -> list[Variant]:
     """List the ways to simplify the Gaussians of a model.
 
     Args:
         model: as it is.
         queries: of the views over which what is frozen is averaged.
         opacities: [N] of the model's slices at the queries, the weights.
+        by_halves: whether time or direction alone may be frozen.
     """
     weights = torch.stack(list(opacities)) + FEW  # [V, N]
     weights = weights / weights.sum(0)
@@ -44,6 +48,8 @@ def variants_of(model: GaussianModel, queries: Sequence[Query], opacities: Seque
         raw = raw | _baked(model, queries, weights, names)
         found.append(Variant(SLICED, {name: raw[name] for name in names}))
     for name, frozen in model.frozen(raw, queries, weights).items():
+        if name != STILL and not by_halves:
+            continue
         found.append(Variant(name, {key: raw[key] for key in names} | frozen))
     found.append(Variant(REMOVED, None))
     return found + [Variant(f"level{level}", _repainted(model, level, queries, opacities, weights), level)
@@ -69,7 +75,8 @@ def _repainted(
 ) -> Raw:
     """Cut the harmonics above a level, and refit the constant one to the colours that the queries saw."""
     whole = {name: value.detach() for name, value in model.splats.items()}
-    cut = whole | model.cut(whole, torch.full((len(model),), level, dtype=torch.int32))
+    levels = torch.full((len(model),), level, dtype=torch.int32, device=weights.device)
+    cut = whole | {"shN": whole["shN"] * model.kept(Classes(0, 0, levels))["shN"]}
     lost = torch.zeros_like(whole["means"])
     for query, seen, weight in zip(queries, opacities, weights, strict=True):
         raw = model.refined(query)

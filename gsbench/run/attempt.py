@@ -4,6 +4,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy.typing as npt
 import torch
@@ -15,12 +16,14 @@ from gsbench.errors import InputError, one_line
 from gsbench.measure import record as records
 from gsbench.measure.provenance import provenance
 from gsbench.measure.quality import Quality, evaluate, evenly
-from gsbench.measure.record import Cost, Effects, Record
+from gsbench.measure.record import Cost, Effects, OnDemand, Record, TimeScreen
 from gsbench.measure.speed import peak_memory, reset_peak_memory, synchroniser, time_renders
 from gsbench.models import GaussianModel
+from gsbench.models.classes import packed_bytes
 from gsbench.models.replay import Replay
 from gsbench.report.pictures import strip, write_png
 from gsbench.run import progress, stop
+from gsbench.run.auto import is_auto, plain_model, resolve, with_candidate
 from gsbench.run.checks import check_config, check_scene, evaluated_views, lpips_weights
 from gsbench.run.identity import Run, training_hash
 from gsbench.run.load import plain_description
@@ -40,7 +43,9 @@ class Attempt:
     def __init__(self, this: Run) -> None:
         """Attempt a run that has a name and a folder; nothing is read or checked yet."""
         self.this = this
-        self.config = this.config
+        # What can be refused of model=auto is, by the candidate that asks for more; `fit` chooses.
+        self.config = with_candidate(this.config, "moving") if is_auto(this.config) else this.config
+        self.screen: TimeScreen | None = None
         self.model: GaussianModel | None = None
         self.scene: Scene | None = None
         self._shown: list[tuple[npt.ArrayLike, npt.ArrayLike]] = []
@@ -54,6 +59,9 @@ class Attempt:
         check_config(self.config)
         self.model = build(self.config)
         self.scene = scene = load_scene(self.config)
+        if is_auto(self.this.config) and not scene.has_time:
+            self.config = with_candidate(self.this.config, "static")
+            self.model = build(self.config)
         check_scene(self.model, scene, self.config)
         evaluated_views(scene, self.config.scene.eval_split)
         records.check(self.describe("failed", "not run"), "planned record")
@@ -67,18 +75,19 @@ class Attempt:
             DivergedError: a loss or gradient was not finite.
             Stopped: the process was told to end; the checkpoint is saved.
         """
-        this, random = self.this, generator(self.config.seed)
-        points = scene.points or initial_points(self.config.data, scene, random)
-        model.initialise(points, scene.extent, random)
-        model.to(self.config.device)
-        trainer = Trainer(model, scene, evaluated_views(scene, self.config.scene.eval_split), self.config)
+        this = self.this
+        if is_auto(this.config):
+            model = self._choose(scene)
+        trainer = self.trainer(model, scene)
         reset_peak_memory(self.config.device)
         path, hashes = this.folder / checkpoint.FILE_NAME, (training_hash(this.plain), scene.fingerprint)
         state = checkpoint.load(path, *hashes, self.config.device) if self.config.resume else None
         if state is not None:
             trainer.load_state_dict(state)
             print(f"{this.name}: goes on from step {trainer.step} of {path}", file=sys.stderr)
-        about = this.plain, plain_description(scene)
+        elif self.screen is not None:
+            trainer.stages.add("screen", self.screen.seconds)
+        about = self.plain(), plain_description(scene)
         with stop.requested() as request:
             report = progress.Reporter(this.folder, this.overrides, self.config.train.iterations)
 
@@ -101,6 +110,28 @@ class Attempt:
             raise InputError("no Gaussian is left: the training pruned all of them; look at train.densify, "
                              "model.min_opacity and data.initial_half_width")  # fmt: skip
         return trainer
+
+    def trainer(self, model: GaussianModel, scene: Scene) -> Trainer:
+        """Initialise a model at the scene's points, and prepare its training."""
+        random = generator(self.config.seed)
+        points = scene.points or initial_points(self.config.data, scene, random)
+        model.initialise(points, scene.extent, random)
+        model.to(self.config.device)
+        return Trainer(model, scene, evaluated_views(scene, self.config.scene.eval_split), self.config)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the config that was trained by in plain values: for model=auto with the model that was chosen."""
+        if not is_auto(self.this.config):
+            return self.this.plain
+        return self.this.plain | {"model": plain_model(self.config), "agr": self.config.agr}
+
+    def _choose(self, scene: Scene) -> GaussianModel:
+        """Choose the model of model=auto, and say why."""
+        self.config, self.screen = resolve(self.this.config, scene)
+        self.model = model = build(self.config)
+        print(f"{self.this.name}: time is {self.screen.decision}: {self.screen.reason}; {self.config.model.name}"
+              f"{' with AGR' if self.config.agr else ''}", file=sys.stderr)  # fmt: skip
+        return model
 
     def measure(self, trainer: Trainer) -> Record:
         """Measure the images, the speed and the size of a fitted model."""
@@ -133,7 +164,7 @@ class Attempt:
             render_ms=times,
             fps=times.fps,
             num_gaussians=len(trainer.model),
-            bytes=sum(p.numel() * p.element_size() for p in trainer.model.parameters()),
+            bytes=packed_bytes(trainer.model),
             peak_memory=peak_memory(config.device),
         )
         metrics, missing = with_best(quality, trainer, config)
@@ -142,7 +173,14 @@ class Attempt:
         return replace(
             record, protocol=record.protocol | made,
             metrics=metrics, missing=missing, per_view=quality.per_view, cost=cost, curve=trainer.curve.points,
+            on_demand=self._on_demand(trainer),
         )  # fmt: skip
+
+    def _on_demand(self, trainer: Trainer) -> OnDemand | None:
+        """Say which effects were chosen; None where none were to be."""
+        if self.screen is None and self.config.effects.gate == "off":
+            return None
+        return OnDemand(self.screen, trainer.gating.gates, trainer.gating.notes)
 
     def draw(self) -> None:
         """Write pictures.png of what was measured; a disk that is full then costs the pictures and not the record."""

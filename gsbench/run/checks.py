@@ -17,6 +17,7 @@ from gsbench.measure.atomic import write_atomically
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
 from gsbench.scenes import Scene, View
+from gsbench.train.gating import GATES
 from gsbench.train.optim import OPTIMIZERS
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -43,6 +44,7 @@ RANGES = {  # of numbers that the schema types but does not bound, both ends inc
     "data.initial_points": (4, ENDLESS),
     "data.initial_half_width": (1e-6, 1e6),
     "scene.downscale": (1, 10_000),
+    "effects.budget_db": (0, 10),
     "protocol.renders": (LEAST_RENDERS, 1_000_000),
     "protocol.pictures": (0, 10_000),
 }
@@ -54,6 +56,7 @@ def check_config(config: Config) -> None:
     _check_choice("data.background", config.data.background, BACKGROUNDS)
     _check_choice("scene.eval_split", config.scene.eval_split, SPLITS)
     _check_choice("optim", config.optim, OPTIMIZERS)
+    _check_choice("effects.gate", config.effects.gate, GATES)
     for key, value in _numbers(config, ""):
         if not math.isfinite(value):
             raise InputError(f"{key}: expected a finite number, got {value}")

@@ -102,6 +102,12 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
 def training_part(plain: Plain) -> Plain:
     """Return the part of a resolved config that a training reads."""
     part: Plain = {key: dict(value) if isinstance(value, dict) else value for key, value in plain.items()}
+    if part.get("effects", {}).get("gate") == "off":
+        del part["effects"]
+    if isinstance(part.get("model"), dict):  # effects.gate is what a training reads; this only gives its default
+        part["model"].pop("gate", None)
+        if not part["model"].get("candidates"):
+            part["model"].pop("candidates", None)
     for dotted in MEASURING:
         head, _, tail = dotted.partition(".")
         if not tail:

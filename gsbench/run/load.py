@@ -68,7 +68,7 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
         raise InputError(f"{folder}: expected the folder of a run with a {checkpoint.FILE_NAME}, found none: "
                          f"run it again, or name its folder, results/EXPERIMENT/SCENE/MODEL/seedK")  # fmt: skip
     found = checkpoint.read(path, device)
-    config = _config(found.config, path)
+    config = typed_config(found.config, path)
     config.device, config.raster.backend = device, backend
     scene = parse(SceneDescription, found.scene, str(path))
     model = build(config)
@@ -90,7 +90,7 @@ def plain_description(scene: Scene) -> dict[str, Any]:
     return asdict(SceneDescription.of(scene))
 
 
-def _config(plain: dict[str, Any], path: Path) -> Config:
+def typed_config(plain: dict[str, Any], path: Path) -> Config:
     """Type the plain config of a checkpoint; raises InputError where it is not one."""
     try:
         typed = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.create(plain))

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
+from gsbench.effects import words
 from gsbench.errors import InputError, one_line
 from gsbench.measure import record as records
 from gsbench.measure.atomic import remove_leftovers
@@ -60,6 +61,8 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
     except OSError as error:  # the other runs of the sweep go on; this one's checkpoint is what it was
         raise InputError(f"{summary(record)}; its record cannot be written: {error.strerror}") from None
     (this.folder / progress.FILE_NAME).unlink(missing_ok=True)
+    for line in words.lines(record.on_demand) if record.on_demand else []:
+        print(f"{this.name}: {line}")
     print(f"{this.name}: {summary(record)}; {this.folder / records.FILE_NAME}")
     attempt.draw()
     return record

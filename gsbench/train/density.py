@@ -92,6 +92,11 @@ class DensityControl:
         self.model.reset_opacities(2 * self.min_opacity)
         self.optimizer.forget(self.model.splats["opacities"])
 
+    def follow(self, rows: Tensor) -> None:
+        """Keep the counts of the given rows, in their order, after `model.select(rows)`."""
+        self.unseen = self.unseen[rows]
+        self.forget()
+
     def state_dict(self) -> dict[str, Tensor]:
         """Return the collected gradients and counts, for the checkpoint."""
         return {"gradient": self.gradient, "seen": self.seen, "unseen": self.unseen}

@@ -17,11 +17,13 @@ from gsbench.measure.curve import Curve
 from gsbench.measure.quality import psnr
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel
+from gsbench.models.classes import pack
 from gsbench.models.render import render
 from gsbench.scenes import Scene, View
 from gsbench.train.checkpoint import whole_number
 from gsbench.train.density import DensityControl
 from gsbench.train.floor import Floor
+from gsbench.train.gating import NO_GATES, Gating
 from gsbench.train.optim import Optimizer
 from gsbench.train.schedule import Schedule, batch, generator
 from gsbench.train.step import Step, fitting_threads
@@ -67,6 +69,7 @@ class Trainer:
         self.floor = Floor(model, [view.camera for view in scene.train])
         self.stages = StageClock(config.device)
         self.gradients = Step(model, self.background, train.ssim_weight, config.raster.antialias, self.stages)
+        self.gating = Gating(model, self.optimizer, self.density, self.floor, scene, self.background, config)
         self.watch = Watch(config.device)
         if config.device.startswith("cuda"):  # a bad step is found some steps later, and must not be applied until then
             self.optimizer.adam.found_inf = self.watch.skip  # type: ignore[attr-defined]
@@ -113,7 +116,17 @@ class Trainer:
                 if time.monotonic() - saved >= 60 * train.checkpoint_minutes and self.step < train.iterations:
                     save(self.state_dict())
                     saved = time.monotonic()
+        if self.step == train.iterations and self.config.effects.gate != "off":
+            self.gate_at_end()
         save(self.state_dict())
+
+    def gate_at_end(self) -> None:
+        """Gate the finished model, and measure what that changed; the measuring counts as no time of the training."""
+        self.model.set_phase(self.schedule.phase(self.step - 1))
+        ungated = self.gating.now()
+        with self.stages("gate"):
+            self.gating.at_end()
+        self.gating.compare(ungated, self.views)
 
     def _descend(self) -> None:
         """Do one step: the loss is the mean over a batch of views."""
@@ -138,6 +151,9 @@ class Trainer:
                 self.density.reset_opacities()
             if (step + 1) % self.schedule.densify_every == 0:
                 self.floor.update()
+        if self.config.effects.gate == "both" and self.schedule.gates(step):
+            with stages("gate"):
+                self.gating.in_training(step + 1)
 
     def _measure(self) -> None:
         """Add a point to the curve; its seconds belong to no stage and so do not count as training time."""
@@ -172,10 +188,11 @@ class Trainer:
         self.watch.look()
         return {
             "step": self.step,
-            "model": self.model.state_dict(),
+            "model": pack(self.model),
             "optimizer": self.optimizer.state_dict(),
             "density": self.density.state_dict(),
             "floor": self.floor.state_dict(),
+            "gating": self.gating.state_dict(),
             "stages": self.stages.state_dict(),
             "curve": self.curve.state_dict(),
             "best": vars(self.best).copy(),
@@ -193,6 +210,7 @@ class Trainer:
             self.optimizer.load_state_dict(state["optimizer"])
             self.density.load_state_dict(state["density"])
             self.floor.load_state_dict(state["floor"])
+            self.gating.load_state_dict(state.get("gating", NO_GATES))
             self.stages.load_state_dict(state["stages"])
             self.curve.load_state_dict(state["curve"])
             self.best = Best(**state["best"])

@@ -9,6 +9,9 @@ from gsbench.models import Phase
 # not scaled, and Adam needs this many between two resets to raise opacities again at its rate of 0.05.
 STEPS_BETWEEN_RESETS = 300
 
+GATE = 18_000  # the step of the recipe after which the model is gated in training, if densification is over ..
+LATEST_GATE = 0.8  # .. and at least the rest of the training is left
+
 
 class Schedule:
     """Steps of a `recipe_iterations` run, scaled to this one: step x iterations / recipe_iterations, rounded."""
@@ -49,6 +52,11 @@ class Schedule:
     def has_reset(self, step: int) -> bool:
         """Tell whether there was an opacity reset; from then on Gaussians that are too large are pruned."""
         return step + 1 > self.reset_every
+
+    def gates(self, step: int) -> bool:
+        """Tell whether the model is gated after a step: once densification is over, while steps are left to recover."""
+        at = max(self.scaled(GATE), self.densify_stop)
+        return step + 1 == at and at <= LATEST_GATE * self.config.iterations
 
     def measures(self, step: int) -> bool:
         """Tell whether a point of the curve is measured after a step; after the last step it always is."""

@@ -1,0 +1,56 @@
+"""Look which effects a scene calls for, without a training, or gate the model of a finished run.
+
+python -m gsbench.effects SCENE_FOLDER [--json]
+python -m gsbench.effects --checkpoint RUN_FOLDER [--budget-db 0.05] [--data-root PATH]
+"""
+
+import argparse
+import json
+import math
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from gsbench import scenes
+from gsbench.effects import words
+from gsbench.effects.choose import screen
+from gsbench.errors import InputError, one_line
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Return 0, or 2 where there is nothing to look at."""
+    parser = argparse.ArgumentParser(prog="python -m gsbench.effects", description=__doc__.partition("\n")[0])
+    parser.add_argument("scene", type=Path, nargs="?", metavar="SCENE_FOLDER", help="of a data set that gsbench reads")
+    parser.add_argument("--json", action="store_true", help="the answer as JSON")
+    parser.add_argument("--seed", type=int, default=0, help="of the points and the permutations")
+    parser.add_argument("--checkpoint", type=Path, metavar="RUN_FOLDER", help="gate this run into one beside it")
+    parser.add_argument("--budget-db", type=float, default=0.05, help="PSNR on val that the gate may cost")
+    parser.add_argument("--data-root", help="where the data set of the run is now")
+    asked = parser.parse_args(arguments)
+    try:
+        if (asked.scene is None) == (asked.checkpoint is None):
+            raise InputError("expected SCENE_FOLDER or --checkpoint RUN_FOLDER, and not both")
+        if not math.isfinite(asked.budget_db) or not 0 <= asked.budget_db <= 10:
+            raise InputError(f"--budget-db: expected 0 to 10 dB, got {asked.budget_db}")
+        if asked.checkpoint is not None:
+            return _gate(asked.checkpoint, asked.budget_db, asked.data_root)
+        found = screen(scenes.load(asked.scene), asked.seed)
+    except (InputError, OSError) as error:
+        print(f"gsbench.effects: {one_line(error)}", file=sys.stderr)
+        return 2
+    print(json.dumps({"time": asdict(found)}) if asked.json else words.of_screen(found))
+    return 0
+
+
+def _gate(folder: Path, budget_db: float, data_root: str | None) -> int:
+    from gsbench.run.regate import gate_run  # a screen needs no training code
+
+    record, new = gate_run(folder, budget_db, data_root)
+    for line in words.lines(record.on_demand) if record.on_demand else []:
+        print(line)
+    print(f"Written: {new}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,75 @@
+"""Gate a model as far as its loss, measured and not only predicted, stays within a budget."""
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsbench.effects.gate import apply, choose
+from gsbench.effects.strength import Strength
+from gsbench.measure.record import Gate
+from gsbench.models import GaussianModel
+from gsbench.models.classes import count, packed_bytes
+
+SHARES = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)  # of the squared error, tried from the largest
+MOST_PREDICTED = 2.0  # times the budget: on few views a loss may be measured that is smaller than it is
+
+
+@dataclass(frozen=True)
+class Gated:
+    """A model after a gate."""
+
+    model: GaussianModel
+    gate: Gate  # what was decided, for the record
+    rows: Tensor  # [M] the place that each Gaussian had before
+    changed: Tensor  # [M] bool: whether it became another variant
+
+
+def gate_within(
+    model: GaussianModel,
+    strength: Strength,
+    budget_db: float,
+    measure: Callable[[GaussianModel], float],
+) -> Gated | None:
+    """Apply the largest of SHARES whose measured loss is within the budget; None where none is.
+
+    The model itself is not changed.
+
+    Args:
+        model: trained, or on its way.
+        strength: of its variants.
+        budget_db: dB that `measure` may fall by.
+        measure: the PSNR of a model, dB, on views that the probe did not look at.
+    """
+    before = measure(model)
+    for share in SHARES:
+        if 10 * math.log10(1 + share) > MOST_PREDICTED * budget_db:
+            continue
+        gated = copy.deepcopy(model)
+        choice = choose(strength, gated, share)
+        rows, changed = apply(gated, strength, choice)
+        loss = before - measure(gated)
+        if loss <= budget_db and len(gated):
+            gate = Gate(
+                share=share,
+                predicted_db=10 * math.log10(1 + choice.predicted),
+                measured_db=loss,
+                rows=count(gated) | {"removed": len(model) - len(gated)},
+                levels=levels_of(gated),
+                bytes_before=packed_bytes(model),
+                bytes=packed_bytes(gated),
+            )
+            return Gated(gated, gate, rows, changed)
+    return None
+
+
+def levels_of(model: GaussianModel) -> dict[str, int]:
+    """Count the Gaussians by the degree of their harmonics, and by frequencies of time where there are several."""
+    if model.classes is None or model.classes.levels is None:
+        return {}
+    values, counts = torch.unique(model.classes.levels, return_counts=True)
+    names = [f"degree {level % 4}" + (f", {level // 4 + 1} waves" if level > 3 else "") for level in values.tolist()]
+    return dict(zip(names, counts.tolist(), strict=True))

@@ -1,0 +1,37 @@
+"""Say in words what was decided about the effects of a scene and of its Gaussians; needs no torch."""
+
+from gsbench.measure.record import Gate, OnDemand, TimeScreen
+
+_KEEP = {
+    "refined": "have AGR",
+    "sliced": "are sliced without AGR",
+    "time": "have time frozen",
+    "direction": "have direction frozen",
+    "still": "are still",
+}
+
+
+def of_screen(screen: TimeScreen) -> str:
+    """Say whether time is simulated, and why."""
+    simulated = "" if screen.decision != "undecided" else ", so it is simulated"
+    return f"time is {screen.decision}{simulated}: {screen.reason}"
+
+
+def of_gate(gate: Gate) -> str:
+    """Say what a gate left of the model, and what that cost."""
+    left = sum(number for name, number in gate.rows.items() if name != "removed")
+    when = "at the end" if gate.step is None else f"after step {gate.step}"
+    kept = ", ".join(f"{gate.rows[name]} {words}" for name, words in _KEEP.items() if gate.rows.get(name))
+    text = (f"gated {when}: of {left + gate.rows.get('removed', 0)} Gaussians {left} are left, of which {kept}; "
+            f"PSNR on {gate.checked_on} {-gate.measured_db:+.3f} dB")  # fmt: skip
+    if gate.eval_loss_db is not None:
+        text += f", evaluated {-gate.eval_loss_db:+.3f} dB"
+    if gate.frame_ms_before and gate.frame_ms:
+        text += f", a frame {gate.frame_ms_before:.2f} -> {gate.frame_ms:.2f} ms"
+    return f"{text}, {gate.bytes_before / 1e6:.2f} -> {gate.bytes / 1e6:.2f} MB"
+
+
+def lines(found: OnDemand) -> list[str]:
+    """Say everything that was decided, a sentence a line."""
+    said = [of_screen(found.screen)] if found.screen else []
+    return said + [of_gate(gate) for gate in found.gates] + found.notes

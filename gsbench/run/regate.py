@@ -1,0 +1,62 @@
+"""Gate the model of a finished run, and write it as a run of its own beside the old one."""
+
+import copy
+from pathlib import Path
+
+from gsbench.errors import InputError
+from gsbench.measure import record as records
+from gsbench.measure.record import Record
+from gsbench.run.attempt import Attempt
+from gsbench.run.checks import check_folder
+from gsbench.run.identity import Plain, Run, training_hash
+from gsbench.run.load import typed_config
+from gsbench.run.run import write
+from gsbench.train import checkpoint
+from gsbench.train.checkpoint import Checkpoint
+
+
+def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
+    """Gate a finished run as `effects.gate=end` would have; return the record of the new run and its folder.
+
+    Args:
+        folder: of the run; it is not changed.
+        budget_db: PSNR on val that the gate may cost.
+        data_root: where the data set is now; where it was for the run by default.
+
+    Raises:
+        InputError: there is no finished run, it is gated at its end already, or the data are gone or others.
+    """
+    path = folder / checkpoint.FILE_NAME
+    if not path.exists():
+        raise InputError(f"{folder}: expected the folder of a run with a {checkpoint.FILE_NAME}, found none")
+    found = checkpoint.read(path)
+    plain: Plain = copy.deepcopy(found.config)
+    if plain.get("effects", {}).get("gate", "off") != "off":
+        raise InputError(f"{folder}: expected a run that was not gated at its end, got effects.gate="
+                         f"{plain['effects']['gate']}")  # fmt: skip
+    plain["effects"] = {"gate": "end", "budget_db": budget_db}
+    if data_root is not None:
+        plain["data"] = plain["data"] | {"root": data_root}
+    config = typed_config(plain, path)
+    old = records.read(folder / records.FILE_NAME)
+    words = ["gate=end"] + ([] if budget_db == 0.05 else [f"budget_db={budget_db}"])
+    variant = ",".join(([old.variant] if old.variant else []) + words)
+    new = folder.parent.parent / f"{old.model},{variant}" / folder.name
+    overrides = sorted([*old.overrides, "effects.gate=end", f"effects.budget_db={budget_db}"])
+    check_folder(new)
+    attempt = Attempt(Run(config, plain, new, old.model, variant, overrides))
+    model, scene = attempt.prepare()
+    if scene.fingerprint != found.data:
+        raise InputError(f"{folder}: expected the data that it was trained on, {scene.name} has changed since")
+    trainer = attempt.trainer(model, scene)
+    trainer.load_state_dict(found.state)
+    if trainer.step < config.train.iterations:
+        raise InputError(f"{folder}: expected a finished run, this one is at step {trainer.step} of "
+                         f"{config.train.iterations}: run it again, it goes on from there")  # fmt: skip
+    trainer.gate_at_end()
+    content = Checkpoint(training_hash(plain), found.data, trainer.state_dict(), plain, found.scene)
+    checkpoint.save(new / checkpoint.FILE_NAME, content)
+    record = attempt.measure(trainer)
+    write(record, new)
+    attempt.draw()
+    return record, new

@@ -1,0 +1,158 @@
+"""Gate the model of a training: once when its densification is over, so that it trains on for less, and at the end."""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsbench.config import Config
+from gsbench.effects.budget import Gated, gate_within
+from gsbench.effects.strength import probe
+from gsbench.errors import InputError
+from gsbench.measure.quality import psnr
+from gsbench.measure.record import Gate
+from gsbench.measure.schema import parse
+from gsbench.measure.speed import synchroniser, time_in_turns
+from gsbench.models import GaussianModel
+from gsbench.models.classes import Classes
+from gsbench.models.render import render
+from gsbench.scenes import Scene, View
+from gsbench.train.density import DensityControl
+from gsbench.train.floor import Floor
+from gsbench.train.optim import Optimizer
+
+GATES = ("off", "end", "both")
+LOSS_IN_TRAINING = 0.5  # dB on val at once: the rest of the training makes up for it (docs/effects.md)
+VIEWS_IN_TRAINING = 30  # that the probe looks at: the gate must cost less than it saves
+VIEWS_AT_END = 60
+HELD_OUT = 8  # every so many training views one, to check on where the scene has no val split of its own
+FEW = 12  # training views, of which none is held out
+
+NO_GATES: dict[str, Any] = {"gates": [], "notes": []}  # the state of a training without gates
+Shape = tuple[dict[str, Tensor], Classes | None]  # raw parameters and classes
+
+
+class Gating:
+    """The gates of one training."""
+
+    def __init__(
+        self, model: GaussianModel, optimizer: Optimizer, density: DensityControl, floor: Floor, scene: Scene,
+        background: Tensor, config: Config,
+    ) -> None:  # fmt: skip
+        """Gate `model`; the moments, the counts and the floor of its Gaussians follow.
+
+        Args:
+            model: of the training.
+            optimizer: of the model.
+            density: of the model.
+            floor: of the model.
+            scene: gives the views that are probed and those that the loss is measured on.
+            background: colour [3].
+            config: says by which gates, and what they may cost.
+        """
+        self.model = model
+        self.optimizer = optimizer
+        self.density = density
+        self.floor = floor
+        self.background = background
+        self.config = config
+        self.gates: list[Gate] = []
+        self.notes: list[str] = []
+        self.probed, self.checked, self.checked_on = scene.train, scene.val, "val"
+        if not scene.val or config.scene.eval_split == "val":
+            self.checked_on = "held-out training views"
+            if len(scene.train) < FEW:
+                self.checked_on = "the training views"
+                self.checked = scene.train
+                self.notes.append(f"{len(scene.train)} training views and no val split: the gate is checked on the "
+                                  f"training views, which says little")  # fmt: skip
+            else:
+                self.checked = scene.train[::HELD_OUT]
+                self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
+
+    def in_training(self, step: int) -> None:
+        """Gate before a step; what that costs on val at once must be at most LOSS_IN_TRAINING."""
+        self._gate(step, LOSS_IN_TRAINING, VIEWS_IN_TRAINING)
+
+    def at_end(self) -> None:
+        """Gate the finished model within `effects.budget_db`."""
+        self._gate(None, self.config.effects.budget_db, VIEWS_AT_END)
+
+    def now(self) -> Shape:
+        """Return the model's Gaussians as they are, for `compare`."""
+        return {name: x.data for name, x in self.model.splats.items()}, self.model.classes
+
+    def compare(self, ungated: Shape, views: list[View]) -> None:
+        """Measure what the gate at the end changed on the evaluated `views`: PSNR, and frames rendered in turns."""
+        if not self.gates or self.gates[-1].step is not None:
+            return
+        gated = self.now()
+        self._become(ungated)
+        before = self._psnr(self.model, views)
+        self._become(gated)
+        loss = before - self._psnr(self.model, views)
+
+        def frames_of(shape: Shape) -> Callable[[int], object]:
+            def frame(i: int) -> object:
+                self._become(shape)
+                return self._render(self.model, views[i % len(views)])
+
+            return frame
+
+        count = max(self.config.protocol.renders, len(views))
+        wait = synchroniser(self.config.device)
+        times = time_in_turns([frames_of(ungated), frames_of(gated)], count, wait)
+        self.gates[-1] = replace(self.gates[-1], eval_loss_db=loss, frame_ms_before=times[0].p50, frame_ms=times[1].p50)
+
+    def _become(self, shape: Shape) -> None:
+        for name, value in shape[0].items():
+            self.model.splats[name].data = value
+        self.model.classes = shape[1]
+
+    @torch.no_grad()
+    def _gate(self, step: int | None, budget_db: float, most: int) -> bool:
+        """Probe, choose and apply; tell whether anything was within the budget."""
+        started = time.perf_counter()
+        # In training nothing is frozen by halves: kernels keep the entries of still rows, but these would learn on.
+        strength = probe(self.model, self.probed, self.background, seed=self.config.seed, most=most,
+                         antialias=self.config.raster.antialias, by_halves=step is None)  # fmt: skip
+        found = gate_within(self.model, strength, budget_db, lambda model: self._psnr(model, self.checked))
+        if found is None:
+            self.notes.append(f"{'at the end' if step is None else f'at step {step}'} no simplification cost at most "
+                              f"{budget_db} dB on {self.checked_on}")  # fmt: skip
+            return False
+        self._adopt(found)
+        self.gates.append(
+            replace(found.gate, step=step, checked_on=self.checked_on, seconds=time.perf_counter() - started)
+        )
+        return True
+
+    def _adopt(self, found: Gated) -> None:
+        for name, parameter in self.model.splats.items():
+            parameter.data = found.model.splats[name].data
+        self.model.classes = found.model.classes
+        self.optimizer.follow(self.model, found.rows, found.changed)
+        self.density.follow(found.rows)
+        self.floor.update()
+
+    @torch.no_grad()
+    def _render(self, model: GaussianModel, view: View) -> Tensor:
+        return render(model, view.camera, view.time, self.background, self.config.raster.antialias)
+
+    def _psnr(self, model: GaussianModel, views: list[View]) -> float:
+        return sum(psnr(self._render(model, view), view.image) for view in views) / len(views)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what was decided, for the checkpoint; the classes are the model's."""
+        return {"gates": [asdict(gate) for gate in self.gates], "notes": list(self.notes)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from the `state_dict` of a checkpoint, once the model is loaded; raises InputError if it is none."""
+        gates, notes = state["gates"], state["notes"]
+        if not isinstance(gates, list) or not isinstance(notes, list) or not all(isinstance(x, str) for x in notes):
+            raise InputError("checkpoint: expected lists of gates and notes")
+        self.gates = [parse(Gate, gate, "checkpoint: gate") for gate in gates]
+        self.notes = notes
