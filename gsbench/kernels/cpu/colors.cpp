@@ -218,25 +218,29 @@ struct Sorted {
     GSB_HD Sorted(const ColorArgs& a, Picked& picked) {
         const Level most{a.degree, a.waves};
         uint8_t level[CHUNK];
-        int next[LEVELS] = {};
+        int first = most.number(), other = 0;  // other: not zero where some level is not the first row's
         if (a.levels) {
-            for (int k = 0; k < picked.count; ++k) {
-                const Level own = Level::of(static_cast<uint32_t>(a.levels[picked.which[k]]));
-                ++next[level[k] = static_cast<uint8_t>(own.at_most(most).number())];
-            }
-        } else {
-            next[most.number()] = picked.count;
+            for (int i = 0; i < a.N; ++i) level[i] = static_cast<uint8_t>(level_of(a.levels[i], most));
+            first = level[0];
+            for (int i = 0; i < a.N; ++i) other |= level[i] ^ first;
         }
-        bool mixed = false;
+        if (!other) {
+            for (int l = first; l < LEVELS; ++l) begin[l + 1] = picked.count;
+            return;
+        }
+        int next[LEVELS] = {};
+        for (int k = 0; k < picked.count; ++k) ++next[level[picked.which[k]]];
         for (int l = 0; l < LEVELS; ++l) {
-            mixed |= next[l] > 0 && next[l] < picked.count;
             begin[l + 1] = begin[l] + next[l];
             next[l] = begin[l];
         }
-        if (!mixed) return;
         uint32_t before[CHUNK];
         __builtin_memcpy(before, picked.which, sizeof(before));
-        for (int k = 0; k < picked.count; ++k) picked.which[next[level[k]]++] = before[k];
+        for (int k = 0; k < picked.count; ++k) picked.which[next[level[before[k]]]++] = before[k];
+    }
+
+    GSB_HD static int level_of(int32_t own, Level most) {
+        return Level::of(static_cast<uint32_t>(own)).at_most(most).number();
     }
 };
 
