@@ -1,27 +1,38 @@
 """Predict what every simplification of every Gaussian would cost, all of them at once, from a few renders.
 
 A variant of a Gaussian (AGR baked in, time or direction frozen, fewer harmonics, removed) changes its slice in view v
-by delta_v. With J the derivative of the image by slices, halfway between the model and the variant, and r the image
-minus the truth, the squared error of all views grows by about
+by delta_v, and the image by x_v. With r the image minus the truth, the squared error of all views grows by
 
-    E = sum over v of max(0, 2 <r, J delta_v>) + <g, J delta_v>^2,
+    E = sum over v of max(0, 2 <r, x_v>) + <g, x_v>^2,
 
-with random signs g, for <g, x>^2 is |x|^2 on average. One product of r and one of g with J, backwards, have this for
-every Gaussian. The linear term is cut at zero: what would improve the training views is not counted on.
+with random signs g, for <g, x>^2 is |x|^2 on average. The linear term is cut at zero: what would improve the training
+views is not counted on. Products of r and g with J, the derivative of the image by slices, have <r, x> and <g, x> for
+all Gaussians at once:
+
+- The image is linear in a Gaussian's colour and in its opacity, so x = J delta for fewer harmonics and for a removal.
+- A variant that moves a Gaussian by less than its size has x = (J + J') delta / 2, with J' at the variant. For that all
+  variants are drawn beside the model's own Gaussians, so thin that they hide nothing of one another.
+- One that moves it farther is missed in one place and seen in another: |x|^2 is the sum of both squares.
+
+Two equal Gaussians that are d standard deviations apart overlap by exp(-d^2 / 4); by so much the second case counts,
+and the third by the rest.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gsbench.models import GaussianModel, Query
-from gsbench.models.base import Gaussians3D, Raw
+from gsbench.models.base import Gaussians3D
 from gsbench.models.render import rasterize_slice
 from gsbench.models.variants import REMOVED, Variant, variants_of
 from gsbench.scenes import Camera, View
+
+THIN = 0.02  # the opacity of Gaussians that are tried out beside the others
 
 
 @dataclass(frozen=True)
@@ -41,6 +52,7 @@ def probe(
     *,
     seed: int = 0,
     most: int = 60,
+    draws: int = 1,
     antialias: bool = False,
     by_halves: bool = True,
 ) -> Strength:
@@ -52,6 +64,7 @@ def probe(
         background: colour [3].
         seed: of the random signs.
         most: this many views, evenly spaced, stand for more.
+        draws: of g for each view; of a Gaussian that few views show, one says little.
         antialias: see `gsbench.raster.rasterize`.
         by_halves: whether time or direction alone may be frozen.
     """
@@ -63,15 +76,14 @@ def probe(
     random = torch.Generator().manual_seed(seed)
     total = 0.0
     for view, query, live in zip(looked_at, queries, seen, strict=True):
+        draw = Drawing(model, view.camera, background, antialias)
         image = rasterize_slice(live, view.camera, background, model.backend, antialias).image[0]
         residual = image - view.image
         total += float(residual.square().sum())
-        signs = torch.randint(0, 2, residual.shape, generator=random).to(residual) * 2 - 1
-        for at, group in _by_midpoint(model, variants, query, live):
-            products = _products(at, view.camera, background, model, antialias, [residual, signs])
-            for name, changed in group:
-                first, second = (_dot(product, live, changed) for product in products)
-                errors[name] += (2 * first).clamp(min=0) + second.square()
+        signs = [torch.randint(0, 2, residual.shape, generator=random).to(residual) * 2 - 1 for _ in range(draws)]
+        here = draw(live, [residual, *signs])
+        for variant in variants:
+            errors[variant.name] += _error(variant, model, query, live, here, draw, [residual, *signs])
     if len(looked_at) < len(views):  # of a Gaussian in none of these views nothing is known, so nothing is taken
         unknown = errors[REMOVED] == 0
         errors = {name: torch.where(unknown, math.inf, error) for name, error in errors.items()}
@@ -84,43 +96,66 @@ def evenly_spaced(views: Sequence[View], most: int) -> list[View]:
     return [views[i * len(views) // count] for i in range(count)]
 
 
-def _by_midpoint(
-    model: GaussianModel, variants: list[Variant], query: Query, live: Gaussians3D
-) -> Iterator[tuple[Gaussians3D, list[tuple[str, Gaussians3D]]]]:
-    """Yield a place between model and variants, and the slices of the variants that share it.
+class Drawn(NamedTuple):
+    """A slice that was drawn, and products of vectors with the derivative of its image."""
 
-    The image is linear in colours and in the opacity of each Gaussian, so the variants that change nothing else share
-    the model's own place.
-    """
-    beside: list[tuple[str, Gaussians3D]] = []
-    for variant in variants:
-        if variant.raw is None:
-            beside.append((variant.name, live._replace(opacities=torch.zeros_like(live.opacities))))
-        elif variant.level is not None:
-            colors = model.paint(_merged(model, variant.raw), live.means, live.opacities, query)
-            beside.append((variant.name, live._replace(colors=colors)))
-        else:
-            raw = _merged(model, variant.raw)
-            means, factors, opacities = model.observe(raw, query)
-            changed = Gaussians3D(means, factors, opacities, model.paint(raw, means, live.opacities, query))
-            yield Gaussians3D(*((a + b) / 2 for a, b in zip(live, changed, strict=True))), [(variant.name, changed)]
-    yield live, beside
+    products: list[Gaussians3D]  # by each vector
+    means2d: Tensor  # [N, 2] pixels
+    radii: Tensor  # [N] pixels, three standard deviations; 0 where it is culled
 
 
-def _merged(model: GaussianModel, raw: Raw) -> Raw:
-    return dict(model.splats.items()) | raw
+class Drawing(NamedTuple):
+    """The rasterizer of one view."""
+
+    model: GaussianModel
+    camera: Camera
+    background: Tensor
+    antialias: bool
+
+    @torch.enable_grad()
+    def __call__(self, at: Gaussians3D, vectors: list[Tensor]) -> Drawn:
+        """Multiply vectors [H, W, 3] by the derivative of the image by a slice, from the left."""
+        place = Gaussians3D(*(x.detach().requires_grad_() for x in at))
+        drawn = rasterize_slice(place, self.camera, self.background, self.model.backend, self.antialias)
+        last = len(vectors) - 1
+        products = [Gaussians3D(*torch.autograd.grad(drawn.image[0], place, vector, retain_graph=i < last))
+                    for i, vector in enumerate(vectors)]  # fmt: skip
+        return Drawn(products, drawn.info.means2d[0].detach(), drawn.info.radii[0])
 
 
-@torch.enable_grad()
-def _products(
-    at: Gaussians3D, camera: Camera, background: Tensor, model: GaussianModel, antialias: bool, vectors: list[Tensor]
-) -> list[Gaussians3D]:
-    """Multiply vectors [H, W, 3] by the derivative of the image by the slice at a place, from the left."""
-    place = Gaussians3D(*(x.detach().requires_grad_() for x in at))
-    image = rasterize_slice(place, camera, background, model.backend, antialias).image[0]
-    last = len(vectors) - 1
-    return [Gaussians3D(*torch.autograd.grad(image, place, vector, retain_graph=i < last))
-            for i, vector in enumerate(vectors)]  # fmt: skip
+def _error(
+    variant: Variant, model: GaussianModel, query: Query, live: Gaussians3D, here: Drawn, draw: Drawing,
+    vectors: list[Tensor],
+) -> Tensor:  # fmt: skip
+    """Compute E [N] of a variant in one view."""
+    removed = [-product.opacities * live.opacities for product in here.products]
+    if variant.raw is None:
+        return _grown(removed)
+    raw = dict(model.splats.items()) | variant.raw
+    if variant.level is not None:
+        colors = model.paint(raw, live.means, live.opacities, query)
+        return _grown([(product.colors * (colors - live.colors)).sum(-1) for product in here.products])
+    means, factors, opacities = model.observe(raw, query)
+    changed = Gaussians3D(means, factors, opacities, model.paint(raw, means, opacities, query))
+    thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))
+    both = draw(Gaussians3D(*(torch.cat(pair) for pair in zip(live, thin, strict=True))), vectors)
+    N = len(live.means)
+    scale = changed.opacities / thin.opacities.clamp(min=1e-12)  # an image of a Gaussian is linear in its opacity
+    there = [Gaussians3D(p.means[N:] * scale[:, None], p.factors[N:] * scale[:, None, None], p.opacities[N:],
+                         p.colors[N:] * scale[:, None]) for p in both.products]  # fmt: skip
+    along = [(_dot(a, live, changed) + _dot(b, live, changed)) / 2 for a, b in zip(here.products, there, strict=True)]
+    added = [product.opacities * changed.opacities for product in there]
+    size = torch.maximum(here.radii, both.radii[N:]).clamp(min=1) / 3
+    distance = (both.means2d[N:] - here.means2d) / (2 * size[:, None])
+    overlap = torch.exp(-distance.square().sum(-1))
+    return overlap * _grown(along) + (1 - overlap) * _grown(removed, added)
+
+
+def _grown(*changes: list[Tensor]) -> Tensor:
+    """Compute max(0, 2 <r, x>) + |x|^2 [N] of changes x that do not overlap, of each <r, x> and then some <g, x>."""
+    first = torch.stack([change[0] for change in changes]).sum(0)
+    second = torch.stack([torch.stack(change[1:]).square().mean(0) for change in changes]).sum(0)
+    return (2 * first).clamp(min=0) + second
 
 
 def _dot(product: Gaussians3D, live: Gaussians3D, changed: Gaussians3D) -> Tensor:
