@@ -34,6 +34,7 @@ class SceneConfig:
     """One scene of the data set."""
 
     name: str = MISSING
+    released_as: str | None = None  # the folder's name in the published release, where the paper's `name` differs
     downscale: int = 1  # integer factor by which images are made smaller, by an area filter
     eval_split: str = "test"  # or val, where the test split is wrong (D-NeRF lego)
     frames: list[int] | None = None  # the first and the last frame of a Technicolor scene; None: all that are there

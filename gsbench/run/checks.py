@@ -136,20 +136,23 @@ def check_device(name: str) -> None:
 
 
 def scene_folder(config: Config) -> Path:
-    """Find the folder of the config's scene.
+    """Find the folder of the config's scene: by its name, else by the name that the published release gives it.
 
     Raises:
-        InputError: there is none in data.root.
+        InputError: there is none in data.root; the message has all names that were looked for.
     """
-    data, name = config.data, config.scene.name
-    folder = data_root(data.root) / name  # a name has no slash: gsbench.measure.record.run_path
-    if not folder.is_dir():
-        published = f"; {data.dataset} is published at: {data.published}" if data.published else ""
-        raise InputError(
-            f"data.root={data.root}: expected a folder '{name}' with transforms_{{train,val,test}}.json and the "
-            f"images they name, looked for {folder}{published}"
-        )
-    return folder
+    data, scene = config.data, config.scene
+    names = [scene.name, *([scene.released_as] if scene.released_as else [])]
+    folders = [data_root(data.root) / name for name in names]  # a name has no slash: gsbench.measure.record.run_path
+    for folder in folders:
+        if folder.is_dir():
+            return folder
+    published = f"; {data.dataset} is published at: {data.published}" if data.published else ""
+    raise InputError(
+        f"data.root={data.root}: expected a folder {' or '.join(map(repr, names))} with "
+        f"transforms_{{train,val,test}}.json and the images they name, looked for {' and '.join(map(str, folders))}"
+        f"{published}"
+    )
 
 
 def data_root(root: str) -> Path:

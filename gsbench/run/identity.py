@@ -22,8 +22,8 @@ Plain = dict[str, Any]  # a resolved config in plain JSON
 # `eval_split` are not here: the best iteration is looked for while the model trains.
 MEASURING = (
     "experiment", "results", "resume", "launch", "data.dataset", "data.paper_dataset", "data.published", "data.root",
-    "data.scenes", "train.checkpoint_minutes", "protocol.name", "protocol.quantise", "protocol.lpips_alex",
-    "protocol.lpips_vgg", "protocol.renders", "protocol.pictures",
+    "data.scenes", "scene.released_as", "train.checkpoint_minutes", "protocol.name", "protocol.quantise",
+    "protocol.lpips_alex", "protocol.lpips_vgg", "protocol.renders", "protocol.pictures",
 )  # fmt: skip
 OWN_NAMES = ("exp", "model", "scene")  # the groups that have a place in a run's path
 DEFAULTS = {"train": "default", "raster": "default", "protocol": "gsbench"}  # groups of conf/config.yaml
