@@ -10,7 +10,7 @@ ARGS ?=
 # The CUDA kernels, compiled for five architectures, take minutes: made where a GPU is to run them. CUDA=on|auto|off.
 CUDA := $(if $(shell nvidia-smi -L 2> /dev/null),auto,off)
 
-.PHONY: help table1 frontier test test-all stability stability-long bench gpu-check slurm-check sanitize lint format setup clean
+.PHONY: help table1 frontier tables test test-all stability stability-long bench gpu-check slurm-check sanitize lint format setup clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
@@ -41,6 +41,9 @@ frontier: setup  ## train the five models at five lengths and three capacities, 
 	done; \
 	$(BIN)/python -m gsbench.report results/frontier || status=$$?; \
 	exit $$status
+
+tables: setup  ## write Tables 1 and 2 of the paper from whatever is in results/, and say what is missing
+	$(BIN)/python -m gsbench.report --tables results
 
 test: lint  ## lint, types and all tests but the slow ones
 	$(BIN)/python -m pytest

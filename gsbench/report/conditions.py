@@ -7,6 +7,7 @@ from gsbench.measure.record import Record
 
 WARNING = "WARNING"
 MOST_RUNS_NAMED = 3
+SPREAD = "mean ± sample standard deviation over the seeds that finished, their number beside it"
 DEFINITIONS = (
     "PSNR: joint over H x W x 3, final iteration, mean over views. SSIM: scikit-image, Gaussian window, data_range 1.",
     "FPS: 1000 / median ms of synchronised renders after warm-up, slicing and AGR included. "
@@ -21,8 +22,13 @@ def printable(text: object) -> str:
     return "".join(c if c.isprintable() else "?" for c in " ".join(str(text).split()))
 
 
-def conditions(records: list[Record]) -> list[str]:
-    """List footnotes on protocol, data, machine, commit, versions and seeds; warnings come first."""
+def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:
+    """List footnotes on protocol, data, machine, commit, versions and seeds; warnings come first.
+
+    Args:
+        records: of one table.
+        spread: says what stands behind ± in it.
+    """
     names = sorted({name for r in records for name in r.protocol} - {"paper_dataset"})
     protocol: dict[str, Get] = {name: partial(_protocol, name=name) for name in names}
     protocol["iterations"] = _iterations
@@ -39,7 +45,7 @@ def conditions(records: list[Record]) -> list[str]:
         notes.append(f"{title}: {get(records[0])}" if same else _differ(title, records, get))
     if any(_commit(r).endswith("-dirty") for r in records):
         notes.append(f"{WARNING}: files differed from their commit (-dirty): it does not reproduce these numbers.")
-    notes += [_seeds(records), *DEFINITIONS]
+    notes += [_seeds(records, spread), *DEFINITIONS]
     return sorted(notes, key=lambda note: not note.startswith(WARNING))
 
 
@@ -65,12 +71,12 @@ def _versions(record: Record) -> str:
     return ", ".join(f"{printable(k)} {printable(v)}" for k, v in sorted(record.provenance.versions.items()))
 
 
-def _seeds(records: list[Record]) -> str:
+def _seeds(records: list[Record], spread: str) -> str:
     seeds = sorted({r.seed for r in records})
     listed = ", ".join(map(str, seeds))
     if len(seeds) == 1:
         return f"seed: {listed}; from one seed no spread is known."
-    return f"seeds: {listed}; mean ± sample standard deviation over the seeds that finished, their number beside it."
+    return f"seeds: {listed}; {spread}."
 
 
 def _goes_with_scene(records: list[Record], get: Get) -> bool:

@@ -1,4 +1,4 @@
-"""Provide the numbers of the 7DGS paper, its Tables 1 and 2, for comparison with measurements.
+"""Provide the numbers of the 7DGS paper, its Tables 1 and 2, and the protocol behind them, for comparison.
 
 Source: Gao et al., "7DGS: Unified Spatial-Temporal-Angular Gaussian Splatting", ICCV 2025. A cell that the paper leaves
 empty is None. Its averages are rows of the scene "avg".
@@ -11,6 +11,41 @@ from importlib import resources
 
 AVERAGE = "avg"
 MODELS = {"4dgs": False, "7dgs": True, "7dgs_noagr": False}  # the models of Table 1, and whether they have AGR
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How the paper trained and tested on a data set (its section "implementation details")."""
+
+    scenes: tuple[str, ...]  # as conf/exp names them
+    sizes: dict[str, str]  # of the images, by scene, "*" for all others
+    batch_size: int
+    splits: dict[str, str]  # by scene, "*" for all others
+    frames: int | None = None  # of each scene; None: the data set has its own list
+    iterations: int = 30_000
+
+
+PROTOCOLS = {
+    "7DGS-PBR": Protocol(
+        scenes=("heart1", "heart2", "cloud", "dust", "flame", "suzanne"),
+        sizes={"heart1": "500x500", "*": "800x800"},  # half of 1000x1000 and 1600x1600
+        batch_size=4,
+        splits={"*": "test"},
+    ),
+    "D-NeRF": Protocol(
+        scenes=("bouncingballs", "hellwarrior", "hook", "jumpingjacks", "lego", "mutant", "standup", "trex"),
+        sizes={"*": "400x400"},  # half of 800x800
+        batch_size=4,
+        splits={"lego": "val", "*": "test"},  # published code measures lego on val: its test split is wrong
+    ),
+    "Technicolor": Protocol(
+        scenes=("Birthday", "Fabien", "Painter", "Theater", "Train"),
+        sizes={"*": "2048x1088"},
+        batch_size=1,
+        splits={"*": "test"},
+        frames=50,
+    ),
+}
 
 
 @dataclass(frozen=True)

@@ -71,11 +71,11 @@ def load(root: Path) -> tuple[list[Record], list[str]]:
 
 def tidy(records: list[Record]) -> pd.DataFrame:
     """Make a data frame with a row for each run and a column for each quantity; missing numbers are empty."""
-    return pd.DataFrame([_quantities(record) for record in records])
+    return pd.DataFrame([quantities(record) for record in records])
 
 
-def _quantities(r: Record) -> dict[str, Any]:
-    """Flatten a record to quantities by name."""
+def quantities(r: Record) -> dict[str, Any]:
+    """Flatten a record to quantities by name: those of `tidy`; a missing number is None."""
     flat: dict[str, Any] = {
         name: getattr(r, name) for name in ("experiment", "dataset", "scene", "model", "variant", "seed")
     }
@@ -106,7 +106,7 @@ class _Builder:
         variants = {r.variant for r in records}
         self.common = variants.pop() if len(variants) == 1 else ""  # said once, below the table
         self.models = sorted({self._name(r) for r in records})
-        flat = [_quantities(r) for r in records]
+        flat = [quantities(r) for r in records]
         shown = [COLUMNS[0], *([TRAIN] if train else []), *COLUMNS[1:]]
         self.columns = [*shown, *(c for c in EXTRA_COLUMNS if any(q[c.key] is not None for q in flat))]
         finished: dict[tuple[str, str], list[dict[str, Any]]] = {}

@@ -1,0 +1,141 @@
+"""Sort records by whether they were measured as the 7DGS paper measured, so that only like stands beside like."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from gsbench.measure.record import Record
+from gsbench.report.arms import iterations
+from gsbench.report.conditions import printable
+from gsbench.report.paper import PROTOCOLS
+
+MODELS = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
+# Words of a variant that change what is measured, or that the heading of a table says, but not how a model is trained.
+_NOT_OF_THE_RECIPE = ("iterations", "downscale", "eval_split", "protocol", "best_on_test", "curve_points")
+
+
+class Arm(NamedTuple):
+    """What the seeds of a row share beside their scene."""
+
+    model: str
+    experiment: str
+    recipe: str  # how it was trained otherwise than its experiment does; "" for nothing
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Runs of one data set that may stand in one table."""
+
+    dataset: str
+    experiment: str
+    size: str  # of the images
+    steps: int  # of training; 0 where the records do not say
+    runs: list[Record] = field(default_factory=list)
+
+    @property
+    def heading(self) -> str:
+        """The data set, the size of its images and the length of training."""
+        return f"{self.dataset}: experiment {self.experiment}, {self.size}, {self.steps:,} iterations"
+
+    @property
+    def effort(self) -> int:
+        """How near the pool is to the paper's protocol: pixels times iterations."""
+        width, _, height = self.size.partition("x")
+        return int(width) * int(height) * self.steps if width.isdecimal() and height.isdecimal() else 0
+
+
+@dataclass(frozen=True)
+class Sorted:
+    """All records of a folder, sorted by what they may be compared with."""
+
+    paper: dict[str, list[Record]]  # by data set: runs at the paper's protocol
+    other_protocol: list[Pool]  # a data set of the paper: the pool that is nearest to its protocol
+    other_data: list[Pool]  # stand-ins for scenes of the paper: of each data set the pool of most effort
+    left_out: dict[str, list[str]]  # by data set of the paper: what is in no table, in words
+
+
+def sort(records: list[Record]) -> Sorted:
+    """Sort records of the five models; what stands for no data set of the paper is left out without a word."""
+    at_paper: dict[str, list[Record]] = {name: [] for name in PROTOCOLS}
+    pools: dict[tuple[str, str, str, str, int], Pool] = {}
+    for r in records:
+        named = r.protocol.get("paper_dataset")
+        if named not in PROTOCOLS or r.model not in MODELS:
+            continue
+        if not departure(r):
+            at_paper[named].append(r)
+            continue
+        size, steps = printable(r.protocol.get("resolution", "a size not recorded")), iterations(r) or 0
+        key = named, r.dataset, r.experiment, size, steps
+        pools.setdefault(key, Pool(r.dataset, r.experiment, size, steps)).runs.append(r)
+    nearest: dict[tuple[str, str], Pool] = {}
+    for (named, dataset, *_), pool in sorted(pools.items(), key=lambda one: (-one[1].effort, one[0])):
+        if any(r.status == "ok" for r in pool.runs):
+            nearest.setdefault((named, dataset), pool)
+    shown = {id(pool) for pool in nearest.values()}
+    left: dict[str, list[str]] = {name: [] for name in PROTOCOLS}
+    for (named, *_), pool in sorted(pools.items()):
+        if id(pool) not in shown:
+            left[named].append(f"{len(pool.runs)} run{'s' * (len(pool.runs) > 1)} of {pool.heading}")
+    return Sorted(
+        at_paper,
+        [pool for (named, dataset), pool in nearest.items() if named == dataset],
+        [pool for (named, dataset), pool in nearest.items() if named != dataset],
+        left,
+    )
+
+
+def departure(record: Record) -> str:
+    """Say in what a run departs from the paper's protocol, "" where it does not."""
+    protocol = PROTOCOLS.get(record.dataset)
+    if protocol is None or record.protocol.get("paper_dataset") != record.dataset:
+        return "data"
+    if record.scene not in protocol.scenes:
+        return "scene"
+    config = record.provenance.config
+    expected: dict[str, tuple[Any, Any]] = {
+        "size": (record.protocol.get("resolution"), protocol.sizes.get(record.scene, protocol.sizes["*"])),
+        "iterations": (iterations(record), protocol.iterations),
+        "batch size": (_part(config, "train").get("batch_size"), protocol.batch_size),
+        "split": (record.protocol.get("eval_split"), protocol.splits.get(record.scene, protocol.splits["*"])),
+        "background": (record.protocol.get("background"), "black"),
+        "quantisation": (record.protocol.get("quantise"), False),
+        "frames": (_count(_part(config, "scene").get("frames")), protocol.frames),
+    }
+    if record.status != "ok" and record.protocol.get("resolution") == "not loaded":
+        del expected["size"]  # a run that failed before it saw an image
+    return ", ".join(name for name, (theirs, papers) in expected.items() if theirs != papers)
+
+
+def arm(record: Record) -> Arm:
+    """Return the arm that a run is of."""
+    words = record.variant.split(",") if record.variant else []
+    kept = [word for word in words if word.partition("=")[0].rpartition(".")[2] not in _NOT_OF_THE_RECIPE]
+    return Arm(record.model, record.experiment, ",".join(kept))
+
+
+def arms(records: list[Record]) -> list[Arm]:
+    """List the arms of records in the order of MODELS."""
+    return sorted({arm(r) for r in records}, key=lambda one: (MODELS.index(one.model), one))
+
+
+def finished(records: list[Record], one: Arm, scenes: Sequence[str]) -> dict[str, list[Record]]:
+    """Return the finished runs of an arm by scene, one a seed: that with the best on test, where two differ in it."""
+    found: dict[str, dict[int, Record]] = {}
+    for r in sorted(records, key=lambda r: (r.metrics or {}).get("psnr_best_on_test") is not None):
+        if r.status == "ok" and r.scene in scenes and arm(r) == one:
+            found.setdefault(r.scene, {})[r.seed] = r
+    return {scene: [found[scene][seed] for seed in sorted(found[scene])] for scene in scenes if scene in found}
+
+
+def _part(config: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return a section of a config, empty where a record lacks it."""
+    part = config.get(name)
+    return part if isinstance(part, dict) else {}
+
+
+def _count(frames: Any) -> int | None:
+    """Return the number of frames from the first to the last one."""
+    if isinstance(frames, list) and len(frames) == 2 and all(isinstance(n, int) for n in frames):
+        return int(frames[1] - frames[0] + 1)
+    return None

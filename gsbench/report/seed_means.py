@@ -1,0 +1,31 @@
+"""Average quantities over seeds and scenes, each with the interval of gsbench's statistics."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from gsbench.measure.record import Record
+from gsbench.report.intervals import Estimate, estimate
+from gsbench.report.tables import quantities
+
+SPREAD = (
+    "± is half the width of the 95 % interval over seeds (Student's t; of these scenes and views); one seed has none"
+)
+
+
+def mean(runs: Mapping[str, Sequence[Record]], key: str) -> Estimate:
+    """Estimate the mean of a quantity over scenes, of its mean over seeds; NaN where a run lacks it.
+
+    Args:
+        runs: finished ones, by scene.
+        key: a column of `gsbench.report.tables.tidy`.
+    """
+    scenes = [np.array([[_number(quantities(run).get(key))] for run in seeds]) for seeds in runs.values()]
+    if any(np.isnan(scene).any() for scene in scenes):
+        return Estimate(math.nan, len(scenes), 0, "")
+    return estimate(scenes, generalise=False)
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
