@@ -41,6 +41,18 @@ class Curve:
         finite = [(p.psnr_val, p) for p in self.points if p.psnr_val is not None]
         return max(finite, key=lambda pair: pair[0])[1] if finite else None
 
+    @property
+    def progress(self) -> str:
+        """The latest point in words, with the change since the one before: "12 s of training, val 24.40 dB (+0.31)"."""
+        if not self.points:
+            return "val not measured yet"
+        before, now = (self.points[-2] if len(self.points) > 1 else None), self.points[-1]
+        told = f"{now.seconds:.0f} s of training, val "
+        if now.psnr_val is None:
+            return f"{told}-"
+        change = "" if before is None or before.psnr_val is None else f" ({now.psnr_val - before.psnr_val:+.2f})"
+        return f"{told}{now.psnr_val:.2f} dB{change}"
+
     def seconds_to(self, psnr: float) -> float | None:
         """Return the training seconds at the first point that reached `psnr` dB, not interpolated; None if none did."""
         return next((p.seconds for p in self.points if p.psnr_val is not None and p.psnr_val >= psnr), None)

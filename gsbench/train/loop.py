@@ -106,10 +106,9 @@ class Trainer:
                     self._measure()
                 self.step += 1
                 bar.update()
-                last = self.curve.last
-                shown = f"{last.psnr_val:.2f} dB" if last and last.psnr_val is not None else "-"
+                # Seconds are those of the last point: reading the clock's own would wait for a GPU at every step.
                 bar.set_postfix_str(
-                    f"loss {self.watch.loss:.4f}, val {shown}, {len(self.model)} Gaussians", refresh=False
+                    f"{self.curve.progress}, loss {self.watch.loss:.4f}, {len(self.model)} Gaussians", refresh=False
                 )
                 if not goes_on():
                     break

@@ -174,3 +174,18 @@ def test_a_curve_continues_from_its_checkpoint_and_never_goes_back(tmp_path):
     for iteration, seconds in ((100, 2.0), (200, 0.5)):
         with pytest.raises(InputError, match="checkpoint"):
             resumed.add(iteration, seconds, 21.0)
+
+
+def test_progress_tells_seconds_and_the_change_on_val():
+    """Would catch a change against another point than the one before, and a number where none was measured."""
+    curve = Curve()
+    assert curve.progress == "val not measured yet"
+    curve.add(100, 3.4, 24.0)
+    assert curve.progress == "3 s of training, val 24.00 dB"
+    curve.add(200, 11.6, 24.4)
+    curve.add(300, 20.0, 24.15)
+    assert curve.progress == "20 s of training, val 24.15 dB (-0.25)"
+    curve.add(400, 31.0, float("nan"))
+    assert curve.progress == "31 s of training, val -"
+    curve.add(500, 40.0, 25.0)
+    assert curve.progress == "40 s of training, val 25.00 dB"

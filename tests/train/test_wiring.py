@@ -1,6 +1,7 @@
 """The trainer's wiring: which gradient, which views, which rows and which rate go where, asked of a real trainer."""
 
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from gsbench.backends import AUTO, REFERENCE
 from gsbench.measure.curve import Point
+from gsbench.measure.speed import StageClock
 from gsbench.models import Query
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene
@@ -223,3 +225,19 @@ def test_the_floor_is_held_in_training_and_follows_the_rows() -> None:
         assert len(held) == len(fitted.floor.least)
         if step == 0:
             torch.testing.assert_close(held, fitted.floor.least.log(), rtol=1e-2, atol=0)
+
+
+def test_the_bar_tells_seconds_and_val_without_reading_the_clock(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a bar that says neither, and one that waits for a GPU at every step to say it."""
+    fitted = trainer("3dgs", "train.curve_points=4")
+    reads = []
+    seconds = StageClock.seconds.fget
+    assert seconds is not None
+    monkeypatch.setattr(StageClock, "seconds", property(lambda clock: reads.append(1) or seconds(clock)))
+    fitted.run(lambda _: None, "square")
+    assert len(reads) == 4 + 1  # the points of the curve, and the checkpoint at the end
+    last = capsys.readouterr().err.split("\r")[-1]
+    assert fitted.curve.progress in last
+    assert re.search(r"\d+ s of training, val \d+\.\d\d dB \([+-]\d", last)
