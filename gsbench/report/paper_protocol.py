@@ -1,5 +1,6 @@
 """Sort records by whether they were measured as the 7DGS paper measured, so that only like stands beside like."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -28,20 +29,19 @@ class Pool:
 
     dataset: str
     experiment: str
-    size: str  # of the images
     steps: int  # of training; 0 where the records do not say
     runs: list[Record] = field(default_factory=list)
 
     @property
     def heading(self) -> str:
-        """The data set, the size of its images and the length of training."""
-        return f"{self.dataset}: experiment {self.experiment}, {self.size}, {self.steps:,} iterations"
+        """The data set, the sizes of its images and the length of training."""
+        sizes = ", ".join(sorted({_size(r) for r in self.runs}))
+        return f"{self.dataset}: experiment {self.experiment}, {sizes}, {self.steps:,} iterations"
 
     @property
     def effort(self) -> int:
-        """How near the pool is to the paper's protocol: pixels times iterations."""
-        width, _, height = self.size.partition("x")
-        return int(width) * int(height) * self.steps if width.isdecimal() and height.isdecimal() else 0
+        """How near the pool is to the paper's protocol: pixels of its largest image times iterations."""
+        return self.steps * max(_pixels(_size(r)) for r in self.runs)
 
 
 @dataclass(frozen=True)
@@ -57,17 +57,17 @@ class Sorted:
 def sort(records: list[Record]) -> Sorted:
     """Sort records of the five models; what stands for no data set of the paper is left out without a word."""
     at_paper: dict[str, list[Record]] = {name: [] for name in PROTOCOLS}
-    pools: dict[tuple[str, str, str, str, int], Pool] = {}
+    pools: dict[tuple[str, str, str, str, int], Pool] = {}  # images of a data set may differ in size by scene
     for r in records:
         named = r.protocol.get("paper_dataset")
-        if named not in PROTOCOLS or r.model not in MODELS:
+        if not isinstance(named, str) or named not in PROTOCOLS or r.model not in MODELS:
             continue
         if not departure(r):
             at_paper[named].append(r)
             continue
-        size, steps = printable(r.protocol.get("resolution", "a size not recorded")), iterations(r) or 0
-        key = named, r.dataset, r.experiment, size, steps
-        pools.setdefault(key, Pool(r.dataset, r.experiment, size, steps)).runs.append(r)
+        steps = iterations(r) or 0
+        key = named, r.dataset, r.experiment, str(r.protocol.get("downscale")), steps
+        pools.setdefault(key, Pool(r.dataset, r.experiment, steps)).runs.append(r)
     nearest: dict[tuple[str, str], Pool] = {}
     for (named, dataset, *_), pool in sorted(pools.items(), key=lambda one: (-one[1].effort, one[0])):
         if any(r.status == "ok" for r in pool.runs):
@@ -126,6 +126,17 @@ def finished(records: list[Record], one: Arm, scenes: Sequence[str]) -> dict[str
         if r.status == "ok" and r.scene in scenes and arm(r) == one:
             found.setdefault(r.scene, {})[r.seed] = r
     return {scene: [found[scene][seed] for seed in sorted(found[scene])] for scene in scenes if scene in found}
+
+
+def _size(record: Record) -> str:
+    """Return the size of a run's images as width x height, in text that a record may have made up."""
+    return printable(record.protocol.get("resolution", "a size not recorded"))
+
+
+def _pixels(size: str) -> int:
+    """Count the pixels of a size; 0 where it is none."""
+    numbers = size.split("x")
+    return int(numbers[0]) * int(numbers[1]) if re.fullmatch(r"[0-9]{1,6}x[0-9]{1,6}", size) else 0
 
 
 def _part(config: dict[str, Any], name: str) -> dict[str, Any]:

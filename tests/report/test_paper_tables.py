@@ -118,6 +118,21 @@ def test_only_the_pool_nearest_to_the_paper_is_shown():
     ]
 
 
+def test_scenes_of_two_sizes_share_a_table():
+    """Would catch 7DGS-PBR split in two: its heart1 is smaller than its other scenes."""
+    sizes = {"heart1": "250x250", "dust": "400x400"}
+    runs = [at_paper(dataset="7DGS-PBR", scene=s, resolution=size, downscale=4) for s, size in sizes.items()]
+    (pool,) = sort(runs).other_protocol
+    assert pool.heading == "7DGS-PBR: experiment dnerf, 250x250, 400x400, 30,000 iterations"
+
+
+@pytest.mark.parametrize("odd", [["D-NeRF"], {"a": 1}, None, 3, "9" * 5000 + "x1"])
+def test_odd_values_in_a_record_stop_nothing(odd, tmp_path):
+    """Would catch a stack trace for a record whose protocol is valid JSON and nonsense."""
+    write([at_paper(paper_dataset=odd), at_paper(resolution=odd, seed=1), at_paper(frames=odd, seed=2)], tmp_path)
+    assert "OTHER PROTOCOL" in (tmp_path / "table1.md").read_text()
+
+
 def test_an_average_stands_in_table_2_only_if_it_is_whole(tmp_path):
     """Would catch an average of seven scenes beside those of eight."""
     scenes = paper.PROTOCOLS["D-NeRF"].scenes
