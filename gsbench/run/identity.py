@@ -104,10 +104,8 @@ def training_part(plain: Plain) -> Plain:
     part: Plain = {key: dict(value) if isinstance(value, dict) else value for key, value in plain.items()}
     if part.get("effects", {}).get("gate") == "off":
         del part["effects"]
-    if isinstance(part.get("model"), dict):  # effects.gate is what a training reads; this only gives its default
-        part["model"].pop("gate", None)
-        if not part["model"].get("candidates"):
-            part["model"].pop("candidates", None)
+    if isinstance(part.get("model"), dict):
+        part["model"].pop("gate", None)  # only the default of effects.gate
     for dotted in MEASURING:
         head, _, tail = dotted.partition(".")
         if not tail:
@@ -118,11 +116,20 @@ def training_part(plain: Plain) -> Plain:
 
 
 def training_hash(plain: Plain) -> str:
-    """Compute the SHA-256 of what a training reads: equal for two runs whose checkpoints can be exchanged.
+    """Compute the SHA-256 of what a training reads: equal for two runs whose checkpoints can be exchanged."""
+    return config_hash(given(training_part(plain)))
 
-    A key that is null counts as absent, so that a new key which is null by default changes no older run.
-    """
-    return config_hash({key: value for key, value in flat(training_part(plain)) if value is not None})
+
+def is_same(plain: Plain, other: Plain) -> bool:
+    """Tell whether two configs are of the same training and measure the same."""
+    measuring = [{key: one for key, one in given(config).items() if not key.startswith(("effects.", "model."))}
+                 for config in (plain, other)]  # fmt: skip
+    return training_hash(plain) == training_hash(other) and measuring[0] == measuring[1]
+
+
+def given(plain: Plain) -> Plain:
+    """Flatten a config; a key that is null counts as absent, so that a new one changes no older run."""
+    return {key: value for key, value in flat(plain) if value is not None}
 
 
 def flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, Any]]:

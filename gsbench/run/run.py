@@ -16,7 +16,7 @@ from gsbench.measure.record import Record
 from gsbench.run import progress
 from gsbench.run.attempt import Attempt
 from gsbench.run.checks import check_folder
-from gsbench.run.identity import Run, identify, training_hash
+from gsbench.run.identity import Run, identify, is_same, training_hash
 from gsbench.train.diagnosis import explain
 from gsbench.train.watch import DivergedError
 
@@ -102,7 +102,7 @@ def finished(this: Run, fingerprint: str) -> Record | None:
             print(f"{this.name}: {error}", file=sys.stderr)
             continue
         theirs = record.provenance
-        if record.status == "ok" and theirs.data_hash == fingerprint and theirs.config == this.plain:
+        if record.status == "ok" and theirs.data_hash == fingerprint and is_same(theirs.config, this.plain):
             path.replace(this.folder / records.FILE_NAME)
             return record
         if record.status == "ok":
