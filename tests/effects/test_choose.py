@@ -1,0 +1,109 @@
+"""Whether a scene changes with time, asked of scenes whose answer is known."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from worlds import World, brightening, filmed, moving, small_mover, still
+
+from gsbench.effects import __main__ as command
+from gsbench.effects import choose
+from gsbench.effects.choose import evidence, screen
+from gsbench.errors import InputError
+from gsbench.models.base import Gaussians3D
+from gsbench.scenes.scene import Scene
+
+EMBEDDED = Path(__file__).resolve().parents[2] / "gsbench/scenes/sample"
+
+
+@pytest.mark.parametrize(
+    ("world", "decision"), [(still, "off"), (moving, "on"), (small_mover, "on"), (brightening, "on")]
+)
+def test_known_worlds(world: World, decision: str) -> None:
+    """Catches a test that finds time in a static scene, or misses motion in 2 % of the image or light that changes."""
+    found = screen(filmed(world))
+    assert found.decision == decision, found
+    assert found.free is not None
+    assert found.free > 0.7
+
+
+def test_shuffled_times_are_no_time() -> None:
+    """Catches a test that sees motion wherever images differ: at shuffled times nothing is slow."""
+    shuffled = torch.randperm(48, generator=torch.Generator().manual_seed(5)) / 47
+    assert screen(filmed(moving, times=shuffled)).decision == "off"
+
+
+def test_flicker_that_is_not_slow_is_no_time() -> None:
+    """Catches a test of brightness instead of slow waves: a light that jumps from view to view cannot be fitted."""
+    jumps = torch.rand(48, generator=torch.Generator().manual_seed(2))
+    moments = iter(jumps.tolist())
+
+    def flicker(_: float) -> Gaussians3D:
+        world = still(0.0)
+        return world._replace(colors=world.colors * (0.5 + next(moments)))
+
+    assert screen(filmed(flicker)).decision == "off"
+
+
+def test_an_orbit_decides_nothing() -> None:
+    """Catches an answer where the camera moves along with time, so that either may explain the images."""
+    for world in (still, moving):
+        found = screen(filmed(world, orbit=True))
+        assert found.decision == "undecided"
+        assert found.free is not None
+        assert found.free < choose.LEAST_FREE
+        assert "camera moves along" in found.reason
+
+
+def test_what_is_too_little_to_tell() -> None:
+    """Catches a verdict from few views, from one time, or from none."""
+    few, one = filmed(moving, views=8), filmed(moving, views=16, times=torch.full((16,), 0.5))
+    assert screen(few).decision == "undecided"
+    assert "too few" in screen(few).reason
+    assert screen(one).decision == "undecided"
+    assert "one time" in screen(one).reason
+    timeless = Scene(**{**vars(one), "train": [type(v)(**{**vars(v), "time": None}) for v in one.train]})
+    assert screen(timeless).decision == "off"
+    with pytest.raises(InputError, match="expected training views"):
+        screen(Scene(**{**vars(one), "train": []}))
+
+
+def test_the_level_of_the_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a permutation test that is wrong too often: leftovers that depend on the camera alone, 300 times dealt."""
+    monkeypatch.setattr(choose, "PERMUTATIONS", 199)
+    random = np.random.default_rng(0)
+    camera = random.standard_normal((40, 9))
+    gradients = camera @ random.standard_normal((9, 50)) * 3 + random.standard_normal((40, 50))
+    deals = [evidence(gradients @ gradients.T, random.permutation(40) / 39, camera, k).p for k in range(300)]
+    assert np.mean(np.array(deals) <= 0.05) == pytest.approx(0.05, abs=0.035)
+    assert np.mean(np.array(deals) <= 0.01) <= 0.027
+
+
+def test_the_answer_is_that_of_its_seed() -> None:
+    """Catches a draw that is not the seed's."""
+    scene = filmed(moving, views=16)
+    first, second = screen(scene, 3), screen(scene, 3)
+    assert (first.p, first.z, first.free) == (second.p, second.z, second.free)
+
+
+def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a command whose JSON is not what the page promises, and bad input that ends in a stack trace."""
+    assert command.main([str(EMBEDDED / "moving-matte"), "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)["time"]
+    assert answer["decision"] == "on"
+    assert answer["p"] == 0.001
+    assert answer.keys() >= {"z", "free", "seconds", "reason"}
+    for wrong in ([], ["/nowhere"], ["x", "--checkpoint", "y"], ["--checkpoint", "/nowhere"],
+                  ["x", "--budget-db", "nan"]):  # fmt: skip
+        assert command.main(wrong) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_five_hundred_views_take_a_moment() -> None:
+    """Catches a screen whose time grows with the square of the views."""
+    few, many = screen(filmed(moving, views=100)), screen(filmed(moving, views=500))
+    assert many.decision == "on"
+    assert many.seconds < 15 * few.seconds

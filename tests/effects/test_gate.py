@@ -1,0 +1,167 @@
+"""What a gate chooses, and what it makes of a model."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+from test_strength import BLACK, OPTIONS, N, trained_a_little, views_of
+from torch import Tensor
+
+from gsbench.effects.budget import gate_within
+from gsbench.effects.gate import apply, choose
+from gsbench.effects.strength import probe
+from gsbench.errors import InputError
+from gsbench.kernels.thresholds import LOG_SIZE_MAX
+from gsbench.measure.quality import psnr
+from gsbench.models import GaussianModel, Query
+from gsbench.models.classes import count, pack, packed_bytes
+from gsbench.models.render import render
+
+
+def gated(name: str, share: float, seed: int = 0) -> tuple[GaussianModel, GaussianModel]:
+    """A model before and after a gate."""
+    model = trained_a_little(name, seed)
+    after = copy.deepcopy(model)
+    strength = probe(model, views_of(model, 1), BLACK)
+    apply(after, strength, choose(strength, after, share))
+    return model, after
+
+
+def images(model: GaussianModel) -> list[Tensor]:
+    return [render(model, view.camera, view.time, BLACK) for view in views_of(trained_a_little("3dgs", 0), 1)[:6]]
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_nothing_is_taken_for_nothing(name: str) -> None:
+    """Catches a gate that changes an image though its budget is zero."""
+    before, after = gated(name, 0.0)
+    assert len(after) <= N
+    for a, b in zip(images(before), images(after), strict=True):
+        torch.testing.assert_close(a, b, atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_more_budget_buys_more(name: str) -> None:
+    """Catches a price of error with the wrong sign, and a sum of errors that is not held."""
+    model = trained_a_little(name, 0)
+    strength = probe(model, views_of(model, 1), BLACK)
+    sizes = []
+    for share in (0.0, 0.1, 1.0, 10.0):
+        after = copy.deepcopy(model)
+        choice = choose(strength, after, share)
+        assert choice.predicted <= share
+        apply(after, strength, choice)
+        sizes.append(packed_bytes(after))
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] < 0.8 * sizes[0]
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_classes_are_as_the_rows(name: str) -> None:
+    """Catches rows sorted into the wrong class: with the classes forgotten the images stay the same."""
+    _, after = gated(name, 3.0)
+    rows, classes = count(after), after.classes
+    assert classes is not None
+    assert sum(rows.values()) == len(after) < N
+    assert 0 <= classes.refined <= classes.sliced <= len(after)
+    plain = copy.deepcopy(after)
+    plain.classes = classes._replace(sliced=len(after))
+    for a, b in zip(images(after), images(plain), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
+
+
+def test_a_frozen_variable_changes_nothing() -> None:
+    """Catches a Gaussian that still moves with what was frozen, or that no longer moves with what was not."""
+    model = trained_a_little("7dgs", 0)
+    views = views_of(model, 1)
+    strength = probe(model, views, BLACK)
+    here = Query.at(torch.tensor([0.0, 0.0, -4.0]), 0.2)
+    later, beside = Query.at(here.center, 0.9), Query.at(torch.tensor([4.0, 0.0, 0.0]), 0.2)
+    for name, same, different in (("time", later, beside), ("direction", beside, later), ("still", later, None)):
+        after = copy.deepcopy(model)
+        everything = choose(strength, after, 0.0)
+        all_rows = {key: torch.full((N,), key == name) for key in everything.geometry}
+        apply(after, strength, replace(everything, geometry=all_rows))
+        assert count(after)[name] == len(after) == N
+        for a, b in zip(after.slice(here)[:3], after.slice(same)[:3], strict=True):
+            torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
+        frozen = after.splats["log_diagonal"][:, [i for x in {"time": "t", "direction": "d"}.get(name, "td")
+                                                  for i in after.rows[x]]]  # fmt: skip
+        assert (frozen == LOG_SIZE_MAX).all()
+        if different is not None:
+            assert not torch.allclose(after.slice(here).means, after.slice(different).means, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_a_second_gate_takes_no_more_for_nothing(name: str) -> None:
+    """Catches a gate that undoes or pays again for what an earlier one did."""
+    _, after = gated(name, 3.0)
+    again = copy.deepcopy(after)
+    strength = probe(after, views_of(after, 1), BLACK)
+    rows, _ = apply(again, strength, choose(strength, again, 0.0))
+    assert count(again)["refined"] <= count(after)["refined"]
+    assert len(rows) <= len(after)
+    for a, b in zip(images(after), images(again), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_only_what_matters_is_stored(name: str) -> None:
+    """Catches a checkpoint that loses an entry, or keeps those that change no image."""
+    _, after = gated(name, 3.0)
+    state = pack(after)
+    stored = sum(x.numel() for key, x in state.items() if key.startswith("splats."))
+    whole = sum(x.numel() for x in after.splats.values())
+    assert stored < 0.9 * whole
+    other = trained_a_little(name, 1)
+    other.load_state(state)
+    assert other.classes is not None
+    assert after.classes is not None
+    for key, value in after.state_dict().items():
+        assert torch.equal(value, other.state_dict()[key]), key
+    assert torch.equal(other.classes.levels, after.classes.levels)
+    assert other.classes[:2] == after.classes[:2]
+
+
+@pytest.mark.parametrize("fault", ["counts", "levels", "frozen", "short", "extra", "no_opacities", "missing"])
+def test_classes_of_a_checkpoint_are_checked(fault: str) -> None:
+    """Catches a damaged checkpoint that reaches the kernels with rows that there are not."""
+    _, after = gated("7dgs", 3.0)
+    state = pack(after)
+    if fault == "counts":
+        state["classes.counts"] = torch.tensor([5, len(after) + 1])
+    elif fault == "levels":
+        state["classes.levels"] = torch.full_like(state["classes.levels"], 77)
+    elif fault == "frozen":
+        state["classes.frozen"] = state["classes.frozen"][1:]
+    elif fault == "short":
+        state["splats.motion"] = state["splats.motion"][:-1]
+    elif fault == "extra":
+        state["classes.more"] = torch.zeros(1)
+    elif fault == "no_opacities":
+        del state["splats.opacities"]
+    else:
+        del state["classes.levels"]
+    with pytest.raises(InputError, match="checkpoint: "):
+        trained_a_little("7dgs", 1).load_state(state)
+
+
+def test_the_loss_is_measured_and_not_only_predicted() -> None:
+    """Catches a gate that goes by its prediction where the views it is checked on say otherwise."""
+    model = trained_a_little("7dgs", 0)
+    views = views_of(model, 1)
+    strength = probe(model, views[5:], BLACK)
+
+    def measure(one: GaussianModel) -> float:
+        return sum(psnr(render(one, view.camera, view.time, BLACK), view.image) for view in views[:5]) / 5
+
+    found = gate_within(model, strength, 0.3, measure)
+    assert found is not None
+    assert found.gate.measured_db <= 0.3
+    assert found.gate.measured_db == pytest.approx(measure(model) - measure(found.model), abs=1e-9)
+    assert sum(found.gate.rows.values()) == N
+    assert found.gate.bytes < found.gate.bytes_before == packed_bytes(model)
+    assert model.classes is None
+    worse = iter([30.0] + [20.0] * 20)
+    assert gate_within(model, strength, 0.3, lambda _: next(worse)) is None
