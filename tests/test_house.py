@@ -21,7 +21,8 @@ FLOORS: tuple[set[str], ...] = (
     {"effects"},
     {"train", "report"},
     {"run"},
-    {"stability", "sweep"},
+    {"stability", "sweep", "view"},
+    {"export"},
     {"__main__"},
 )
 LEAST_WORDS = 4

@@ -1,4 +1,4 @@
-"""Read the vertices of an ascii or little-endian PLY file, as untrusted input, into a structured array."""
+"""Read the vertices of a PLY file in any of its three encodings, as untrusted input, into a structured array."""
 
 import re
 from pathlib import Path
@@ -13,13 +13,14 @@ from gsbench.reading import read_file
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "<i2"),
-    **dict.fromkeys(("ushort", "uint16"), "<u2"),
-    **dict.fromkeys(("int", "int32"), "<i4"),
-    **dict.fromkeys(("uint", "uint32"), "<u4"),
-    **dict.fromkeys(("float", "float32"), "<f4"),
-    **dict.fromkeys(("double", "float64"), "<f8"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
 }
+_ENCODINGS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}  # and their order of bytes
 _MAX_FILE = 1 << 32  # bytes; 17 million Gaussians of 3DGS
 _ASCII_VALUE = 100  # bytes of memory that a value takes while it is parsed
 _HEADER_LIMIT = 65536  # bytes; a 3DGS header of 62 properties takes 1,600
@@ -54,10 +55,10 @@ def _read_header(lines: list[str], path: Path) -> tuple[str, int, np.dtype[np.vo
     words = [line.split() for line in lines[1:]]
     words = [line for line in words if line and line[0] not in ("comment", "obj_info")]
     match words:
-        case [["format", ("ascii" | "binary_little_endian") as encoding, _], *rest]:
+        case [["format", encoding, _], *rest] if encoding in _ENCODINGS:
             pass
         case _:
-            raise InputError(f"{path}: format: expected 'ascii' or 'binary_little_endian', got {words[:1]!r:.80}")
+            raise InputError(f"{path}: format: expected one of {', '.join(_ENCODINGS)}, got {words[:1]!r:.80}")
     match rest:
         case [["element", "vertex", count], *rest] if re.fullmatch("[0-9]{1,18}", count):
             pass
@@ -69,7 +70,7 @@ def _read_header(lines: list[str], path: Path) -> tuple[str, int, np.dtype[np.vo
             case ["element", *_]:
                 break
             case ["property", kind, name] if kind in _TYPES and name not in fields:
-                fields[name] = _TYPES[kind]
+                fields[name] = _ENCODINGS[encoding] + _TYPES[kind]
             case _:
                 raise InputError(f"{path}: element vertex: expected distinct scalar properties, got {line!r:.80}")
     if not fields or int(count) == 0:

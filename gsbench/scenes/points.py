@@ -84,7 +84,7 @@ def _seen_by_all(points: Tensor, K: Tensor, viewmats: Tensor, size: Tensor) -> T
 
 
 def read_ply(path: str | Path) -> Points:
-    """Read points from an ascii or binary little-endian PLY: `x y z` and `red green blue`, else 3DGS' `f_dc_0..2`.
+    """Read points from a PLY: `x y z` and `red green blue`, else 3DGS' `f_dc_0..2`.
 
     Integer colours are divided by their type's largest value, float colours are used unchanged; a colour outside
     [0, 1] is refused, except one from `f_dc`, where it is usual and is clamped.

@@ -23,7 +23,7 @@ POINTS = 3
 def draw(seed: int, folder: Path) -> Case:
     """Draw a point cloud, damaged in its header, its values, its bytes or as a file."""
     r = generator("ply", seed)
-    encoding = r.choice(("ascii", "binary_little_endian"))
+    encoding = r.choice(("ascii", "binary_little_endian", "binary_big_endian"))
     names = ["x", "y", "z", *r.choice((("red", "green", "blue"), ("f_dc_0", "f_dc_1", "f_dc_2")))]
     kinds = ["float"] * 3 + [r.choice(("uchar", "float", *KINDS))] * 3
     header = ["ply", f"format {encoding} 1.0", "comment made by hand", f"element vertex {POINTS}",
@@ -83,10 +83,11 @@ def _body(encoding: str, kinds: list[str], texts: list[str]) -> bytes:
     """Write the vertices; in binary a number that its type cannot hold becomes all ones."""
     if encoding == "ascii":
         return " ".join(texts).encode("latin-1")
+    order = "<" if encoding == "binary_little_endian" else ">"
     body = b""
     for kind, text in zip(kinds, texts, strict=True):
         try:
-            body += struct.pack("<" + KINDS[kind], float(text) if kind in ("float", "double") else int(text))
+            body += struct.pack(order + KINDS[kind], float(text) if kind in ("float", "double") else int(text))
         except (ValueError, OverflowError, struct.error):
             body += b"\xff" * struct.calcsize(KINDS[kind])
     return body

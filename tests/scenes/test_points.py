@@ -24,7 +24,8 @@ def ply(vertices: np.ndarray, encoding: str = "binary_little_endian") -> bytes:
     if encoding == "ascii":
         body = "".join(" ".join(str(value) for value in row) + "\n" for row in vertices.tolist()).encode()
     else:
-        body = vertices.tobytes()
+        order = "<" if encoding == "binary_little_endian" else ">"
+        body = vertices.astype(vertices.dtype.newbyteorder(order)).tobytes()
     return (header + "end_header\n").encode() + body
 
 
@@ -40,11 +41,11 @@ ROUND_TRIP = settings(suppress_health_check=[HealthCheck.function_scoped_fixture
 @ROUND_TRIP
 @given(
     hnp.arrays(np.float32, st.tuples(st.integers(1, 9), st.just(3)), elements=st.floats(-1e6, 1e6, width=32)),
-    st.sampled_from(["ascii", "binary_little_endian"]),
+    st.sampled_from(["ascii", "binary_little_endian", "binary_big_endian"]),
     st.integers(0, 255),
 )
 def test_ply_round_trip(tmp_path: Path, means: np.ndarray, encoding: str, red: int) -> None:
-    """Catches swapped columns, a wrong stride, lost digits and a colour off by its scale, in both encodings."""
+    """Catches swapped columns, a wrong stride, lost digits and a colour off by its scale, in each encoding."""
     vertices = np.zeros(len(means), VERTEX)
     vertices["x"], vertices["y"], vertices["z"] = means.T
     vertices["red"], vertices["blue"] = red, 255
@@ -77,7 +78,7 @@ GOOD_ASCII = ply(np.ones(3, VERTEX), "ascii")
 BAD_PLY = {
     "not a ply": (b"solid cube", "'ply'"),
     "no end of header": (GOOD[:60], "end_header"),
-    "big endian": (GOOD.replace(b"little", b"big"), "format"),
+    "middle endian": (GOOD.replace(b"little", b"middle"), "format"),
     "no vertex": (GOOD.replace(b"vertex", b"face"), "element vertex"),
     "count negative": (GOOD.replace(b"vertex 3", b"vertex -3"), "element vertex"),
     "count zero": (GOOD.replace(b"vertex 3", b"vertex 0"), "element vertex"),

@@ -1,0 +1,146 @@
+"""Export a trained model: as a PLY of 3DGS, as a video, as images (``python -m gsbench.export RUN_FOLDER ...``)."""
+
+import argparse
+import sys
+from contextlib import closing
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from gsbench.errors import InputError, one_line
+from gsbench.measure.atomic import write_atomically
+from gsbench.models.query import Query
+from gsbench.run.checks import check_device
+from gsbench.run.load import LoadedRun, load_run
+from gsbench.scenes import Scene
+from gsbench.scenes.splats import ply_of
+from gsbench.view import film, paths
+from gsbench.view.gaussians import splats_of
+from gsbench.view.sights import find_view, scene_of
+
+PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
+MOST_FRAMES = 100_000
+
+
+class Asked(NamedTuple):
+    """What a command line asks for, checked."""
+
+    run: LoadedRun
+    scene: Scene | None  # None where nothing asks for the data set
+    time: float | None
+    options: argparse.Namespace
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write what is asked for; return 0, or 2 with one line on stderr."""
+    try:
+        asked = prepare(parser().parse_args(arguments))
+        if asked.options.ply:
+            write_ply(asked, asked.options.ply)
+        if asked.options.video:
+            with closing(film.frames(asked.run, shots(asked))) as images:  # and its bar
+                film.write_video(images, asked.options.video, asked.options.fps)
+        if asked.options.images:
+            with closing(film.frames(asked.run, shots(asked))) as images:
+                film.write_images(images, asked.options.images)
+    except (InputError, OSError) as error:
+        print(f"gsbench.export: {one_line(error)}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    made = argparse.ArgumentParser(prog="python -m gsbench.export", description=__doc__)
+    made.add_argument("run", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
+    made.add_argument("--ply", type=Path, metavar="OUT.ply", help="write the 3D Gaussians of one slice")
+    made.add_argument("--video", type=Path, metavar="OUT.mp4", help="write a video along --path")
+    made.add_argument("--images", type=Path, metavar="FOLDER", help="write the frames of that video as PNG")
+    made.add_argument("--time", type=float, help="of the slice, in [0, 1]; in a video time then stands still")
+    seen = made.add_mutually_exclusive_group()
+    seen.add_argument("--camera", metavar="I", help="a training view's number, or a view's name; it stands still")
+    seen.add_argument("--direction", metavar="X,Y,Z", help="of sight, for --ply: from a camera far away")
+    made.add_argument("--path", choices=[*PATHS, "test"], default="orbit", help="of the camera; test: the test views")
+    made.add_argument("--fps", type=float, default=30, help="frames a second (30)")
+    made.add_argument("--seconds", type=float, default=4, help="length of an orbit or a spiral (4)")
+    made.add_argument("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
+    made.add_argument("--device", default="cpu", help="cpu or cuda")
+    return made
+
+
+def prepare(options: argparse.Namespace) -> Asked:
+    """Load what is asked for; raises InputError where it cannot be had."""
+    if not (options.ply or options.video or options.images):
+        raise InputError("expected --ply OUT.ply, --video OUT.mp4 or --images FOLDER, got none of them")
+    if options.time is not None and not 0 <= options.time <= 1:
+        raise InputError(f"--time: expected a number in [0, 1], got {options.time}")
+    if not 0 < options.fps <= 1000 or not 1 <= options.fps * options.seconds <= MOST_FRAMES:
+        raise InputError(f"--fps, --seconds: expected 1 to {MOST_FRAMES} frames of at most 1000 a second, got "
+                         f"{options.fps} x {options.seconds}")  # fmt: skip
+    for path in (path for path in (options.ply, options.video, options.images) if path):
+        film.check_parent(path)
+    check_device(options.device)
+    run = load_run(options.run, options.device)
+    filming = options.video or options.images
+    needed = options.camera is not None or (filming and options.path == "test")
+    time = options.time if run.scene.has_time else None
+    return Asked(run, scene_of(run, options.data_root) if needed else None, time, options)
+
+
+def write_ply(asked: Asked, path: Path) -> None:
+    """Write one slice as a PLY and say what it holds."""
+    run, options = asked.run, asked.options
+    query, keep = slice_place(asked)
+    splats = splats_of(run.model, query, keep_harmonics=keep)
+    write_atomically(path, ply_of(splats))
+    culled = len(run.model) - len(splats)
+    when = "" if query.time is None else f" at time {float(query.time):g}"
+    whence = f"camera {options.camera}" if options.camera is not None else f"direction {options.direction}"
+    colours = f"harmonics of degree {run.model.phase.sh_degree}" if keep else f"as seen from {whence}"
+    print(f"{path}: {len(splats)} Gaussians{when}, colours {colours}; {culled} of {len(run.model)} are left out, as "
+          f"their opacity there is below 1/255")  # fmt: skip
+
+
+def slice_place(asked: Asked) -> tuple[Query, bool]:
+    """Return the query of the slice, and whether its colours stay harmonics: where no place is asked for."""
+    run, options = asked.run, asked.options
+    time = asked.time
+    if asked.scene is not None and options.camera is not None:
+        view = find_view(asked.scene, options.camera)
+        return Query.of(view.camera.to(run.config.device), view.time if time is None else time), False
+    if time is None and run.scene.has_time:
+        time = 0.0
+    keep = options.direction is None
+    center = torch.zeros(3) if keep else paths.far_along(run, direction(options.direction))
+    return Query.at(center.to(run.config.device), time), keep
+
+
+def direction(text: str) -> torch.Tensor:
+    """Read a direction X,Y,Z; raises InputError where it is none."""
+    try:
+        found = torch.tensor([float(word) for word in text.split(",")])
+    except ValueError:
+        found = torch.zeros(0)
+    if found.shape != (3,) or not found.isfinite().all() or not found.norm() > 0:
+        raise InputError(f"--direction: expected three numbers X,Y,Z that are not all zero, got '{text}'")
+    return found
+
+
+def shots(asked: Asked) -> list[paths.Shot]:
+    """Return the cameras and the times of a video: time runs once from 0 to 1 unless it is asked to stand still."""
+    options = asked.options
+    count = round(options.fps * options.seconds)
+    if asked.scene is not None and options.camera is not None:
+        cameras = [find_view(asked.scene, options.camera).camera] * count
+    elif asked.scene is not None:
+        return [(view.camera, view.time if asked.time is None else asked.time) for view in asked.scene.test]
+    else:
+        cameras = PATHS[options.path](asked.run, count)
+    if not asked.run.scene.has_time:
+        return [(camera, None) for camera in cameras]
+    return [(camera, i / max(1, count - 1) if asked.time is None else asked.time) for i, camera in enumerate(cameras)]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,107 @@
+"""Read and write trained 3D Gaussians as the PLY of 3DGS, which other trainers and viewers share.
+
+Columns: `x y z [nx ny nz] f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`. Scales are logarithms, the opacity is a
+logit, the rotation a quaternion wxyz, and `f_rest` holds the harmonics above degree 0 channel after channel.
+"""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.memory import require
+from gsbench.scenes.ply import read_vertices
+
+MAX_DEGREE = 3  # of the harmonics that gsbench's models have; a file may have one more
+_FILE_DEGREES = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(MAX_DEGREE + 2)}  # by the count of f_rest_*
+_COLUMNS = {
+    "means": ("x", "y", "z"),
+    "dc": ("f_dc_0", "f_dc_1", "f_dc_2"),
+    "logits": ("opacity",),
+    "log_scales": ("scale_0", "scale_1", "scale_2"),
+    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
+}
+_LARGEST = 1e30  # squares of what is read stay finite in double, and sums in single precision
+_VALUE = 40  # bytes that a value of a Gaussian takes while it is read: in the file, in double and in single precision
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N trained 3D Gaussians in raw parameters, float32 on the CPU."""
+
+    means: Tensor  # [N, 3] world units
+    log_scales: Tensor  # [N, 3] ln of standard deviations in world units
+    quats: Tensor  # [N, 4] wxyz, of any length but zero
+    logits: Tensor  # [N] of opacities
+    dc: Tensor  # [N, 3] harmonics of degree 0: colour = 0.5 + Y_00 dc
+    rest: Tensor  # [N, K - 1, 3] harmonics above degree 0, in 3DGS' order
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+def read_splats(path: Path) -> Splats:
+    """Read trained Gaussians from a PLY of 3DGS, in any encoding and of any degree from 0 to 4.
+
+    Normals and other columns may be there or not; they are not read.
+
+    Raises:
+        InputError: the file is no such PLY, lacks a column, or has a value that is not finite.
+    """
+    vertices = read_vertices(path)
+    names = vertices.dtype.names or ()
+    for name in (name for columns in _COLUMNS.values() for name in columns):
+        if name not in names:
+            raise InputError(f"{path}: expected trained Gaussians, x y z f_dc_0..2 opacity scale_0..2 rot_0..3 and "
+                             f"f_rest_*, found no '{name}': is it a cloud of points, or compressed?")  # fmt: skip
+    count = sum(name.startswith("f_rest_") for name in names)
+    if count not in _FILE_DEGREES:
+        expected = ", ".join(map(str, _FILE_DEGREES))
+        raise InputError(f"{path}: f_rest_*: expected {expected} columns, for degree 0 to 4, found {count}")
+    rest = tuple(f"f_rest_{i}" for i in range(count))
+    if missing := [name for name in rest if name not in names]:
+        raise InputError(f"{path}: f_rest_*: expected the numbers 0 to {count - 1}, found no '{missing[0]}'")
+    require(_VALUE * len(vertices) * (14 + count), f"{path}: {len(vertices)} Gaussians", "use a smaller file")
+    read = {name: _table(vertices, columns, path) for name, columns in _COLUMNS.items()}
+    if not (read["quats"].square().sum(1) > 0).all():
+        raise InputError(f"{path}: rot_0..3: expected quaternions, some are zero")
+    channels = _table(vertices, rest, path) if rest else torch.zeros(len(vertices), 0)
+    read["logits"] = read["logits"][:, 0]
+    return Splats(**read, rest=channels.unflatten(1, (3, -1)).mT.contiguous() if rest else channels.view(-1, 0, 3))
+
+
+def ply_of(splats: Splats) -> bytes:
+    """Return the bytes of a little-endian PLY with the columns of 3DGS at degree 3, which its own viewer asks for.
+
+    Raises:
+        InputError: a value is not finite, or the harmonics are above degree 3.
+    """
+    N, K = len(splats), (MAX_DEGREE + 1) ** 2
+    if splats.rest.shape[1] > K - 1:
+        raise InputError(f"PLY: expected harmonics up to degree {MAX_DEGREE}, got {splats.rest.shape[1]} above 0")
+    for field in fields(splats):
+        if not getattr(splats, field.name).isfinite().all():
+            raise InputError(f"PLY: expected finite {field.name}, some are not: has the training diverged?")
+    rest = torch.zeros(N, K - 1, 3)
+    rest[:, : splats.rest.shape[1]] = splats.rest
+    parts = [splats.means, torch.zeros(N, 3), splats.dc, rest.mT.flatten(1), splats.logits[:, None],
+             splats.log_scales, splats.quats]  # fmt: skip
+    names = [*_COLUMNS["means"], "nx", "ny", "nz", *_COLUMNS["dc"], *(f"f_rest_{i}" for i in range(3 * (K - 1))),
+             *_COLUMNS["logits"], *_COLUMNS["log_scales"], *_COLUMNS["quats"]]  # fmt: skip
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {N}",
+              *(f"property float {name}" for name in names), "end_header\n"]  # fmt: skip
+    return "\n".join(header).encode() + torch.cat(parts, 1).numpy().astype("<f4").tobytes()
+
+
+def _table(vertices: NDArray[np.void], names: tuple[str, ...], path: Path) -> Tensor:
+    """Return columns as [N, len(names)] float32; raises InputError unless they are finite."""
+    table = np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
+    if not (np.abs(table) <= _LARGEST).all():
+        wrong = int((~(np.abs(table) <= _LARGEST)).any(axis=1).sum())
+        raise InputError(f"{path}: {names[0]}..{names[-1]}: expected finite numbers, {wrong} Gaussians have others: "
+                         f"remove them")  # fmt: skip
+    return torch.from_numpy(table.astype(np.float32))

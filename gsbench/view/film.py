@@ -1,0 +1,78 @@
+"""Write what a model looks like along a path of cameras, as a video or as one PNG a frame."""
+
+import os
+import secrets
+from collections.abc import Generator, Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from tqdm import tqdm
+
+from gsbench.errors import InputError
+from gsbench.models.render import render
+from gsbench.report.pictures import write_png
+from gsbench.run.load import LoadedRun
+from gsbench.view.paths import Shot
+
+CODEC = "vp09"  # VP9, which browsers play; the encoder comes with OpenCV's wheel, unlike one for H.264
+
+Pixels = npt.NDArray[np.uint8]
+
+
+def frames(run: LoadedRun, shots: list[Shot]) -> Generator[Pixels, None, None]:
+    """Render shots one after the other as uint8 [H, W, 3] RGB, with a bar on stderr."""
+    background = torch.tensor(run.scene.background).to(run.config.device)
+    with torch.inference_mode(), tqdm(shots, desc=run.scene.name, unit="frame") as bar:
+        for camera, time in bar:
+            image = render(run.model, camera.to(run.config.device), time, background, run.config.raster.antialias)
+            yield pixels(image)
+
+
+def pixels(image: torch.Tensor) -> Pixels:
+    """Convert an image [H, W, 3] of floats in [0, 1] to 8 bits."""
+    return np.asarray((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
+
+
+def write_video(images: Iterable[Pixels], path: Path, fps: float) -> None:
+    """Write images of one size as a video; `path` is the whole video or, after an error, what it was before.
+
+    Raises:
+        InputError: the folder is not there, or OpenCV cannot write such a file.
+    """
+    check_parent(path)
+    part = path.with_name(f".{secrets.token_hex(4)}.part{path.suffix}")
+    writer, size = None, (0, 0)
+    try:
+        for image in images:
+            if writer is None:
+                size = image.shape[1], image.shape[0]
+                writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*CODEC), fps, size)
+                if not writer.isOpened():
+                    raise InputError(f"{path}: expected a file that OpenCV can encode, such as out.mp4")
+            writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        if writer is not None:
+            writer.release()
+            os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_images(images: Iterable[Pixels], folder: Path) -> None:
+    """Write images as 0000.png, 0001.png, .. into a folder, which is made where only it is missing.
+
+    Raises:
+        InputError: the folder's own folder is not there.
+    """
+    check_parent(folder)
+    folder.mkdir(exist_ok=True)
+    for i, image in enumerate(images):
+        write_png(image, folder / f"{i:04d}.png")
+
+
+def check_parent(path: Path) -> None:
+    """Raise InputError unless the folder that is to hold `path` is there."""
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: expected a folder {path.parent} to write into, there is none: make it first")

@@ -1,0 +1,76 @@
+"""Turn a model at a query into trained 3D Gaussians as 3DGS stores them."""
+
+import math
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.kernels.thresholds import ALPHA_MIN
+from gsbench.models.base import GaussianModel
+from gsbench.models.gaussians4d import Gaussians4DModel
+from gsbench.models.query import Query
+from gsbench.scenes.points import SH_C0
+from gsbench.scenes.splats import Splats
+
+LEAST_SCALE = 1e-20  # world units; a slice that is flat to the last bit still has a logarithm
+LARGEST_OPACITY = 1 - 2**-24  # the largest float32 below 1, whose logit is finite
+
+
+def splats_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = False) -> Splats:
+    """Slice a model and return what is drawn of the slice, without the Gaussians that are culled by their opacity.
+
+    Args:
+        model: initialised.
+        query: the slice's place and time.
+        keep_harmonics: whether colours stay harmonics of the direction; else they are those seen from the query's
+            place, as harmonics of degree 0.
+
+    Raises:
+        InputError: the model's geometry or its colours are known from one place only, and harmonics are asked for; or
+            no Gaussian is left, or one is not finite.
+    """
+    if keep_harmonics and not has_harmonics(model):
+        raise InputError(f"expected --camera I or --direction X,Y,Z: a slice of {type(model).__name__} depends on it")
+    with torch.no_grad():
+        means, factors, opacities, colors = (part.detach().cpu() for part in model.slice(query))
+        drawn = opacities >= ALPHA_MIN  # the rasterizer skips an alpha below it, and no alpha is above the opacity
+        if not drawn.any():
+            raise InputError("no Gaussian can be seen at this time and from this place: choose others")
+        sh = harmonics_at(model, query).cpu()[drawn] if keep_harmonics else (colors[drawn, None] - 0.5) / SH_C0
+    if not factors[drawn].isfinite().all():
+        raise InputError("expected finite Gaussians, some are not: has the training diverged?")
+    log_scales, quats = decompose(factors[drawn])
+    logits = torch.logit(opacities[drawn].double().clamp(max=LARGEST_OPACITY)).float()
+    return Splats(means[drawn], log_scales, quats, logits, sh[:, 0], sh[:, 1:])
+
+
+def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:
+    """Decompose covariances F F^T = R S^2 R^T: ln S [N, 3] and the quaternions wxyz [N, 4] of the rotations R.
+
+    The left singular vectors of F are the axes; one of them is turned round where they are left-handed.
+    """
+    axes, sizes, _ = torch.linalg.svd(factors.double())
+    axes[:, :, 2] *= torch.where(torch.linalg.det(axes) < 0, -1.0, 1.0)[:, None]
+    xyzw = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat())
+    return sizes.clamp(min=LEAST_SCALE).log().float(), xyzw.roll(1, dims=1).float()
+
+
+def has_harmonics(model: GaussianModel) -> bool:
+    """Tell whether a slice of the model is the same from everywhere, and its colours are known harmonics."""
+    own = type(model).paint in (GaussianModel.paint, Gaussians4DModel.paint)
+    return own and "direction" not in model.observes
+
+
+def harmonics_at(model: GaussianModel, query: Query) -> Tensor:
+    """Return the harmonics of the colours at a query's time, [N, K, 3]; those not yet in use are left out."""
+    used = (model.phase.sh_degree + 1) ** 2
+    sh0, shN = model.splats["sh0"], model.splats["shN"]
+    if not isinstance(model, Gaussians4DModel):
+        return torch.cat([sh0, shN], 1)[:, :used]
+    waves = torch.cat([sh0.flatten(1, 2), shN], 1).unflatten(1, (model.time_degree + 1, -1))  # [N, M, K, 3]
+    assert query.time is not None
+    frequencies = torch.arange(model.time_degree + 1).to(waves)
+    phase = 2 * math.pi * frequencies * (query.time - model.refined(query)["times"])  # AGR moves mean times too
+    return (waves * torch.cos(phase)[..., None, None]).sum(1)[:, :used]

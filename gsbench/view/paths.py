@@ -1,0 +1,81 @@
+"""Lay out the cameras of a film around a model: an orbit or a spiral about its middle, as large as its scene.
+
+A checkpoint holds no cameras. What it tells of them is the extent, which is about their distance, and the images' size.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from gsbench.models.base import GaussianModel
+from gsbench.run.load import LoadedRun
+from gsbench.scenes import Camera
+
+UP = (0.0, 0.0, 1.0)  # of Blender's layout: D-NeRF, 7DGS-PBR, the embedded scenes
+ELEVATION = math.radians(25)  # of an orbit above the horizon
+HIGHEST = math.radians(60)  # where a spiral ends
+TURNS = 2  # of a spiral
+FIELD_OF_VIEW = 0.69  # radians, horizontal; D-NeRF's camera_angle_x
+FAR_AWAY = 1e4  # extents; from there all directions are one to 1e-4
+
+Shot = tuple[Camera, float | None]  # a frame of a film: its camera and its time
+
+
+def middle(model: GaussianModel) -> Tensor:
+    """Return where most of a model is, [3]: the median of its means, a mean counting by its opacity."""
+    means = model.splats["means"].detach().cpu()
+    order = means.argsort(0)
+    weights = torch.sigmoid(model.splats["opacities"].detach().cpu())[order].cumsum(0)  # [N, 3]
+    half = (weights < weights[-1] / 2).sum(0, keepdim=True)
+    return means.gather(0, order.gather(0, half.clamp(max=len(means) - 1)))[0]
+
+
+def look_at(eye: Tensor, target: Tensor) -> Tensor:
+    """Return the viewmat [4, 4] of a camera at `eye` [3] that looks at `target` [3] with the sky above."""
+    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    up = torch.tensor(UP).to(eye)
+    if torch.linalg.cross(forward, up).norm() < 1e-3:  # straight up or down
+        up = up.roll(1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat = torch.eye(4).to(eye)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    return viewmat
+
+
+def intrinsics(width: int, height: int) -> Tensor:
+    """Return K [3, 3] of an image of that size with this module's field of view."""
+    focal = width / 2 / math.tan(FIELD_OF_VIEW / 2)
+    return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+
+
+def around(run: LoadedRun, azimuth: float, elevation: float) -> Camera:
+    """Return a camera that looks at the middle of a model from the distance of its scene's cameras.
+
+    Args:
+        run: of the model.
+        azimuth: radians, about the axis `UP`.
+        elevation: radians, above the horizon.
+    """
+    flat = math.cos(elevation)
+    towards = torch.tensor([flat * math.sin(azimuth), -flat * math.cos(azimuth), math.sin(elevation)])
+    target = middle(run.model)
+    size = run.scene.width, run.scene.height
+    return Camera(look_at(target + run.scene.extent * towards, target), intrinsics(*size), *size)
+
+
+def orbit(run: LoadedRun, frames: int) -> list[Camera]:
+    """Return cameras that go once around a model; the last one is before the first one again."""
+    return [around(run, 2 * math.pi * i / frames, ELEVATION) for i in range(frames)]
+
+
+def spiral(run: LoadedRun, frames: int) -> list[Camera]:
+    """Return cameras that go twice around a model and rise from the horizon as they do."""
+    parts = [i / max(1, frames - 1) for i in range(frames)]
+    return [around(run, 2 * math.pi * TURNS * part, HIGHEST * part) for part in parts]
+
+
+def far_along(run: LoadedRun, direction: Tensor) -> Tensor:
+    """Return a place [3] so far away that all of a model is seen from it along `direction` [3]."""
+    return middle(run.model) - FAR_AWAY * run.scene.extent * torch.nn.functional.normalize(direction, dim=0)

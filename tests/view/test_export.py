@@ -1,0 +1,127 @@
+"""The command `python -m gsbench.export`: what it writes, and everything that can be asked wrong."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+
+from gsbench.export import main
+from gsbench.models.render import render
+from gsbench.run.load import load_run
+from gsbench.run.setup import load_scene
+from gsbench.scenes.splats import read_splats
+from gsbench.view import film, paths
+
+SHORT = ("--seconds", "0.5", "--fps", "8")
+
+
+@pytest.mark.parametrize("place", [("--camera", "2"), ("--direction", "0,0,-1", "--time", "0.5")])
+def test_a_ply_says_what_it_holds(
+    place: tuple[str, ...], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a count of what is left out that is not that of the file."""
+    assert main([str(folder), "--ply", str(tmp_path / "a.ply"), *place]) == 0
+    kept, total = len(read_splats(tmp_path / "a.ply")), len(load_run(folder).model)
+    said = capsys.readouterr().out
+    assert f": {kept} Gaussians at time" in said
+    assert f"{total - kept} of {total} are left out" in said
+
+
+def test_a_video_has_its_frames(folder: Path, tmp_path: Path) -> None:
+    """Catches a video that cannot be read, or with another length, size or rate than was asked for."""
+    path = tmp_path / "a.mp4"
+    assert main([str(folder), "--video", str(path), *SHORT]) == 0
+    video = cv2.VideoCapture(str(path))
+    count = 0
+    while video.read()[0]:
+        count += 1
+    assert (count, video.get(cv2.CAP_PROP_FPS)) == (4, 8)
+    assert [*tmp_path.iterdir()] == [path]
+
+
+@pytest.mark.parametrize("path", ["test", "orbit", "spiral"])
+def test_images_are_what_the_model_renders(path: str, folder: Path, tmp_path: Path) -> None:
+    """Catches swapped colours, and test views that are rendered at other times than their own."""
+    assert main([str(folder), "--images", str(tmp_path / "a"), "--path", path, *SHORT]) == 0
+    images = [cv2.imread(str(file)) for file in sorted((tmp_path / "a").iterdir())]
+    run = load_run(folder)
+    if path != "test":
+        assert len(images) == 4
+        assert any((image != images[0]).any() for image in images)
+        return
+    views = load_scene(run.config).test
+    assert len(images) == len(views)
+    for image, view in zip(images, views, strict=True):
+        expected = film.pixels(render(run.model, view.camera, view.time, torch.tensor(run.scene.background)))
+        assert (image[:, :, ::-1] == expected).all()
+
+
+def test_time_runs_once_unless_it_stands_still(folder: Path, tmp_path: Path) -> None:
+    """Catches a clip that is cut off, and --time without effect."""
+    for more, differ in (((), True), (("--time", "0.5"), False)):
+        out = tmp_path / f"still{differ}"
+        assert main([str(folder), "--images", str(out), "--camera", "train/r_0", *SHORT, *more]) == 0
+        first, *others = [cv2.imread(str(file)) for file in sorted(out.iterdir())]
+        assert any((image != first).any() for image in others) == differ
+
+
+def test_an_orbit_looks_at_the_model(folder: Path) -> None:
+    """Catches cameras that look away, stand on their heads or are left-handed."""
+    run = load_run(folder)
+    for camera in (*paths.orbit(run, 5), *paths.spiral(run, 5), paths.around(run, 0.0, 1.5707963)):
+        rotation = camera.viewmat[:3, :3]
+        torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
+        assert torch.linalg.det(rotation) > 0
+        assert rotation[1] @ torch.tensor(paths.UP) < 1e-3  # y points down
+        center = camera.viewmat[:3, :3] @ paths.middle(run.model) + camera.viewmat[:3, 3]
+        torch.testing.assert_close(center, torch.tensor([0, 0, run.scene.extent]), atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "--ply OUT.ply"),
+        (("--ply", "a.ply"), "--direction"),
+        (("--ply", "a.ply", "--camera", "6"), "0 to 5"),
+        (("--ply", "a.ply", "--camera", "²"), "0 to 5"),
+        (("--ply", "a.ply", "--camera", "train/r_9"), "train/r_9"),
+        (("--ply", "a.ply", "--camera", "0", "--data-root", "/nowhere"), "--data-root"),
+        (("--ply", "a.ply", "--direction", "0,0,0"), "--direction"),
+        (("--ply", "a.ply", "--direction", "1,x"), "--direction"),
+        (("--ply", "a.ply", "--time", "1.5"), "--time"),
+        (("--ply", "a.ply", "--time", "nan"), "--time"),
+        (("--ply", "nowhere/a.ply"), "nowhere"),
+        (("--images", "nowhere/a"), "nowhere"),
+        (("--video", "a.nothing"), "a.nothing"),
+        (("--video", "a.mp4", "--fps", "0"), "--fps"),
+        (("--video", "a.mp4", "--seconds", "inf"), "--seconds"),
+        (("--ply", "a.ply", "--device", "gpu"), "device"),
+    ],
+)
+def test_what_is_asked_wrong_is_told_in_one_line(
+    words: tuple[str, ...], said: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Catches a stack trace, a message that does not name the option, and a file that is left behind."""
+    monkeypatch.chdir(tmp_path)
+    assert main([str(folder), *words]) == 2
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("gsbench.export:")]
+    assert said in line
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_folder_without_a_checkpoint_and_other_data_are_refused(
+    folder: Path, square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches images of one scene that are taken for another's, and a stack trace for a wrong path."""
+    assert main([str(tmp_path), "--ply", str(tmp_path / "a.ply")]) == 2
+    assert "checkpoint.pt" in capsys.readouterr().err
+    shutil.copytree(square, tmp_path / "moved")
+    asked = [str(folder), "--ply", str(tmp_path / "a.ply"), "--camera", "0", "--data-root", str(tmp_path / "moved")]
+    assert main(asked) == 0
+    transforms = tmp_path / "moved" / "square" / "transforms_train.json"
+    transforms.write_text(transforms.read_text().replace("0.7", "0.8"))
+    assert main(asked) == 2
+    assert "expected the data of the training" in capsys.readouterr().err

@@ -1,0 +1,123 @@
+"""A slice as a PLY of 3DGS: read by plyfile and drawn from its columns alone, it is the image of the model."""
+
+import io
+
+import numpy as np
+import pytest
+import torch
+from models.small import MODELS, VARIANTS, lively
+from plyfile import PlyData
+
+from gsbench.errors import InputError
+from gsbench.models import GaussianModel, Phase, Query
+from gsbench.models.render import render
+from gsbench.raster import rasterize
+from gsbench.scenes import Camera
+from gsbench.scenes.splats import ply_of
+from gsbench.view.gaussians import decompose, splats_of
+from gsbench.view.paths import intrinsics, look_at
+
+SIZE = 48
+BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
+COLUMNS = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(45)),
+           "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
+
+
+def camera(x: float, y: float, z: float) -> Camera:
+    """A camera there that looks at the origin."""
+    return Camera(look_at(torch.tensor([x, y, z]), torch.zeros(3)), intrinsics(SIZE, SIZE), SIZE, SIZE)
+
+
+def trained(variant: str) -> GaussianModel:
+    """A model in the midst of a training, with everything switched on."""
+    model = lively(variant, count=60).float()
+    model.set_phase(Phase(3, model.agr, True))
+    return model.requires_grad_(False)
+
+
+def drawn(data: bytes, seen: Camera) -> torch.Tensor:
+    """Draw a PLY by plyfile, numpy and the rasterizer: the conventions of 3DGS, written a second time."""
+    rows = PlyData.read(io.BytesIO(data))["vertex"].data
+    assert rows.dtype.names == tuple(COLUMNS)
+    take = {name: np.stack([rows[name + end] for end in ends], 1).astype(np.float64) for name, ends in
+            (("f_dc_", "012"), ("scale_", "012"), ("rot_", "0123"), ("", "xyz"))}  # fmt: skip
+    w, x, y, z = (take["rot_"] / np.linalg.norm(take["rot_"], axis=1, keepdims=True)).T
+    R = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                  [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                  [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]).transpose(2, 0, 1)  # fmt: skip
+    directions = take[""] - seen.center.double().numpy()
+    a, b, c = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
+    xx, yy, zz = a * a, b * b, c * c
+    basis = np.stack([
+        -0.4886025 * b, 0.4886025 * c, -0.4886025 * a,
+        1.0925484 * a * b, -1.0925484 * b * c, 0.3153916 * (2 * zz - xx - yy), -1.0925484 * a * c,
+        0.5462742 * (xx - yy), -0.5900436 * b * (3 * xx - yy), 2.8906114 * a * b * c,
+        -0.4570458 * b * (4 * zz - xx - yy), 0.3731763 * c * (2 * zz - 3 * xx - 3 * yy),
+        -0.4570458 * a * (4 * zz - xx - yy), 1.4453057 * c * (xx - yy), -0.5900436 * a * (xx - 3 * yy),
+    ], 1)  # fmt: skip
+    rest = np.stack([rows[f"f_rest_{i}"] for i in range(45)], 1).reshape(-1, 3, 15)
+    colors = np.clip(0.5 + 0.28209479 * take["f_dc_"] + np.einsum("nck,nk->nc", rest, basis), 0, None)
+    opacities = 1 / (1 + np.exp(-rows["opacity"].astype(np.float64)))
+    parts = (take[""], R * np.exp(take["scale_"])[:, None, :], opacities, colors)
+    tensors = [torch.tensor(part, dtype=torch.float32) for part in parts]
+    return rasterize(*tensors, seen.viewmat[None], seen.K[None], SIZE, SIZE, background=BACKGROUND).image[0]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_ply_is_the_image(variant: str) -> None:
+    """Catches scales, rotations, colours or opacities in another convention, and a mirrored rotation."""
+    model, seen = trained(variant), camera(0.3, -4.0, 1.0)
+    splats = splats_of(model, Query.of(seen, 0.4))
+    image = render(model, seen, 0.4, BACKGROUND)
+    assert (image - BACKGROUND).abs().max() > 0.1
+    assert (drawn(ply_of(splats), seen) - image).abs().max() < 2e-3
+
+
+@pytest.mark.parametrize("variant", ["3dgs", "3dgs_agr", "4dgs", "4dgs_agr", "4dgs_constant_colors"])
+def test_harmonics_are_right_from_everywhere(variant: str) -> None:
+    """Catches f_rest in the wrong order, waves of time that are left out, or mean times that AGR has not moved."""
+    model = trained(variant)
+    data = ply_of(splats_of(model, Query.at(torch.zeros(3), 0.4), keep_harmonics=True))
+    for seen in (camera(0.3, -4.0, 1.0), camera(3.0, 2.0, -2.0)):
+        assert (drawn(data, seen) - render(model, seen, 0.4, BACKGROUND)).abs().max() < 2e-3
+
+
+@pytest.mark.parametrize("name", ["6dgs", "7dgs"])
+def test_a_slice_of_one_direction_has_no_harmonics(name: str) -> None:
+    """Catches a PLY that claims to be right from everywhere for a model whose geometry is not."""
+    with pytest.raises(InputError, match="--direction"):
+        splats_of(trained(name), Query.at(torch.zeros(3), 0.4), keep_harmonics=True)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_what_is_culled_is_left_out(name: str) -> None:
+    """Catches a file of Gaussians that nobody sees, and an empty file."""
+    model = trained(name)
+    model.splats["opacities"][:20] = -20.0
+    assert 0 < len(splats_of(model, Query.of(camera(0.0, -4.0, 0.0), 0.4))) <= 40
+    model.splats["opacities"][:] = -20.0
+    with pytest.raises(InputError, match="no Gaussian"):
+        splats_of(model, Query.of(camera(0.0, -4.0, 0.0), 0.4))
+
+
+def test_factors_are_decomposed() -> None:
+    """Catches left-handed axes, and a scale of zero whose logarithm is not finite."""
+    factors = torch.randn(200, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    factors[:5, :, 0] = 0
+    log_scales, quats = decompose(factors)
+    assert log_scales.isfinite().all()
+    w, v = quats[:, :1].double(), quats[:, 1:].double()
+    cross = torch.zeros(200, 3, 3, dtype=torch.float64)
+    for i, j, k, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):
+        cross[:, i, j], cross[:, j, i] = sign * v[:, k], -sign * v[:, k]
+    R = torch.eye(3) + 2 * w[:, :, None] * cross + 2 * cross @ cross  # Rodrigues' formula of a unit quaternion
+    S = R * log_scales.exp()[:, None, :]
+    torch.testing.assert_close(S @ S.mT, factors @ factors.mT, atol=1e-5, rtol=1e-5)
+
+
+def test_a_ply_of_a_diverged_model_is_refused() -> None:
+    """Catches a file of NaN."""
+    model = trained("3dgs")
+    model.splats["means"][3, 1] = float("nan")
+    with pytest.raises(InputError, match="means"):
+        ply_of(splats_of(model, Query.at(torch.zeros(3), None)))
