@@ -41,6 +41,14 @@ class SceneConfig:
 
 
 @dataclass
+class InitConfig:
+    """What a training starts from instead of points: +init.ply=FILE."""
+
+    ply: str | None = None  # trained 3D Gaussians, as 3DGS writes them
+    ply_sha256: str | None = None  # of that file: it tells two runs apart; filled in where it is not given
+
+
+@dataclass
 class LearningRate:
     """A learning rate over the run, log-linear from start to end."""
 
@@ -154,6 +162,7 @@ class Config:
     model: ModelConfig = field(default_factory=ModelConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     data: DataConfig = field(default_factory=DataConfig)
+    init: InitConfig = field(default_factory=InitConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)

@@ -21,15 +21,17 @@ from gsbench.measure.speed import peak_memory, reset_peak_memory, synchroniser, 
 from gsbench.models import GaussianModel
 from gsbench.models.classes import packed_bytes
 from gsbench.models.replay import Replay
+from gsbench.models.start import start_from
 from gsbench.report.pictures import strip, write_png
 from gsbench.run import progress, stop
 from gsbench.run.auto import is_auto, plain_model, resolve, with_candidate
-from gsbench.run.checks import check_config, check_scene, evaluated_views, lpips_weights
+from gsbench.run.checks import check_config, check_scene, evaluated_views, lpips_weights, trained_start
 from gsbench.run.identity import Run, training_hash
 from gsbench.run.load import plain_description
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Points, Scene, View
 from gsbench.scenes.points import frustum_points, random_points
+from gsbench.scenes.splats import Splats
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.loop import Trainer
@@ -48,6 +50,7 @@ class Attempt:
         self.screen: TimeScreen | None = None
         self.model: GaussianModel | None = None
         self.scene: Scene | None = None
+        self.start: Splats | None = None  # trained Gaussians to start from; None: points
         self._shown: list[tuple[npt.ArrayLike, npt.ArrayLike]] = []
 
     def prepare(self) -> tuple[GaussianModel, Scene]:
@@ -58,6 +61,7 @@ class Attempt:
         """
         check_config(self.config)
         self.model = build(self.config)
+        self.start = trained_start(self.config)
         self.scene = scene = load_scene(self.config)
         if is_auto(self.this.config) and not scene.has_time:
             self.config = with_candidate(self.this.config, "static")
@@ -112,10 +116,13 @@ class Attempt:
         return trainer
 
     def trainer(self, model: GaussianModel, scene: Scene) -> Trainer:
-        """Initialise a model at the scene's points, and prepare its training."""
+        """Initialise a model, at the scene's points or as trained Gaussians are, and prepare its training."""
         random = generator(self.config.seed)
-        points = scene.points or initial_points(self.config.data, scene, random)
-        model.initialise(points, scene.extent, random)
+        if self.start is not None:
+            start_from(model, self.start, scene.extent, random)
+        else:
+            points = scene.points or initial_points(self.config.data, scene, random)
+            model.initialise(points, scene.extent, random)
         model.to(self.config.device)
         return Trainer(model, scene, evaluated_views(scene, self.config.scene.eval_split), self.config)
 

@@ -16,12 +16,15 @@ from gsbench.measure import perceptual
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
+from gsbench.run.identity import hash_of
 from gsbench.scenes import Scene, View
+from gsbench.scenes.splats import Splats, read_splats
 from gsbench.train.gating import GATES
 from gsbench.train.optim import OPTIMIZERS
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 SPLITS = ("test", "val")
+LEAST_GAUSSIANS = 4  # to start from: sizes are those of three neighbours until they are known
 ENDLESS = 10**9  # more than any machine will do
 RANGES = {  # of numbers that the schema types but does not bound, both ends included
     "train.iterations": (1, ENDLESS),
@@ -70,6 +73,27 @@ def check_config(config: Config) -> None:
     resolve(config.raster.backend, torch.device(config.device).type)
     for backbone, file in lpips_weights(config).items():
         perceptual.load(backbone, file, config.device)
+
+
+def trained_start(config: Config) -> Splats | None:
+    """Read the trained Gaussians that a training starts from; None where it starts from points.
+
+    Raises:
+        InputError: the file is not such a PLY, holds fewer than four Gaussians, or is not the one that is asked for.
+    """
+    if config.init.ply is None:
+        if config.init.ply_sha256 is not None:
+            raise InputError("init.ply_sha256: expected it beside init.ply, got no file: add +init.ply=FILE")
+        return None
+    path = Path(config.init.ply).expanduser()
+    splats = read_splats(path)
+    if len(splats) < LEAST_GAUSSIANS:
+        raise InputError(f"{path}: expected at least {LEAST_GAUSSIANS} Gaussians, found {len(splats)}")
+    found = hash_of(config.init.ply)
+    if found != config.init.ply_sha256:
+        raise InputError(f"init.ply={config.init.ply}: expected the SHA-256 {config.init.ply_sha256!s:.70}, found "
+                         f"{found}: another file, or one that has just changed")  # fmt: skip
+    return splats
 
 
 def lpips_weights(config: Config) -> dict[str, Path]:

@@ -15,6 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from gsbench.config import Config
 from gsbench.measure import record as records
 from gsbench.measure.provenance import config_hash
+from gsbench.reading import read_file
+from gsbench.scenes.files import digest
+from gsbench.scenes.ply import MAX_FILE
 
 Plain = dict[str, Any]  # a resolved config in plain JSON
 
@@ -22,7 +25,7 @@ Plain = dict[str, Any]  # a resolved config in plain JSON
 # `eval_split` are not here: the best iteration is looked for while the model trains.
 MEASURING = (
     "experiment", "results", "resume", "launch", "data.dataset", "data.paper_dataset", "data.published", "data.root",
-    "data.scenes", "scene.released_as", "train.checkpoint_minutes", "protocol.name", "protocol.quantise",
+    "data.scenes", "init.ply", "scene.released_as", "train.checkpoint_minutes", "protocol.name", "protocol.quantise",
     "protocol.lpips_alex", "protocol.lpips_vgg", "protocol.renders", "protocol.pictures",
 )  # fmt: skip
 OWN_NAMES = ("exp", "model", "scene")  # the groups that have a place in a run's path
@@ -58,21 +61,29 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
         overrides: the words of the command line that made it (HydraConfig.overrides.task).
 
     Raises:
-        InputError: a name cannot be that of a folder. Hydra has already refused unknown keys and wrong types.
+        InputError: a name cannot be that of a folder, or there is no file to start from. Hydra has already refused
+            unknown keys and wrong types.
     """
     config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
     plain: Plain = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
+    if config.init.ply is not None:
+        config.init.ply_sha256 = plain["init"]["ply_sha256"] = config.init.ply_sha256 or hash_of(config.init.ply)
     as_published = config.agr == config.model.published_with_agr
     label = config.model.name + ("" if as_published else "_agr" if config.agr else "_noagr")
     variant = name_variant(plain, choices) if choices else ""
     folder = records.run_path(
         Path(config.results), config.experiment, config.scene.name, label, config.seed, variant=variant
     )
-    for key in UNNAMED:
+    for key in UNNAMED if config.init.ply is not None else (*UNNAMED, "init"):  # older runs have no such key
         del plain[key]
     plain = _storable(plain)
     repeating = sorted(word for word in overrides if re.split("[=.]", word.lstrip("+"))[0] not in UNNAMED)
     return Run(config, plain, folder, label, variant, repeating)
+
+
+def hash_of(ply: str) -> str:
+    """Compute the SHA-256 of the file that a training starts from; raises InputError where it cannot be read."""
+    return digest(read_file(Path(ply).expanduser(), f"init.ply={ply!a:.200}", MAX_FILE))
 
 
 def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
@@ -151,8 +162,13 @@ def _storable(value: Any) -> Any:
 
 
 def _printed(value: Any) -> str:
-    """Print a value for the name of a folder; as a hash where it has characters that a folder should not have."""
+    """Print a value for the name of a folder; as a hash where it has characters that a folder should not have.
+
+    A SHA-256 is cut to its first eight digits.
+    """
     text = value if isinstance(value, str) else json.dumps(value)
+    if re.fullmatch("[0-9a-f]{64}", text):
+        return text[:8]
     text = text.replace("/", ".")
     return text if re.fullmatch(r"[A-Za-z0-9_.+-]+", text) else _digest(text)
 

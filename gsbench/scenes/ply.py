@@ -21,7 +21,7 @@ _TYPES = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 _ENCODINGS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}  # and their order of bytes
-_MAX_FILE = 1 << 32  # bytes; 17 million Gaussians of 3DGS
+MAX_FILE = 1 << 32  # bytes; 17 million Gaussians of 3DGS
 _ASCII_VALUE = 100  # bytes of memory that a value takes while it is parsed
 _HEADER_LIMIT = 65536  # bytes; a 3DGS header of 62 properties takes 1,600
 _HEADER_END = re.compile(rb"\nend_header[ \t]*\r?\n")
@@ -36,7 +36,7 @@ def read_vertices(path: Path) -> NDArray[np.void]:
     Raises:
         InputError: the file is not such a PLY, or has fewer bytes or values than its header states.
     """
-    data = read_file(path, str(path), _MAX_FILE)
+    data = read_file(path, str(path), MAX_FILE)
     end = _HEADER_END.search(data, 0, _HEADER_LIMIT)
     if not data.startswith(b"ply") or end is None:
         raise InputError(f"{path}: expected a PLY: 'ply' first and 'end_header' within {_HEADER_LIMIT} bytes")

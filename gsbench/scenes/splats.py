@@ -71,7 +71,7 @@ def read_splats(path: Path) -> Splats:
         raise InputError(f"{path}: rot_0..3: expected quaternions, some are zero")
     channels = _table(vertices, rest, path) if rest else torch.zeros(len(vertices), 0)
     read["logits"] = read["logits"][:, 0]
-    return Splats(**read, rest=channels.unflatten(1, (3, -1)).mT.contiguous() if rest else channels.view(-1, 0, 3))
+    return Splats(**read, rest=channels.view(len(vertices), 3, count // 3).mT.contiguous())
 
 
 def ply_of(splats: Splats) -> bytes:

@@ -1,5 +1,6 @@
 """A run's name: made of what its training reads, equal for equal trainings, and fit for a folder."""
 
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,20 @@ def test_measuring_is_not_training(word: str) -> None:
 def test_training_is_training(word: str) -> None:
     """Catches a checkpoint that is taken by a run with other numbers."""
     assert training_hash(named(word).plain) != training_hash(named().plain)
+
+
+def test_a_file_to_start_from_is_training(tmp_path: Path) -> None:
+    """Catches a run that is taken for one that started from another file, and one that depends on the file's place."""
+    runs = []
+    for name, content in (("a", b"1"), ("b", b"2"), ("c", b"1")):
+        (tmp_path / f"{name}.ply").write_bytes(content)
+        runs.append(named(f"+init.ply={tmp_path / name}.ply"))
+    a, b, c = runs
+    assert training_hash(a.plain) != training_hash(b.plain) != training_hash(named().plain)
+    assert training_hash(a.plain) == training_hash(c.plain)
+    assert a.variant == f"ply_sha256={hashlib.sha256(b'1').hexdigest()[:8]}" == c.variant != b.variant
+    assert a.plain["init"]["ply_sha256"] == a.config.init.ply_sha256 == hashlib.sha256(b"1").hexdigest()
+    assert "init" not in named().plain  # so that the records of older runs are still those of the same config
 
 
 def test_every_key_is_of_training_or_of_measuring() -> None:
