@@ -19,7 +19,7 @@ FLOORS: tuple[set[str], ...] = (
     {"raster"},
     {"models", "measure"},
     {"effects"},
-    {"train", "report"},
+    {"train", "report", "fetch"},
     {"run"},
     {"stability", "sweep", "view"},
     {"export"},

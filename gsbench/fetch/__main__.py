@@ -1,0 +1,81 @@
+"""Fetch data sets and weights (``python -m gsbench.fetch dnerf|pbr|lpips-alex|lpips-vgg|--list``)."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from gsbench.errors import InputError, one_line
+from gsbench.fetch.sources import Source, find, sources
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Fetch what is asked for, one after the other; return 0, or 2 with a line on stderr for each that failed."""
+    made = argparse.ArgumentParser(prog="python -m gsbench.fetch", description=__doc__)
+    made.add_argument("names", nargs="*", metavar="NAME", help="dnerf, pbr, lpips-alex or lpips-vgg")
+    made.add_argument("--list", action="store_true", help="print what can be fetched, and what is there")
+    made.add_argument("--dry-run", action="store_true", help="print what would be fetched, from where and to where")
+    made.add_argument("--to", type=Path, default=Path("data"), metavar="FOLDER", help="of data sets (data)")
+    asked = made.parse_args(arguments)
+    if not asked.names and not asked.list:
+        made.error("expected a NAME, or --list")
+    known = sources(asked.to.expanduser())
+    failed = 0
+    for name in list(known) if asked.list else asked.names:
+        try:
+            source = find(name, known)
+            print(line_of(source) if asked.list else plan_of(source) if asked.dry_run else fetch(source))
+        except (InputError, OSError) as error:
+            print(f"gsbench.fetch: {one_line(error)}", file=sys.stderr)
+            failed = 2
+    return failed
+
+
+def line_of(source: Source) -> str:
+    """Describe a source in a line of the list."""
+    return f"{source.name:<11} {source.what}; {'is in' if source.target.exists() else 'goes to'} {source.target}"
+
+
+def plan_of(source: Source) -> str:
+    """Say what would be fetched, from where, to where, and what is checked."""
+    if source.target.exists():
+        return f"{source.name}: {source.target} is there: nothing would be fetched"
+    checked = f"its SHA-256 must begin with {source.sha256}" if source.sha256 else "no SHA-256 of it is published"
+    return f"{source.name}: {source.address()} -> {source.target}; {checked}"
+
+
+def fetch(source: Source) -> str:
+    """Fetch a source and say where it lies.
+
+    Raises:
+        InputError: it cannot be fetched, or is not what it should be.
+    """
+    from gsbench.fetch.download import check, download, sha256_of
+    from gsbench.fetch.unpack import scenes_in, unpack
+
+    if source.target.exists() and source.is_archive:
+        return f"{source.name}: {source.target} is there: nothing fetched; {scenes(scenes_in(source.target))}"
+    if not source.is_archive:
+        there = source.target.exists()
+        path = download(source, source.folder)
+        check(path, source, "remove it and fetch again")
+        return f"{source.name}: {path} {'is there: nothing fetched' if there else 'fetched'}"
+    source.folder.parent.mkdir(parents=True, exist_ok=True)
+    archive = download(source, source.folder.parent)
+    digest = sha256_of(archive)
+    try:
+        unpack(archive, source.folder)
+    finally:
+        archive.unlink()  # a damaged one would be in the way of the next attempt
+    return (f"{source.name}: unpacked into {source.folder}; SHA-256 of the archive, to compare with others: {digest}; "
+            f"{scenes(scenes_in(source.folder))}")  # fmt: skip
+
+
+def scenes(found: dict[Path, list[str]]) -> str:
+    """Say which data.root to name."""
+    if not found:
+        return "no scene with a transforms_train.json is in it"
+    return "; ".join(f"data.root={root} has {', '.join(names)}" for root, names in found.items())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

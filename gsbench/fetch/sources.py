@@ -1,0 +1,108 @@
+"""List what can be fetched: where it is published, what its bytes must be, and where it goes."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from omegaconf import OmegaConf
+
+from gsbench.config import CONF
+from gsbench.errors import InputError, did_you_mean
+
+MIRROR = "GSBENCH_MIRROR"  # an address; every file is then fetched from it, by the name in `Source.file`
+
+
+@dataclass(frozen=True)
+class Source:
+    """Something that is published elsewhere."""
+
+    name: str
+    what: str
+    file: str  # its name on a mirror, and on this machine while it is fetched
+    folder: Path  # where it goes; an archive is unpacked into it
+    url: str | None  # None: it is published in a way that only a browser can follow
+    sha256: str | None = None  # the first digits that are known; None: its authors publish none
+    published: str = ""  # where, in words
+
+    @property
+    def is_archive(self) -> bool:
+        """Whether it is unpacked."""
+        return self.file.endswith(".zip")
+
+    @property
+    def target(self) -> Path:
+        """The file, or the folder of an archive, that is there once it is fetched."""
+        return self.folder if self.is_archive else self.folder / self.file
+
+    def address(self) -> str:
+        """Return the URL that is asked: that of the mirror where there is one.
+
+        Raises:
+            InputError: there is none, or the mirror's is not one.
+        """
+        mirror = os.environ.get(MIRROR)
+        if mirror:
+            if urlsplit(mirror).scheme not in ("http", "https"):
+                raise InputError(f"{MIRROR}: expected an address such as https://host/folder, got {mirror!r:.200}")
+            return f"{mirror.rstrip('/')}/{self.file}"
+        if self.url is None:
+            raise InputError(f"{self.name}: {self.what} has no address that a program can follow: download it in a "
+                             f"browser ({self.published}) and unpack it into {self.folder}, or set {MIRROR} to a "
+                             f"server that has {self.file}")  # fmt: skip
+        return self.url
+
+
+def sources(data: Path) -> dict[str, Source]:
+    """Return everything that can be fetched, by name; data sets go into folders of `data`."""
+    known = [
+        Source(
+            name="dnerf",
+            what="D-NeRF, eight moving scenes",
+            file="dnerf.zip",
+            folder=data / "dnerf",
+            url="https://www.dropbox.com/s/0bf6fl0ye2vz3vr/data.zip?dl=1",
+            published=_published("dnerf"),
+        ),
+        Source(
+            name="pbr",
+            what="7DGS-PBR, six physically based scenes",
+            file="pbr.zip",
+            folder=data / "pbr",
+            url=None,  # a folder of Google Drive
+            published=_published("pbr"),
+        ),
+        _trunk("alex"),
+        _trunk("vgg"),
+    ]
+    return {source.name: source for source in known}
+
+
+def find(name: str, known: dict[str, Source]) -> Source:
+    """Return the source of that name; raises InputError where there is none."""
+    if name not in known:
+        raise InputError(f"'{name}' is not known. {did_you_mean(name, known)}")
+    return known[name]
+
+
+def _published(experiment: str) -> str:
+    """Read from an experiment's config where its data are published."""
+    return str(OmegaConf.load(CONF / "exp" / f"{experiment}.yaml").data.published)
+
+
+def _trunk(backbone: str) -> Source:
+    """Return a trunk of LPIPS, which gsbench.measure looks for in torch's own folder."""
+    import torch  # it takes two seconds to load
+
+    from gsbench.measure.perceptual import BACKBONES
+
+    chosen = BACKBONES[backbone]
+    return Source(
+        name=f"lpips-{backbone}",
+        what=f"the trunk of LPIPS' {backbone} column, torchvision's ImageNet weights",
+        file=chosen.file,
+        folder=Path(torch.hub.get_dir()) / "checkpoints",
+        url=f"https://download.pytorch.org/models/{chosen.file}",
+        sha256=chosen.trunk_sha256[0],
+        published="torchvision",
+    )

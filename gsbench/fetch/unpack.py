@@ -1,0 +1,55 @@
+"""Unpack a zip that was fetched, into one folder and nowhere else."""
+
+import secrets
+import shutil
+import stat
+import zipfile
+import zlib
+from pathlib import Path, PurePosixPath
+
+from gsbench.errors import InputError, one_line
+
+MOST_FILES = 1_000_000
+
+
+def unpack(archive: Path, folder: Path) -> None:
+    """Unpack a zip into a new folder, which appears when it is complete.
+
+    Raises:
+        InputError: it is no zip, it is damaged, a name in it leads out of the folder, or the disk is too small for it.
+    """
+    part = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.part")
+    try:
+        with zipfile.ZipFile(archive) as opened:
+            members = opened.infolist()
+            for member in members:
+                check(member, archive)
+            size, free = sum(member.file_size for member in members), shutil.disk_usage(folder.parent).free
+            if size > free or len(members) > MOST_FILES:
+                raise InputError(f"{archive}: expected at most {MOST_FILES} files and {free} bytes, which are free in "
+                                 f"{folder.parent}, got {len(members)} and {size}")  # fmt: skip
+            opened.extractall(part)
+        part.replace(folder)
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, zlib.error) as error:
+        raise InputError(f"{archive}: expected a zip, which can be unpacked: {one_line(error)}") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def check(member: zipfile.ZipInfo, archive: Path) -> None:
+    """Raise InputError where a file of a zip would lie outside of its folder, or is no plain file or folder."""
+    name = member.filename
+    path = PurePosixPath(name.replace("\\", "/"))
+    if path.is_absolute() or ".." in path.parts or ":" in name or not name.isprintable():
+        raise InputError(f"{archive}: refused, as it would write outside of its folder: {name!a:.200}")
+    kind = stat.S_IFMT(member.external_attr >> 16)
+    if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+        raise InputError(f"{archive}: refused, as it holds a link or a device: {name!a:.200}")
+
+
+def scenes_in(folder: Path) -> dict[Path, list[str]]:
+    """Return the folders below `folder` that hold scenes, each with the names of its scenes."""
+    found: dict[Path, list[str]] = {}
+    for marker in sorted(folder.rglob("transforms_train.json")):
+        found.setdefault(marker.parent.parent, []).append(marker.parent.name)
+    return found

@@ -1,0 +1,214 @@
+"""Fetching from a server on this machine: what arrives is whole and as it should be, or nothing is left."""
+
+import hashlib
+import io
+import threading
+import zipfile
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from gsbench.errors import InputError
+from gsbench.fetch.__main__ import main
+from gsbench.fetch.download import download
+from gsbench.fetch.sources import MIRROR, Source
+
+PAYLOAD = bytes(range(256)) * 4000  # a megabyte, many chunks
+
+
+def zipped(files: dict[str, bytes], mode: int = 0o100644) -> bytes:
+    """A zip of files, whose names are written as they are."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in files.items():
+            member = zipfile.ZipInfo("x")
+            member.filename, member.external_attr = name, mode << 16
+            archive.writestr(member, content)
+    return buffer.getvalue()
+
+
+GOOD = zipped({"data/trex/transforms_train.json": b"{}", "data/lego/transforms_train.json": b"{}", "data/a.txt": b"a"})
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Serves files, and every fault by its address."""
+
+    files: dict[str, bytes]
+    asked: list[str]
+
+    def do_GET(self) -> None:
+        self.asked.append(self.path)
+        if self.path.startswith("/moved/"):
+            self.send_response(302)
+            self.send_header("Location", self.path.removeprefix("/moved"))
+            self.end_headers()
+            return
+        name = self.path.rpartition("/")[2]
+        if name not in self.files:
+            self.send_error(404)
+            return
+        content = self.files[name]
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content[: len(content) // 2] if "/cut/" in self.path else content)
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server() -> Iterator[ThreadingHTTPServer]:
+    Handler.files, Handler.asked = {"file.bin": PAYLOAD, "dnerf.zip": GOOD}, []
+    made = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=made.serve_forever, args=(0.02,))
+    thread.start()
+    yield made
+    made.shutdown()
+    thread.join()
+    made.server_close()
+
+
+@pytest.fixture
+def address(server: ThreadingHTTPServer) -> str:
+    return f"http://127.0.0.1:{server.server_address[1]}"
+
+
+def source(url: str, folder: Path, sha256: str | None = None) -> Source:
+    return Source("file", "a file", "file.bin", folder, url, sha256)
+
+
+@pytest.mark.parametrize("path", ["/file.bin", "/moved/file.bin"])
+def test_a_file_arrives_whole_and_once(path: str, address: str, tmp_path: Path) -> None:
+    """Catches a redirect that is taken for the file, and a file that is fetched twice."""
+    known = hashlib.sha256(PAYLOAD).hexdigest()
+    for _ in range(2):
+        assert download(source(address + path, tmp_path, known[:8]), tmp_path).read_bytes() == PAYLOAD
+    assert Handler.asked.count(path) == 1
+    assert len([*tmp_path.iterdir()]) == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "sha256", "said"),
+    [
+        ("/cut/file.bin", None, "broke off"),
+        ("/file.bin", "00000000", "expected file.bin with SHA-256 00000000"),
+        ("/nothing.bin", None, "404"),
+        ("/moved/nothing.bin", None, "404"),
+    ],
+)
+def test_what_is_not_the_file_is_not_kept(
+    path: str, sha256: str | None, said: str, address: str, tmp_path: Path
+) -> None:
+    """Catches half a file, another file or a page of words in the place of weights."""
+    with pytest.raises(InputError, match=said) as caught:
+        download(source(address + path, tmp_path, sha256), tmp_path)
+    assert "\n" not in str(caught.value)
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_offline_is_told_in_one_line(tmp_path: Path) -> None:
+    """Catches the stack trace of four libraries."""
+    with pytest.raises(InputError, match="is this machine online") as caught:
+        download(source("http://127.0.0.1:9/file.bin", tmp_path), tmp_path)
+    assert "by hand" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_proxy_of_the_environment_is_asked(address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a download that goes past the only way out of a cluster."""
+    monkeypatch.setenv("http_proxy", address)
+    monkeypatch.setenv("no_proxy", "")
+    assert download(source("http://nowhere.invalid/file.bin", tmp_path), tmp_path).read_bytes() == PAYLOAD
+    assert Handler.asked == ["http://nowhere.invalid/file.bin"]
+
+
+def fetched(address: str, to: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    """Run the command against a mirror."""
+    monkeypatch.setenv(MIRROR, address)
+    monkeypatch.setenv("TORCH_HOME", str(to / "torch"))
+    return main([*words, "--to", str(to / "data")])
+
+
+def test_an_archive_is_unpacked_and_its_scenes_named(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches data that lie where nobody is told, an archive that stays, and data that are fetched again."""
+    for said in ("unpacked into", "nothing fetched"):
+        assert fetched(address, tmp_path, monkeypatch, "dnerf") == 0
+        out = capsys.readouterr().out
+        assert said in out
+        assert f"data.root={tmp_path}/data/dnerf/data has lego, trex" in out
+    assert (tmp_path / "data/dnerf/data/a.txt").read_bytes() == b"a"
+    assert [path.name for path in (tmp_path / "data").iterdir()] == ["dnerf"]
+    assert Handler.asked == ["/dnerf.zip"]
+
+
+@pytest.mark.parametrize(
+    ("archive", "said"),
+    [
+        (zipped({"a/../../evil": b""}), "outside"),
+        (zipped({"/tmp/evil": b""}), "outside"),
+        (zipped({"a\\..\\..\\evil": b""}), "outside"),
+        (zipped({"C:evil": b""}), "outside"),
+        (zipped({"good": b"", "link": b"/etc/passwd"}, mode=0o120777), "link"),
+        (b"<!DOCTYPE html>", "expected a zip"),
+        (GOOD[:-30], "expected a zip"),
+        (GOOD.replace(b"{}", b"[]", 1), "expected a zip"),  # its CRC is another one
+    ],
+)
+def test_a_hostile_or_damaged_archive_is_refused(
+    archive: bytes, said: str, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Catches a file that is written beside the folder, and half a data set in it."""
+    Handler.files["dnerf.zip"] = archive
+    assert fetched(address, tmp_path, monkeypatch, "dnerf") == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench.fetch:")]
+    assert said in line
+    assert [*(tmp_path / "data").iterdir()] == []
+    assert not (tmp_path / "evil").exists()
+
+
+def test_weights_go_where_they_are_looked_for(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches other weights under the right name, and a place that gsbench.measure does not read."""
+    from gsbench.measure import perceptual
+
+    Handler.files["alexnet-owt-7be5be79.pth"] = PAYLOAD
+    assert fetched(address, tmp_path, monkeypatch, "lpips-alex") == 2
+    assert "SHA-256 7be5be79" in capsys.readouterr().err
+    place = tmp_path / "torch/hub/checkpoints/alexnet-owt-7be5be79.pth"
+    assert not place.exists()
+    place.write_bytes(PAYLOAD)
+    with pytest.raises(InputError, match="expected SHA-256"):  # so it is this file that is read
+        perceptual.load.__wrapped__("alex")
+
+
+def test_a_dry_run_fetches_nothing(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a dry run that is none, and a plan that does not say from where, to where and what is checked."""
+    assert fetched(address, tmp_path, monkeypatch, "dnerf", "lpips-vgg", "--dry-run") == 0
+    plans = capsys.readouterr().out.splitlines()
+    assert plans[0] == f"dnerf: {address}/dnerf.zip -> {tmp_path}/data/dnerf; no SHA-256 of it is published"
+    assert plans[1].endswith("must begin with 397923af")
+    assert Handler.asked == []
+    assert [*tmp_path.iterdir()] == []
+    assert fetched(address, tmp_path, monkeypatch, "--list") == 0
+    assert len(capsys.readouterr().out.splitlines()) == 4
+
+
+def test_what_cannot_be_fetched_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a name or a mirror that is typed wrong, and a folder of Google Drive that is taken for a file."""
+    assert fetched("", tmp_path, monkeypatch, "pbr", "dnrf") == 2
+    err = capsys.readouterr().err.splitlines()
+    assert "download it in a browser" in err[0]
+    assert "Did you mean 'dnerf'" in err[1]
+    assert fetched("ftp://x", tmp_path, monkeypatch, "dnerf") == 2
+    assert MIRROR in capsys.readouterr().err
