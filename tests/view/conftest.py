@@ -1,4 +1,4 @@
-"""A finished run that the tests of a room share."""
+"""Finished runs that the tests of a room share."""
 
 from pathlib import Path
 
@@ -14,11 +14,21 @@ def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
-@pytest.fixture(scope="session")
-def folder(square: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a finished run of 7DGS with AGR on that data set."""
-    root = tmp_path_factory.mktemp("run")
-    done = gsbench(*overrides(square, root, "model=7dgs", "train.iterations=20"))
+def trained(square: Path, root: Path, *words: str) -> Path:
+    """Do a run on that data set; return its folder."""
+    done = gsbench(*overrides(square, root, *words))
     assert done.returncode == 0, done.stderr
     (path,) = record.find(root)
     return path.parent
+
+
+@pytest.fixture(scope="session")
+def folder(square: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run of 7DGS with AGR."""
+    return trained(square, tmp_path_factory.mktemp("run"), "model=7dgs", "train.iterations=20")
+
+
+@pytest.fixture(scope="session")
+def other_folder(square: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run of 4DGS, without AGR, on the same data."""
+    return trained(square, tmp_path_factory.mktemp("other"), "model=4dgs", "train.iterations=60")

@@ -1,0 +1,59 @@
+"""Look at trained models in a browser (``python -m gsbench.view RUN_FOLDER [RUN_FOLDER ...]``)."""
+
+import argparse
+import importlib.util
+import sys
+from pathlib import Path
+
+from gsbench.errors import InputError, one_line
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Serve until Ctrl-C; return 0, or 2 with one line on stderr."""
+    made = argparse.ArgumentParser(prog="python -m gsbench.view", description=__doc__)
+    made.add_argument("runs", nargs="+", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
+    made.add_argument("--host", default="localhost", help="the address to listen on (localhost: this machine only)")
+    made.add_argument("--port", type=int, default=8080, help="to listen on, or the next free one (8080)")
+    made.add_argument("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
+    made.add_argument("--device", default="cpu", help="cpu or cuda")
+    asked = made.parse_args(arguments)
+    try:
+        serve(asked)
+    except (InputError, OSError) as error:
+        print(f"gsbench.view: {one_line(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        pass
+    return 0
+
+
+def serve(asked: argparse.Namespace) -> None:
+    """Load the runs and serve them.
+
+    Raises:
+        InputError: viser is not installed, a folder has no checkpoint, or runs do not belong together.
+        KeyboardInterrupt: it is told to end.
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise InputError("the viewer needs viser: pip install 'gsbench[view]'")
+    if not 0 < asked.port < 65536:
+        raise InputError(f"--port: expected 1 to 65535, got {asked.port}")
+    from gsbench.run.checks import check_device
+    from gsbench.run.load import load_run
+    from gsbench.view.viewer import Viewer
+
+    check_device(asked.device)
+    viewer = Viewer([load_run(run, asked.device) for run in asked.runs], asked.host, asked.port, asked.data_root)
+    for painter in viewer.painters:
+        print(f"{painter.run.folder}: {len(painter.run.model)} Gaussians")
+    if isinstance(viewer.scene, str):
+        print(f"no training cameras: {viewer.scene}")
+    print(f"Open http://{asked.host}:{viewer.server.get_port()} in a browser; Ctrl-C ends it.", flush=True)
+    try:
+        viewer.server.sleep_forever()
+    finally:
+        viewer.stop()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

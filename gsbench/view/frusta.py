@@ -1,0 +1,70 @@
+"""Show training cameras as frusta with their images, in one browser of the viewer."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import viser
+from scipy.spatial.transform import Rotation
+
+from gsbench.measure.quality import evenly
+from gsbench.scenes import Scene, View
+from gsbench.view.film import pixels
+
+MOST = 100  # frusta; evenly spaced among the training views where there are more
+THUMBNAIL = 96  # pixels of the longer side
+SIZE = 0.06  # of a frustum, extents
+
+GoTo = Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64], float | None], None]
+
+
+class Frusta:
+    """The frusta of a scene in one browser; they are made when they are first shown."""
+
+    def __init__(self, client: viser.ClientHandle, scene: Scene, go_to: GoTo) -> None:
+        """Prepare the frusta.
+
+        Args:
+            client: the browser.
+            scene: whose training views are shown.
+            go_to: called with the position, the quaternion and the time of a frustum that is clicked on.
+        """
+        self.client, self.scene, self.go_to = client, scene, go_to
+        self.handles: list[viser.CameraFrustumHandle] = []
+
+    def show(self, visible: bool) -> None:
+        """Show or hide all frusta."""
+        if visible and not self.handles:
+            views = evenly(self.scene.train, min(MOST, len(self.scene.train)))
+            self.handles = [self._add(i, view) for i, view in enumerate(views)]
+        for handle in self.handles:
+            handle.visible = visible
+
+    def _add(self, number: int, view: View) -> viser.CameraFrustumHandle:
+        """Add the frustum of a view."""
+        camera = view.to("cpu").camera
+        xyzw = Rotation.from_matrix(camera.viewmat[:3, :3].T.double().numpy()).as_quat()
+        wxyz, position = np.roll(xyzw, 1), camera.center.double().numpy()
+        handle = self.client.scene.add_camera_frustum(
+            f"/training/{number}",
+            fov=2 * float(np.arctan(camera.height / 2 / float(camera.K[1, 1]))),
+            aspect=camera.width / camera.height,
+            scale=SIZE * self.scene.extent,
+            color=(200, 120, 40),
+            image=thumbnail(view),
+            wxyz=wxyz,
+            position=position,
+        )
+        handle.on_click(lambda _: self.go_to(position, wxyz, view.time))
+        return handle
+
+
+def thumbnail(view: View) -> npt.NDArray[np.uint8]:
+    """Return a view's image as uint8 [H, W, 3] RGB, made smaller where it is large."""
+    image = pixels(view.image)
+    factor = THUMBNAIL / max(image.shape[:2])
+    if factor >= 1:
+        return image
+    size = max(1, round(factor * image.shape[1])), max(1, round(factor * image.shape[0]))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,85 @@
+"""Serve the viewer: browsers come and go, each with controls of its own."""
+
+import threading
+from collections.abc import Sequence
+
+import numpy as np
+import viser
+
+from gsbench.errors import InputError
+from gsbench.run.load import LoadedRun
+from gsbench.scenes import Scene
+from gsbench.view import paths
+from gsbench.view.client import Client
+from gsbench.view.frame import Painter
+from gsbench.view.sights import scene_of
+
+
+class Viewer:
+    """A server with the models of one scene."""
+
+    def __init__(self, runs: Sequence[LoadedRun], host: str, port: int, data_root: str | None = None) -> None:
+        """Begin to serve.
+
+        Args:
+            runs: one or more, of one scene.
+            host: the address to listen on.
+            port: to listen on; where it is taken, viser takes the next free one.
+            data_root: the folder of the data set, where it has moved.
+
+        Raises:
+            InputError: the runs are of different scenes.
+        """
+        first = runs[0]
+        for run in runs:
+            if run.scene.fingerprint != first.scene.fingerprint:
+                raise InputError(f"expected runs of one scene to look at together, got {first.scene.name} in "
+                                 f"{first.folder} and other data in {run.folder}")  # fmt: skip
+        self.painters = [Painter(run) for run in runs]
+        names = [painter.name for painter in self.painters]
+        for painter in (painter for painter in self.painters if names.count(painter.name) > 1):
+            painter.name = str(painter.run.folder)
+        self.scene = scene_or_reason(first, data_root)
+        self.clients: dict[int, Client] = {}
+        self._lock = threading.Lock()
+        self.server = viser.ViserServer(host, port, label=f"gsbench: {first.scene.name}", verbose=False)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._stand(first)
+        self.server.on_client_disconnect(self._forget)
+        self.server.on_client_connect(self._welcome)
+
+    def stop(self) -> None:
+        """End the server and all that render for it."""
+        for client in list(self.clients.values()):
+            client.leave()
+        self.server.stop()
+
+    def _stand(self, run: LoadedRun) -> None:
+        """Let every browser begin where an orbit begins."""
+        camera = paths.around(run, 0.0, paths.ELEVATION)
+        self.server.scene.set_up_direction(paths.UP)
+        start = self.server.initial_camera
+        start.position = camera.center.double().numpy()
+        start.look_at = paths.middle(run.model).double().numpy()
+        start.up = np.array(paths.UP)
+        start.fov = 2 * float(np.arctan(camera.height / 2 / float(camera.K[1, 1])))
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            self.clients[client.client_id] = Client(client, self.painters, self.scene)
+        if client.client_id not in self.server.get_clients():  # it has left before its controls were there
+            self._forget(client)
+
+    def _forget(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            gone = self.clients.pop(client.client_id, None)
+        if gone is not None:
+            gone.leave()
+
+
+def scene_or_reason(run: LoadedRun, data_root: str | None) -> Scene | str:
+    """Load the scene of a run, or say why it cannot be had; the model is looked at all the same."""
+    try:
+        return scene_of(run, data_root)
+    except InputError as error:
+        return str(error)

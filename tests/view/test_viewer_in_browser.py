@@ -1,0 +1,223 @@
+"""The viewer in Chromium: it opens, its controls change the picture, browsers come and go, nobody else can reach it."""
+
+import os
+import re
+import shutil
+import socket
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gsbench.errors import InputError
+from gsbench.run.load import load_run
+from gsbench.view.viewer import Viewer
+
+pytestmark = pytest.mark.slow
+CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run"]
+FLAGS += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
+WIDTH, HEIGHT = 900, 600
+PICTURE = {"x": 0, "y": 170, "width": 560, "height": 430}  # without the panel, and what Chromium says of its GPU
+SHARP = f"{WIDTH} x {HEIGHT}"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if not CHROMIUM:
+        pytest.skip("needs Debian's chromium: apt-get install chromium (or CHROMIUM=FILE)")
+    api = pytest.importorskip("playwright.sync_api", reason="needs playwright, which is in the dev extra")
+    with api.sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield found
+        found.close()
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture(scope="module")
+def viewer(folder, other_folder):
+    made = Viewer([load_run(folder), load_run(other_folder)], "localhost", free_port())
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def visit(browser, viewer):
+    """Opens the viewer and waits for its first picture at rest; returns the page with what it complained of."""
+    contexts = []
+
+    def open_page():
+        context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
+        contexts.append(context)
+        page = context.new_page()
+        page.viewer, page.complaints, page.asked = viewer, [], []
+        page.on("pageerror", lambda error: page.complaints.append(str(error)))
+        page.on("request", lambda request: page.asked.append(request.url))
+        # viser gives a slow browser fewer pixels unless it is told not to, and pictures are compared here
+        page.goto(f"http://localhost:{viewer.server.get_port()}/?fixedDpr=1")
+        settle(page)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+
+
+def settle(page):
+    """Wait until everything is rendered with all pixels and has arrived, and return the picture."""
+    page.wait_for_selector(f"text={SHARP}", timeout=60_000)
+    shown = []
+    for _ in range(80):
+        page.wait_for_timeout(250)
+        rests = all(client.rests and not client.changed.is_set() for client in page.viewer.clients.values())
+        shown = [*shown, page.screenshot(clip=PICTURE)] if rests and page.locator(f"text={SHARP}").count() else []
+        if len(shown) > 2 and shown[-1] == shown[-2] == shown[-3]:
+            return shown[-1]
+    raise AssertionError("the picture does not come to rest")
+
+
+def control(page, label, kind):
+    return page.locator(f"//label[normalize-space()='{label}']/following::input[@type='{kind}'][1]")
+
+
+def slide(page, label, value):
+    field = control(page, label, "text")
+    field.fill(str(value))
+    field.press("Enter")
+    page.wait_for_timeout(300)
+
+
+def switch(page, label):
+    control(page, label, "checkbox").click(force=True)
+    page.wait_for_timeout(300)
+
+
+def choose(page, label, option):
+    page.locator(f"//label[normalize-space()='{label}']/following::input[@role='combobox'][1]").click()
+    page.get_by_role("option", name=option, exact=True).click()
+    page.wait_for_timeout(300)
+
+
+def turn(page):
+    """Drag the camera round."""
+    page.mouse.move(200, 400)
+    page.mouse.down()
+    page.mouse.move(400, 430, steps=5)
+    page.mouse.up()
+    page.wait_for_timeout(300)
+
+
+def test_it_opens_and_stays_on_this_machine(visit, viewer):
+    """Catches a page that fails, a request that leaves the machine, and a server that others can reach."""
+    page = visit()
+    assert page.complaints == []
+    foreign = [url for url in page.asked if not re.match(r"data:|(blob:)?(http|ws)://localhost:", url)]
+    assert foreign == []
+    assert re.search(r"slice [\d.]+ ms, raster [\d.]+ ms: \d+ FPS", page.content())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(("192.0.2.1", 9))  # sends nothing; it tells this machine's own address
+        address = probe.getsockname()[0]
+    if not address.startswith("127."):
+        with pytest.raises(OSError, match="refused"):
+            socket.create_connection((address, viewer.server.get_port()), timeout=5)
+
+
+def test_the_time_slider_changes_the_picture_unless_time_is_frozen(visit):
+    """Catches a slider without effect, and frozen time that goes on."""
+    page = visit()
+    start = settle(page)
+    slide(page, "time", 1)
+    end = settle(page)
+    assert start != end
+    switch(page, "freeze time")
+    slide(page, "time", 0)
+    assert settle(page) == end
+    switch(page, "freeze time")
+    assert settle(page) == start
+
+
+def test_play_moves_the_slider(visit):
+    """Catches a clip that stands still, and a browser in which everything is left as coarse as it moves."""
+    page = visit()
+    switch(page, "play")
+    page.wait_for_timeout(1000)
+    switch(page, "play")
+    assert control(page, "time", "text").input_value() != "0"
+    settle(page)
+
+
+def test_the_camera_turns_and_a_frozen_direction_is_another_picture(visit):
+    """Catches a drag without effect, and a frozen direction that follows the camera."""
+    page = visit()
+    start = settle(page)
+    switch(page, "freeze direction")
+    assert settle(page) == start
+    turn(page)
+    frozen = settle(page)
+    switch(page, "freeze direction")
+    free = settle(page)
+    assert len({start, frozen, free}) == 3
+
+
+def test_two_models_are_compared(visit):
+    """Catches a comparison that shows one model twice."""
+    page = visit()
+    pictures = {settle(page)}
+    for mode in ("wipe", "side by side"):
+        choose(page, "show", mode)
+        pictures.add(settle(page))
+    choose(page, "show", "wipe")
+    slide(page, "wipe at", 0)
+    pictures.add(settle(page))
+    assert len(pictures) == 4
+    switch(page, "AGR")
+    assert settle(page) in pictures  # the second model has none
+    slide(page, "wipe at", 1)
+    assert settle(page) not in pictures
+
+
+def test_training_cameras_are_shown(visit):
+    """Catches frusta that are not there, or do not go away."""
+    page = visit()
+    start = settle(page)
+    switch(page, "training cameras")
+    page.wait_for_timeout(1000)
+    shown = settle(page)
+    switch(page, "training cameras")
+    assert settle(page) == start != shown
+
+
+def test_two_browsers_have_controls_of_their_own_and_one_may_leave(visit, viewer):
+    """Catches a slider that moves everybody's picture, and a thread that renders for a browser that is gone."""
+    one, two = visit(), visit()
+    deadline = time.monotonic() + 20
+    assert len(viewer.clients) == 2
+    start = settle(two)
+    slide(one, "time", 1)
+    assert settle(one) != start
+    assert settle(two) == start
+    threads = [client.thread for client in viewer.clients.values()]
+    one.close()
+    while len(viewer.clients) > 1 or sum(thread.is_alive() for thread in threads) > 1:
+        assert time.monotonic() < deadline + 20, "the browser that left is still served"
+        time.sleep(0.2)
+    slide(two, "time", 1)
+    assert settle(two) != start
+
+
+def test_without_data_there_are_no_cameras_and_runs_of_two_scenes_are_refused(folder, other_folder):
+    """Catches a viewer that needs the data set, and models of two scenes under one camera."""
+    run, other = load_run(folder), load_run(other_folder)
+    run.config.data.root = "/nowhere"
+    made = Viewer([run], "localhost", free_port())
+    made.stop()
+    assert "--data-root" in made.scene
+    elsewhere = replace(other, scene=replace(other.scene, fingerprint="0"), folder=Path("elsewhere"))
+    with pytest.raises(InputError, match="elsewhere"):
+        Viewer([run, elsewhere], "localhost", free_port())
