@@ -1,4 +1,4 @@
-"""Hostile PLY files: points that are finite, or an InputError of one line."""
+"""Hostile PLY files: points or trained Gaussians that are finite, or an InputError of one line."""
 
 import random
 import struct
@@ -8,6 +8,7 @@ from mutations import damage_bytes, replace_file
 from workers import Case, Pool, generator, sample
 
 from gsbench.scenes.points import read_ply
+from gsbench.scenes.splats import read_splats
 
 COUNTS = ("0", "1", "2", "3", "4", "-1", "003", "1e3", "1000000000000", "9" * 18, "9" * 30, "x", "")
 KINDS = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
@@ -26,10 +27,15 @@ def draw(seed: int, folder: Path) -> Case:
     encoding = r.choice(("ascii", "binary_little_endian", "binary_big_endian"))
     names = ["x", "y", "z", *r.choice((("red", "green", "blue"), ("f_dc_0", "f_dc_1", "f_dc_2")))]
     kinds = ["float"] * 3 + [r.choice(("uchar", "float", *KINDS))] * 3
+    trained = names[3] == "f_dc_0" and r.random() < 0.7
+    if trained:
+        rest = [f"f_rest_{i}" for i in range(r.choice((0, 0, 9, 8)))]
+        names += [*rest, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+        kinds += [r.choice(("float", "float", *KINDS))] * (len(names) - 6)
     header = ["ply", f"format {encoding} 1.0", "comment made by hand", f"element vertex {POINTS}",
               *(f"property {kind} {name}" for kind, name in zip(kinds, names, strict=True)), "end_header"]  # fmt: skip
     texts = [r.choice("01") for _ in names * POINTS]
-    done = [encoding, f"colours of {kinds[-1]}"]
+    done = [encoding, f"colours of {kinds[5]}"]
     damage = r.choice(("none", "header", "header", "header", "values", "bytes", "file"))
     if damage == "header":
         done.append(_damage_header(r, header))
@@ -46,13 +52,17 @@ def draw(seed: int, folder: Path) -> Case:
     if damage == "file":
         done.append(replace_file(r, path))
 
+    def call_trained() -> None:
+        splats = read_splats(path)
+        assert all(value.isfinite().all() and len(value) == len(splats) for value in vars(splats).values())
+
     def call() -> None:
         points = read_ply(path)
         assert points.means.shape == points.colors.shape == (len(points.means), 3)
         assert points.means.isfinite().all()
         assert ((points.colors >= 0) & (points.colors <= 1)).all()
 
-    return Case("; ".join(done), call)
+    return Case("; ".join(done), call_trained if trained else call)
 
 
 def _damage_header(r: random.Random, header: list[str]) -> str:
