@@ -4,9 +4,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+
+if TYPE_CHECKING:
+    from gsbench.measure.record import Record
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZE = 16
@@ -59,3 +63,23 @@ def gsbench(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         command(*arguments), capture_output=True, text=True, timeout=240, cwd=ROOT, env=environment(), check=False
     )
+
+
+def run_here(*words: str) -> tuple["Record", Path]:
+    """Do one run in this process, which costs no start of another one; return its record and its folder."""
+    import hydra
+    from omegaconf import OmegaConf
+
+    from gsbench.config import CONF, register_schema
+    from gsbench.run.identity import identify
+    from gsbench.run.run import run
+
+    register_schema()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        composed = hydra.compose("config", [*words], return_hydra_config=True)
+        choices = OmegaConf.to_container(composed.hydra.runtime.choices)
+        OmegaConf.set_struct(composed, False)
+        del composed.hydra
+        record, folder = run(composed, choices, words), identify(composed, choices).folder
+    assert record is not None
+    return record, folder

@@ -3,9 +3,7 @@
 from pathlib import Path
 
 import pytest
-from tiny_run import gsbench, overrides, write_moving_square
-
-from gsbench.measure import record
+from tiny_run import overrides, run_here, write_moving_square
 
 
 @pytest.fixture(scope="session")
@@ -16,10 +14,9 @@ def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def trained(square: Path, root: Path, *words: str) -> Path:
     """Do a run on that data set; return its folder."""
-    done = gsbench(*overrides(square, root, *words))
-    assert done.returncode == 0, done.stderr
-    (path,) = record.find(root)
-    return path.parent
+    record, folder = run_here(*overrides(square, root, *words))
+    assert record.status == "ok", record.reason
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -3,32 +3,13 @@
 import hashlib
 from pathlib import Path
 
-import hydra
 import pytest
 import torch
-from omegaconf import OmegaConf
-from tiny_run import overrides, write_moving_square
+from tiny_run import overrides, run_here, write_moving_square
 
-from gsbench.config import CONF, register_schema
-from gsbench.measure.record import Record
+from gsbench.errors import InputError
 from gsbench.run.load import load_run
-from gsbench.run.run import run
 from gsbench.scenes.splats import Splats, ply_of
-
-
-def do(*words: str) -> tuple[Record, Path]:
-    """Do a run in this process; return its record and its folder."""
-    register_schema()
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        composed = hydra.compose("config", [*words], return_hydra_config=True)
-        choices = OmegaConf.to_container(composed.hydra.runtime.choices)
-        OmegaConf.set_struct(composed, False)
-        results = Path(composed.results)
-        del composed.hydra
-        record = run(composed, choices, words)
-    assert record is not None
-    made = next(path for path in results.rglob("record.json") if str(record.provenance.time) in path.read_text())
-    return record, made.parent
 
 
 def write_splats(path: Path, count: int = 8) -> Splats:
@@ -47,7 +28,7 @@ def test_a_run_starts_from_the_file(model: str, tmp_path: Path) -> None:
     slow = "model.lr.means.start=1e-6"  # one step moves means by the rate, 1e-6 x extent x sqrt(30,000)
     words = [*overrides(data, tmp_path / "r", f"model={model}", "train.iterations=1", slow),
              f"+init.ply={tmp_path}/a.ply"]  # fmt: skip
-    record, folder = do(*words)
+    record, folder = run_here(*words)
     assert record.status == "ok", record.reason
     sha256 = hashlib.sha256((tmp_path / "a.ply").read_bytes()).hexdigest()
     assert record.provenance.config["init"]["ply_sha256"] == sha256
@@ -55,7 +36,7 @@ def test_a_run_starts_from_the_file(model: str, tmp_path: Path) -> None:
     means = load_run(folder).model.splats["means"]
     assert len(means) == len(splats)
     assert 0 < (means - splats.means).abs().max() < 1e-3
-    assert do(*words)[0].provenance.time == record.provenance.time  # finished before, kept
+    assert run_here(*words)[0].provenance.time == record.provenance.time  # finished before, kept
 
 
 def test_three_gaussians_and_another_file_than_asked_for_are_refused(tmp_path: Path) -> None:
@@ -64,6 +45,16 @@ def test_three_gaussians_and_another_file_than_asked_for_are_refused(tmp_path: P
     words = [*overrides(data, tmp_path / "r", "model=3dgs", "train.iterations=1"), f"+init.ply={tmp_path}/a.ply"]
     for count, more, said in ((3, [], "at least 4 Gaussians"), (8, ["+init.ply_sha256=" + 64 * "0"], "SHA-256")):
         write_splats(tmp_path / "a.ply", count)
-        record, _ = do(*words, *more)
+        record, _ = run_here(*words, *more)
         assert record.status == "failed"
         assert said in (record.reason or "")
+
+
+def test_a_hash_without_a_file_and_an_endless_file_are_refused(tmp_path: Path) -> None:
+    """Catches a hash that nothing is compared with, and a file that is read for ever before the run has a name."""
+    data = write_moving_square(tmp_path / "data")
+    words = overrides(data, tmp_path / "r", "model=3dgs", "train.iterations=1")
+    record, _ = run_here(*words, "+init.ply_sha256=0")
+    assert "init.ply_sha256" in (record.reason or "")
+    with pytest.raises(InputError, match=r"init\.ply='/dev/zero': expected a file, found a device"):
+        run_here(*words, "+init.ply=/dev/zero")
