@@ -11,12 +11,12 @@ import torch
 from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.models.query import Query
-from gsbench.run.checks import check_device
+from gsbench.run.checks import check_device, evaluated_views
 from gsbench.run.load import LoadedRun, load_run
 from gsbench.scenes import Scene
-from gsbench.scenes.splats import ply_of
+from gsbench.scenes.trained import ply_of
 from gsbench.view import film, paths
-from gsbench.view.gaussians import splats_of
+from gsbench.view.gaussians import trained_of
 from gsbench.view.sights import find_view, scene_of
 
 PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
@@ -28,7 +28,6 @@ class Asked(NamedTuple):
 
     run: LoadedRun
     scene: Scene | None  # None where nothing asks for the data set
-    time: float | None
     options: argparse.Namespace
 
 
@@ -61,7 +60,9 @@ def parser() -> argparse.ArgumentParser:
     seen = made.add_mutually_exclusive_group()
     seen.add_argument("--camera", metavar="I", help="a training view's number, or a view's name; it stands still")
     seen.add_argument("--direction", metavar="X,Y,Z", help="of sight, for --ply: from a camera far away")
-    made.add_argument("--path", choices=[*PATHS, "test"], default="orbit", help="of the camera; test: the test views")
+    made.add_argument(
+        "--path", choices=[*PATHS, "test"], default="orbit", help="of the camera; test: the views it was measured on"
+    )
     made.add_argument("--fps", type=float, default=30, help="frames a second (30)")
     made.add_argument("--seconds", type=float, default=4, help="length of an orbit or a spiral (4)")
     made.add_argument("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
@@ -82,30 +83,31 @@ def prepare(options: argparse.Namespace) -> Asked:
         film.check_parent(path)
     check_device(options.device)
     run = load_run(options.run, options.device)
+    if options.time is not None and not run.scene.has_time:
+        raise InputError(f"--time: expected a scene with times, {run.scene.name} has none: leave it out")
     filming = options.video or options.images
     needed = options.camera is not None or (filming and options.path == "test")
-    time = options.time if run.scene.has_time else None
-    return Asked(run, scene_of(run, options.data_root) if needed else None, time, options)
+    return Asked(run, scene_of(run, options.data_root) if needed else None, options)
 
 
 def write_ply(asked: Asked, path: Path) -> None:
     """Write one slice as a PLY and say what it holds."""
     run, options = asked.run, asked.options
     query, keep = slice_place(asked)
-    splats = splats_of(run.model, query, keep_harmonics=keep)
-    write_atomically(path, ply_of(splats))
-    culled = len(run.model) - len(splats)
+    trained = trained_of(run.model, query, keep_harmonics=keep)
+    write_atomically(path, ply_of(trained))
+    culled = len(run.model) - len(trained)
     when = "" if query.time is None else f" at time {float(query.time):g}"
     whence = f"camera {options.camera}" if options.camera is not None else f"direction {options.direction}"
     colours = f"harmonics of degree {run.model.phase.sh_degree}" if keep else f"as seen from {whence}"
-    print(f"{path}: {len(splats)} Gaussians{when}, colours {colours}; {culled} of {len(run.model)} are left out, as "
+    print(f"{path}: {len(trained)} Gaussians{when}, colours {colours}; {culled} of {len(run.model)} are left out, as "
           f"their opacity there is below 1/255")  # fmt: skip
 
 
 def slice_place(asked: Asked) -> tuple[Query, bool]:
     """Return the query of the slice, and whether its colours stay harmonics: where no place is asked for."""
     run, options = asked.run, asked.options
-    time = asked.time
+    time = options.time
     if asked.scene is not None and options.camera is not None:
         view = find_view(asked.scene, options.camera)
         return Query.of(view.camera.to(run.config.device), view.time if time is None else time), False
@@ -134,12 +136,14 @@ def shots(asked: Asked) -> list[paths.Shot]:
     if asked.scene is not None and options.camera is not None:
         cameras = [find_view(asked.scene, options.camera).camera] * count
     elif asked.scene is not None:
-        return [(view.camera, view.time if asked.time is None else asked.time) for view in asked.scene.test]
+        views = evaluated_views(asked.scene, asked.run.config.scene.eval_split)
+        return [(view.camera, view.time if options.time is None else options.time) for view in views]
     else:
         cameras = PATHS[options.path](asked.run, count)
     if not asked.run.scene.has_time:
         return [(camera, None) for camera in cameras]
-    return [(camera, i / max(1, count - 1) if asked.time is None else asked.time) for i, camera in enumerate(cameras)]
+    times = [i / max(1, count - 1) if options.time is None else options.time for i in range(count)]
+    return list(zip(cameras, times, strict=True))
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from gsbench.run.load import plain_description
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Points, Scene, View
 from gsbench.scenes.points import frustum_points, random_points
-from gsbench.scenes.splats import Splats
+from gsbench.scenes.trained import TrainedGaussians
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.loop import Trainer
@@ -50,7 +50,7 @@ class Attempt:
         self.screen: TimeScreen | None = None
         self.model: GaussianModel | None = None
         self.scene: Scene | None = None
-        self.start: Splats | None = None  # trained Gaussians to start from; None: points
+        self.start: TrainedGaussians | None = None  # trained Gaussians to start from; None: points
         self._shown: list[tuple[npt.ArrayLike, npt.ArrayLike]] = []
 
     def prepare(self) -> tuple[GaussianModel, Scene]:

@@ -18,7 +18,7 @@ from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
 from gsbench.run.identity import hash_of
 from gsbench.scenes import Scene, View
-from gsbench.scenes.splats import Splats, read_splats
+from gsbench.scenes.trained import TrainedGaussians, read_trained
 from gsbench.train.gating import GATES
 from gsbench.train.optim import OPTIMIZERS
 
@@ -75,7 +75,7 @@ def check_config(config: Config) -> None:
         perceptual.load(backbone, file, config.device)
 
 
-def trained_start(config: Config) -> Splats | None:
+def trained_start(config: Config) -> TrainedGaussians | None:
     """Read the trained Gaussians that a training starts from; None where it starts from points.
 
     Raises:
@@ -86,14 +86,14 @@ def trained_start(config: Config) -> Splats | None:
             raise InputError("init.ply_sha256: expected it beside init.ply, got no file: add +init.ply=FILE")
         return None
     path = Path(config.init.ply).expanduser()
-    splats = read_splats(path)
-    if len(splats) < LEAST_GAUSSIANS:
-        raise InputError(f"{path}: expected at least {LEAST_GAUSSIANS} Gaussians, found {len(splats)}")
+    trained = read_trained(path)
+    if len(trained) < LEAST_GAUSSIANS:
+        raise InputError(f"{path}: expected at least {LEAST_GAUSSIANS} Gaussians, found {len(trained)}")
     found = hash_of(config.init.ply)
     if found != config.init.ply_sha256:
         raise InputError(f"init.ply={config.init.ply}: expected the SHA-256 {config.init.ply_sha256!s:.70}, found "
                          f"{found}: another file, or one that has just changed")  # fmt: skip
-    return splats
+    return trained
 
 
 def lpips_weights(config: Config) -> dict[str, Path]:

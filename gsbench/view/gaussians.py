@@ -12,13 +12,13 @@ from gsbench.models.base import GaussianModel
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.query import Query
 from gsbench.scenes.points import SH_C0
-from gsbench.scenes.splats import Splats
+from gsbench.scenes.trained import TrainedGaussians
 
 LEAST_SCALE = 1e-20  # world units; a slice that is flat to the last bit still has a logarithm
 LARGEST_OPACITY = 1 - 2**-24  # the largest float32 below 1, whose logit is finite
 
 
-def splats_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = False) -> Splats:
+def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = False) -> TrainedGaussians:
     """Slice a model and return what is drawn of the slice, without the Gaussians that are culled by their opacity.
 
     Args:
@@ -43,7 +43,7 @@ def splats_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fals
         raise InputError("expected finite Gaussians, some are not: has the training diverged?")
     log_scales, quats = decompose(factors[drawn])
     logits = torch.logit(opacities[drawn].double().clamp(max=LARGEST_OPACITY)).float()
-    return Splats(means[drawn], log_scales, quats, logits, sh[:, 0], sh[:, 1:])
+    return TrainedGaussians(means[drawn], log_scales, quats, logits, sh[:, 0], sh[:, 1:])
 
 
 def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:

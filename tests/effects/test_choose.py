@@ -71,7 +71,7 @@ def test_what_is_too_little_to_tell() -> None:
 
 
 def test_the_level_of_the_test(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a permutation test that is wrong too often: leftovers that depend on the camera alone, 300 times dealt."""
+    """Catches a permutation test that is wrong too often: leftovers that only the camera explains."""
     monkeypatch.setattr(choose, "PERMUTATIONS", 199)
     random = np.random.default_rng(0)
     camera = random.standard_normal((40, 9))

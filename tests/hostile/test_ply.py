@@ -8,7 +8,7 @@ from mutations import damage_bytes, replace_file
 from workers import Case, Pool, generator, sample
 
 from gsbench.scenes.points import read_ply
-from gsbench.scenes.splats import read_splats
+from gsbench.scenes.trained import read_trained
 
 COUNTS = ("0", "1", "2", "3", "4", "-1", "003", "1e3", "1000000000000", "9" * 18, "9" * 30, "x", "")
 KINDS = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
@@ -53,8 +53,8 @@ def draw(seed: int, folder: Path) -> Case:
         done.append(replace_file(r, path))
 
     def call_trained() -> None:
-        splats = read_splats(path)
-        assert all(value.isfinite().all() and len(value) == len(splats) for value in vars(splats).values())
+        given = read_trained(path)
+        assert all(value.isfinite().all() and len(value) == len(given) for value in vars(given).values())
 
     def call() -> None:
         points = read_ply(path)

@@ -12,29 +12,29 @@ from gsbench.models.base import Conditioned, Raw
 from gsbench.models.factors import rotation, rotation4d
 from gsbench.models.start import quaternions_in_space, start_from
 from gsbench.scenes.scene import Points
-from gsbench.scenes.splats import Splats
+from gsbench.scenes.trained import TrainedGaussians
 
 N = 12
 
 
-def trained(degree: int = 3) -> Splats:
+def trained(degree: int = 3) -> TrainedGaussians:
     """Gaussians of every shape."""
     g = seeded(3)
     K = (degree + 1) ** 2
     draws = [torch.randn(shape, generator=g) for shape in ((N, 3), (N, 3), (N, 4), (N,), (N, 3), (N, K - 1, 3))]
-    return Splats(*draws)
+    return TrainedGaussians(*draws)
 
 
-def started(variant: str, splats: Splats, **options: Any) -> GaussianModel:
+def started(variant: str, given: TrainedGaussians, **options: Any) -> GaussianModel:
     name, own = VARIANTS[variant]
     model = build(name, **own | options)
-    start_from(model, splats, 2.0, seeded(0))
+    start_from(model, given, 2.0, seeded(0))
     model.set_phase(Phase(model.sh_degree, False, False))
     return model.requires_grad_(False)
 
 
-def covariance(splats: Splats) -> Tensor:
-    F = rotation(splats.quats) * splats.log_scales.exp()[:, None, :]
+def covariance(given: TrainedGaussians) -> Tensor:
+    F = rotation(given.quats) * given.log_scales.exp()[:, None, :]
     return F @ F.mT
 
 
@@ -42,47 +42,47 @@ def covariance(splats: Splats) -> Tensor:
 @pytest.mark.parametrize("variant", [name for name in VARIANTS if not name.endswith("row_scaled")])
 def test_the_shape_in_space_is_theirs(variant: str) -> None:
     """Catches axes in another order, a mirrored quaternion, and time or direction that leak into space."""
-    splats = trained()
-    model = started(variant, splats)
+    given = trained()
+    model = started(variant, given)
     if "times" in model.splats:
         model.splats["times"][:] = 0.3
     seen = model.condition(dict(model.splats.items()), Query.at(CAMERA.float(), 0.3))
-    torch.testing.assert_close(seen.means, splats.means, atol=1e-4, rtol=0)
-    torch.testing.assert_close(seen.factors @ seen.factors.mT, covariance(splats), atol=2e-4, rtol=2e-4)
-    torch.testing.assert_close(model.splats["opacities"].data, splats.logits)
+    torch.testing.assert_close(seen.means, given.means, atol=1e-4, rtol=0)
+    torch.testing.assert_close(seen.factors @ seen.factors.mT, covariance(given), atol=2e-4, rtol=2e-4)
+    torch.testing.assert_close(model.splats["opacities"].data, given.logits)
 
 
 def test_3dgs_is_theirs_to_the_bit() -> None:
     """Catches a detour over covariances that loses digits."""
-    splats = trained()
-    model = started("3dgs", splats)
-    assert torch.equal(model.splats["scales"], splats.log_scales)
-    assert torch.equal(model.splats["quats"], splats.quats)
-    assert torch.equal(model.splats["shN"], splats.rest)
-    assert torch.equal(model.splats["sh0"][:, 0], splats.dc)
+    given = trained()
+    model = started("3dgs", given)
+    assert torch.equal(model.splats["scales"], given.log_scales)
+    assert torch.equal(model.splats["quats"], given.quats)
+    assert torch.equal(model.splats["shN"], given.rest)
+    assert torch.equal(model.splats["sh0"][:, 0], given.dc)
 
 
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize(("theirs", "own"), [(0, 3), (1, 2), (3, 1), (4, 3), (3, 0)])
 def test_harmonics_of_another_degree(name: str, theirs: int, own: int) -> None:
     """Catches harmonics that move to another degree or wave, and colours that differ where both have them."""
-    splats = trained(theirs)
+    given = trained(theirs)
     shared = (min(theirs, own) + 1) ** 2 - 1
-    cut = Splats(splats.means, splats.log_scales, splats.quats, splats.logits, splats.dc, splats.rest[:, :shared])
+    cut = TrainedGaussians(given.means, given.log_scales, given.quats, given.logits, given.dc, given.rest[:, :shared])
     query = Query.at(CAMERA.float(), 0.3)
-    model, still = started(name, splats, sh_degree=own), started("3dgs", cut, sh_degree=own)
+    model, still = started(name, given, sh_degree=own), started("3dgs", cut, sh_degree=own)
     opaque = torch.ones(N)
-    colors = [one.paint(dict(one.splats.items()), splats.means, opaque, query) for one in (model, still)]
+    colors = [one.paint(dict(one.splats.items()), given.means, opaque, query) for one in (model, still)]
     torch.testing.assert_close(*colors)
     assert colors[0].std() > 0.1
 
 
 def test_a_flat_gaussian_has_a_triangle() -> None:
     """Catches a logarithm of zero: 2D Gaussians that were written as 3D ones have a scale of 1e-20 or so."""
-    splats = trained()
-    splats.log_scales[:, 1] = -46
+    given = trained()
+    given.log_scales[:, 1] = -46
     for name in ("6dgs", "7dgs"):
-        assert all(parameter.isfinite().all() for parameter in started(name, splats).splats.values())
+        assert all(parameter.isfinite().all() for parameter in started(name, given).splats.values())
 
 
 def test_quaternions_in_space() -> None:
@@ -113,6 +113,6 @@ def test_a_model_that_is_not_known_starts_with_spheres() -> None:
         def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
             raise NotImplementedError
 
-    model, splats = Balls(), trained()
-    start_from(model, splats, 2.0, seeded(0))
-    torch.testing.assert_close(model.splats["radii"][:, 0].data, splats.log_scales.mean(1))
+    model, given = Balls(), trained()
+    start_from(model, given, 2.0, seeded(0))
+    torch.testing.assert_close(model.splats["radii"][:, 0].data, given.log_scales.mean(1))

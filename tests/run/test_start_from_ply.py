@@ -9,21 +9,21 @@ from tiny_run import overrides, run_here, write_moving_square
 
 from gsbench.errors import InputError
 from gsbench.run.load import load_run
-from gsbench.scenes.splats import Splats, ply_of
+from gsbench.scenes.trained import TrainedGaussians, ply_of
 
 
-def write_splats(path: Path, count: int = 8) -> Splats:
+def write_trained(path: Path, count: int = 8) -> TrainedGaussians:
     g = torch.Generator().manual_seed(0)
     draws = [torch.randn(shape, generator=g) for shape in ((count, 3), (count, 3), (count, 4), (count,), (count, 3))]
-    splats = Splats(0.3 * draws[0], 0.1 * draws[1] - 1, *draws[2:], torch.zeros(count, 15, 3))
-    path.write_bytes(ply_of(splats))
-    return splats
+    trained = TrainedGaussians(0.3 * draws[0], 0.1 * draws[1] - 1, *draws[2:], torch.zeros(count, 15, 3))
+    path.write_bytes(ply_of(trained))
+    return trained
 
 
 @pytest.mark.parametrize("model", ["3dgs", "7dgs"])
 def test_a_run_starts_from_the_file(model: str, tmp_path: Path) -> None:
     """Catches a file that is read and not used, a record that does not say which, and a run that is done again."""
-    splats = write_splats(tmp_path / "a.ply")
+    trained = write_trained(tmp_path / "a.ply")
     data = write_moving_square(tmp_path / "data")
     slow = "model.lr.means.start=1e-6"  # one step moves means by the rate, 1e-6 x extent x sqrt(30,000)
     words = [*overrides(data, tmp_path / "r", f"model={model}", "train.iterations=1", slow),
@@ -34,8 +34,8 @@ def test_a_run_starts_from_the_file(model: str, tmp_path: Path) -> None:
     assert record.provenance.config["init"]["ply_sha256"] == sha256
     assert sha256[:8] in folder.parent.name
     means = load_run(folder).model.splats["means"]
-    assert len(means) == len(splats)
-    assert 0 < (means - splats.means).abs().max() < 1e-3
+    assert len(means) == len(trained)
+    assert 0 < (means - trained.means).abs().max() < 1e-3
     assert run_here(*words)[0].provenance.time == record.provenance.time  # finished before, kept
 
 
@@ -44,7 +44,7 @@ def test_three_gaussians_and_another_file_than_asked_for_are_refused(tmp_path: P
     data = write_moving_square(tmp_path / "data")
     words = [*overrides(data, tmp_path / "r", "model=3dgs", "train.iterations=1"), f"+init.ply={tmp_path}/a.ply"]
     for count, more, said in ((3, [], "at least 4 Gaussians"), (8, ["+init.ply_sha256=" + 64 * "0"], "SHA-256")):
-        write_splats(tmp_path / "a.ply", count)
+        write_trained(tmp_path / "a.ply", count)
         record, _ = run_here(*words, *more)
         assert record.status == "failed"
         assert said in (record.reason or "")

@@ -1,6 +1,7 @@
 """The command `python -m gsbench.export`: what it writes, and everything that can be asked wrong."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from gsbench.export import main
 from gsbench.models.render import render
 from gsbench.run.load import load_run
 from gsbench.run.setup import load_scene
-from gsbench.scenes.splats import read_splats
+from gsbench.scenes.trained import read_trained
 from gsbench.view import film, paths
 
 SHORT = ("--seconds", "0.5", "--fps", "8")
@@ -23,7 +24,7 @@ def test_a_ply_says_what_it_holds(
 ) -> None:
     """Catches a count of what is left out that is not that of the file."""
     assert main([str(folder), "--ply", str(tmp_path / "a.ply"), *place]) == 0
-    kept, total = len(read_splats(tmp_path / "a.ply")), len(load_run(folder).model)
+    kept, total = len(read_trained(tmp_path / "a.ply")), len(load_run(folder).model)
     said = capsys.readouterr().out
     assert f": {kept} Gaussians at time" in said
     assert f"{total - kept} of {total} are left out" in said
@@ -110,6 +111,17 @@ def test_what_is_asked_wrong_is_told_in_one_line(
     (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("gsbench.export:")]
     assert said in line
     assert [*tmp_path.iterdir()] == []
+
+
+def test_a_scene_without_times_has_none_to_ask_for(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches --time without effect."""
+    run = load_run(folder)
+    static = replace(run, scene=replace(run.scene, has_time=False))
+    monkeypatch.setattr("gsbench.export.load_run", lambda *_: static)
+    assert main([str(folder), "--ply", str(tmp_path / "a.ply"), "--direction", "0,0,1", "--time", "0.5"]) == 2
+    assert "--time: expected a scene with times" in capsys.readouterr().err
 
 
 def test_a_folder_without_a_checkpoint_and_other_data_are_refused(

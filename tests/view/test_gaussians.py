@@ -13,8 +13,8 @@ from gsbench.models import GaussianModel, Phase, Query
 from gsbench.models.render import render
 from gsbench.raster import rasterize
 from gsbench.scenes import Camera
-from gsbench.scenes.splats import ply_of
-from gsbench.view.gaussians import decompose, splats_of
+from gsbench.scenes.trained import ply_of
+from gsbench.view.gaussians import decompose, trained_of
 from gsbench.view.paths import intrinsics, look_at
 
 SIZE = 48
@@ -67,17 +67,17 @@ def drawn(data: bytes, seen: Camera) -> torch.Tensor:
 def test_the_ply_is_the_image(variant: str) -> None:
     """Catches scales, rotations, colours or opacities in another convention, and a mirrored rotation."""
     model, seen = trained(variant), camera(0.3, -4.0, 1.0)
-    splats = splats_of(model, Query.of(seen, 0.4))
+    given = trained_of(model, Query.of(seen, 0.4))
     image = render(model, seen, 0.4, BACKGROUND)
     assert (image - BACKGROUND).abs().max() > 0.1
-    assert (drawn(ply_of(splats), seen) - image).abs().max() < 2e-3
+    assert (drawn(ply_of(given), seen) - image).abs().max() < 2e-3
 
 
 @pytest.mark.parametrize("variant", ["3dgs", "3dgs_agr", "4dgs", "4dgs_agr", "4dgs_constant_colors"])
 def test_harmonics_are_right_from_everywhere(variant: str) -> None:
     """Catches f_rest in the wrong order, waves of time that are left out, or mean times that AGR has not moved."""
     model = trained(variant)
-    data = ply_of(splats_of(model, Query.at(torch.zeros(3), 0.4), keep_harmonics=True))
+    data = ply_of(trained_of(model, Query.at(torch.zeros(3), 0.4), keep_harmonics=True))
     for seen in (camera(0.3, -4.0, 1.0), camera(3.0, 2.0, -2.0)):
         assert (drawn(data, seen) - render(model, seen, 0.4, BACKGROUND)).abs().max() < 2e-3
 
@@ -86,7 +86,7 @@ def test_harmonics_are_right_from_everywhere(variant: str) -> None:
 def test_a_slice_of_one_direction_has_no_harmonics(name: str) -> None:
     """Catches a PLY that claims to be right from everywhere for a model whose geometry is not."""
     with pytest.raises(InputError, match="--direction"):
-        splats_of(trained(name), Query.at(torch.zeros(3), 0.4), keep_harmonics=True)
+        trained_of(trained(name), Query.at(torch.zeros(3), 0.4), keep_harmonics=True)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -94,10 +94,10 @@ def test_what_is_culled_is_left_out(name: str) -> None:
     """Catches a file of Gaussians that nobody sees, and an empty file."""
     model = trained(name)
     model.splats["opacities"][:20] = -20.0
-    assert 0 < len(splats_of(model, Query.of(camera(0.0, -4.0, 0.0), 0.4))) <= 40
+    assert 0 < len(trained_of(model, Query.of(camera(0.0, -4.0, 0.0), 0.4))) <= 40
     model.splats["opacities"][:] = -20.0
     with pytest.raises(InputError, match="no Gaussian"):
-        splats_of(model, Query.of(camera(0.0, -4.0, 0.0), 0.4))
+        trained_of(model, Query.of(camera(0.0, -4.0, 0.0), 0.4))
 
 
 def test_factors_are_decomposed() -> None:
@@ -120,4 +120,4 @@ def test_a_ply_of_a_diverged_model_is_refused() -> None:
     model = trained("3dgs")
     model.splats["means"][3, 1] = float("nan")
     with pytest.raises(InputError, match="means"):
-        ply_of(splats_of(model, Query.at(torch.zeros(3), None)))
+        ply_of(trained_of(model, Query.at(torch.zeros(3), None)))

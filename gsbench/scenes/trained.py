@@ -30,7 +30,7 @@ _VALUE = 40  # bytes that a value of a Gaussian takes while it is read: in the f
 
 
 @dataclass(frozen=True)
-class Splats:
+class TrainedGaussians:
     """N trained 3D Gaussians in raw parameters, float32 on the CPU."""
 
     means: Tensor  # [N, 3] world units
@@ -44,7 +44,7 @@ class Splats:
         return len(self.means)
 
 
-def read_splats(path: Path) -> Splats:
+def read_trained(path: Path) -> TrainedGaussians:
     """Read trained Gaussians from a PLY of 3DGS, in any encoding and of any degree from 0 to 4.
 
     Normals and other columns may be there or not; they are not read.
@@ -71,25 +71,25 @@ def read_splats(path: Path) -> Splats:
         raise InputError(f"{path}: rot_0..3: expected quaternions, some are zero")
     channels = _table(vertices, rest, path) if rest else torch.zeros(len(vertices), 0)
     read["logits"] = read["logits"][:, 0]
-    return Splats(**read, rest=channels.view(len(vertices), 3, count // 3).mT.contiguous())
+    return TrainedGaussians(**read, rest=channels.view(len(vertices), 3, count // 3).mT.contiguous())
 
 
-def ply_of(splats: Splats) -> bytes:
+def ply_of(trained: TrainedGaussians) -> bytes:
     """Return the bytes of a little-endian PLY with the columns of 3DGS at degree 3, which its own viewer asks for.
 
     Raises:
         InputError: a value is not finite, or the harmonics are above degree 3.
     """
-    N, K = len(splats), (MAX_DEGREE + 1) ** 2
-    if splats.rest.shape[1] > K - 1:
-        raise InputError(f"PLY: expected harmonics up to degree {MAX_DEGREE}, got {splats.rest.shape[1]} above 0")
-    for field in fields(splats):
-        if not getattr(splats, field.name).isfinite().all():
+    N, K = len(trained), (MAX_DEGREE + 1) ** 2
+    if trained.rest.shape[1] > K - 1:
+        raise InputError(f"PLY: expected harmonics up to degree {MAX_DEGREE}, got {trained.rest.shape[1]} above 0")
+    for field in fields(trained):
+        if not getattr(trained, field.name).isfinite().all():
             raise InputError(f"PLY: expected finite {field.name}, some are not: has the training diverged?")
     rest = torch.zeros(N, K - 1, 3)
-    rest[:, : splats.rest.shape[1]] = splats.rest
-    parts = [splats.means, torch.zeros(N, 3), splats.dc, rest.mT.flatten(1), splats.logits[:, None],
-             splats.log_scales, splats.quats]  # fmt: skip
+    rest[:, : trained.rest.shape[1]] = trained.rest
+    parts = [trained.means, torch.zeros(N, 3), trained.dc, rest.mT.flatten(1), trained.logits[:, None],
+             trained.log_scales, trained.quats]  # fmt: skip
     names = [*_COLUMNS["means"], "nx", "ny", "nz", *_COLUMNS["dc"], *(f"f_rest_{i}" for i in range(3 * (K - 1))),
              *_COLUMNS["logits"], *_COLUMNS["log_scales"], *_COLUMNS["quats"]]  # fmt: skip
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {N}",

@@ -9,7 +9,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from gsbench.errors import InputError
-from gsbench.scenes.splats import Splats, ply_of, read_splats
+from gsbench.scenes.trained import TrainedGaussians, ply_of, read_trained
 
 N = 5
 NEEDED = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
@@ -49,7 +49,7 @@ def test_what_is_found_in_the_wild_is_read(
     """Catches columns that are taken by their place, bytes in the wrong order, and harmonics with channels mixed up."""
     path = tmp_path / "a.ply"
     rows = written(path, columns(degree, *more), **how)  # type: ignore[arg-type]
-    read = read_splats(path)
+    read = read_trained(path)
     K = (degree + 1) ** 2
     assert read.rest.shape == (N, K - 1, 3)
     for field, names in (
@@ -71,13 +71,13 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     """Catches a column that is written in another place than it is read from; plyfile agrees on the header."""
     g = torch.Generator().manual_seed(0)
     shapes = ((N, 3), (N, 3), (N, 4), (N,), (N, 3), (N, 8, 3))
-    splats = Splats(*(torch.randn(shape, generator=g) for shape in shapes))
-    (tmp_path / "a.ply").write_bytes(ply_of(splats))
-    read = read_splats(tmp_path / "a.ply")
-    assert all(torch.equal(getattr(read, name), getattr(splats, name)) for name in vars(splats) if name != "rest")
-    assert torch.equal(read.rest[:, :8], splats.rest)
+    trained = TrainedGaussians(*(torch.randn(shape, generator=g) for shape in shapes))
+    (tmp_path / "a.ply").write_bytes(ply_of(trained))
+    read = read_trained(tmp_path / "a.ply")
+    assert all(torch.equal(getattr(read, name), getattr(trained, name)) for name in vars(trained) if name != "rest")
+    assert torch.equal(read.rest[:, :8], trained.rest)
     assert not read.rest[:, 8:].any()
-    assert PlyData.read(io.BytesIO(ply_of(splats)))["vertex"].count == N
+    assert PlyData.read(io.BytesIO(ply_of(trained)))["vertex"].count == N
 
 
 def spoilt(name: str, value: float) -> np.ndarray:
@@ -105,6 +105,6 @@ def test_what_is_not_trained_gaussians_is_refused(rows: np.ndarray, said: str, t
     """Catches a KeyError, and values that would be drawn as NaN."""
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "a.ply"))
     with pytest.raises(InputError, match=said) as caught:
-        read_splats(tmp_path / "a.ply")
+        read_trained(tmp_path / "a.ply")
     assert "a.ply" in str(caught.value)
     assert "\n" not in str(caught.value)
