@@ -102,7 +102,7 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
            for group, choice in [*((name, choices[name]) for name in OWN_NAMES), *groups.items()]]  # fmt: skip
     own += [f"seed={plain['seed']}", f"agr={str(plain['agr']).lower()}", f"scene.name={plain['scene']['name']}"]
     base: Plain = OmegaConf.to_container(hydra.compose("config", own), resolve=True)  # type: ignore[assignment]
-    theirs = dict(flat(training_part(base)))
+    theirs = {"effects.budget_db": base["effects"]["budget_db"]} | dict(flat(training_part(base)))
     changed = {key: value for key, value in flat(training_part(plain)) if key not in theirs or value != theirs[key]}
     shorts = [key.removeprefix("model.options.").partition(".")[2] or key.rpartition(".")[2] for key in changed]
     for (key, value), short in zip(changed.items(), shorts, strict=True):

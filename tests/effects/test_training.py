@@ -1,0 +1,148 @@
+"""Gates in a training, model=auto, and the gate of a finished run, as a user meets them."""
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_run import gsbench, overrides, write_moving_square
+
+from gsbench.effects import __main__ as command
+from gsbench.measure import record
+from gsbench.run.load import load_run
+from gsbench.run.setup import build
+from gsbench.scenes.scene import Scene
+from gsbench.stability.training_cases import compose, moving_square
+from gsbench.train.gating import Gating
+from gsbench.train.loop import Trainer
+from gsbench.train.schedule import Schedule, generator
+
+STEPS = 100
+
+
+def trainer(*words: str, model: str = "7dgs") -> Trainer:
+    """A trainer at step 0 of a scene with three views of val."""
+    config = compose(model, STEPS, "train.densify.reset_every=1000000", *words)
+    square = moving_square()
+    scene = Scene(**{**vars(square), "val": square.train[:3], "test": square.train[3:5]})
+    made = build(config)
+    assert scene.points is not None
+    made.initialise(scene.points, scene.extent, generator(config.seed))
+    return Trainer(made, scene, scene.test, config)
+
+
+def end(one: Trainer) -> dict[str, object]:
+    """Train to the end; return the last state, without the seconds that no two runs share."""
+    states: list[dict[str, object]] = []
+    one.run(lambda state: states.append(copy.deepcopy(state)), "test")
+    last = states[-1]
+    return {key: last[key] for key in ("model", "optimizer", "density", "floor")}
+
+
+def assert_same(a: object, b: object) -> None:
+    if isinstance(a, dict):
+        assert isinstance(b, dict)
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_same(a[key], b[key])
+    else:
+        assert isinstance(a, torch.Tensor)
+        assert isinstance(b, torch.Tensor)
+        assert torch.equal(a, b)
+
+
+def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a checkpoint that lacks what a gate decided: broken off after the gate, and gone on from there."""
+    monkeypatch.setattr("gsbench.train.gating.LOSS_IN_TRAINING", 3.0)
+    whole = trainer("effects.gate=both")
+    expected = end(whole)
+    assert whole.gating.gates[0].step == 60
+    assert whole.model.classes is not None
+    first = trainer("effects.gate=both")
+    states: list[dict[str, object]] = []
+    first.run(lambda state: states.append(copy.deepcopy(state)), "test", lambda: first.step < 75)
+    second = trainer("effects.gate=both")
+    second.load_state_dict(states[-1])
+    assert second.model.classes is not None
+    assert second.gating.gates == first.gating.gates
+    assert_same(end(second), expected)
+
+
+def test_off_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a gate that acts, or draws a random number, where none was asked for."""
+    monkeypatch.setattr(Gating, "_gate", lambda *_: pytest.fail("a gate was asked"))
+    plain = trainer("effects.gate=off")
+    end(plain)
+    assert plain.model.classes is None
+
+
+def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches momentum that moves on what a gate froze, and kept entries that no longer learn."""
+    monkeypatch.setattr("gsbench.train.gating.LOSS_IN_TRAINING", 20.0)
+    monkeypatch.setattr("gsbench.effects.budget.SHARES", (0.5,))
+    one = trainer("effects.gate=both")
+    one.run(lambda _: None, "test", lambda: one.step < 61)
+    classes = one.model.classes
+    assert classes is not None
+    assert classes.sliced < len(one.model)
+    before = {name: value.detach().clone() for name, value in one.model.splats.items()}
+    one.run(lambda _: None, "test", lambda: one.step < 70)
+    masks = one.model.kept(classes)
+    for name, value in one.model.splats.items():
+        mask = masks[name].expand_as(value) if name in masks else torch.ones_like(value, dtype=torch.bool)
+        assert torch.equal(value[~mask], before[name][~mask]), name
+        assert not mask.any() or not torch.equal(value[mask], before[name][mask]), name
+
+
+def test_when_a_model_is_gated() -> None:
+    """Catches a gate while Gaussians are still cloned and split, or with no steps left to recover."""
+
+    def due(*words: str) -> list[int]:
+        schedule = Schedule(compose("7dgs", STEPS, *words).train, 3, True)
+        return [step for step in range(STEPS) if schedule.gates(step)]
+
+    assert due() == [59]
+    assert due("train.densify.stop=21000") == [69]
+    assert due("train.densify.stop=29000") == []
+
+
+@pytest.fixture(scope="module")
+def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_square(tmp_path_factory.mktemp("data"))
+
+
+def test_auto_and_a_gate_after_the_fact(square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches model=auto that says nothing of what it chose, a loaded run of another model, a gate that spoils the old.
+
+    The scene has six views, which are too few to tell: it is simulated, and that is said.
+    """
+    done = gsbench(*overrides(square, tmp_path, "model=auto", "train.iterations=60"))
+    assert done.returncode == 0, done.stderr
+    assert "too few to tell" in done.stderr + done.stdout
+    (folder,) = tmp_path.glob("dnerf/square/auto,*/seed0")
+    found = record.read(folder / record.FILE_NAME)
+    assert found.model == "auto"
+    assert found.effects.time
+    assert found.on_demand is not None
+    assert found.on_demand.screen is not None
+    assert found.on_demand.screen.decision == "undecided"
+    assert found.cost is not None
+    assert found.cost.stage_s["screen"] > 0
+    loaded = load_run(folder)
+    assert loaded.config.model.name == "7dgs"
+    assert len(loaded.model) == found.cost.num_gaussians
+
+    plain = gsbench(*overrides(square, tmp_path, "model=7dgs", "train.iterations=60"))
+    assert plain.returncode == 0, plain.stderr
+    (old,) = tmp_path.glob("dnerf/square/7dgs,*/seed0")
+    kept = {path.name: path.read_bytes() for path in old.iterdir()}
+    assert command.main(["--checkpoint", str(old), "--budget-db", "1"]) == 0
+    assert {path.name: path.read_bytes() for path in old.iterdir()} == kept
+    (new,) = tmp_path.glob("dnerf/square/7dgs,*,gate=end,budget_db=1.0/seed0")
+    gated = record.read(new / record.FILE_NAME)
+    assert gated.on_demand is not None
+    assert len(gated.on_demand.gates) + len(gated.on_demand.notes) >= 1
+    assert len(load_run(new).model) <= len(load_run(old).model)
+    capsys.readouterr()
+    assert command.main(["--checkpoint", str(new)]) == 2
+    assert "not gated at its end" in capsys.readouterr().err
