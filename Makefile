@@ -3,7 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-MODELS := 3dgs,4dgs,6dgs,7dgs,7dgs_noagr
+MODELS := 3dgs,4dgs,6dgs,7dgs,7dgs_noagr,auto
 # More overrides: make table1 ARGS="train.iterations=3000 seed=1"
 ARGS ?=
 
@@ -28,7 +28,7 @@ $(VENV)/installed: pyproject.toml constraints.txt $(NATIVE)
 		--config-settings cmake.define.CUDA=$(CUDA) --editable '.[dev,stability]'
 	touch $@
 
-table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR on the embedded scenes; print and write the table
+table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR, and model=auto, on the embedded scenes; print and write the table
 	@status=0; \
 	$(BIN)/python -m gsbench --multirun +exp=mini model=$(MODELS) $(ARGS) || status=$$?; \
 	$(BIN)/python -m gsbench.report results/mini || status=$$?; \
