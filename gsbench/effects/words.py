@@ -2,6 +2,13 @@
 
 from gsbench.measure.record import Gate, OnDemand, TimeScreen
 
+CLASSES = {  # of Gaussians: the names of gsbench.models.classes, in its order, and what they are called
+    "refined": "refined by AGR",
+    "sliced": "sliced",
+    "time": "time frozen",
+    "direction": "direction frozen",
+    "still": "still",
+}
 _KEEP = {
     "refined": "have AGR",
     "sliced": "are sliced without AGR",

@@ -31,6 +31,7 @@ QUANTITIES: dict[str, Callable[[Record], float]] = {
     "ms": lambda r: r.cost.render_ms.p50 if r.cost else math.nan,  # a frame, median
     "mb": lambda r: r.cost.bytes / 1e6 if r.cost else math.nan,  # of the model's parameters
 }
+GATE_WORDS = ("gate=", "budget_db=")  # at the start of a word of a variant
 OF_THE_MACHINE = ("seconds", "ms")  # quantities that compare only between runs of one machine
 
 
@@ -42,6 +43,12 @@ class Arm:
     variant: str  # empty: as the experiment has it
     runs: dict[str, list[Record]]  # by scene, in order of the seeds
     name: str  # the model, and its variant where not all runs have the same
+    series: str  # the model, and how its Gaussians were gated where not all runs were alike: `Group.series_of`
+
+    @property
+    def on_demand(self) -> bool:
+        """Whether effects were chosen for the scenes or the Gaussians, so that not every one is paid for."""
+        return any(r.on_demand for runs in self.runs.values() for r in runs)
 
     @property
     def iterations(self) -> int | None:
@@ -89,7 +96,24 @@ class Group:
             runs.setdefault((r.model, r.variant), {}).setdefault(r.scene, []).append(r)
         several = len({variant for _, variant in runs}) > 1
         names = {(m, v): f"{m}, {v}" if v and several else m for m, v in runs}
-        return [Arm(m, v, scenes, names[m, v]) for (m, v), scenes in sorted(runs.items())]
+        return [Arm(m, v, scenes, names[m, v], self.series_of(m, v)) for (m, v), scenes in sorted(runs.items())]
+
+    @cached_property
+    def series(self) -> list[str]:
+        """The curves of the frontier, also of runs that failed: the models, those that were gated apart."""
+        return sorted({self.series_of(r.model, r.variant) for r in self.records})
+
+    def series_of(self, model: str, variant: str) -> str:
+        """Name the frontier that an arm is a point of: lengths and capacities share one, gated models have their own.
+
+        Where all runs were gated alike, the model says enough.
+        """
+        own = gating(variant)
+        return f"{model}, {own}" if own and len(self._gatings) > 1 else model
+
+    @cached_property
+    def _gatings(self) -> set[str]:
+        return {gating(r.variant) for r in self.records}
 
     @cached_property
     def variant(self) -> str:
@@ -162,6 +186,11 @@ def groups(records: list[Record]) -> list[Group]:
     for r in sorted(records, key=lambda r: (r.experiment, r.dataset, r.scene, r.model, r.variant, r.seed)):
         found.setdefault((r.experiment, r.dataset), []).append(r)
     return [Group(runs) for runs in found.values()]
+
+
+def gating(variant: str) -> str:
+    """Return those words of a variant that say how its Gaussians were gated."""
+    return ",".join(word for word in variant.split(",") if word.startswith(GATE_WORDS))
 
 
 def machine(record: Record) -> str:

@@ -88,6 +88,7 @@ class Cube:
     prices: list[Price]
     missing: list[str]  # the cells that no finished run fills, in words
     left_out: list[str]  # models that simulate the same effects as one that is used
+    on_demand: list[str]  # models whose Gaussians do not all have the effects, so that they price none
 
 
 def cube(group: Group) -> Cube:
@@ -99,13 +100,14 @@ def cube(group: Group) -> Cube:
     cells: dict[Cell, Arm] = {}
     left_out = []
     rank = {name: i for i, name in enumerate(PUBLISHED)}
-    for arm in sorted(group.main_arms, key=lambda arm: (rank.get(arm.model, len(rank)), arm.model)):
+    whole = [arm for arm in group.main_arms if not arm.on_demand]
+    for arm in sorted(whole, key=lambda arm: (rank.get(arm.model, len(rank)), arm.model)):
         if cells.setdefault(_cell(arm), arm) is not arm:
             left_out.append(arm.model)
     every: list[Cell] = list(itertools.product((False, True), (False, True), (False, True)))
     missing = [_words(cell) for cell in every if cell not in cells]
     prices = [price for weights in _contrasts() if (price := _price(group, cells, *weights))]
-    return Cube(cells, prices, missing, left_out)
+    return Cube(cells, prices, missing, left_out, [arm.model for arm in group.main_arms if arm.on_demand])
 
 
 def _cell(arm: Arm) -> Cell:

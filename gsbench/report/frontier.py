@@ -23,9 +23,9 @@ class Point:
     cost: dict[str, float]  # by COSTS; NaN where it is missing
 
     @property
-    def model(self) -> str:
-        """The model of the arm."""
-        return self.arm.model
+    def series(self) -> str:
+        """The frontier that the point belongs to: that of a model, or of a gated one."""
+        return self.arm.series
 
 
 def points(group: Group, scenes: list[str]) -> list[Point]:
@@ -76,8 +76,8 @@ def choose(group: Group, of: Sequence[Point], cost: str, budget: float) -> Choic
     """
     best: dict[str, Point] = {}
     for point in of:
-        if point.cost[cost] <= budget and point.psnr.mean > best.get(point.model, _NOTHING).psnr.mean:
-            best[point.model] = point
+        if point.cost[cost] <= budget and point.psnr.mean > best.get(point.series, _NOTHING).psnr.mean:
+            best[point.series] = point
     if not best:
         return None
     first, *others = sorted(best.values(), key=lambda p: -p.psnr.mean)
@@ -86,7 +86,7 @@ def choose(group: Group, of: Sequence[Point], cost: str, budget: float) -> Choic
     return Choice(first, level, any(math.isnan(d.low) for _, d in differences))
 
 
-_NOTHING = Point(Arm("", "", {}, ""), Estimate(-math.inf, 0, 0, ""), {})
+_NOTHING = Point(Arm("", "", {}, "", ""), Estimate(-math.inf, 0, 0, ""), {})
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def targets(group: Group) -> list[Target]:
         for arm in group.arms:
             quality, cost = (group.sample(arm, scene, name) for name in ("psnr_val", "seconds"))
             if len(quality) and len(cost):
-                reached.setdefault(arm.model, []).append((float(quality.mean()), float(cost.mean())))
+                reached.setdefault(arm.series, []).append((float(quality.mean()), float(cost.mean())))
         for rule, psnr in _rules(group, scene, {m: max(p for p, _ in arms) for m, arms in reached.items()}):
             needed = {m: min((s for p, s in arms if p >= psnr), default=math.inf) for m, arms in reached.items()}
             found.append(Target(scene, rule, psnr, needed))

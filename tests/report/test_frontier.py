@@ -44,7 +44,7 @@ def three_lengths():
 def test_the_frontier_rises_and_leaves_out_what_is_dominated():
     """Catches a frontier through dominated points, or one that is not sorted by cost."""
     of = frontier.points(three_lengths(), ["suzanne"])
-    a = [p for p in of if p.model == "a"]
+    a = [p for p in of if p.series == "a"]
     assert [p.cost["seconds"] for p in frontier.frontier(a, "seconds")] == [10.0, 40.0]
     assert {p.arm.name for p in frontier.dominated(of, "seconds")} == {"a, iterations=2", "b"}
     assert frontier.dominated(a[:1], "seconds") == []
@@ -61,7 +61,7 @@ def test_a_point_is_the_mean_of_its_scenes():
     """Catches an arm that has not finished a scene and is averaged over fewer."""
     runs = group(*arm("a", "", 20.0, 10.0), *arm("a", "", 30.0, 30.0, scene="x"), *arm("b", "", 20.0, 10.0))
     (point,) = frontier.points(runs, ["suzanne", "x"])
-    assert (point.model, point.psnr.mean, point.cost["seconds"]) == ("a", 25.0, 20.0)
+    assert (point.series, point.psnr.mean, point.cost["seconds"]) == ("a", 25.0, 20.0)
     assert frontier.points(runs, []) == []
 
 
@@ -85,8 +85,8 @@ def test_a_choice_names_what_it_cannot_be_told_from():
     ]
     near = group(*noisy, *arm("b", "", 20.001, 10.0, (0, 1, 2)))
     choice = frontier.choose(near, frontier.points(near, ["suzanne"]), "seconds", 60)
-    assert choice.point.model == "b"
-    assert [p.model for p in choice.level] == ["a"]
+    assert choice.point.series == "b"
+    assert [p.series for p in choice.level] == ["a"]
     assert not choice.unknown
     one = three_lengths()
     choice = frontier.choose(one, frontier.points(one, ["suzanne"]), "seconds", 1e9)

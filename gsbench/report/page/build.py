@@ -12,7 +12,7 @@ from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
 from gsbench.report import layout
 from gsbench.report.arms import Group, groups
-from gsbench.report.page import cost, evidence, time_to_quality, words, worth
+from gsbench.report.page import cost, evidence, on_demand, time_to_quality, words, worth
 from gsbench.report.page.content import Canvas, Runs, Section, Table
 from gsbench.report.page.gallery import View, gallery
 from gsbench.report.page.palette import DARK, LIGHT, STAGES_DARK, STAGES_LIGHT, Style, styles
@@ -56,9 +56,11 @@ def write(records: list[Record], folder: Path, faults: Sequence[str] = (), *, re
 def render(records: list[Record], folder: Path, faults: Sequence[str] = (), *, reload: int = 0) -> str:
     """Return the page as HTML; arguments as of `write`."""
     found = groups(records)
-    look = styles(sorted({r.model for r in records}))
+    look = styles(sorted({name for group in found for name in group.series}))
     runs, scenes = Runs(), MOST_SCENES // len(found)
-    canvases = [Canvas(f"g{i}", runs, {m: look[m] for m in group.models}, scenes) for i, group in enumerate(found)]
+    canvases = [
+        Canvas(f"g{i}", runs, {name: look[name] for name in group.series}, scenes) for i, group in enumerate(found)
+    ]
     chapters = [_chapter(group, folder, canvas) for group, canvas in zip(found, canvases, strict=True)]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader(__package__, "."),
@@ -103,17 +105,23 @@ def _chapter(group: Group, folder: Path, canvas: Canvas) -> Chapter:
         summary=" · ".join([*counts, words.cut(group.machine, 80)]),
         answers=cost.answers(group),
         basis=cost.basis_words(group),
-        sections=[
-            cost.frontier_section(group, canvas),
-            time_to_quality.quality_section(group, canvas),
-            worth.effects_section(group, canvas),
-            worth.stages_section(group, canvas),
-            time_to_quality.anytime_section(group, canvas),
-            worth.pairs_section(group, canvas),
-            evidence.protocol_section(group),
-        ],
+        sections=_sections(group, folder, canvas),
         views=gallery([r for r in group.finished if r.variant == group.variant], folder),
         tables=evidence.paper_tables(group),
         failures=evidence.failures(group),
         legend=list(canvas.look.items()),
     )
+
+
+def _sections(group: Group, folder: Path, canvas: Canvas) -> list[Section]:
+    chosen = on_demand.on_demand_section(group, canvas, folder)
+    return [
+        cost.frontier_section(group, canvas),
+        time_to_quality.quality_section(group, canvas),
+        worth.effects_section(group, canvas),
+        *([chosen] if chosen else []),
+        worth.stages_section(group, canvas),
+        time_to_quality.anytime_section(group, canvas),
+        worth.pairs_section(group, canvas),
+        evidence.protocol_section(group),
+    ]

@@ -162,24 +162,41 @@ def differences(rows: list[Row], x: str) -> Panel:
     return panel
 
 
-def stages(rows: list[tuple[str, dict[str, float]]], names: list[str]) -> Panel:
-    """Draw where the seconds of training go: a bar for each model, a piece for each stage."""
+@dataclass(frozen=True)
+class Bar:
+    """A whole with its parts, in order."""
+
+    label: str
+    parts: Sequence[float]
+    note: str
+
+
+def bars(rows: list[Bar], colours: list[str], x: str) -> Panel:
+    """Draw stacked bars, the name of each above it; `colours` are those of the parts."""
     panel = Panel(66 + ROW * len(rows), left=2, top=4)
     axes = panel.axes
-    longest = max(sum(parts.values()) for _, parts in rows)
-    for i, (label, parts) in enumerate(rows):
+    for i, row in enumerate(rows):
         y, start = len(rows) - i - 0.66, 0.0
-        for stage, name in enumerate(names):
-            share = parts.get(name, 0.0)
-            axes.barh([y], [share], 0.42, [start], color=stage_colour(stage), edgecolor=PAPER, linewidth=0.8)
-            start += share
-        panel.above(len(rows) - i - 0.06, label, f"{start:,.0f} s" if start >= 100 else f"{start:.3g} s")
-    axes.set_xlim(0, longest)
+        for part, colour in zip(row.parts, colours, strict=True):
+            axes.barh([y], [part], 0.42, [start], color=colour, edgecolor=PAPER, linewidth=0.8)
+            start += part
+        panel.above(len(rows) - i - 0.06, row.label, row.note)
+    axes.set_xlim(0, max(sum(row.parts) for row in rows) or 1.0)
     axes.set_ylim(0, len(rows))
     axes.yaxis.set_major_locator(NullLocator())
     axes.xaxis.set_major_locator(_ticks(6))
-    panel.labels("training seconds")
+    panel.labels(x)
     return panel
+
+
+def stages(rows: list[tuple[str, dict[str, float]]], names: list[str]) -> Panel:
+    """Draw where the seconds of training go: a bar for each model, a piece for each stage."""
+    found = []
+    for label, parts in rows:
+        total = sum(parts.values())
+        note = f"{total:,.0f} s" if total >= 100 else f"{total:.3g} s"
+        found.append(Bar(label, [parts.get(name, 0.0) for name in names], note))
+    return bars(found, [stage_colour(i) for i in range(len(names))], "training seconds")
 
 
 def _scale_x(axes: Axes, values: Sequence[float]) -> None:

@@ -81,6 +81,24 @@ class Tab:
 
 
 @dataclass(frozen=True)
+class Swatch:
+    """A colour of a drawing, as a variable of the style sheet, with what it stands for."""
+
+    name: str
+    variable: str
+
+
+@dataclass(frozen=True)
+class Image:
+    """A picture with its caption; the source is a data address."""
+
+    caption: str
+    source: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
 class Section:
     """A figure of the page with what it says in words."""
 
@@ -92,7 +110,8 @@ class Section:
     beside: bool = False  # the table stands open beside the drawings
     legend: bool = False
     notes: list[str] = field(default_factory=list)
-    stages: list[str] = field(default_factory=list)  # names for a legend of stages
+    swatches: list[Swatch] = field(default_factory=list)  # a legend of colours
+    images: list[Image] = field(default_factory=list)  # below the drawings
 
 
 class Runs:
@@ -139,7 +158,7 @@ class Canvas:
 
     name: str  # keeps the ids of its drawings apart from those of others
     runs: Runs
-    look: dict[str, Style]  # by model
+    look: dict[str, Style]  # by `Arm.series`
     scenes: int  # that have drawings of their own
 
 

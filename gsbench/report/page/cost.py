@@ -65,9 +65,9 @@ def _answer(group: Group, points: list[Point], cost: str, budget: float, title: 
         return Answer(title, "", "none fits", "", f"The quickest took {write(min(known))}.")
     point = choice.point
     detail = f"{_length(point.arm)}{write(point.cost[cost])}. "
-    others = {p.model for p in points if p.cost[cost] <= budget} - {point.model}
+    others = {p.series for p in points if p.cost[cost] <= budget} - {point.series}
     if choice.level:
-        detail += f"Not told apart from {words.listing([p.model for p in choice.level])}."
+        detail += f"Not told apart from {words.listing([p.series for p in choice.level])}."
     elif choice.unknown:
         detail += "One seed: whether it is ahead is not known."
     elif others:
@@ -77,7 +77,7 @@ def _answer(group: Group, points: list[Point], cost: str, budget: float, title: 
     if cost == "seconds" and budget > 2 * max(known):
         detail += f" Nothing here trained longer than {write(max(known))}."
     value = f"{words.plain(point.psnr.mean)} dB"
-    return Answer(title, point.model, value, words.interval(point.psnr), detail)
+    return Answer(title, point.series, value, words.interval(point.psnr), detail)
 
 
 def _length(arm: Arm) -> str:
@@ -117,7 +117,7 @@ def _rows(group: Group, scenes: list[str]) -> list[list[Value]]:
     return [
         [
             _title(scenes),
-            p.model,
+            p.arm.model,
             p.arm.variant or "none",
             p.psnr.seeds,
             p.psnr.mean,
@@ -132,20 +132,20 @@ def _rows(group: Group, scenes: list[str]) -> list[list[Value]]:
     ]
 
 
-def _frontier_tab(group: Group, canvas: Canvas, name: str, label: str, scenes: list[str]) -> Tab:
+def _frontier_tab(group: Group, canvas: Canvas, key: str, label: str, scenes: list[str]) -> Tab:
     """Draw the three panels of some scenes."""
     points = f.points(group, scenes)
     drawings = []
     for cost, title in AXES:
         curves = [
-            _curve(group, canvas.runs, style, [p for p in points if p.model == m], cost, scenes)
-            for m, style in canvas.look.items()
+            _curve(group, canvas.runs, style, [p for p in points if p.series == name], cost, scenes)
+            for name, style in canvas.look.items()
         ]
         drawn = [c for c in curves if c.best]
         if drawn:
             alt = f"PSNR in dB against {title} of {words.listing([p.arm.name for p in points][:20])}, {label}"
             drawings.append(
-                Drawing(f"PSNR against {title}", charts.frontier(drawn, title).svg(canvas.name + name + cost, alt))
+                Drawing(f"PSNR against {title}", charts.frontier(drawn, title).svg(canvas.name + key + cost, alt))
             )
     return Tab(label, drawings)
 
@@ -159,11 +159,12 @@ def _curve(group: Group, runs: Runs, style: Style, points: list[Point], cost: st
     single: list[charts.Mark] = []
     theirs: list[charts.Mark] = []
     if len(scenes) == 1:
+        gated = any(p.arm.on_demand for p in points)  # the paper's models are not
         own = [r for p in points for r in p.arm.runs[scenes[0]]]
-        if len(own) > len(points) and len(own) <= MOST_RUNS // max(1, len(group.models)):
+        if len(own) > len(points) and len(own) <= MOST_RUNS // max(1, len(group.series)):
             pairs = [(group.value(r, cost), group.value(r, "psnr"), runs.of_record(group, r)) for r in own]
             single = [charts.Mark(x, y, run) for x, y, run in pairs if not math.isnan(x + y)]
-        theirs = [charts.Mark(*at, runs.of_paper(r)) for r in own[:1] if (at := _paper(r, cost))]
+        theirs = [charts.Mark(*at, runs.of_paper(r)) for r in own[:1] if not gated and (at := _paper(r, cost))]
     return charts.Curve(style, [mark(p) for p in best], [mark(p) for p in beaten], single, theirs)
 
 

@@ -8,11 +8,14 @@ import cv2
 import numpy as np
 
 from gsbench.measure.record import Record
+from gsbench.report.page.content import Image
 from gsbench.report.page.words import cut
 from gsbench.report.pictures import GAP, HEADER, Pixels
 
 FILE_NAME = "pictures.png"
 BUDGET = 900_000  # bytes of all images as text, which leaves the page below 2 MB
+IMAGES_BUDGET = 300_000  # of `images`, beside those
+IMAGE_SIDE = 800  # pixels
 STEPS = ((400, 92, 3), (400, 85, 3), (320, 80, 3), (256, 75, 3), (256, 75, 1), (160, 70, 1), (96, 60, 1), (48, 50, 1))
 
 
@@ -49,15 +52,44 @@ def gallery(records: list[Record], folder: Path) -> list[View]:
 
 def _strips(records: list[Record], folder: Path) -> dict[str, dict[str, tuple[Record, list[Cut]]]]:
     """Find, by scene and model, the record and the cut strip of the first seed that has one."""
-    places = {path.parts[-5:-1]: path for path in sorted(folder.resolve().rglob(FILE_NAME))}
+    at = places(folder, FILE_NAME)
     found: dict[str, dict[str, tuple[Record, list[Cut]]]] = {}
     for r in sorted(records, key=lambda r: r.seed):
-        label = f"{r.model},{r.variant}" if r.variant else r.model
-        path = places.get((r.experiment, r.scene, label, f"seed{r.seed}"))
+        path = at.get(place(r))
         models = found.setdefault(r.scene, {})
         if path and r.model not in models and (rows := cut_strip(path)):
             models[r.model] = r, rows
     return {scene: dict(sorted(models.items())) for scene, models in sorted(found.items()) if models}
+
+
+def places(folder: Path, name: str) -> dict[tuple[str, ...], Path]:
+    """Find the files of a name below a folder of results, by `place`."""
+    return {path.parts[-5:-1]: path for path in sorted(folder.resolve().rglob(name))}
+
+
+def place(record: Record) -> tuple[str, ...]:
+    """Return the last parts of the folder of a run: experiment, scene, model with its variant, seed."""
+    label = f"{record.model},{record.variant}" if record.variant else record.model
+    return record.experiment, record.scene, label, f"seed{record.seed}"
+
+
+def images(of: list[tuple[str, Path]]) -> list[Image]:
+    """Return pictures with their captions, the first ones in less than IMAGES_BUDGET bytes; damaged ones are left out.
+
+    Pictures that do not fit are first compressed more, then left out.
+    """
+    read = [(caption, data) for caption, path in of if (data := cv2.imread(str(path), cv2.IMREAD_COLOR)) is not None]
+    for quality in (90, 75, 60):
+        shown = [_image(caption, np.asarray(data, np.uint8), quality) for caption, data in read]
+        if sum(len(one.source) for one in shown) <= IMAGES_BUDGET:
+            return shown
+    while sum(len(one.source) for one in shown) > IMAGES_BUDGET:
+        shown.pop()
+    return shown
+
+
+def _image(caption: str, image: Pixels, quality: int) -> Image:
+    return Image(caption, _encode(image, IMAGE_SIDE, quality), image.shape[1], image.shape[0])
 
 
 def cut_strip(path: Path) -> list[Cut]:

@@ -6,7 +6,14 @@ page and lightened for a black one to a contrast of at least 4.5:1. Markers tell
 
 from dataclasses import dataclass
 
-MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "3dgs_agr", "4dgs_agr", "6dgs_agr")
+MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "3dgs_agr", "4dgs_agr", "6dgs_agr", "auto")
+CLASS_LIKE = {  # a Gaussian has the colour of the model whose effects it still has
+    "refined": "7dgs",
+    "sliced": "7dgs_noagr",
+    "time": "6dgs",
+    "direction": "4dgs",
+    "still": "3dgs",
+}
 LIGHT = ("#5c6066", "#0069a8", "#00734f", "#b34700", "#9c3d82", "#7d6608", "#1f6f78", "#4b4fa3", "#8c2d2d", "#3d6b1f")
 DARK = ("#b9bec6", "#5cbcf2", "#3ccb9f", "#ff9454", "#eb9fd0", "#e3cc4a", "#6fd0da", "#a9adff", "#ff9c9c", "#a8d672")
 MARKERS = ("^", "s", "h", "o", "D", "v", "P", "X", "<", ">")

@@ -68,7 +68,7 @@ def anytime_section(group: Group, canvas: Canvas) -> Section:
                 seen |= {letter for _, letters in marks for letter in letters}
                 at = [(_when(step, steps, seconds), letters) for step, letters in marks]
                 curves.append(
-                    charts.Anytime(canvas.look[arm.model], seconds, psnr, canvas.runs.of_arm(group, arm, [scene]), at)
+                    charts.Anytime(canvas.look[arm.series], seconds, psnr, canvas.runs.of_arm(group, arm, [scene]), at)
                 )
                 rows += [[scene, arm.model, *point] for point in zip(steps, seconds, psnr, strict=True)]
                 tails.setdefault(arm.model, []).append(max(psnr) - psnr[-1])

@@ -8,7 +8,7 @@ from gsbench.report.arms import Group
 from gsbench.report.compare import Cube, Pair, Price
 from gsbench.report.intervals import Estimate
 from gsbench.report.page import charts, words
-from gsbench.report.page.content import Canvas, Column, Drawing, Section, Tab, Table, Value
+from gsbench.report.page.content import Canvas, Column, Drawing, Section, Swatch, Tab, Table, Value
 
 UNITS = (("psnr", "dB", 2), ("seconds", "training s", 1), ("ms", "ms a frame", 2), ("mb", "MB", 2))
 STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer")
@@ -28,6 +28,8 @@ def effects_section(group: Group, canvas: Canvas) -> Section:
         notes.append(f"Not run, so not priced: models with {words.listing(cube.missing, 'or')}.")
     if cube.left_out:
         notes.append(f"Left out, as another model has the same effects: {words.listing(cube.left_out)}.")
+    if cube.on_demand:
+        notes.append(f"Left out, as their Gaussians keep only the effects that pay: {words.listing(cube.on_demand)}.")
     if {"4dgs", "7dgs_noagr"} <= {arm.model for arm in cube.cells.values()}:
         notes.append(PARAMETRISATION)
     if not cube.prices:
@@ -113,7 +115,7 @@ def stages_section(group: Group, canvas: Canvas) -> Section:
         [Tab("", [drawing])],
         table,
         beside=True,
-        stages=names,
+        swatches=[Swatch(words.cut(name, 40), f"stage-{i}") for i, name in enumerate(names)],
     )
 
 

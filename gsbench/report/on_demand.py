@@ -1,0 +1,108 @@
+"""Average over the seeds what was decided about the effects of a scene and of its Gaussians."""
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import fmean
+
+import numpy as np
+
+from gsbench.effects.words import CLASSES
+from gsbench.measure.record import Gate, Record
+from gsbench.report.arms import Arm, Group, machine
+from gsbench.report.intervals import Estimate, estimate
+
+REMOVED = "removed"
+DEGREES = 4  # of harmonics: 0, 1, 2, 3
+
+
+@dataclass(frozen=True)
+class Decided:
+    """What was decided on a scene for the runs of an arm, by means over the seeds."""
+
+    scene: str
+    arm: Arm
+    runs: list[Record]  # those that chose effects, in order of the seeds
+    gated: int  # how many of them a gate has changed: the numbers below are theirs
+    rows: dict[str, float]  # Gaussians at the end by class, and how many all gates removed
+    degrees: list[float]  # Gaussians at the end by the degree of their harmonics
+    views: str  # that the change of PSNR was measured on
+    psnr: Estimate  # change by the gate at the end, dB
+    ms: Estimate  # change of the median frame by the gate at the end
+    ms_before: float
+    mb_before: float  # of the model before the first gate
+    mb: float
+    predicted: float  # change of PSNR that the gate at the end foresaw, dB
+
+    @property
+    def before(self) -> float:
+        """Gaussians before the first gate."""
+        return sum(self.rows.values())
+
+    @property
+    def left(self) -> float:
+        """Gaussians after the last gate."""
+        return self.before - self.rows.get(REMOVED, 0.0)
+
+
+def decided(group: Group) -> list[Decided]:
+    """Return what was decided, by scene and arm; nothing where every Gaussian pays for every effect."""
+    found = []
+    for scene in group.scenes:
+        for arm in group.arms:
+            runs = [r for r in arm.runs.get(scene, []) if r.on_demand]
+            if runs:
+                found.append(_average(group, scene, arm, runs))
+    return found
+
+
+def _average(group: Group, scene: str, arm: Arm, runs: list[Record]) -> Decided:
+    gates = [r.on_demand.gates for r in runs if r.on_demand and r.on_demand.gates]
+    at_end = [(r, r.on_demand.gates[-1]) for r in runs if r.on_demand and _ends(r.on_demand.gates)]
+    evaluated = all(gate.eval_loss_db is not None for _, gate in at_end)
+    loss: Callable[[Gate], float | None] = lambda g: g.eval_loss_db if evaluated else g.measured_db  # noqa: E731
+    here = [gate for r, gate in at_end if machine(r) == group.machine]
+    splits = [str(r.protocol.get("eval_split", "evaluated")) if evaluated else gate.checked_on for r, gate in at_end]
+    names = [*CLASSES, REMOVED] if gates else []
+    return Decided(
+        scene,
+        arm,
+        runs,
+        len(gates),
+        {name: fmean(_rows(one, name) for one in gates) for name in names},
+        [fmean(_of_degree(one[-1], degree) for one in gates) for degree in range(DEGREES)] if gates else [],
+        next(iter(splits), ""),
+        _mean([_less(loss(gate), 0.0) for _, gate in at_end]),
+        _mean([_less(gate.frame_ms_before, gate.frame_ms) for gate in here]),
+        _mean([math.nan if gate.frame_ms_before is None else gate.frame_ms_before for gate in here]).mean,
+        fmean(one[0].bytes_before for one in gates) / 1e6 if gates else math.nan,
+        fmean(one[-1].bytes for one in gates) / 1e6 if gates else math.nan,
+        fmean(-gate.predicted_db for _, gate in at_end) if at_end else math.nan,
+    )
+
+
+def _ends(gates: list[Gate]) -> bool:
+    return bool(gates) and gates[-1].step is None
+
+
+def _rows(gates: list[Gate], name: str) -> int:
+    """Count the Gaussians of a class after the last gate; the removed ones are those of all gates."""
+    of = gates if name == REMOVED else gates[-1:]
+    return sum(max(0, gate.rows.get(name, 0)) for gate in of)
+
+
+def _of_degree(gate: Gate, degree: int) -> int:
+    """Count the Gaussians whose harmonics have a degree, with any number of waves."""
+    return sum(max(0, n) for name, n in gate.levels.items() if re.match(rf"degree {degree}\b", name))
+
+
+def _less(before: float | None, after: float | None) -> float:
+    """Return what a value changed by: minus `before`, plus `after`."""
+    return math.nan if before is None or after is None else after - before
+
+
+def _mean(values: list[float]) -> Estimate:
+    """Estimate a mean over seeds, without the missing ones."""
+    known = np.array([value for value in values if math.isfinite(value)])
+    return estimate([known[:, None]] if len(known) else [], generalise=False)

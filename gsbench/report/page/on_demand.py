@@ -1,0 +1,199 @@
+"""Write the section on effects on demand: whether time was simulated and why, and what the gates left of the model."""
+
+import math
+from collections import Counter
+from pathlib import Path
+from statistics import fmean
+
+from gsbench.effects.words import CLASSES, of_screen
+from gsbench.measure.record import Record, TimeScreen
+from gsbench.report.arms import Group
+from gsbench.report.on_demand import DEGREES, REMOVED, Decided, decided
+from gsbench.report.page import charts, gallery, words
+from gsbench.report.page.content import Canvas, Column, Drawing, Image, Section, Swatch, Tab, Table, Value
+from gsbench.report.page.palette import CLASS_LIKE, MODELS
+from gsbench.report.page.svg import LINE, model_colour, stage_colour
+
+PICTURE = "classes.png"
+MOST_SAID = 12  # scenes and models that have a sentence
+MOST_BARS = 24
+MOST_NOTES = 12
+LONGEST_REASON = 200
+NAMES = CLASSES | {REMOVED: "removed"}
+
+
+def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> Section | None:
+    """Say what was decided, and draw the classes and the harmonics of the Gaussians; None where nothing was."""
+    found = decided(group)
+    if not found:
+        return None
+    said = [_sentence(one) for one in found[:MOST_SAID]]
+    if len(found) > MOST_SAID:
+        said.append(f"Of {len(found)} scenes and models {MOST_SAID} are said here; the table has all.")
+    gated = [one for one in found if one.gated]
+    return Section(
+        "on-demand",
+        "Effects on demand",
+        said,
+        [Tab("", _drawings(gated[:MOST_BARS], canvas))] if gated else [],
+        _table(found),
+        notes=_notes(found, len(gated)),
+        swatches=_swatches() if gated else [],
+        images=_images(found, folder),
+    )
+
+
+# ---- sentences
+
+
+def _sentence(one: Decided) -> str:
+    """Say what was decided on a scene for a model."""
+    parts = [_screen_words(one.runs), *_gate_words(one)]
+    return f"{one.scene}, {one.arm.name}: {' '.join(part for part in parts if part)}"
+
+
+def _screen_words(runs: list[Record]) -> str:
+    """Say whether time was simulated, why in the first run, and whether other seeds decided otherwise."""
+    screens = _screens(runs)
+    if not screens:
+        return ""
+    first = screens[0]
+    text = words.cut(of_screen(first), LONGEST_REASON)
+    others = Counter(screen.decision for screen in screens if screen.decision != first.decision)
+    if others:
+        parts = [f"{words.cut(decision, 20)} with {words.count(n, 'seed')}" for decision, n in sorted(others.items())]
+        text += f"; {words.listing(parts)}"
+    elif len(screens) > 1:
+        text += f"; {first.decision} with all {len(screens)} seeds"
+    return f"{text}."
+
+
+def _screens(runs: list[Record]) -> list[TimeScreen]:
+    return [r.on_demand.screen for r in runs if r.on_demand and r.on_demand.screen]
+
+
+def _gate_words(one: Decided) -> list[str]:
+    """Say what the gates left, and what the gate at the end changed."""
+    if not one.gated:
+        return ["No gate has changed a Gaussian."]
+    kept = [f"{one.rows[name]:,.0f} {said}" for name, said in CLASSES.items() if one.rows[name] >= 0.5]
+    share = f" ({100 * one.left / one.before:.0f} %)" if one.before else ""
+    where = "" if one.gated == len(one.runs) else f" On {one.gated} of {len(one.runs)} seeds:"
+    text = f"{where} Of {one.before:,.0f} Gaussians the gates left {one.left:,.0f}{share}"
+    said = [(f"{text}: {words.listing(kept)}." if kept else f"{text}.").strip()]
+    if one.psnr.scenes:
+        change = f"{words.signed(one.psnr.mean, 3)} dB ({words.interval(one.psnr, 3, sign=True)})"
+        text = f"The gate at the end changed PSNR on {words.cut(one.views, 40)} by {change}"
+        if one.ms.scenes:
+            change = f"{words.signed(one.ms.mean)} ms ({words.interval(one.ms, sign=True)})"
+            text += f" and a frame of {words.plain(one.ms_before)} ms by {change}"
+        said.append(f"{text}.")
+    return said
+
+
+def _notes(found: list[Decided], gated: int) -> list[str]:
+    """List what could not be decided, once where seeds say the same."""
+    named: dict[str, list[int]] = {}
+    for one in found:
+        for run in one.runs:
+            for note in run.on_demand.notes if run.on_demand else []:
+                named.setdefault(f"{one.scene}, {one.arm.name}, §: {words.cut(note)}", []).append(run.seed)
+    notes = []
+    for text, seeds in named.items():
+        which = f"seed{'' if len(seeds) == 1 else 's'} {words.listing([str(seed) for seed in seeds[:5]])}"
+        notes.append(text.replace("§", which, 1))
+    more = [f"and {len(notes) - MOST_NOTES} more notes."] if len(notes) > MOST_NOTES else []
+    if gated > MOST_BARS:
+        more.append(f"Of {gated} bars {MOST_BARS} are drawn; the table has all.")
+    return notes[:MOST_NOTES] + more
+
+
+# ---- figures
+
+
+def _drawings(gated: list[Decided], canvas: Canvas) -> list[Drawing]:
+    """Draw a bar of classes and a bar of degrees for each scene and model."""
+    label = lambda one: words.cut(f"{one.scene}, {one.arm.name}", 40)  # noqa: E731
+    classes = [
+        charts.Bar(label(one), _shares([one.rows[name] for name in NAMES]), f"{one.left:,.0f} of {one.before:,.0f}")
+        for one in gated
+    ]
+    degrees = [charts.Bar(label(one), _shares(one.degrees), f"mean degree {_mean_degree(one)}") for one in gated]
+    colours = [model_colour(MODELS.index(CLASS_LIKE[name])) for name in CLASSES]
+    whose = words.listing([bar.label for bar in classes])
+    drawn = (
+        ("Gaussians by class, of those before the gates", "k", classes, [*colours, LINE]),
+        ("Harmonics by degree, of the Gaussians left", "d", degrees, [stage_colour(i) for i in range(DEGREES)]),
+    )
+    return [
+        Drawing(title, charts.bars(bars, hues, "%").svg(f"{canvas.name}o{key}", f"{title}: {whose}"))
+        for title, key, bars, hues in drawn
+    ]
+
+
+def _shares(values: list[float]) -> list[float]:
+    """Return values as percentages of their sum."""
+    total = sum(values)
+    return [100 * value / total if total else 0.0 for value in values]
+
+
+def _mean_degree(one: Decided) -> str:
+    total = sum(one.degrees)
+    return words.plain(sum(i * n for i, n in enumerate(one.degrees)) / total if total else math.nan, 1)
+
+
+def _swatches() -> list[Swatch]:
+    """Name the colours of both drawings."""
+    classes = [Swatch(said, f"model-{MODELS.index(CLASS_LIKE[name])}") for name, said in CLASSES.items()]
+    degrees = [Swatch(f"degree {i}", f"stage-{i}") for i in range(DEGREES)]
+    return [*classes, Swatch(NAMES[REMOVED], "line"), *degrees]
+
+
+def _images(found: list[Decided], folder: Path) -> list[Image]:
+    """Show the picture by class of the first seed of each scene and model, as many as there is room for."""
+    places = gallery.places(folder, PICTURE)
+    paths = [next((p for r in one.runs if (p := places.get(gallery.place(r)))), None) for one in found]
+    captions = [f"{one.scene}, {one.arm.name}" for one in found]
+    return gallery.images([(c, path) for c, path in zip(captions, paths, strict=True) if path])
+
+
+# ---- numbers
+
+
+def _table(found: list[Decided]) -> Table:
+    columns = [Column("scene"), Column("model"), Column("variant"), Column("seeds"), Column("time")]
+    columns += [Column("largest p", 3), Column("% free of the camera", 0), Column("screen s", 1), Column("seeds gated")]
+    columns += [Column("Gaussians before", 0), *(Column(said, 0) for said in NAMES.values())]
+    columns += [Column(f"degree {i}", 0) for i in range(DEGREES)]
+    columns += [Column("predicted dB", 3), Column("PSNR measured on"), Column("PSNR dB", 3), Column("95 % low", 3)]
+    columns += [Column("95 % high", 3), Column("ms a frame before", 2), Column("change in ms", 2), Column("low", 2)]
+    columns += [Column("high", 2), Column("MB before", 2), Column("MB", 2)]
+    return Table("effects_on_demand.csv", columns, [_row(one) for one in found])
+
+
+def _row(one: Decided) -> list[Value]:
+    screens = _screens(one.runs)
+    decisions = Counter(screen.decision for screen in screens)
+    p = [screen.p for screen in screens if screen.p is not None]
+    free = [100 * screen.free for screen in screens if screen.free is not None]
+    rows = [one.rows[name] for name in NAMES] if one.gated else [math.nan] * len(NAMES)
+    return [
+        one.scene,
+        one.arm.model,
+        one.arm.variant or "none",
+        len(one.runs),
+        ", ".join(f"{decision} {n}" for decision, n in sorted(decisions.items())) or "not asked",
+        max(p, default=math.nan),
+        fmean(free) if free else math.nan,
+        fmean(screen.seconds for screen in screens) if screens else math.nan,
+        one.gated,
+        one.before if one.gated else math.nan,
+        *rows,
+        *(one.degrees or [math.nan] * DEGREES),
+        one.predicted,
+        one.views or None,
+        *(one.psnr.mean, one.psnr.low, one.psnr.high),
+        *(one.ms_before, one.ms.mean, one.ms.low, one.ms.high),
+        one.mb_before,
+        one.mb,
+    ]
