@@ -1,7 +1,8 @@
-"""Look which effects a scene calls for, without a training, or gate the model of a finished run.
+"""Look which effects a scene calls for, without a training; gate the model of a finished run, or draw its classes.
 
 python -m gsbench.effects SCENE_FOLDER [--json]
 python -m gsbench.effects --checkpoint RUN_FOLDER [--budget-db 0.05] [--data-root PATH]
+python -m gsbench.effects --picture RUN_FOLDER --out FILE.png [--camera 0] [--time 0.5] [--data-root PATH]
 """
 
 import argparse
@@ -25,15 +26,23 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the points and the permutations")
     parser.add_argument("--checkpoint", type=Path, metavar="RUN_FOLDER", help="gate this run into one beside it")
     parser.add_argument("--budget-db", type=float, default=0.05, help="PSNR on val that the gate may cost")
+    parser.add_argument("--picture", type=Path, metavar="RUN_FOLDER", help="draw its Gaussians by class")
+    parser.add_argument("--camera", type=int, default=0, help="of --picture: the number of the evaluated view")
+    parser.add_argument("--time", type=float, help="of --picture: in [0, 1]; that of the view by default")
+    parser.add_argument("--out", type=Path, metavar="FILE.png", help="where --picture goes")
     parser.add_argument("--data-root", help="where the data set of the run is now")
     asked = parser.parse_args(arguments)
     try:
-        if (asked.scene is None) == (asked.checkpoint is None):
-            raise InputError("expected SCENE_FOLDER or --checkpoint RUN_FOLDER, and not both")
+        if sum(one is not None for one in (asked.scene, asked.checkpoint, asked.picture)) != 1:
+            raise InputError("expected one of SCENE_FOLDER, --checkpoint RUN_FOLDER and --picture RUN_FOLDER")
+        if (asked.picture is None) != (asked.out is None):
+            raise InputError("expected --picture RUN_FOLDER and --out FILE.png together")
         if not math.isfinite(asked.budget_db) or not 0 <= asked.budget_db <= 10:
             raise InputError(f"--budget-db: expected 0 to 10 dB, got {asked.budget_db}")
         if asked.checkpoint is not None:
             return _gate(asked.checkpoint, asked.budget_db, asked.data_root)
+        if asked.picture is not None:
+            return _draw(asked.picture, asked.camera, asked.time, asked.data_root, asked.out)
         found = screen(scenes.load(asked.scene), asked.seed)
     except (InputError, OSError) as error:
         print(f"gsbench.effects: {one_line(error)}", file=sys.stderr)
@@ -49,6 +58,15 @@ def _gate(folder: Path, budget_db: float, data_root: str | None) -> int:
     for line in words.lines(record.on_demand) if record.on_demand else []:
         print(line)
     print(f"Written: {new}")
+    return 0
+
+
+def _draw(folder: Path, camera: int, time: float | None, data_root: str | None, out: Path) -> int:
+    from gsbench.report.pictures import write_png
+    from gsbench.run.picture import draw_run
+
+    write_png(draw_run(folder, camera, time, data_root), out)
+    print(f"Written: {out}")
     return 0
 
 

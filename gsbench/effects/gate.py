@@ -54,7 +54,7 @@ def choose(strength: Strength, model: GaussianModel, budget: float) -> Choice:
     assert now.levels is not None
     levels = torch.stack([now.levels] + [_lower(now.levels, v.level) for v in strength.variants if v.level is not None])
     hues = torch.stack([none] + [strength.errors[v.name] for v in strength.variants if v.level is not None])
-    painting = torch.tensor(COLORING, device=live.device)[levels % 4] * (levels // 4 + 1)
+    painting = _painting(levels)
 
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
         """Choose for a price of error; return both choices, and the error of each Gaussian."""
@@ -82,6 +82,23 @@ def _live_cost(model: GaussianModel, now: Classes) -> Tensor:
     cost -= LESS_TO_READ * (now.frozen > 0)
     cost[: now.refined] += REFINING
     return cost
+
+
+def cost_of(model: GaussianModel) -> Tensor:
+    """Return the nanoseconds that each Gaussian adds to a frame before it is rasterized, colours counted, [N]."""
+    now = classes_of(model)
+    assert now.levels is not None
+    return _live_cost(model, now) + _painting(now.levels)
+
+
+def most_cost(model: GaussianModel) -> float:
+    """Return the nanoseconds of a Gaussian that pays for everything that this model can have."""
+    return REFINING + SLICING + float(_painting(torch.tensor(model.full_level())))
+
+
+def _painting(levels: Tensor) -> Tensor:
+    """Return the nanoseconds that colours of some levels take."""
+    return torch.tensor(COLORING, device=levels.device)[levels % 4] * (levels // 4 + 1)
 
 
 def _lower(levels: Tensor, most: int) -> Tensor:

@@ -31,7 +31,6 @@ QUANTITIES: dict[str, Callable[[Record], float]] = {
     "ms": lambda r: r.cost.render_ms.p50 if r.cost else math.nan,  # a frame, median
     "mb": lambda r: r.cost.bytes / 1e6 if r.cost else math.nan,  # of the model's parameters
 }
-GATE_WORDS = ("gate=", "budget_db=")  # at the start of a word of a variant
 OF_THE_MACHINE = ("seconds", "ms")  # quantities that compare only between runs of one machine
 
 
@@ -104,7 +103,7 @@ class Group:
         return sorted({self.series_of(r.model, r.variant) for r in self.records})
 
     def series_of(self, model: str, variant: str) -> str:
-        """Name the frontier that an arm is a point of: lengths and capacities share one, gated models have their own.
+        """Name the frontier that an arm is a point of: lengths, capacities and budgets share one, gated models have their own.
 
         Where all runs were gated alike, the model says enough.
         """
@@ -189,8 +188,8 @@ def groups(records: list[Record]) -> list[Group]:
 
 
 def gating(variant: str) -> str:
-    """Return those words of a variant that say how its Gaussians were gated."""
-    return ",".join(word for word in variant.split(",") if word.startswith(GATE_WORDS))
+    """Return the word of a variant that says when its Gaussians were gated; "" where they were not."""
+    return next((word for word in variant.split(",") if word.startswith("gate=")), "")
 
 
 def machine(record: Record) -> str:

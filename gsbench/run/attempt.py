@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsbench import models
 from gsbench.config import Config, DataConfig
+from gsbench.effects import picture
 from gsbench.errors import InputError, one_line
 from gsbench.measure import record as records
 from gsbench.measure.provenance import provenance
@@ -52,6 +53,7 @@ class Attempt:
         self.scene: Scene | None = None
         self.start: TrainedGaussians | None = None  # trained Gaussians to start from; None: points
         self._shown: list[tuple[npt.ArrayLike, npt.ArrayLike]] = []
+        self._classes: picture.Pixels | None = None
 
     def prepare(self) -> tuple[GaussianModel, Scene]:
         """Check everything that can be refused before step 0, build the model and load the scene.
@@ -176,11 +178,16 @@ class Attempt:
         )
         metrics, missing = with_best(quality, trainer, config)
         metrics["psnr_train"] = trainer.psnr(evenly(trainer.scene.train, len(views)))
-        record = self.describe("ok", None)
+        record, on_demand = self.describe("ok", None), self._on_demand(trainer)
+        if on_demand and self._shown:
+            first = views[0]
+            self._classes = picture.draw(
+                trainer.model, first.camera, first.time, trainer.background, config.raster.antialias
+            )
         return replace(
             record, protocol=record.protocol | made,
             metrics=metrics, missing=missing, per_view=quality.per_view, cost=cost, curve=trainer.curve.points,
-            on_demand=self._on_demand(trainer),
+            on_demand=on_demand,
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:
@@ -190,14 +197,21 @@ class Attempt:
         return OnDemand(self.screen, trainer.gating.gates, trainer.gating.notes)
 
     def draw(self) -> None:
-        """Write pictures.png of what was measured; a disk that is full then costs the pictures and not the record."""
+        """Write pictures.png of what was measured, and classes.png of a model whose effects were chosen.
+
+        A disk that is full then costs the pictures and not the record.
+        """
         if not self._shown:
             return
-        path = self.this.folder / "pictures.png"
-        try:
-            write_png(strip(self._shown), path)
-        except OSError as error:
-            print(f"{self.this.name}: no pictures: {path}: {error.strerror}", file=sys.stderr)
+        drawn = {"pictures.png": strip(self._shown)}
+        if self._classes is not None:
+            drawn["classes.png"] = self._classes
+        for name, image in drawn.items():
+            path = self.this.folder / name
+            try:
+                write_png(image, path)
+            except OSError as error:
+                print(f"{self.this.name}: no pictures: {path}: {error.strerror}", file=sys.stderr)
 
     def describe(self, status: str, reason: str | None) -> Record:
         """Describe the run in a record without measurements: what was run, where, and how it ended.

@@ -8,6 +8,7 @@ from statistics import fmean
 from gsbench.effects.words import CLASSES, of_screen
 from gsbench.measure.record import Record, TimeScreen
 from gsbench.report.arms import Group
+from gsbench.report.intervals import Estimate
 from gsbench.report.on_demand import DEGREES, REMOVED, Decided, decided
 from gsbench.report.page import charts, gallery, words
 from gsbench.report.page.content import Canvas, Column, Drawing, Image, Section, Swatch, Tab, Table, Value
@@ -82,13 +83,17 @@ def _gate_words(one: Decided) -> list[str]:
     text = f"{where} Of {one.before:,.0f} Gaussians the gates left {one.left:,.0f}{share}"
     said = [(f"{text}: {words.listing(kept)}." if kept else f"{text}.").strip()]
     if one.psnr.scenes:
-        change = f"{words.signed(one.psnr.mean, 3)} dB ({words.interval(one.psnr, 3, sign=True)})"
-        text = f"The gate at the end changed PSNR on {words.cut(one.views, 40)} by {change}"
+        text = f"The gate at the end changed PSNR on {words.cut(one.views, 40)} by {_change(one.psnr, 'dB', 3)}"
         if one.ms.scenes:
-            change = f"{words.signed(one.ms.mean)} ms ({words.interval(one.ms, sign=True)})"
-            text += f" and a frame of {words.plain(one.ms_before)} ms by {change}"
-        said.append(f"{text}.")
+            text += f" and a frame of {words.plain(one.ms_before)} ms by {_change(one.ms, 'ms', 2)}"
+        said.append(f"{text}." if one.psnr.over else f"{text}; {words.NO_SPREAD}.")
     return said
+
+
+def _change(of: Estimate, unit: str, digits: int) -> str:
+    """Write a change with its interval, where there is one."""
+    interval = f" ({words.interval(of, digits, sign=True)})" if of.over else ""
+    return f"{words.signed(of.mean, digits)} {unit}{interval}"
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
@@ -123,12 +128,17 @@ def _drawings(gated: list[Decided], canvas: Canvas) -> list[Drawing]:
     whose = words.listing([bar.label for bar in classes])
     drawn = (
         ("Gaussians by class, of those before the gates", "k", classes, [*colours, LINE]),
-        ("Harmonics by degree, of the Gaussians left", "d", degrees, [stage_colour(i) for i in range(DEGREES)]),
+        ("Harmonics by degree, of the Gaussians left", "d", degrees, [stage_colour(_stage(i)) for i in range(DEGREES)]),
     )
     return [
         Drawing(title, charts.bars(bars, hues, "%").svg(f"{canvas.name}o{key}", f"{title}: {whose}"))
         for title, key, bars, hues in drawn
     ]
+
+
+def _stage(degree: int) -> int:
+    """Return the colour of a degree: more harmonics stand out more from the page, in both themes."""
+    return DEGREES - 1 - degree
 
 
 def _shares(values: list[float]) -> list[float]:
@@ -145,7 +155,7 @@ def _mean_degree(one: Decided) -> str:
 def _swatches() -> list[Swatch]:
     """Name the colours of both drawings."""
     classes = [Swatch(said, f"model-{MODELS.index(CLASS_LIKE[name])}") for name, said in CLASSES.items()]
-    degrees = [Swatch(f"degree {i}", f"stage-{i}") for i in range(DEGREES)]
+    degrees = [Swatch(f"degree {i}", f"stage-{_stage(i)}") for i in range(DEGREES)]
     return [*classes, Swatch(NAMES[REMOVED], "line"), *degrees]
 
 

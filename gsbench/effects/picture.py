@@ -1,0 +1,121 @@
+"""Draw a model's image beside the same Gaussians in the colours of their classes, and what each pixel pays.
+
+The third panel is the cost of the Gaussians that a pixel shows, weighted as their colours are: nanoseconds of a frame
+by the constants of gsbench.effects.gate, black for none, bright yellow for a Gaussian with AGR and all harmonics.
+"""
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from gsbench.effects.gate import classes_of, cost_of, most_cost
+from gsbench.effects.words import CLASSES
+from gsbench.models import GaussianModel, Query
+from gsbench.models.classes import NAMES
+from gsbench.models.render import rasterize_slice
+from gsbench.scenes import Camera
+
+# RGB, those of the report's page on white: a Gaussian has the colour of the model whose effects it still has.
+COLOURS = {
+    "refined": (0xB3, 0x47, 0x00),
+    "sliced": (0x9C, 0x3D, 0x82),
+    "time": (0x00, 0x73, 0x4F),
+    "direction": (0x00, 0x69, 0xA8),
+    "still": (0x5C, 0x60, 0x66),
+}
+LEAST_WIDTH, MOST_WIDTH = 300, 640  # pixels of a panel: smaller images are enlarged by an integer factor, larger shrunk
+GAP = 4  # pixels
+GREY = 200
+LINE = 22  # pixels of a line of text
+COLUMNS = 3
+
+Pixels = npt.NDArray[np.uint8]
+
+
+@torch.no_grad()
+def draw(
+    model: GaussianModel, camera: Camera, time: float | None, background: Tensor, antialias: bool = False
+) -> Pixels:
+    """Draw the three panels with their titles and a legend: uint8 [H', W', 3] RGB.
+
+    Args:
+        model: initialised; one without classes is refined, sliced or still everywhere.
+        camera: sees it.
+        time: in [0, 1]; None where the scene has no time.
+        background: colour [3] of the image; that of the classes is white.
+        antialias: see `gsbench.raster.rasterize`.
+
+    Raises:
+        InputError: the model observes time and there is none.
+    """
+    seen = model.slice(Query.of(camera, time))
+    kinds = kinds_of(model)
+    hues = torch.tensor([COLOURS[name] for name in NAMES]).to(seen.colors) / 255
+    pays = (cost_of(model) / most_cost(model)).to(seen.colors)
+    layers = (
+        (seen.colors, background),
+        (hues[kinds], torch.ones_like(background)),
+        (pays[:, None].expand(-1, 3).contiguous(), torch.zeros_like(background)),
+    )
+    images = [
+        rasterize_slice(seen._replace(colors=colors), camera, behind, model.backend, antialias).image[0]
+        for colors, behind in layers
+    ]
+    panels = [_bytes(image) for image in images]
+    panels[2] = _heat(panels[2][..., 0])
+    counts = torch.bincount(kinds, minlength=len(NAMES)).tolist()
+    return _arranged(panels, dict(zip(NAMES, counts, strict=True)), most_cost(model))
+
+
+def kinds_of(model: GaussianModel) -> Tensor:
+    """Return the class of each Gaussian as its place among NAMES, [N] int64."""
+    classes = classes_of(model)
+    assert classes.frozen is not None
+    place = torch.arange(len(model), device=classes.frozen.device)
+    sliced = 1 + classes.frozen.long()  # TIME and DIRECTION follow one another as in NAMES, and both are still
+    still = torch.full_like(place, NAMES.index("still"))
+    return torch.where(place < classes.refined, 0, torch.where(place < classes.sliced, sliced, still))
+
+
+def _arranged(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixels:
+    """Put panels side by side, titles above and the legend below."""
+    height, width = panels[0].shape[:2]
+    factor = max(1, -(-LEAST_WIDTH // width))
+    if width > MOST_WIDTH:
+        size = (MOST_WIDTH, max(1, round(height * MOST_WIDTH / width)))
+        panels = [np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA), np.uint8) for panel in panels]
+    panels = [panel.repeat(factor, 0).repeat(factor, 1) for panel in panels]
+    width = panels[0].shape[1]
+    gap = np.full((panels[0].shape[0], GAP, 3), GREY, np.uint8)
+    row = np.concatenate([panels[0], gap, panels[1], gap, panels[2]], 1)
+    step = width + GAP
+    titles = _paper(1, row.shape[1])
+    names = ("image", f"{sum(counts.values()):,} Gaussians by class", f"what a pixel pays, 0 to {most:.0f} ns")
+    for i, title in enumerate(names):
+        _write(titles, title, i * step + 6, 0)
+    legend = _paper(-(-len(counts) // COLUMNS), row.shape[1])
+    for i, (name, number) in enumerate(counts.items()):
+        line, left = i // COLUMNS, i % COLUMNS * step + 6
+        legend[line * LINE + 5 : line * LINE + 17, left : left + 12] = COLOURS[name]
+        _write(legend, f"{CLASSES[name]}: {number:,}", left + 18, line)
+    return np.concatenate([titles, row, legend])
+
+
+def _paper(lines: int, width: int) -> Pixels:
+    return np.full((lines * LINE, width, 3), 255, np.uint8)
+
+
+def _write(image: Pixels, text: str, x: int, line: int) -> None:
+    cv2.putText(image, text, (x, line * LINE + 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+
+
+def _bytes(image: Tensor) -> Pixels:
+    """Convert an image in [0, 1] to 8 bits."""
+    return np.asarray((image.clamp(0, 1) * 255).round().byte().cpu().numpy(), np.uint8)
+
+
+def _heat(levels: Pixels) -> Pixels:  # [H, W]
+    """Map levels to OpenCV's inferno colours, [H, W, 3] RGB."""
+    return np.asarray(cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), np.uint8)

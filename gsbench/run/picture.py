@@ -1,0 +1,38 @@
+"""Draw the Gaussians of a finished run by class, as one of the evaluated cameras sees them."""
+
+from pathlib import Path
+
+import torch
+
+from gsbench.effects.picture import Pixels, draw
+from gsbench.errors import InputError
+from gsbench.run.checks import evaluated_views
+from gsbench.run.load import load_run
+from gsbench.run.setup import load_scene
+
+
+def draw_run(folder: Path, camera: int, time: float | None, data_root: str | None = None) -> Pixels:
+    """Draw `gsbench.effects.picture.draw` of a run: uint8 [H', W', 3] RGB.
+
+    Args:
+        folder: of the run; its checkpoint is read.
+        camera: the number of the evaluated view.
+        time: in [0, 1]; None: that of the view.
+        data_root: where the data set is now; where it was for the run by default.
+
+    Raises:
+        InputError: there is no run, no data or no such view, or the time is none.
+    """
+    if time is not None and not 0 <= time <= 1:
+        raise InputError(f"--time: expected 0 to 1, got {time}")
+    loaded = load_run(folder)
+    if data_root is not None:
+        loaded.config.data.root = data_root
+    scene = load_scene(loaded.config)
+    views = evaluated_views(scene, loaded.config.scene.eval_split)
+    if not 0 <= camera < len(views):
+        raise InputError(f"--camera: expected 0 to {len(views) - 1}, the evaluated views of {scene.name}, got {camera}")
+    view = views[camera]
+    background = torch.tensor(scene.background)
+    when = view.time if time is None else time
+    return draw(loaded.model, view.camera, when, background, loaded.config.raster.antialias)
