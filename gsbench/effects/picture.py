@@ -1,4 +1,4 @@
-"""Draw a model's image beside the same Gaussians in the colours of their classes, and what each pixel pays.
+"""Draw a model's image beside the same Gaussians in the colours of their classes, and what a pixel pays for.
 
 The third panel is the cost of the Gaussians that a pixel shows, weighted as their colours are: nanoseconds of a frame
 by the constants of gsbench.effects.gate, black for none, bright yellow for a Gaussian with AGR and all harmonics.
@@ -92,7 +92,7 @@ def _arranged(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixe
     row = np.concatenate([panels[0], gap, panels[1], gap, panels[2]], 1)
     step = width + GAP
     titles = _paper(1, row.shape[1])
-    names = ("image", f"{sum(counts.values()):,} Gaussians by class", f"what a pixel pays, 0 to {most:.0f} ns")
+    names = ("image", f"{sum(counts.values()):,} Gaussians by class", f"cost of what a pixel shows, 0 to {most:.0f} ns")
     for i, title in enumerate(names):
         _write(titles, title, i * step + 6, 0)
     legend = _paper(-(-len(counts) // COLUMNS), row.shape[1])

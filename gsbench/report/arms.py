@@ -103,9 +103,9 @@ class Group:
         return sorted({self.series_of(r.model, r.variant) for r in self.records})
 
     def series_of(self, model: str, variant: str) -> str:
-        """Name the frontier that an arm is a point of: lengths, capacities and budgets share one, gated models have their own.
+        """Name the frontier that an arm is a point of.
 
-        Where all runs were gated alike, the model says enough.
+        Lengths, capacities and budgets of a model share one, what is gated has its own. Where all runs were gated alike, the model says enough.
         """
         own = gating(variant)
         return f"{model}, {own}" if own and len(self._gatings) > 1 else model
