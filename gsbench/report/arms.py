@@ -105,7 +105,8 @@ class Group:
     def series_of(self, model: str, variant: str) -> str:
         """Name the frontier that an arm is a point of.
 
-        Lengths, capacities and budgets of a model share one, what is gated has its own. Where all runs were gated alike, the model says enough.
+        Lengths, capacities and budgets of a model share one, and what is gated has its own. Where all runs were gated
+        alike, the model says enough.
         """
         own = gating(variant)
         return f"{model}, {own}" if own and len(self._gatings) > 1 else model
