@@ -31,6 +31,7 @@ QUANTITIES: dict[str, Callable[[Record], float]] = {
     "ms": lambda r: r.cost.render_ms.p50 if r.cost else math.nan,  # a frame, median
     "mb": lambda r: r.cost.bytes / 1e6 if r.cost else math.nan,  # of the model's parameters
 }
+GATES = ("off", "end", "both")  # of effects.gate
 OF_THE_MACHINE = ("seconds", "ms")  # quantities that compare only between runs of one machine
 
 
@@ -95,25 +96,26 @@ class Group:
             runs.setdefault((r.model, r.variant), {}).setdefault(r.scene, []).append(r)
         several = len({variant for _, variant in runs}) > 1
         names = {(m, v): f"{m}, {v}" if v and several else m for m, v in runs}
-        return [Arm(m, v, scenes, names[m, v], self.series_of(m, v)) for (m, v), scenes in sorted(runs.items())]
+        series = {(r.model, r.variant): self.series_of(r) for r in self.finished}
+        return [Arm(m, v, scenes, names[m, v], series[m, v]) for (m, v), scenes in sorted(runs.items())]
 
     @cached_property
     def series(self) -> list[str]:
         """The curves of the frontier, also of runs that failed: the models, those that were gated apart."""
-        return sorted({self.series_of(r.model, r.variant) for r in self.records})
+        return sorted({self.series_of(r) for r in self.records})
 
-    def series_of(self, model: str, variant: str) -> str:
-        """Name the frontier that an arm is a point of.
+    def series_of(self, record: Record) -> str:
+        """Name the frontier that a run belongs to.
 
         Lengths, capacities and budgets of a model share one, and what is gated has its own. Where all runs were gated
         alike, the model says enough.
         """
-        own = gating(variant)
-        return f"{model}, {own}" if own and len(self._gatings) > 1 else model
+        own = gating(record)
+        return f"{record.model}, {own}" if own and len(self._gatings) > 1 else record.model
 
     @cached_property
     def _gatings(self) -> set[str]:
-        return {gating(r.variant) for r in self.records}
+        return {gating(r) for r in self.records}
 
     @cached_property
     def variant(self) -> str:
@@ -188,9 +190,12 @@ def groups(records: list[Record]) -> list[Group]:
     return [Group(runs) for runs in found.values()]
 
 
-def gating(variant: str) -> str:
-    """Return the word of a variant that says when its Gaussians were gated; "" where they were not."""
-    return next((word for word in variant.split(",") if word.startswith("gate=")), "")
+def gating(record: Record) -> str:
+    """Say when the Gaussians of a run were gated, in the words of a variant; "" where that is its model's default."""
+    config = record.provenance.config
+    effects, model = (part if isinstance(part := config.get(name), dict) else {} for name in ("effects", "model"))
+    gate = effects.get("gate", "off")
+    return f"gate={gate}" if gate in GATES and gate != model.get("gate", "off") else ""
 
 
 def machine(record: Record) -> str:

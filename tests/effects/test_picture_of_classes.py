@@ -1,0 +1,174 @@
+"""Gaussians drawn by class: each in its colour, counted in the legend, at its cost; of a run, by the command line."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tiny_run import gsbench, overrides, write_moving_square
+
+from gsbench.effects import picture
+from gsbench.effects.__main__ import main
+from gsbench.effects.gate import COLORING, COSTS, LESS_TO_READ, REFINING, SLICING, cost_of, most_cost
+from gsbench.effects.words import CLASSES
+from gsbench.measure import record
+from gsbench.models import GaussianModel, Phase, build
+from gsbench.models.base import Gaussians3D
+from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes, count
+from gsbench.models.variants import STILL
+from gsbench.report.page.palette import CLASS_LIKE, LIGHT, MODELS
+from gsbench.scenes import Camera, Points
+
+CAMERA = Camera(torch.eye(4), torch.tensor([[50.0, 0, 50], [0, 50, 10], [0, 0, 1]]), 100, 20)
+CENTRES = (10, 30, 50, 70, 90)  # pixels of five Gaussians, four standard deviations of which are between two
+ENLARGED = 3
+OPTIONS = {"7dgs": {"lambda_t": 0.5, "lambda_d": 0.3}, "3dgs": {}}
+
+
+def five(name: str = "7dgs", *, agr: bool = True, classes: Classes | None = None) -> GaussianModel:
+    """A model of five opaque grey Gaussians in a row, whatever is asked of it."""
+    model = build(name, agr=agr, **OPTIONS[name])
+    means = torch.tensor([[(x - 50) / 10, 0.0, 5.0] for x in CENTRES])
+    model.initialise(Points(means, torch.full((5, 3), 0.5)), 1.0, torch.Generator().manual_seed(0))
+    model.set_phase(Phase(3, agr, True))
+    model.classes = classes
+    seen = Gaussians3D(means, 0.35 * torch.eye(3).expand(5, 3, 3), torch.full((5,), 0.999), torch.full((5, 3), 0.5))
+    model.slice = lambda _: seen  # type: ignore[method-assign]
+    return model
+
+
+def one_of_each() -> GaussianModel:
+    """One Gaussian of each class, in the order of NAMES, with harmonics of degrees 3, 3, 2, 1, 0."""
+    levels, frozen = torch.tensor([3, 3, 2, 1, 0], dtype=torch.int32), torch.zeros(5, dtype=torch.uint8)
+    frozen[2], frozen[3] = TIME, DIRECTION
+    return five(classes=Classes(1, 4, levels, frozen))
+
+
+def panel(image: picture.Pixels, number: int) -> list[list[int]]:
+    """The colours of one panel at the five centres."""
+    row = picture.LINE + ENLARGED * 10
+    return [image[row, number * (ENLARGED * 100 + picture.GAP) + ENLARGED * x].tolist() for x in CENTRES]
+
+
+def test_each_class_has_its_colour() -> None:
+    """Catches rows taken for those of another class, swapped red and blue, and panels in another order."""
+    model = one_of_each()
+    image = picture.draw(model, CAMERA, 0.5, torch.zeros(3))
+    assert picture.kinds_of(model).tolist() == list(range(5))
+    assert dict(zip(NAMES, torch.bincount(picture.kinds_of(model)).tolist(), strict=True)) == count(model)
+    assert np.abs(np.array(panel(image, 0)) - 127.5).max() < 3
+    assert np.abs(np.array(panel(image, 1)) - [picture.COLOURS[name] for name in NAMES]).max() < 6
+    corner = image[picture.LINE, ENLARGED * 100 + picture.GAP]
+    assert corner.tolist() == [255, 255, 255], "the classes stand on white, whatever the background is"
+
+
+def test_the_legend_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a count beside the wrong name, and a swatch of another colour than its Gaussians."""
+    written = []
+    monkeypatch.setattr(cv2, "putText", lambda *given: written.append(given[1]))
+    frozen = torch.tensor([0, 0, 0, TIME, 0], dtype=torch.uint8)
+    model = five(classes=Classes(2, 4, torch.zeros(5, dtype=torch.int32), frozen))
+    image = picture.draw(model, CAMERA, 0.5, torch.ones(3))
+    counts = dict(zip(NAMES, (2, 1, 1, 0, 1), strict=True))
+    assert written[3:] == [f"{CLASSES[name]}: {number}" for name, number in counts.items()]
+    assert written[1] == "5 Gaussians by class"
+    legend = image[picture.LINE + ENLARGED * 20 :]
+    for i, name in enumerate(NAMES):
+        left = i % 3 * (ENLARGED * 100 + picture.GAP)
+        assert legend[i // 3 * picture.LINE + 10, left + 10].tolist() == list(picture.COLOURS[name])
+
+
+def test_what_a_pixel_pays_for() -> None:
+    """Catches costs of other Gaussians than those that are seen, without colours, or on a scale of their own."""
+    model = one_of_each()
+    frozen = SLICING - LESS_TO_READ
+    geometry = [REFINING + SLICING, SLICING, frozen, frozen, COSTS[STILL]]
+    expected = [g + COLORING[degree] for g, degree in zip(geometry, (3, 3, 2, 1, 0), strict=True)]
+    assert cost_of(model).tolist() == pytest.approx(expected)
+    assert most_cost(model) == REFINING + SLICING + COLORING[3]
+    shown = panel(picture.draw(model, CAMERA, 0.5, torch.ones(3)), 2)
+    bright = [sum(colour) for colour in shown]
+    assert bright == sorted(bright, reverse=True)
+    assert shown[0][0] > 230, "a Gaussian that pays for everything is bright yellow"
+    assert shown[0][1] > 230
+
+
+@pytest.mark.parametrize(
+    ("name", "agr", "kind"), [("7dgs", True, "refined"), ("7dgs", False, "sliced"), ("3dgs", False, "still")]
+)
+def test_a_model_without_classes_is_of_one_class(name: str, agr: bool, kind: str) -> None:
+    """Catches a model that was not gated and cannot be drawn, or is drawn as what it is not."""
+    model = five(name, agr=agr)
+    assert picture.kinds_of(model).tolist() == [NAMES.index(kind)] * 5
+    shown = panel(picture.draw(model, CAMERA, 0.5, torch.zeros(3)), 1)
+    assert np.abs(np.array(shown) - picture.COLOURS[kind]).max() < 6
+
+
+def test_large_images_are_made_smaller() -> None:
+    """Catches a file of many megabytes for a scene of full size."""
+    wide = Camera(CAMERA.viewmat, CAMERA.K, 2000, 500)
+    image = picture.draw(one_of_each(), wide, 0.5, torch.zeros(3))
+    assert image.shape[1] == 3 * picture.MOST_WIDTH + 2 * picture.GAP
+    assert image.shape[0] == 160 + 3 * picture.LINE
+
+
+def test_the_page_has_the_same_colours() -> None:
+    """Catches a class that has one colour in the picture and another in the figure above it."""
+    page = {name: LIGHT[MODELS.index(like)] for name, like in CLASS_LIKE.items()}
+    assert {name: f"#{r:02x}{g:02x}{b:02x}" for name, (r, g, b) in picture.COLOURS.items()} == page
+    assert tuple(page) == tuple(CLASSES) == NAMES
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that is gated at its end."""
+    root = tmp_path_factory.mktemp("run")
+    data = write_moving_square(root / "data")
+    done = gsbench(*overrides(data, root / "r", "model=7dgs", "effects.gate=end", "effects.budget_db=0.01"))
+    assert done.returncode == 0, done.stderr
+    (path,) = record.find(root)
+    return path.parent
+
+
+def test_a_run_that_chose_effects_leaves_its_picture(folder: Path) -> None:
+    """Catches a picture that is not written, or not where the report looks."""
+    assert record.read(folder / record.FILE_NAME).on_demand
+    assert cv2.imread(str(folder / "classes.png")).shape[1] == 3 * 304 + 2 * picture.GAP
+
+
+def test_the_command_draws_a_run(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a command that draws another view or moment than it was asked for, or than the run itself drew."""
+    out = [tmp_path / f"{i}.png" for i in range(3)]
+    asked = [[], ["--camera", "1"], ["--camera", "1", "--time", "0.2"]]
+    for path, more in zip(out, asked, strict=True):
+        assert main(["--picture", str(folder), "--out", str(path), *more]) == 0
+    assert out[0].read_bytes() == (folder / "classes.png").read_bytes()
+    assert len({path.read_bytes() for path in out}) == 3
+    assert str(out[2]) in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--camera", "2"], "--camera: expected 0 to 1, the evaluated views of square, got 2"),
+        (["--camera", "-1"], "--camera: expected 0 to 1"),
+        (["--time", "nan"], "--time: expected 0 to 1, got nan"),
+        (["--data-root", "/nowhere"], "/nowhere"),
+    ],
+)
+def test_the_command_refuses(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], said: str
+) -> None:
+    """Catches a stack trace, and a view that is counted from the end."""
+    assert main(["--picture", str(folder), "--out", str(tmp_path / "x.png"), *more]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "x.png").exists()
+
+
+def test_the_command_needs_one_task_and_a_file(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a file that is asked for and never written, and two tasks of which one is forgotten."""
+    for arguments, said in (([], "expected one of"), (["a", "--picture", "b", "--out", "c"], "expected one of"),
+                            (["a", "--out", "c"], "together"), (["--picture", "b"], "together")):  # fmt: skip
+        assert main(arguments) == 2
+        assert said in capsys.readouterr().err
