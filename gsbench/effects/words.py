@@ -18,10 +18,14 @@ _KEEP = {
 }
 
 
+def of_decision(screen: TimeScreen) -> str:
+    """Say whether time is simulated."""
+    return f"time is {screen.decision}{', so it is simulated' if screen.decision == 'undecided' else ''}"
+
+
 def of_screen(screen: TimeScreen) -> str:
     """Say whether time is simulated, and why."""
-    simulated = "" if screen.decision != "undecided" else ", so it is simulated"
-    return f"time is {screen.decision}{simulated}: {screen.reason}"
+    return f"{of_decision(screen)}: {screen.reason}"
 
 
 def of_gate(gate: Gate) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import fmean
@@ -23,6 +24,7 @@ class Decided:
 
     scene: str
     arm: Arm
+    name: str  # of the arm: as short as tells it from the others here
     runs: list[Record]  # those that chose effects, in order of the seeds
     gated: int  # how many of them a gate has changed: the numbers below are theirs
     rows: dict[str, float]  # Gaussians at the end by class, and how many all gates removed
@@ -48,29 +50,32 @@ class Decided:
 
 def decided(group: Group) -> list[Decided]:
     """Return what was decided, by scene and arm; nothing where every Gaussian pays for every effect."""
-    found = []
-    for scene in group.scenes:
-        for arm in group.arms:
-            runs = [r for r in arm.runs.get(scene, []) if r.on_demand]
-            if runs:
-                found.append(_average(group, scene, arm, runs))
-    return found
+    arms = [arm for arm in group.arms if arm.on_demand]
+    shared = Counter(arm.series for arm in arms)
+    names = [arm.series if shared[arm.series] == 1 else arm.name for arm in arms]
+    return [
+        _average(group, scene, arm, name, runs)
+        for scene in group.scenes
+        for arm, name in zip(arms, names, strict=True)
+        if (runs := [r for r in arm.runs.get(scene, []) if r.on_demand])
+    ]
 
 
-def _average(group: Group, scene: str, arm: Arm, runs: list[Record]) -> Decided:
+def _average(group: Group, scene: str, arm: Arm, name: str, runs: list[Record]) -> Decided:
     gates = [r.on_demand.gates for r in runs if r.on_demand and r.on_demand.gates]
     at_end = [(r, r.on_demand.gates[-1]) for r in runs if r.on_demand and _ends(r.on_demand.gates)]
     evaluated = all(gate.eval_loss_db is not None for _, gate in at_end)
     loss: Callable[[Gate], float | None] = lambda g: g.eval_loss_db if evaluated else g.measured_db  # noqa: E731
     here = [gate for r, gate in at_end if machine(r) == group.machine]
     splits = [str(r.protocol.get("eval_split", "evaluated")) if evaluated else gate.checked_on for r, gate in at_end]
-    names = [*CLASSES, REMOVED] if gates else []
+    kinds = [*CLASSES, REMOVED] if gates else []
     return Decided(
         scene,
         arm,
+        name,
         runs,
         len(gates),
-        {name: fmean(_rows(one, name) for one in gates) for name in names},
+        {kind: fmean(_rows(one, kind) for one in gates) for kind in kinds},
         [fmean(_of_degree(one[-1], degree) for one in gates) for degree in range(DEGREES)] if gates else [],
         next(iter(splits), ""),
         _mean([_less(loss(gate), 0.0) for _, gate in at_end]),

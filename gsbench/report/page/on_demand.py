@@ -5,7 +5,7 @@ from collections import Counter
 from pathlib import Path
 from statistics import fmean
 
-from gsbench.effects.words import CLASSES, of_screen
+from gsbench.effects.words import CLASSES, of_decision
 from gsbench.measure.record import Record, TimeScreen
 from gsbench.report.arms import Group
 from gsbench.report.intervals import Estimate
@@ -20,6 +20,7 @@ MOST_SAID = 12  # scenes and models that have a sentence
 MOST_BARS = 24
 MOST_NOTES = 12
 LONGEST_REASON = 200
+LONGEST_LABEL = 32  # of a bar, which has a number beside it
 NAMES = CLASSES | {REMOVED: "removed"}
 
 
@@ -50,7 +51,7 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> Section | N
 def _sentence(one: Decided) -> str:
     """Say what was decided on a scene for a model."""
     parts = [_screen_words(one.runs), *_gate_words(one)]
-    return f"{one.scene}, {one.arm.name}: {' '.join(part for part in parts if part)}"
+    return f"On {one.scene}, {one.name}: {' '.join(part for part in parts if part)}"
 
 
 def _screen_words(runs: list[Record]) -> str:
@@ -59,13 +60,13 @@ def _screen_words(runs: list[Record]) -> str:
     if not screens:
         return ""
     first = screens[0]
-    text = words.cut(of_screen(first), LONGEST_REASON)
+    text = words.cut(f"{of_decision(first)}, as {first.reason}", LONGEST_REASON)
     others = Counter(screen.decision for screen in screens if screen.decision != first.decision)
     if others:
         parts = [f"{words.cut(decision, 20)} with {words.count(n, 'seed')}" for decision, n in sorted(others.items())]
         text += f"; {words.listing(parts)}"
     elif len(screens) > 1:
-        text += f"; {first.decision} with all {len(screens)} seeds"
+        text += f"; the same with all {len(screens)} seeds"
     return f"{text}."
 
 
@@ -102,7 +103,7 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
     for one in found:
         for run in one.runs:
             for note in run.on_demand.notes if run.on_demand else []:
-                named.setdefault(f"{one.scene}, {one.arm.name}, §: {words.cut(note)}", []).append(run.seed)
+                named.setdefault(f"{one.scene}, {one.name}, §: {words.cut(note)}", []).append(run.seed)
     notes = []
     for text, seeds in named.items():
         which = f"seed{'' if len(seeds) == 1 else 's'} {words.listing([str(seed) for seed in seeds[:5]])}"
@@ -118,7 +119,7 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
 
 def _drawings(gated: list[Decided], canvas: Canvas) -> list[Drawing]:
     """Draw a bar of classes and a bar of degrees for each scene and model."""
-    label = lambda one: words.cut(f"{one.scene}, {one.arm.name}", 40)  # noqa: E731
+    label = lambda one: words.cut(f"{one.scene}, {one.name}", LONGEST_LABEL)  # noqa: E731
     classes = [
         charts.Bar(label(one), _shares([one.rows[name] for name in NAMES]), f"{one.left:,.0f} of {one.before:,.0f}")
         for one in gated
@@ -163,7 +164,7 @@ def _images(found: list[Decided], folder: Path) -> list[Image]:
     """Show the picture by class of the first seed of each scene and model, as many as there is room for."""
     places = gallery.places(folder, PICTURE)
     paths = [next((p for r in one.runs if (p := places.get(gallery.place(r)))), None) for one in found]
-    captions = [f"{one.scene}, {one.arm.name}" for one in found]
+    captions = [f"{one.scene}, {one.name}" for one in found]
     return gallery.images([(c, path) for c, path in zip(captions, paths, strict=True) if path])
 
 

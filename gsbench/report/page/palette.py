@@ -32,7 +32,8 @@ class Style:
 def styles(models: list[str]) -> dict[str, Style]:
     """Return the style of each model: a known one always has the same, others take what is left, in turn."""
     others = sorted(set(models) - set(MODELS))
-    free = [i for i in range(len(LIGHT)) if i >= len(MODELS) or MODELS[i] not in models]
+    spare = range(len(MODELS), len(LIGHT))
+    free = [*spare, *(i for i, m in enumerate(MODELS) if m not in models)]
     chosen = {m: MODELS.index(m) for m in models if m in MODELS}
     chosen |= {m: free[i % len(free)] if free else i % len(LIGHT) for i, m in enumerate(others)}
     return {m: Style(i, MARKERS[i]) for m, i in chosen.items()}

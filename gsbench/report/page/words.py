@@ -40,7 +40,9 @@ def probability(p: float) -> str:
 def signed(value: float, digits: int = 2) -> str:
     """Write a difference with its sign; none where it rounds to zero."""
     text = plain(value, digits)
-    return text if math.isnan(value) or text.startswith("−") or not float(text) else f"+{text}"
+    if math.isnan(value) or float(text.replace("−", "-")) == 0:
+        return text.removeprefix("−")
+    return text if text.startswith("−") else f"+{text}"
 
 
 def duration(seconds: float) -> str:
