@@ -8,9 +8,9 @@ from make_golden import make
 
 from gsbench.measure import record as files
 from gsbench.measure.curve import Point
-from gsbench.measure.record import Effects, Record, ViewScore
+from gsbench.measure.record import Effects, Gate, OnDemand, Record, TimeScreen, ViewScore
 from gsbench.measure.speed import RenderTimes
-from gsbench.report.pictures import strip, write_png
+from gsbench.report.pictures import Pixels, strip, write_png
 
 EFFECTS = {
     "3dgs": Effects(False, False, False),
@@ -71,6 +71,37 @@ def one(model: str, scene: str, seed: int, length: int, views: int, lengths: tup
     )
 
 
+def gates(seed: int = 0) -> list[Gate]:
+    """A gate in training and one at the end, with numbers that differ from seed to seed."""
+    first = {"refined": 500, "sliced": 200, "time": 0, "direction": 0, "still": 100, "removed": 200}
+    last = {"refined": 300 + 10 * seed, "sliced": 150, "time": 40, "direction": 10, "still": 200, "removed": 100}
+    last["removed"] -= 10 * seed
+    levels = {"degree 0": 350, "degree 1": 50, "degree 2": 100, "degree 3, 2 waves": 200 + 10 * seed}
+    return [
+        Gate(0.1, 0.4, 0.3, first, {"degree 3": 800}, 400_000, 300_000, step=600, seconds=1.0),
+        Gate(0.01, 0.04, 0.03, last, levels, 300_000, 200_000, None, "val", 2.0, 0.02 + 0.01 * seed, 4.0, 3.0),
+    ]  # fmt: skip
+
+
+def on_demand(records: list[Record], *, label: str = "auto", gate: str = "both") -> list[Record]:
+    """The same runs with effects chosen, as another model or another variant of their own one."""
+    found = []
+    for r in records:
+        own = label == r.model
+        config = r.provenance.config | {"effects": {"gate": gate}, "model": {"gate": "off" if own else gate}}
+        screen = TimeScreen("on", "what a static fit leaves over changes with time", 0.001, 12.0, 0.9, 0.8)
+        found.append(
+            dataclasses.replace(
+                r,
+                model=label,
+                variant=",".join(filter(None, [r.variant, f"gate={gate}"])) if own else r.variant,
+                on_demand=OnDemand(None if own else screen, gates(r.seed)),
+                provenance=dataclasses.replace(r.provenance, config=config),
+            )
+        )
+    return found
+
+
 def hostile() -> list[Record]:
     """Runs whose every free text tries to leave its place, and one that failed with such a reason."""
     runs = frontier(("3dgs", "7dgs"), ("suzanne",), 2, (1000,))
@@ -82,8 +113,18 @@ def hostile() -> list[Record]:
     stages = dataclasses.replace(runs[0].cost, stage_s={HOSTILE: 1.0})
     changes = {"dataset": HOSTILE, "protocol": protocol, "provenance": provenance, "overrides": [HOSTILE, "seed=0"]}
     bad = [dataclasses.replace(r, per_view=views, cost=stages, **changes) for r in runs]
+    bad[-1] = dataclasses.replace(bad[-1], on_demand=hostile_choice())
     lost = {"status": "failed", "reason": HOSTILE, "metrics": None, "missing": {}, "cost": None}
     return [*bad, dataclasses.replace(bad[0], model="4dgs", per_view=[], curve=[], **lost)]
+
+
+def hostile_choice() -> OnDemand:
+    """Words, classes and numbers that no gate would write."""
+    screen = TimeScreen(HOSTILE, HOSTILE, 2.0, -1e300, 1e300, -1.0)
+    rows = {HOSTILE: 2**62, "refined": -(2**62), "removed": 2**62, "sliced": 0}
+    levels = {HOSTILE: 1, f"degree 1{HOSTILE}": -5, "degree 3": 2**62}
+    gate = Gate(-1.0, 1e300, -1e300, rows, levels, -1, 2**62, None, HOSTILE, -1.0, None, 1e300, -1e300)
+    return OnDemand(screen, [gate], [HOSTILE, HOSTILE[::-1], "", *(f"note {i}" for i in range(50))])
 
 
 def write_all(records: list[Record], root: Path, *, pictures: int = 0) -> Path:
@@ -95,4 +136,11 @@ def write_all(records: list[Record], root: Path, *, pictures: int = 0) -> Path:
             random = np.random.default_rng(len(r.model))
             rows = [(random.random((40, 60, 3)), np.full((40, 60, 3), i / pictures)) for i in range(pictures)]
             write_png(strip(rows), folder / "pictures.png")
+            if r.on_demand:
+                write_png(classes(random), folder / "classes.png")
     return root / records[0].experiment
+
+
+def classes(random: np.random.Generator) -> Pixels:
+    """A picture of the size of classes.png, of noise."""
+    return random.integers(0, 256, (120, 912, 3)).astype(np.uint8)

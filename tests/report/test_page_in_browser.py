@@ -4,7 +4,7 @@ import os
 import shutil
 
 import pytest
-from many_records import frontier, hostile, write_all
+from many_records import frontier, hostile, on_demand, write_all
 
 from gsbench.report.page import build
 
@@ -31,6 +31,8 @@ def pages(tmp_path_factory):
     """The files of a page with everything on it, and of one made of hostile records."""
     root = tmp_path_factory.mktemp("pages")
     records = frontier(lengths=(500, 1000))
+    whole = [r for r in records if r.model == "7dgs"]
+    records += on_demand(whole) + on_demand(whole, label="7dgs")
     good = build.write(records, write_all(records, root, pictures=2))
     (root / "bad").mkdir()
     return {"good": good, "hostile": build.write(hostile(), root / "bad")}

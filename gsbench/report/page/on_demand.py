@@ -21,6 +21,10 @@ MOST_BARS = 24
 MOST_NOTES = 12
 LONGEST_REASON = 200
 LONGEST_LABEL = 32  # of a bar, which has a number beside it
+IN_TRAINING = (
+    "What the gate in training changed is not in these dB and ms, as the training goes on after it: the frontier has "
+    "runs with and without gates, where both were run."
+)
 NAMES = CLASSES | {REMOVED: "removed"}
 
 
@@ -98,7 +102,7 @@ def _change(of: Estimate, unit: str, digits: int) -> str:
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
-    """List what could not be decided, once where seeds say the same."""
+    """List what could not be decided, once where seeds say the same, and what the numbers do not hold."""
     named: dict[str, list[int]] = {}
     for one in found:
         for run in one.runs:
@@ -111,6 +115,9 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
     more = [f"and {len(notes) - MOST_NOTES} more notes."] if len(notes) > MOST_NOTES else []
     if gated > MOST_BARS:
         more.append(f"Of {gated} bars {MOST_BARS} are drawn; the table has all.")
+    gates = [g for one in found for r in one.runs for g in (r.on_demand.gates if r.on_demand else [])]
+    if any(gate.step is not None for gate in gates):
+        more.append(IN_TRAINING)
     return notes[:MOST_NOTES] + more
 
 
