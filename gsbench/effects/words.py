@@ -1,6 +1,6 @@
 """Say in words what was decided about the effects of a scene and of its Gaussians; needs no torch."""
 
-from gsbench.measure.record import Gate, OnDemand, TimeScreen
+from gsbench.measure.record import Direction, Gate, OnDemand, TimeScreen
 
 CLASSES = {  # of Gaussians: the names of gsbench.models.classes, in its order, and what they are called
     "refined": "refined by AGR",
@@ -42,7 +42,15 @@ def of_gate(gate: Gate) -> str:
     return f"{text}, {gate.bytes_before / 1e6:.2f} -> {gate.bytes / 1e6:.2f} MB"
 
 
+def of_direction(found: Direction) -> str:
+    """Say what direction is worth."""
+    return (f"direction: {found.kept:.0%} of the Gaussians keep it; freezing it in all would change PSNR by "
+            f"{-found.loss_db:+.2f} dB and a frame from {found.frame_ms:.2f} to "
+            f"{found.frame_ms_without:.2f} ms")  # fmt: skip
+
+
 def lines(found: OnDemand) -> list[str]:
     """Say everything that was decided, a sentence a line."""
     said = [of_screen(found.screen)] if found.screen else []
-    return said + [of_gate(gate) for gate in found.gates] + found.notes
+    said += [of_gate(gate) for gate in found.gates]
+    return said + ([of_direction(found.direction)] if found.direction else []) + found.notes

@@ -39,8 +39,7 @@ def variants_of(
         opacities: [N] of the model's slices at the queries, the weights.
         by_halves: whether time or direction alone may be frozen.
     """
-    weights = torch.stack(list(opacities)) + FEW  # [V, N]
-    weights = weights / weights.sum(0)
+    weights = shares_of(opacities)
     found = []
     names = (*model.centers, *model.geometry)
     raw: Raw = {name: value.detach() for name, value in model.splats.items()}
@@ -54,6 +53,12 @@ def variants_of(
     found.append(Variant(REMOVED, None))
     return found + [Variant(f"level{level}", _repainted(model, level, queries, opacities, weights), level)
                     for level in model.lower_levels()]  # fmt: skip
+
+
+def shares_of(opacities: Sequence[Tensor]) -> Tensor:
+    """Return the weights [V, N] of queries, from the opacities of their slices; each Gaussian's sum to 1."""
+    weights = torch.stack(list(opacities)) + FEW
+    return weights / weights.sum(0)
 
 
 def _baked(model: GaussianModel, queries: Sequence[Query], weights: Tensor, names: Sequence[str]) -> Raw:

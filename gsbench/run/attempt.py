@@ -194,7 +194,8 @@ class Attempt:
         """Say which effects were chosen; None where none were to be."""
         if self.screen is None and self.config.effects.gate == "off":
             return None
-        return OnDemand(self.screen, trainer.gating.gates, trainer.gating.notes)
+        gating = trainer.gating
+        return OnDemand(self.screen, gating.gates, gating.notes, gating.direction)
 
     def draw(self) -> None:
         """Write pictures.png of what was measured, and classes.png of a model whose effects were chosen.

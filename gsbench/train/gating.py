@@ -1,8 +1,9 @@
 """Gate the model of a training: once when its densification is over, so that it trains on for less, and at the end."""
 
+import copy
 import time
-from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -10,10 +11,11 @@ from torch import Tensor
 
 from gsbench.config import Config
 from gsbench.effects.budget import Gated, gate_within
+from gsbench.effects.direction import share_with_direction, without_direction
 from gsbench.effects.strength import probe
 from gsbench.errors import InputError
 from gsbench.measure.quality import psnr
-from gsbench.measure.record import Gate
+from gsbench.measure.record import Direction, Gate
 from gsbench.measure.schema import parse
 from gsbench.measure.speed import synchroniser, time_in_turns
 from gsbench.models import GaussianModel
@@ -33,6 +35,13 @@ FEW = 12  # training views, of which none is held out
 
 NO_GATES: dict[str, Any] = {"gates": [], "notes": []}  # the state of a training without gates
 Shape = tuple[dict[str, Tensor], Classes | None]  # raw parameters and classes
+
+
+def become(model: GaussianModel, shape: Shape) -> None:
+    """Give a model other Gaussians."""
+    for name, value in shape[0].items():
+        model.splats[name].data = value
+    model.classes = shape[1]
 
 
 class Gating:
@@ -61,6 +70,7 @@ class Gating:
         self.config = config
         self.gates: list[Gate] = []
         self.notes: list[str] = []
+        self.direction: Direction | None = None
         self.probed, self.checked, self.checked_on = scene.train, scene.val, "val"
         if not scene.val or config.scene.eval_split == "val":
             self.checked_on = "held-out training views"
@@ -86,31 +96,26 @@ class Gating:
         return {name: x.data for name, x in self.model.splats.items()}, self.model.classes
 
     def compare(self, ungated: Shape, views: list[View]) -> None:
-        """Measure what the gate at the end changed on the evaluated `views`: PSNR, and frames rendered in turns."""
-        if not self.gates or self.gates[-1].step is not None:
-            return
-        gated = self.now()
-        self._become(ungated)
-        before = self._psnr(self.model, views)
-        self._become(gated)
-        loss = before - self._psnr(self.model, views)
+        """Measure on the evaluated `views` what the gate at the end changed, and what freezing direction would."""
+        if self.gates and self.gates[-1].step is None:
+            before = copy.deepcopy(self.model)
+            become(before, ungated)
+            loss, times = self._beside(before, self.model, views)
+            self.gates[-1] = replace(self.gates[-1], eval_loss_db=loss, frame_ms_before=times[0], frame_ms=times[1])
+        frozen = without_direction(self.model, self.probed)
+        if frozen is not None:
+            loss, times = self._beside(self.model, frozen, views)
+            self.direction = Direction(share_with_direction(self.model), loss, *times)
 
-        def frames_of(shape: Shape) -> Callable[[int], object]:
-            def frame(i: int) -> object:
-                self._become(shape)
-                return self._render(self.model, views[i % len(views)])
-
-            return frame
-
+    def _beside(self, one: GaussianModel, other: GaussianModel, views: list[View]) -> tuple[float, list[float]]:
+        """Return the PSNR that the other model has less on views, and the median milliseconds of frames of both."""
         count = max(self.config.protocol.renders, len(views))
-        wait = synchroniser(self.config.device)
-        times = time_in_turns([frames_of(ungated), frames_of(gated)], count, wait)
-        self.gates[-1] = replace(self.gates[-1], eval_loss_db=loss, frame_ms_before=times[0].p50, frame_ms=times[1].p50)
+        frames = [partial(self._frame, model, views) for model in (one, other)]
+        times = time_in_turns(frames, count, synchroniser(self.config.device))
+        return self._psnr(one, views) - self._psnr(other, views), [one.p50 for one in times]
 
-    def _become(self, shape: Shape) -> None:
-        for name, value in shape[0].items():
-            self.model.splats[name].data = value
-        self.model.classes = shape[1]
+    def _frame(self, model: GaussianModel, views: list[View], i: int) -> Tensor:
+        return self._render(model, views[i % len(views)])
 
     @torch.no_grad()
     def _gate(self, step: int | None, budget_db: float, most: int) -> bool:
@@ -147,7 +152,8 @@ class Gating:
 
     def state_dict(self) -> dict[str, Any]:
         """Return what was decided, for the checkpoint; the classes are the model's."""
-        return {"gates": [asdict(gate) for gate in self.gates], "notes": list(self.notes)}
+        direction = asdict(self.direction) if self.direction else None
+        return {"gates": [asdict(gate) for gate in self.gates], "notes": list(self.notes), "direction": direction}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from the `state_dict` of a checkpoint, once the model is loaded; raises InputError if it is none."""
@@ -156,3 +162,5 @@ class Gating:
             raise InputError("checkpoint: expected lists of gates and notes")
         self.gates = [parse(Gate, gate, "checkpoint: gate") for gate in gates]
         self.notes = notes
+        direction = state.get("direction")
+        self.direction = parse(Direction, direction, "checkpoint: direction") if direction is not None else None

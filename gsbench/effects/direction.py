@@ -1,0 +1,47 @@
+"""Freeze direction in every Gaussian of a model, to measure what it is worth: that it is there cannot be detected."""
+
+import copy
+from collections.abc import Sequence
+
+import torch
+
+from gsbench.effects.gate import classes_of
+from gsbench.effects.strength import evenly_spaced
+from gsbench.models import GaussianModel, Query
+from gsbench.models.classes import DIRECTION
+from gsbench.models.variants import STILL, shares_of
+from gsbench.scenes import View
+
+MOST_VIEWS = 60
+
+
+@torch.no_grad()
+def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianModel | None:
+    """Return a copy whose slices do not change with the direction of view; None where the model's never do.
+
+    AGR goes on, as do time and the harmonics of the colours.
+
+    Args:
+        model: trained.
+        views: training views, over which the frozen direction is averaged.
+    """
+    if "direction" not in model.observes:
+        return None
+    queries = [Query.of(view.camera, view.time) for view in evenly_spaced(views, MOST_VIEWS)]
+    weights = shares_of([model.slice(query).opacities for query in queries])
+    frozen = model.frozen({name: value.detach() for name, value in model.splats.items()}, queries, weights)
+    changed = copy.deepcopy(model)
+    name = "direction" if "direction" in frozen else STILL
+    for key, value in frozen[name].items():
+        if key != "directions":  # AGR reads them
+            changed.splats[key].data = value.clone()
+    if name == STILL:
+        changed.classes = classes_of(model)._replace(refined=0, sliced=0)
+    return changed
+
+
+def share_with_direction(model: GaussianModel) -> float:
+    """Return the share of Gaussians whose slices change with the direction of view."""
+    classes = classes_of(model)
+    assert classes.frozen is not None
+    return float((classes.frozen[: classes.sliced] & DIRECTION == 0).sum()) / max(1, len(model))
