@@ -51,6 +51,12 @@ def assert_same(a: object, b: object) -> None:
         assert torch.equal(a, b)
 
 
+@pytest.fixture(autouse=True)
+def few_steps_recover(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trainings of a test are short."""
+    monkeypatch.setattr("gsbench.train.schedule.STEPS_TO_RECOVER", 20)
+
+
 def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a checkpoint that lacks what a gate decided: broken off after the gate, and gone on from there."""
     monkeypatch.setattr("gsbench.train.gating.LOSS_IN_TRAINING", 3.0)
