@@ -1,16 +1,18 @@
 """What a gate chooses, and what it makes of a model."""
 
 import copy
+import functools
 from dataclasses import replace
 
 import pytest
 import torch
-from test_strength import BLACK, OPTIONS, N, trained_a_little, views_of
+from test_strength import BLACK, OPTIONS, SIZE, N, trained_a_little, views_of
 from torch import Tensor
+from worlds import camera
 
 from gsbench.effects.budget import gate_within
 from gsbench.effects.gate import apply, choose
-from gsbench.effects.strength import probe
+from gsbench.effects.strength import Strength, probe
 from gsbench.errors import InputError
 from gsbench.kernels.thresholds import LOG_SIZE_MAX
 from gsbench.measure.quality import psnr
@@ -18,18 +20,27 @@ from gsbench.models import GaussianModel, Query
 from gsbench.models.classes import count, pack, packed_bytes
 from gsbench.models.render import render
 
+VIEWS = 10
 
-def gated(name: str, share: float, seed: int = 0) -> tuple[GaussianModel, GaussianModel]:
-    """A model before and after a gate."""
-    model = trained_a_little(name, seed)
+
+@functools.cache
+def probed(name: str) -> tuple[GaussianModel, Strength]:
+    """A model and what its variants would cost; no test may change them."""
+    model = trained_a_little(name, 0)
+    return model, probe(model, views_of(model, 1)[:VIEWS], BLACK)
+
+
+@functools.cache
+def gated(name: str, share: float) -> tuple[GaussianModel, GaussianModel]:
+    """A model before and after a gate; no test may change them."""
+    model, strength = probed(name)
     after = copy.deepcopy(model)
-    strength = probe(model, views_of(model, 1), BLACK)
     apply(after, strength, choose(strength, after, share))
     return model, after
 
 
 def images(model: GaussianModel) -> list[Tensor]:
-    return [render(model, view.camera, view.time, BLACK) for view in views_of(trained_a_little("3dgs", 0), 1)[:6]]
+    return [render(model, camera(azimuth, 0.3, SIZE), azimuth / 6, BLACK) for azimuth in range(5)]
 
 
 @pytest.mark.parametrize("name", OPTIONS)
@@ -44,8 +55,7 @@ def test_nothing_is_taken_for_nothing(name: str) -> None:
 @pytest.mark.parametrize("name", OPTIONS)
 def test_more_budget_buys_more(name: str) -> None:
     """Catches a price of error with the wrong sign, and a sum of errors that is not held."""
-    model = trained_a_little(name, 0)
-    strength = probe(model, views_of(model, 1), BLACK)
+    model, strength = probed(name)
     sizes = []
     for share in (0.0, 0.1, 1.0, 10.0):
         after = copy.deepcopy(model)
@@ -73,9 +83,7 @@ def test_classes_are_as_the_rows(name: str) -> None:
 
 def test_a_frozen_variable_changes_nothing() -> None:
     """Catches a Gaussian that still moves with what was frozen, or that no longer moves with what was not."""
-    model = trained_a_little("7dgs", 0)
-    views = views_of(model, 1)
-    strength = probe(model, views, BLACK)
+    model, strength = probed("7dgs")
     here = Query.at(torch.tensor([0.0, 0.0, -4.0]), 0.2)
     later, beside = Query.at(here.center, 0.9), Query.at(torch.tensor([4.0, 0.0, 0.0]), 0.2)
     for name, same, different in (("time", later, beside), ("direction", beside, later), ("still", later, None)):
@@ -98,7 +106,7 @@ def test_a_second_gate_takes_no_more_for_nothing(name: str) -> None:
     """Catches a gate that undoes or pays again for what an earlier one did."""
     _, after = gated(name, 3.0)
     again = copy.deepcopy(after)
-    strength = probe(after, views_of(after, 1), BLACK)
+    strength = probe(after, views_of(after, 1)[:VIEWS], BLACK)
     rows, _ = apply(again, strength, choose(strength, again, 0.0))
     assert count(again)["refined"] <= count(after)["refined"]
     assert len(rows) <= len(after)

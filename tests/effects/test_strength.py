@@ -78,7 +78,9 @@ def ranks(x: Tensor) -> Tensor:
     return x.argsort().argsort().double()
 
 
-@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize(
+    "name", ["7dgs", *(pytest.param(name, marks=pytest.mark.slow) for name in OPTIONS if name != "7dgs")]
+)
 def test_prediction_against_brute_force(name: str) -> None:
     """Catches a probe that mistakes which Gaussians need an effect, or by how much."""
     model = trained_a_little(name, 0)
