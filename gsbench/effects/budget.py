@@ -25,7 +25,7 @@ class Gated:
     model: GaussianModel
     gate: Gate  # what was decided, for the record
     rows: Tensor  # [M] the place that each Gaussian had before
-    changed: Tensor  # [M] bool: whether it became another variant
+    changed: Tensor  # [M] bool: whether it became another cut
 
 
 def gate_within(
@@ -40,7 +40,7 @@ def gate_within(
 
     Args:
         model: trained, or on its way.
-        strength: of its variants.
+        strength: of its cuts.
         budget_db: dB that `measure` may fall by.
         measure: the PSNR of a model, dB, on views that the probe did not look at.
     """

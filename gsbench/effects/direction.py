@@ -9,7 +9,7 @@ from gsbench.effects.gate import classes_of
 from gsbench.effects.strength import evenly_spaced
 from gsbench.models import GaussianModel, Query
 from gsbench.models.classes import DIRECTION
-from gsbench.models.variants import STILL, shares_of
+from gsbench.models.cuts import STILL, shares_of
 from gsbench.scenes import View
 
 MOST_VIEWS = 60

@@ -1,6 +1,6 @@
 """Predict what every simplification of every Gaussian would cost, all of them at once, from a few renders.
 
-A variant of a Gaussian (AGR baked in, time or direction frozen, fewer harmonics, removed) changes its slice in view v
+A cut of a Gaussian (AGR baked in, time or direction frozen, fewer harmonics, removed) changes its slice in view v
 by delta_v, and the image by x_v. With r the image minus the truth, the squared error of all views grows by
 
     E = sum over v of max(0, 2 <r, x_v>) + <g, x_v>^2,
@@ -10,8 +10,8 @@ views is not counted on. Products of r and g with J, the derivative of the image
 all Gaussians at once:
 
 - The image is linear in a Gaussian's colour and in its opacity, so x = J delta for fewer harmonics and for a removal.
-- A variant that moves a Gaussian by less than its size has x = (J + J') delta / 2, with J' at the variant. For that all
-  variants are drawn beside the model's own Gaussians, so thin that they hide nothing of one another.
+- A cut that moves a Gaussian by less than its size has x = (J + J') delta / 2, with J' at the cut. For that all
+  cuts are drawn beside the model's own Gaussians, so thin that they hide nothing of one another.
 - One that moves it farther is missed in one place and seen in another: |x|^2 is the sum of both squares.
 
 Two equal Gaussians that are d standard deviations apart overlap by exp(-d^2 / 4); by so much the second case counts,
@@ -28,8 +28,8 @@ from torch import Tensor
 
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Gaussians3D
+from gsbench.models.cuts import REMOVED, Cut, cuts_of
 from gsbench.models.render import rasterize_slice
-from gsbench.models.variants import REMOVED, Variant, variants_of
 from gsbench.scenes import Camera, View
 
 THIN = 0.02  # the opacity of Gaussians that are tried out beside the others
@@ -37,10 +37,10 @@ THIN = 0.02  # the opacity of Gaussians that are tried out beside the others
 
 @dataclass(frozen=True)
 class Strength:
-    """What each variant of each Gaussian would add to the squared error of the training views."""
+    """What each cut of each Gaussian would add to the squared error of the training views."""
 
-    variants: list[Variant]
-    errors: dict[str, Tensor]  # [N] by the name of the variant, summed over pixels, channels and views
+    cuts: list[Cut]
+    errors: dict[str, Tensor]  # [N] by the name of the cut, summed over pixels, channels and views
     total: float  # the squared error of the model as it is, in the same units
 
 
@@ -56,7 +56,7 @@ def probe(
     antialias: bool = False,
     by_halves: bool = True,
 ) -> Strength:
-    """Predict the error of every variant of every Gaussian.
+    """Predict the error of every cut of every Gaussian.
 
     Args:
         model: trained, or on its way.
@@ -71,8 +71,8 @@ def probe(
     looked_at = evenly_spaced(views, most)
     queries = [Query.of(view.camera, view.time) for view in looked_at]
     seen = [model.slice(query) for query in queries]
-    variants = variants_of(model, queries, [one.opacities for one in seen], by_halves)
-    errors = {variant.name: torch.zeros_like(seen[0].opacities) for variant in variants}
+    cuts = cuts_of(model, queries, [one.opacities for one in seen], by_halves)
+    errors = {cut.name: torch.zeros_like(seen[0].opacities) for cut in cuts}
     random = torch.Generator().manual_seed(seed)
     total = 0.0
     for view, query, live in zip(looked_at, queries, seen, strict=True):
@@ -82,12 +82,12 @@ def probe(
         total += float(residual.square().sum())
         signs = [torch.randint(0, 2, residual.shape, generator=random).to(residual) * 2 - 1 for _ in range(draws)]
         here = draw(live, [residual, *signs])
-        for variant in variants:
-            errors[variant.name] += _error(variant, model, query, live, here, draw, [residual, *signs])
+        for cut in cuts:
+            errors[cut.name] += _error(cut, model, query, live, here, draw, [residual, *signs])
     if len(looked_at) < len(views):  # of a Gaussian in none of these views nothing is known, so nothing is taken
         unknown = errors[REMOVED] == 0
         errors = {name: torch.where(unknown, math.inf, error) for name, error in errors.items()}
-    return Strength(variants, errors, total)
+    return Strength(cuts, errors, total)
 
 
 def evenly_spaced(views: Sequence[View], most: int) -> list[View]:
@@ -124,15 +124,15 @@ class Drawing(NamedTuple):
 
 
 def _error(
-    variant: Variant, model: GaussianModel, query: Query, live: Gaussians3D, here: Drawn, draw: Drawing,
+    cut: Cut, model: GaussianModel, query: Query, live: Gaussians3D, here: Drawn, draw: Drawing,
     vectors: list[Tensor],
 ) -> Tensor:  # fmt: skip
-    """Compute E [N] of a variant in one view."""
+    """Compute E [N] of a cut in one view."""
     removed = [-product.opacities * live.opacities for product in here.products]
-    if variant.raw is None:
+    if cut.raw is None:
         return _grown(removed)
-    raw = dict(model.splats.items()) | variant.raw
-    if variant.level is not None:
+    raw = dict(model.splats.items()) | cut.raw
+    if cut.level is not None:
         colors = model.paint(raw, live.means, live.opacities, query)
         return _grown([(product.colors * (colors - live.colors)).sum(-1) for product in here.products])
     means, factors, opacities = model.observe(raw, query)

@@ -118,8 +118,8 @@ class Gating:
         return self._render(model, views[i % len(views)])
 
     @torch.no_grad()
-    def _gate(self, step: int | None, budget_db: float, most: int) -> bool:
-        """Probe, choose and apply; tell whether anything was within the budget."""
+    def _gate(self, step: int | None, budget_db: float, most: int) -> None:
+        """Probe, choose and apply; where nothing is within the budget, note that."""
         started = time.perf_counter()
         # In training nothing is frozen by halves: kernels keep the entries of still rows, but these would learn on.
         strength = probe(self.model, self.probed, self.background, seed=self.config.seed, most=most,
@@ -128,12 +128,11 @@ class Gating:
         if found is None:
             self.notes.append(f"{'at the end' if step is None else f'at step {step}'} no simplification cost at most "
                               f"{budget_db} dB on {self.checked_on}")  # fmt: skip
-            return False
+            return
         self._adopt(found)
         self.gates.append(
             replace(found.gate, step=step, checked_on=self.checked_on, seconds=time.perf_counter() - started)
         )
-        return True
 
     def _adopt(self, found: Gated) -> None:
         for name, parameter in self.model.splats.items():

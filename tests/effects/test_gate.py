@@ -25,7 +25,7 @@ VIEWS = 10
 
 @functools.cache
 def probed(name: str) -> tuple[GaussianModel, Strength]:
-    """A model and what its variants would cost; no test may change them."""
+    """A model and what its cuts would cost; no test may change them."""
     model = trained_a_little(name, 0)
     return model, probe(model, views_of(model, 1)[:VIEWS], BLACK)
 

@@ -16,7 +16,7 @@ from gsbench.measure import record
 from gsbench.models import GaussianModel, Phase, build
 from gsbench.models.base import Gaussians3D
 from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes, count
-from gsbench.models.variants import STILL
+from gsbench.models.cuts import STILL
 from gsbench.report.page.palette import CLASS_LIKE, LIGHT, MODELS
 from gsbench.scenes import Camera, Points
 

@@ -8,8 +8,8 @@ from worlds import camera
 from gsbench.effects.strength import probe
 from gsbench.models import GaussianModel, Phase, Query, build
 from gsbench.models.base import Gaussians3D
+from gsbench.models.cuts import Cut, cuts_of
 from gsbench.models.render import rasterize_slice
-from gsbench.models.variants import Variant, variants_of
 from gsbench.scenes.scene import Points, View
 
 N, SIZE, VIEWS = 60, 24, 30
@@ -45,25 +45,25 @@ def views_of(model: GaussianModel, seed: int) -> list[View]:
     return film
 
 
-def slice_of(model: GaussianModel, variant: Variant, live: Gaussians3D, query: Query) -> Gaussians3D:
-    """All Gaussians as the variant has them."""
-    if variant.raw is None:
+def slice_of(model: GaussianModel, cut: Cut, live: Gaussians3D, query: Query) -> Gaussians3D:
+    """All Gaussians as the cut has them."""
+    if cut.raw is None:
         return live._replace(opacities=torch.zeros_like(live.opacities))
-    if variant.level is not None:
-        raw = model.refined(query) | variant.raw
+    if cut.level is not None:
+        raw = model.refined(query) | cut.raw
         return live._replace(colors=model.paint(raw, live.means, live.opacities, query))
-    raw = dict(model.splats.items()) | variant.raw
+    raw = dict(model.splats.items()) | cut.raw
     means, factors, opacities = model.observe(raw, query)
     return Gaussians3D(means, factors, opacities, model.paint(raw, means, opacities, query))
 
 
-def brute_force(model: GaussianModel, views: list[View], variant: Variant) -> Tensor:
-    """The error that each Gaussian adds when it alone becomes the variant, what improves a view not counted, [N]."""
+def brute_force(model: GaussianModel, views: list[View], cut: Cut) -> Tensor:
+    """The error that each Gaussian adds when it alone becomes the cut, what improves a view not counted, [N]."""
     errors = torch.zeros(N)
     for view in views:
         query = Query.of(view.camera, view.time)
         live = model.slice(query)
-        changed = slice_of(model, variant, live, query)
+        changed = slice_of(model, cut, live, query)
         before = rasterize_slice(live, view.camera, BLACK, model.backend).image[0]
         for i in range(N):
             one = Gaussians3D(*(x.clone() for x in live))
@@ -88,16 +88,16 @@ def test_prediction_against_brute_force(name: str) -> None:
     predicted = probe(model, views, BLACK, draws=4)
     queries = [Query.of(view.camera, view.time) for view in views]
     seen = [model.slice(query).opacities for query in queries]
-    for variant in variants_of(model, queries, seen):
-        true, guess = brute_force(model, views, variant), predicted.errors[variant.name]
+    for cut in cuts_of(model, queries, seen):
+        true, guess = brute_force(model, views, cut), predicted.errors[cut.name]
         # The image is linear in opacities and colours, and not in what moves: docs/effects.md has the figures.
-        linear = variant.raw is None or variant.level is not None
+        linear = cut.raw is None or cut.level is not None
         least_rank, least_share = (0.98, 0.5) if linear else (0.92, 0.25)
-        assert float(torch.corrcoef(torch.stack([ranks(true), ranks(guess)]))[0, 1]) > least_rank, variant.name
+        assert float(torch.corrcoef(torch.stack([ranks(true), ranks(guess)]))[0, 1]) > least_rank, cut.name
         worst = true.argsort(descending=True)[: N // 3]
-        assert (guess[worst] > least_share * true[worst]).all(), variant.name
+        assert (guess[worst] > least_share * true[worst]).all(), cut.name
         if linear:
-            assert float(guess.sum() / true.sum()) == pytest.approx(1, abs=0.15), variant.name
+            assert float(guess.sum() / true.sum()) == pytest.approx(1, abs=0.15), cut.name
 
 
 def test_what_is_hidden_is_not_taken() -> None:

@@ -20,7 +20,7 @@ FEW = 1e-6  # added to weights: a Gaussian that no query sees is averaged over a
 
 
 @dataclass(frozen=True)
-class Variant:
+class Cut:
     """All Gaussians of a model, simplified in one way."""
 
     name: str
@@ -28,9 +28,9 @@ class Variant:
     level: int | None = None  # of the harmonics that are left (see Classes.levels), where only the colour changes
 
 
-def variants_of(
+def cuts_of(
     model: GaussianModel, queries: Sequence[Query], opacities: Sequence[Tensor], by_halves: bool = True
-) -> list[Variant]:
+) -> list[Cut]:
     """List the ways to simplify the Gaussians of a model.
 
     Args:
@@ -45,13 +45,13 @@ def variants_of(
     raw: Raw = {name: value.detach() for name, value in model.splats.items()}
     if model.refinement is not None and model.phase.refine:
         raw = raw | _baked(model, queries, weights, names)
-        found.append(Variant(SLICED, {name: raw[name] for name in names}))
+        found.append(Cut(SLICED, {name: raw[name] for name in names}))
     for name, frozen in model.frozen(raw, queries, weights).items():
         if name != STILL and not by_halves:
             continue
-        found.append(Variant(name, {key: raw[key] for key in names} | frozen))
-    found.append(Variant(REMOVED, None))
-    return found + [Variant(f"level{level}", _repainted(model, level, queries, opacities, weights), level)
+        found.append(Cut(name, {key: raw[key] for key in names} | frozen))
+    found.append(Cut(REMOVED, None))
+    return found + [Cut(f"level{level}", _repainted(model, level, queries, opacities, weights), level)
                     for level in model.lower_levels()]  # fmt: skip
 
 
