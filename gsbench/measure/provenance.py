@@ -52,15 +52,21 @@ def versions() -> dict[str, str]:
     return found
 
 
-def git_commit() -> str | None:
-    """Return the commit of the checkout that this file belongs to, with "-dirty" if tracked files differ from it.
+NO_CODE = ("results", "docs", "*.md")
 
-    None if git does not track this file, as in a wheel that is installed inside another repository.
+
+def git_commit() -> str | None:
+    """Return the commit of the checkout that this file belongs to, with "-dirty" if tracked code differs from it.
+
+    Results and texts make no numbers, so a sweep that writes over landed records stays clean. None if git does not
+    track this file, as in a wheel that is installed inside another repository.
     """
     here = Path(__file__)
     if _git(here.parent, "ls-files", "--error-unmatch", here.name) is None:
         return None
-    return _git(here.parent, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+    head = _git(here.parent, "rev-parse", "HEAD")
+    changed = _git(here.parent, "diff", "--name-only", "HEAD", "--", ":/", *(f":(top,exclude){x}" for x in NO_CODE))
+    return f"{head}-dirty" if head is not None and changed else head
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

@@ -322,3 +322,20 @@ def test_records_and_tables_do_not_import_torch():
         "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_results_make_no_commit_dirty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches records called dirty because another's record was written over, and changed code that is not."""
+    place = tmp_path / "gsbench/measure/provenance.py"
+    for path in (place, tmp_path / "results/record.json", tmp_path / "README.md"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("1")
+    for words in (["init", "-q"], ["add", "-A"], ["-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "x"]):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    monkeypatch.setattr("gsbench.measure.provenance.__file__", str(place))
+    clean = git_commit()
+    (tmp_path / "results/record.json").write_text("2")
+    (tmp_path / "README.md").write_text("2")
+    assert git_commit() == clean
+    place.write_text("2")
+    assert git_commit() == f"{clean}-dirty"
