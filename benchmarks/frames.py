@@ -16,8 +16,7 @@ from gsbench.errors import InputError
 from gsbench.measure.speed import time_in_turns
 from gsbench.models.classes import packed_bytes
 from gsbench.models.render import render
-from gsbench.run.load import LoadedRun, load_run
-from gsbench.run.setup import load_scene
+from gsbench.run.load import LoadedRun, load_run, scene_of
 from gsbench.scenes import View
 
 
@@ -43,10 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     try:
         runs = [load_run(folder) for folder in asked.runs]
-        config = runs[0].config
-        if asked.data_root is not None:
-            config.data.root = asked.data_root
-        views = load_scene(config).test
+        views = scene_of(runs[0], asked.data_root).test
     except InputError as error:
         print(f"benchmarks.frames: {error}", file=sys.stderr)
         return 2

@@ -12,12 +12,12 @@ from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.models.query import Query
 from gsbench.run.checks import check_device, evaluated_views
-from gsbench.run.load import LoadedRun, load_run
+from gsbench.run.load import LoadedRun, load_run, scene_of
 from gsbench.scenes import Scene
 from gsbench.scenes.trained import ply_of
 from gsbench.view import film, paths
 from gsbench.view.gaussians import trained_of
-from gsbench.view.sights import find_view, scene_of
+from gsbench.view.sights import find_view
 
 PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
 MOST_FRAMES = 100_000

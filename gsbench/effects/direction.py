@@ -6,13 +6,11 @@ from collections.abc import Sequence
 import torch
 
 from gsbench.effects.gate import classes_of
-from gsbench.effects.strength import evenly_spaced
+from gsbench.effects.strength import MOST_VIEWS, evenly_spaced
 from gsbench.models import GaussianModel, Query
 from gsbench.models.classes import DIRECTION
 from gsbench.models.cuts import STILL, shares_of
 from gsbench.scenes import View
-
-MOST_VIEWS = 60
 
 
 @torch.no_grad()

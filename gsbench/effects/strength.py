@@ -32,6 +32,7 @@ from gsbench.models.cuts import REMOVED, Cut, cuts_of
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes import Camera, View
 
+MOST_VIEWS = 60  # evenly spaced ones stand for more
 THIN = 0.02  # the opacity of Gaussians that are tried out beside the others
 
 
@@ -51,7 +52,7 @@ def probe(
     background: Tensor,
     *,
     seed: int = 0,
-    most: int = 60,
+    most: int = MOST_VIEWS,
     draws: int = 1,
     antialias: bool = False,
     by_halves: bool = True,

@@ -1,6 +1,6 @@
-"""Load the model of a finished or broken run back from its folder."""
+"""Load the model of a finished or broken run back from its folder, and the scene that it was trained on."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.measure.schema import parse
 from gsbench.models import GaussianModel
-from gsbench.run.setup import build
+from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Scene
 from gsbench.scenes.scene import Points
 from gsbench.train import checkpoint
@@ -83,6 +83,27 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     schedule = Schedule(config.train, config.model.sh_degree, config.agr)
     model.set_phase(schedule.phase(max(0, step - 1)))
     return LoadedRun(model.requires_grad_(False), config, scene, step, Path(folder))
+
+
+def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
+    """Load the scene that a run was trained on.
+
+    Args:
+        run: whose config names the scene.
+        data_root: the folder of its data set, where it is no longer the one in the config.
+
+    Raises:
+        InputError: the data are gone, have a fault, or are others than those of the training.
+    """
+    config = replace(run.config, data=replace(run.config.data, root=data_root or run.config.data.root))
+    try:
+        scene = load_scene(config)
+    except InputError as error:
+        raise InputError(f"{error}; name the folder of the data by --data-root") from None
+    if scene.fingerprint != run.scene.fingerprint:
+        raise InputError(f"{run.scene.name} in {config.data.root}: expected the data of the training, found others: "
+                         f"name the right folder by --data-root")  # fmt: skip
+    return scene
 
 
 def plain_description(scene: Scene) -> dict[str, Any]:

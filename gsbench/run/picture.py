@@ -7,8 +7,7 @@ import torch
 from gsbench.effects.picture import Pixels, draw
 from gsbench.errors import InputError
 from gsbench.run.checks import evaluated_views
-from gsbench.run.load import load_run
-from gsbench.run.setup import load_scene
+from gsbench.run.load import load_run, scene_of
 
 
 def draw_run(folder: Path, camera: int, time: float | None, data_root: str | None = None) -> Pixels:
@@ -26,9 +25,7 @@ def draw_run(folder: Path, camera: int, time: float | None, data_root: str | Non
     if time is not None and not 0 <= time <= 1:
         raise InputError(f"--time: expected 0 to 1, got {time}")
     loaded = load_run(folder)
-    if data_root is not None:
-        loaded.config.data.root = data_root
-    scene = load_scene(loaded.config)
+    scene = scene_of(loaded, data_root)
     views = evaluated_views(scene, loaded.config.scene.eval_split)
     if not 0 <= camera < len(views):
         raise InputError(f"--camera: expected 0 to {len(views) - 1}, the evaluated views of {scene.name}, got {camera}")

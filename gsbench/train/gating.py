@@ -12,7 +12,7 @@ from torch import Tensor
 from gsbench.config import Config
 from gsbench.effects.budget import Gated, gate_within
 from gsbench.effects.direction import share_with_direction, without_direction
-from gsbench.effects.strength import probe
+from gsbench.effects.strength import MOST_VIEWS, probe
 from gsbench.errors import InputError
 from gsbench.measure.quality import psnr
 from gsbench.measure.record import Direction, Gate
@@ -29,12 +29,16 @@ from gsbench.train.optim import Optimizer
 GATES = ("off", "end", "both")
 LOSS_IN_TRAINING = 0.5  # dB on val at once: the rest of the training makes up for it (docs/effects.md)
 VIEWS_IN_TRAINING = 30  # that the probe looks at: the gate must cost less than it saves
-VIEWS_AT_END = 60
 HELD_OUT = 8  # every so many training views one, to check on where the scene has no val split of its own
 FEW = 12  # training views, of which none is held out
 
 NO_GATES: dict[str, Any] = {"gates": [], "notes": []}  # the state of a training without gates
 Shape = tuple[dict[str, Tensor], Classes | None]  # raw parameters and classes
+
+
+def shape_of(model: GaussianModel) -> Shape:
+    """Return the Gaussians of a model, for `become`."""
+    return {name: x.data for name, x in model.splats.items()}, model.classes
 
 
 def become(model: GaussianModel, shape: Shape) -> None:
@@ -89,11 +93,11 @@ class Gating:
 
     def at_end(self) -> None:
         """Gate the finished model within `effects.budget_db`."""
-        self._gate(None, self.config.effects.budget_db, VIEWS_AT_END)
+        self._gate(None, self.config.effects.budget_db, MOST_VIEWS)
 
     def now(self) -> Shape:
         """Return the model's Gaussians as they are, for `compare`."""
-        return {name: x.data for name, x in self.model.splats.items()}, self.model.classes
+        return shape_of(self.model)
 
     def compare(self, ungated: Shape, views: list[View]) -> None:
         """Measure on the evaluated `views` what the gate at the end changed, and what freezing direction would."""
@@ -135,9 +139,7 @@ class Gating:
         )
 
     def _adopt(self, found: Gated) -> None:
-        for name, parameter in self.model.splats.items():
-            parameter.data = found.model.splats[name].data
-        self.model.classes = found.model.classes
+        become(self.model, shape_of(found.model))
         self.optimizer.follow(self.model, found.rows, found.changed)
         self.density.follow(found.rows)
         self.floor.update()

@@ -7,12 +7,11 @@ import numpy as np
 import viser
 
 from gsbench.errors import InputError
-from gsbench.run.load import LoadedRun
+from gsbench.run.load import LoadedRun, scene_of
 from gsbench.scenes import Scene
 from gsbench.view import paths
 from gsbench.view.client import Client
 from gsbench.view.frame import Painter
-from gsbench.view.sights import scene_of
 
 
 class Viewer:
