@@ -1,29 +1,18 @@
 """The page in Chromium: it opens from disk in silence, answers to mouse and keyboard, and can be read by everyone."""
 
-import os
-import shutil
-
 import pytest
+from chromium import launched
 from many_records import frontier, hostile, on_demand, write_all
 
 from gsbench.report.page import build
 
 pytestmark = pytest.mark.slow
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"]
-FLAGS += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
 WIDTHS = (375, 820, 1280)
 
 
 @pytest.fixture(scope="module")
 def browser():
-    if not CHROMIUM:
-        pytest.skip("needs Debian's chromium: apt-get install chromium (or CHROMIUM=FILE)")
-    api = pytest.importorskip("playwright.sync_api", reason="needs playwright, which is in the dev extra")
-    with api.sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield found
-        found.close()
+    yield from launched("--disable-gpu")
 
 
 @pytest.fixture(scope="module")

@@ -1,23 +1,19 @@
 """The viewer in Chromium: it opens, its controls change the picture, browsers come and go, nobody else can reach it."""
 
-import os
 import re
-import shutil
 import socket
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from chromium import launched
 
 from gsbench.errors import InputError
 from gsbench.run.load import load_run
 from gsbench.view.viewer import Viewer
 
 pytestmark = pytest.mark.slow
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run"]
-FLAGS += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
 WIDTH, HEIGHT = 900, 600
 PICTURE = {"x": 0, "y": 170, "width": 560, "height": 430}  # without the panel, and what Chromium says of its GPU
 SHARP = f"{WIDTH} x {HEIGHT}"
@@ -25,13 +21,7 @@ SHARP = f"{WIDTH} x {HEIGHT}"
 
 @pytest.fixture(scope="module")
 def browser():
-    if not CHROMIUM:
-        pytest.skip("needs Debian's chromium: apt-get install chromium (or CHROMIUM=FILE)")
-    api = pytest.importorskip("playwright.sync_api", reason="needs playwright, which is in the dev extra")
-    with api.sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield found
-        found.close()
+    yield from launched("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
 def free_port():
