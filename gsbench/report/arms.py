@@ -129,6 +129,15 @@ class Group:
         return [arm for arm in self.arms if arm.variant == self.variant]
 
     @cached_property
+    def compared(self) -> list[Arm]:
+        """The arms that are told apart in pairs: those at the common variant, and the same but for their gates."""
+        return [arm for arm in self.arms if arm.variant == self.variant or _ungated(arm.variant) == self.variant]
+
+    def label(self, arm: Arm) -> str:
+        """Name an arm among the compared ones: its model, and its variant where that is not the common one."""
+        return arm.model if arm.variant == self.variant else arm.name
+
+    @cached_property
     def covered(self) -> list[str]:
         """The scenes that every model has finished at the common variant, over which averages are taken."""
         return [s for s in self.scenes if self.main_arms and all(s in arm.runs for arm in self.main_arms)]
@@ -196,6 +205,11 @@ def gating(record: Record) -> str:
     effects, model = (part if isinstance(part := config.get(name), dict) else {} for name in ("effects", "model"))
     gate = effects.get("gate", "off")
     return f"gate={gate}" if gate in GATES and gate != model.get("gate", "off") else ""
+
+
+def _ungated(variant: str) -> str:
+    """Return a variant without its words on gates."""
+    return ",".join(word for word in variant.split(",") if word.partition("=")[0] not in ("gate", "budget_db"))
 
 
 def machine(record: Record) -> str:

@@ -32,9 +32,12 @@ class Pair:
 
 
 def pairs(group: Group) -> list[Pair]:
-    """Compare every two models at the common variant, on what both have finished; the largest difference first."""
+    """Compare every two models at the common variant, gated ones too, on what both have finished.
+
+    The largest difference comes first.
+    """
     found = []
-    for a, b in itertools.combinations(group.main_arms, 2):
+    for a, b in itertools.combinations(group.compared, 2):
         difference = estimate(group.contrast([(1.0, a), (-1.0, b)], "psnr"))
         if difference.scenes == 0:
             continue

@@ -142,7 +142,7 @@ def pairs_section(group: Group, canvas: Canvas) -> Section:
         return Section("pairs", "Is it a difference?", [text])
     rows = [
         charts.Row(
-            f"{p.better.model} − {p.other.model}", p.difference.mean, p.difference.low, p.difference.high,
+            _pair_name(group, p), p.difference.mean, p.difference.low, p.difference.high,
             p.differs, words.signed(p.difference.mean),
         )
         for p in found[:MOST_PAIRS]
@@ -150,7 +150,7 @@ def pairs_section(group: Group, canvas: Canvas) -> Section:
     alt = f"Differences in PSNR of {words.count(len(rows), 'pair')} of models with 95 % intervals"
     columns = [Column("pair"), Column("dB", 2), Column("95 % low", 2), Column("95 % high", 2)]
     columns += [Column("ahead on % of views", 0), Column("p, Holm"), Column("told apart")]
-    table = Table("pairs.csv", columns, [_pair_row(p) for p in found])
+    table = Table("pairs.csv", columns, [_pair_row(group, p) for p in found])
     drawing = Drawing("Difference in PSNR", charts.differences(rows, "dB").svg(f"{canvas.name}p", alt))
     first = found[0].difference
     notes = [
@@ -161,15 +161,19 @@ def pairs_section(group: Group, canvas: Canvas) -> Section:
         else f"{words.NO_SPREAD.capitalize()}: no interval and no p-value is given."
     ]
     return Section(
-        "pairs", "Is it a difference?", _pair_words(found), [Tab("", [drawing])], table, beside=True, notes=notes
+        "pairs", "Is it a difference?", _pair_words(group, found), [Tab("", [drawing])], table, beside=True, notes=notes
     )
 
 
-def _pair_row(pair: Pair) -> list[Value]:
+def _pair_name(group: Group, pair: Pair) -> str:
+    return f"{group.label(pair.better)} − {group.label(pair.other)}"
+
+
+def _pair_row(group: Group, pair: Pair) -> list[Value]:
     d = pair.difference
     told = "not known" if math.isnan(pair.p_holm) else "yes" if pair.differs else "no"
     return [
-        f"{pair.better.model} − {pair.other.model}",
+        _pair_name(group, pair),
         d.mean,
         d.low,
         d.high,
@@ -179,13 +183,18 @@ def _pair_row(pair: Pair) -> list[Value]:
     ]
 
 
-def _pair_words(found: list[Pair]) -> list[str]:
+def _pair_words(group: Group, found: list[Pair]) -> list[str]:
     """Say how many pairs are told apart, and name those that are not."""
     if all(math.isnan(p.p_holm) for p in found):
         first = found[0]
-        ahead = f"{first.better.model} is ahead of {first.other.model} by {words.plain(first.difference.mean)} dB"
+        by = f"by {words.plain(first.difference.mean)} dB"
+        ahead = f"{group.label(first.better)} is ahead of {group.label(first.other)} {by}"
         return [f"{words.NO_SPREAD.capitalize()}. The largest difference: {ahead}."]
-    level = [f"{p.better.model} from {p.other.model}" for p in found if not p.differs and not math.isnan(p.p_holm)]
+    level = [
+        f"{group.label(p.better)} from {group.label(p.other)}"
+        for p in found
+        if not p.differs and not math.isnan(p.p_holm)
+    ]
     tested = sum(not math.isnan(p.p_holm) for p in found)
     if not level:
         return [
