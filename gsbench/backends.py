@@ -24,6 +24,14 @@ class Backend:
         device = tensor.device.type
         return tensor.dtype == torch.float32 and device in self.devices and _built(device)
 
+    def lanes(self, tensor: Tensor) -> int:
+        """Tell how many independent pieces of work on such tensors are worth threads of Python's, side by side.
+
+        Only the time of the CPU's kernels is: torch holds Python's lock between its operations, and a GPU does one
+        thing after the other anyway.
+        """
+        return torch.get_num_threads() if tensor.device.type == "cpu" and self.serves(tensor) else 1
+
 
 REFERENCE = Backend("reference", ())
 CPU = Backend("cpu", ("cpu",))

@@ -12,7 +12,7 @@ FLOORS: tuple[set[str], ...] = (
     {"openmp"},
     {""},  # the package itself, which Python imports before any room
     {"errors", "config"},
-    {"memory", "tensors"},
+    {"lanes", "memory", "tensors"},
     {"reading"},
     {"scenes", "kernels"},
     {"backends"},

@@ -14,15 +14,18 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from gsbench.backends import resolve
 from gsbench.errors import InputError
+from gsbench.kernels.tape import Tape
+from gsbench.lanes import side_by_side
 from gsbench.measure.record import TimeScreen
 from gsbench.models.appearance import sh_basis
 from gsbench.models.gaussians3d import Gaussians3DModel
@@ -159,22 +162,29 @@ def _leftovers(views: Sequence[View], scene: Scene, seed: int, backend: str) -> 
     groups = [{"params": [model.splats[name]], "lr": rate * (scene.extent if name == "means" else 1.0)}
               for name, rate in RATES.items()]  # fmt: skip
     adam = torch.optim.Adam(groups, eps=1e-15)
+    fitted = [model.splats[name] for name in RATES]
+    lanes = model.backend.lanes(fitted[0])
+    of_view = partial(_gradients, model, fitted, background)
     for _ in range(STEPS):
         chosen = torch.randint(len(views), (BATCH,), generator=random).tolist()
-        adam.zero_grad()
-        torch.stack([_squared_error(model, views[i], background) for i in chosen]).mean().backward()
+        by_view = list(side_by_side(of_view, [views[i] for i in chosen], lanes))
+        for parameter, gradients in zip(fitted, zip(*by_view, strict=True), strict=True):
+            parameter.grad = torch.stack(gradients).mean(0)
         adam.step()
-    means, rows = model.splats["means"], []
-    for view in views:
-        (gradient,) = torch.autograd.grad(_squared_error(model, view, background), means)
-        rows.append(gradient.flatten())
-    gradients = torch.stack(rows).double().cpu().numpy()
-    return np.asarray(gradients @ gradients.T)
+    rows = [gradients[0].flatten() for gradients in side_by_side(of_view, views, lanes)]
+    matrix = torch.stack(rows).double().cpu().numpy()
+    return np.asarray(matrix @ matrix.T)
 
 
-def _squared_error(model: Gaussians3DModel, view: View, background: Tensor) -> Tensor:
-    seen = model.slice(Query.of(view.camera, None))
-    return F.mse_loss(rasterize_slice(seen, view.camera, background, model.backend).image[0], view.image)
+def _gradients(model: Gaussians3DModel, by: list[nn.Parameter], background: Tensor, view: View) -> list[Tensor]:
+    """Compute the gradients of a view's mean squared error by some parameters."""
+    with Tape() as tape:
+        gaussians = model.slice(Query.of(view.camera, None))
+        image = rasterize_slice(gaussians, view.camera, background, model.backend).image
+    found: dict[int, Tensor] = {}
+    residual = image.detach() - view.image
+    tape.backward(image, 2 / residual.numel() * residual, by, found)
+    return [found.get(id(parameter), torch.zeros_like(parameter)) for parameter in by]
 
 
 def _smaller(view: View) -> View:

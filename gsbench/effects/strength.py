@@ -26,6 +26,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsbench.lanes import side_by_side
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Gaussians3D
 from gsbench.models.cuts import REMOVED, Cut, cuts_of
@@ -56,6 +57,7 @@ def probe(
     draws: int = 1,
     antialias: bool = False,
     by_halves: bool = True,
+    hidden: Tensor | None = None,  # [N] bool
 ) -> Strength:
     """Predict the error of every cut of every Gaussian.
 
@@ -68,25 +70,34 @@ def probe(
         draws: of g for each view; of a Gaussian that few views show, one says little.
         antialias: see `gsbench.raster.rasterize`.
         by_halves: whether time or direction alone may be frozen.
+        hidden: Gaussians that none of all the views shows.
     """
     looked_at = evenly_spaced(views, most)
     queries = [Query.of(view.camera, view.time) for view in looked_at]
-    seen = [model.slice(query) for query in queries]
-    cuts = cuts_of(model, queries, [one.opacities for one in seen], by_halves)
-    errors = {cut.name: torch.zeros_like(seen[0].opacities) for cut in cuts}
+    lanes = model.backend.lanes(model.splats["means"])
+    seen = list(side_by_side(model.slice, queries, lanes))
+    cuts = cuts_of(model, queries, seen, by_halves)
     random = torch.Generator().manual_seed(seed)
-    total = 0.0
-    for view, query, live in zip(looked_at, queries, seen, strict=True):
-        draw = Drawing(model, view.camera, background, antialias)
-        image = rasterize_slice(live, view.camera, background, model.backend, antialias).image[0]
-        residual = image - view.image
-        total += float(residual.square().sum())
-        signs = [torch.randint(0, 2, residual.shape, generator=random).to(residual) * 2 - 1 for _ in range(draws)]
-        here = draw(live, [residual, *signs])
-        for cut in cuts:
-            errors[cut.name] += _error(cut, model, query, live, here, draw, [residual, *signs])
+    seeds = torch.randint(2**62, (len(looked_at),), generator=random).tolist()
+
+    def errors_in(v: int) -> tuple[float, list[Tensor]]:
+        """Return the squared error of a view as it is, and what each cut would add to it."""
+        view = looked_at[v]
+        drawing = Drawing(model, view.camera, background, antialias)
+        here = drawing(seen[v])
+        residual = here.image - view.image
+        own = torch.Generator().manual_seed(seeds[v])
+        signs = [torch.randint(0, 2, residual.shape, generator=own).to(residual) * 2 - 1 for _ in range(draws)]
+        place = Place(model, queries[v], seen[v], here, here.products([residual, *signs]), [residual, *signs])
+        return float(residual.square().sum()), [_error(cut, place, drawing) for cut in cuts]
+
+    errors, total = {cut.name: torch.zeros_like(seen[0].opacities) for cut in cuts}, 0.0
+    for squared, added in side_by_side(errors_in, range(len(looked_at)), lanes):
+        total += squared
+        for cut, error in zip(cuts, added, strict=True):
+            errors[cut.name] += error
     if len(looked_at) < len(views):  # of a Gaussian in none of these views nothing is known, so nothing is taken
-        unknown = errors[REMOVED] == 0
+        unknown = (errors[REMOVED] == 0) if hidden is None else (errors[REMOVED] == 0) & ~hidden
         errors = {name: torch.where(unknown, math.inf, error) for name, error in errors.items()}
     return Strength(cuts, errors, total)
 
@@ -98,11 +109,23 @@ def evenly_spaced(views: Sequence[View], most: int) -> list[View]:
 
 
 class Drawn(NamedTuple):
-    """A slice that was drawn, and products of vectors with the derivative of its image."""
+    """A slice that was drawn."""
 
-    products: list[Gaussians3D]  # by each vector
+    at: Gaussians3D
+    rendered: Tensor  # [H, W, 3], with its graph
     means2d: Tensor  # [N, 2] pixels
     radii: Tensor  # [N] pixels, three standard deviations; 0 where it is culled
+
+    @property
+    def image(self) -> Tensor:
+        """The image [H, W, 3]."""
+        return self.rendered.detach()
+
+    def products(self, vectors: list[Tensor]) -> list[Gaussians3D]:
+        """Multiply vectors [H, W, 3] by the derivative of the image by the slice, from the left; only once."""
+        last = len(vectors) - 1
+        return [Gaussians3D(*torch.autograd.grad(self.rendered, self.at, vector, retain_graph=i < last))
+                for i, vector in enumerate(vectors)]  # fmt: skip
 
 
 class Drawing(NamedTuple):
@@ -114,40 +137,46 @@ class Drawing(NamedTuple):
     antialias: bool
 
     @torch.enable_grad()
-    def __call__(self, at: Gaussians3D, vectors: list[Tensor]) -> Drawn:
-        """Multiply vectors [H, W, 3] by the derivative of the image by a slice, from the left."""
-        place = Gaussians3D(*(x.detach().requires_grad_() for x in at))
-        drawn = rasterize_slice(place, self.camera, self.background, self.model.backend, self.antialias)
-        last = len(vectors) - 1
-        products = [Gaussians3D(*torch.autograd.grad(drawn.image[0], place, vector, retain_graph=i < last))
-                    for i, vector in enumerate(vectors)]  # fmt: skip
-        return Drawn(products, drawn.info.means2d[0].detach(), drawn.info.radii[0])
+    def __call__(self, gaussians: Gaussians3D) -> Drawn:
+        """Draw a slice."""
+        at = Gaussians3D(*(x.detach().requires_grad_() for x in gaussians))
+        output = rasterize_slice(at, self.camera, self.background, self.model.backend, self.antialias)
+        return Drawn(at, output.image[0], output.info.means2d[0].detach(), output.info.radii[0])
 
 
-def _error(
-    cut: Cut, model: GaussianModel, query: Query, live: Gaussians3D, here: Drawn, draw: Drawing,
-    vectors: list[Tensor],
-) -> Tensor:  # fmt: skip
+class Place(NamedTuple):
+    """A model as one view shows it."""
+
+    model: GaussianModel
+    query: Query
+    live: Gaussians3D
+    drawn: Drawn
+    products: list[Gaussians3D]  # of `vectors` with the derivative of the image
+    vectors: list[Tensor]  # [H, W, 3]: the residual, then random signs
+
+
+def _error(cut: Cut, here: Place, draw: Drawing) -> Tensor:
     """Compute E [N] of a cut in one view."""
+    model, live = here.model, here.live
     removed = [-product.opacities * live.opacities for product in here.products]
     if cut.raw is None:
         return _grown(removed)
     raw = dict(model.splats.items()) | cut.raw
     if cut.level is not None:
-        colors = model.paint(raw, live.means, live.opacities, query)
+        colors = model.paint(raw, live.means, live.opacities, here.query)
         return _grown([(product.colors * (colors - live.colors)).sum(-1) for product in here.products])
-    means, factors, opacities = model.observe(raw, query)
-    changed = Gaussians3D(means, factors, opacities, model.paint(raw, means, opacities, query))
+    means, factors, opacities = model.observe(raw, here.query)
+    changed = Gaussians3D(means, factors, opacities, model.paint(raw, means, opacities, here.query))
     thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))
-    both = draw(Gaussians3D(*(torch.cat(pair) for pair in zip(live, thin, strict=True))), vectors)
+    both = draw(Gaussians3D(*(torch.cat(pair) for pair in zip(live, thin, strict=True))))
     N = len(live.means)
     scale = changed.opacities / thin.opacities.clamp(min=1e-12)  # an image of a Gaussian is linear in its opacity
     there = [Gaussians3D(p.means[N:] * scale[:, None], p.factors[N:] * scale[:, None, None], p.opacities[N:],
-                         p.colors[N:] * scale[:, None]) for p in both.products]  # fmt: skip
+                         p.colors[N:] * scale[:, None]) for p in both.products(here.vectors)]  # fmt: skip
     along = [(_dot(a, live, changed) + _dot(b, live, changed)) / 2 for a, b in zip(here.products, there, strict=True)]
     added = [product.opacities * changed.opacities for product in there]
-    size = torch.maximum(here.radii, both.radii[N:]).clamp(min=1) / 3
-    distance = (both.means2d[N:] - here.means2d) / (2 * size[:, None])
+    size = torch.maximum(here.drawn.radii, both.radii[N:]).clamp(min=1) / 3
+    distance = (both.means2d[N:] - here.drawn.means2d) / (2 * size[:, None])
     overlap = torch.exp(-distance.square().sum(-1))
     return overlap * _grown(along) + (1 - overlap) * _grown(removed, added)
 

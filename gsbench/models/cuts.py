@@ -4,13 +4,15 @@ A simplified Gaussian is an ordinary row of the model's parameters, so every mod
 What is frozen stays at its mean over given queries, weighted by the Gaussian's opacity at each of them.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from gsbench.models.base import GaussianModel, Raw
+from gsbench.lanes import side_by_side
+from gsbench.models.base import GaussianModel, Gaussians3D, Raw
 from gsbench.models.classes import Classes
 from gsbench.models.query import Query
 from gsbench.scenes.points import SH_C0
@@ -29,30 +31,37 @@ class Cut:
 
 
 def cuts_of(
-    model: GaussianModel, queries: Sequence[Query], opacities: Sequence[Tensor], by_halves: bool = True
+    model: GaussianModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], by_halves: bool = True
 ) -> list[Cut]:
     """List the ways to simplify the Gaussians of a model.
 
     Args:
         model: as it is.
         queries: of the views over which what is frozen is averaged.
-        opacities: [N] of the model's slices at the queries, the weights.
+        slices: of the model at the queries; their opacities are the weights.
         by_halves: whether time or direction alone may be frozen.
     """
-    weights = shares_of(opacities)
+    weights = shares_of([one.opacities for one in slices])
     found = []
     names = (*model.centers, *model.geometry)
+    refines = model.refinement is not None and model.phase.refine
     raw: Raw = {name: value.detach() for name, value in model.splats.items()}
-    if model.refinement is not None and model.phase.refine:
-        raw = raw | _baked(model, queries, weights, names)
-        found.append(Cut(SLICED, {name: raw[name] for name in names}))
+    fewer = {level: raw | {"shN": raw["shN"] * model.kept(Classes(0, 0, _all(model, level)))["shN"]}
+             for level in model.lower_levels()}  # fmt: skip
+    refined, lost = _averages(model, queries, slices, weights, names if refines else (), list(fewer.values()))
+    raw = raw | refined
+    if refines:
+        found.append(Cut(SLICED, refined))
     for name, frozen in model.frozen(raw, queries, weights).items():
         if name != STILL and not by_halves:
             continue
         found.append(Cut(name, {key: raw[key] for key in names} | frozen))
     found.append(Cut(REMOVED, None))
-    return found + [Cut(f"level{level}", _repainted(model, level, queries, opacities, weights), level)
-                    for level in model.lower_levels()]  # fmt: skip
+    for (level, cut), missing in zip(fewer.items(), lost, strict=True):
+        constant = cut["sh0"].clone()
+        constant.flatten(1, -2)[:, 0] += missing / SH_C0
+        found.append(Cut(f"level{level}", {"sh0": constant, "shN": cut["shN"]}, level))
+    return found
 
 
 def shares_of(opacities: Sequence[Tensor]) -> Tensor:
@@ -61,34 +70,37 @@ def shares_of(opacities: Sequence[Tensor]) -> Tensor:
     return weights / weights.sum(0)
 
 
-def _baked(model: GaussianModel, queries: Sequence[Query], weights: Tensor, names: Sequence[str]) -> Raw:
-    """Average what AGR makes of the raw parameters over the queries."""
-    total: Raw = {name: torch.zeros_like(model.splats[name]) for name in names}
-    moved: dict[float, Raw] = {}
-    for query, weight in zip(queries, weights, strict=True):
-        assert query.time is not None
-        key = float(query.time)
-        if key not in moved:
-            moved = {key: model.refined(query)}
-        for name in names:
-            total[name] += weight[:, None] * moved[key][name]
+def _all(model: GaussianModel, level: int) -> Tensor:
+    """Return one level of colour for all Gaussians, [N]."""
+    return torch.full((len(model),), level, dtype=torch.int32, device=model.splats["means"].device)
+
+
+def _averages(
+    model: GaussianModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], weights: Tensor,
+    names: Sequence[str], cuts: Sequence[Raw],
+) -> tuple[Raw, list[Tensor]]:  # fmt: skip
+    """Average over the queries what AGR makes of the raw parameters, and the colour [N, 3] that each cut loses.
+
+    Args:
+        model: as it is.
+        queries: V of them.
+        slices: at the queries.
+        weights: [V, N].
+        names: of the raw parameters that AGR moves; none without AGR.
+        cuts: raw parameters with fewer harmonics.
+    """
+
+    def at(v: int) -> list[Tensor]:
+        moved, seen, weight = model.refined(queries[v]), slices[v], weights[v][:, None]
+        colors = [model.paint(moved | {"shN": cut["shN"]}, seen.means, seen.opacities, queries[v]) for cut in cuts]
+        return [weight * moved[name] for name in names] + [weight * (seen.colors - less) for less in colors]
+
+    lanes = model.backend.lanes(weights)
+    total = functools.reduce(_add, side_by_side(at, range(len(queries)), lanes))
+    return dict(zip(names, total, strict=False)), total[len(names) :]
+
+
+def _add(total: list[Tensor], more: list[Tensor]) -> list[Tensor]:
+    for one, other in zip(total, more, strict=True):
+        one += other
     return total
-
-
-def _repainted(
-    model: GaussianModel, level: int, queries: Sequence[Query], opacities: Sequence[Tensor], weights: Tensor
-) -> Raw:
-    """Cut the harmonics above a level, and refit the constant one to the colours that the queries saw."""
-    whole = {name: value.detach() for name, value in model.splats.items()}
-    levels = torch.full((len(model),), level, dtype=torch.int32, device=weights.device)
-    cut = whole | {"shN": whole["shN"] * model.kept(Classes(0, 0, levels))["shN"]}
-    lost = torch.zeros_like(whole["means"])
-    for query, seen, weight in zip(queries, opacities, weights, strict=True):
-        raw = model.refined(query)
-        means, _, _ = model.observe(raw, query)
-        colors = [model.paint(raw | {k: v for k, v in one.items() if k in ("sh0", "shN")}, means, seen, query)
-                  for one in (whole, cut)]  # fmt: skip
-        lost += weight[:, None] * (colors[0] - colors[1])
-    constant = cut["sh0"].clone()
-    constant.flatten(1, -2)[:, 0] += lost / SH_C0
-    return {"sh0": constant, "shN": cut["shN"]}

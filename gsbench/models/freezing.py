@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from gsbench.kernels.thresholds import LOG_SIZE_MAX, TIME_GATE_MIN
+from gsbench.kernels.headers import LOG_SIZE_MAX, TIME_GATE_MIN
 from gsbench.models.factors import partner, quaternion, turn_of_space
 from gsbench.models.query import Query, unit
 from gsbench.models.slicing import Reduced, gain_of, reduce, whiten
@@ -45,15 +45,18 @@ def freeze_triangular(
     by_name = {"time": [3], "direction": [0, 1, 2], "still": [0, 1, 2, 3]}
     if "time" not in model.observes:
         by_name = {"still": [0, 1, 2]}
-    shift = sum(w[:, None].double() * _delta(model, raw, q) for q, w in zip(queries, weights, strict=True))
+    shift, gates = torch.zeros_like(gain[:, 0]), {name: torch.zeros_like(gain[:, 0, 0]) for name in by_name}
+    for query, weight in zip(queries, weights.double(), strict=True):
+        delta = _delta(model, raw, query)
+        shift += weight[:, None] * delta
+        exponents = _exponents(model, blocks, delta)
+        for name, columns in by_name.items():
+            parts = [exponents[i] for i in columns if i in exponents]
+            gates[name] += weight * torch.exp(-torch.stack(parts).sum(0))
     changed = {}
     for name, columns in by_name.items():
-        gate = sum(w.double() * _gate(model, blocks, _delta(model, raw, q), columns)
-                   for q, w in zip(queries, weights, strict=True))  # fmt: skip
-        assert isinstance(shift, Tensor)
-        assert isinstance(gate, Tensor)
         moved = raw["means"] + (gain[..., columns] @ shift[:, columns, None])[..., 0]
-        opacity = (torch.sigmoid(raw["opacities"].double()) * gate).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+        opacity = (torch.sigmoid(raw["opacities"].double()) * gates[name]).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
         new = model.triangle.parameters(_without(model, blocks, gain, columns)) | {"means": moved}
         new["opacities"] = torch.logit(opacity)
         for center, own in (("times", 3), ("directions", 0)):
@@ -72,17 +75,15 @@ def _delta(model: TriangularModel, raw: Raw, query: Query) -> Tensor:
     return delta.double()
 
 
-def _gate(model: TriangularModel, blocks: Reduced, delta: Tensor, columns: list[int]) -> Tensor:
-    """Compute the product of f_dir and f_temp [N], of those whose variable is frozen (7DGS eq. 11 and 12)."""
-    exponent = torch.zeros_like(delta[:, 0])
-    if 0 in columns:
-        half = 0.5 if model.directional_half else 1.0
-        white = whiten(blocks.T_qq[:, :3, :3], delta[:, :3])
-        exponent = exponent + half * model.modulation("direction").double() * white.square().sum(-1)
-    if 3 in columns:
+def _exponents(model: TriangularModel, blocks: Reduced, delta: Tensor) -> dict[int, Tensor]:
+    """Compute -ln f_dir and -ln f_temp [N], by the first column of their variable (7DGS eq. 11 and 12)."""
+    half = 0.5 if model.directional_half else 1.0
+    white = whiten(blocks.T_qq[:, :3, :3], delta[:, :3])
+    found = {0: half * model.modulation("direction").double() * white.square().sum(-1)}
+    if "time" in model.observes:
         distance = delta[:, 3] / blocks.T_qq[:, 3].norm(dim=-1)
-        exponent = exponent + 0.5 * model.modulation("time").double() * distance.square()
-    return torch.exp(-exponent)
+        found[3] = 0.5 * model.modulation("time").double() * distance.square()
+    return found
 
 
 def _without(model: TriangularModel, blocks: Reduced, gain: Tensor, columns: list[int]) -> Tensor:

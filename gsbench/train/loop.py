@@ -14,7 +14,6 @@ from tqdm import tqdm
 from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.measure.curve import Curve
-from gsbench.measure.quality import psnr
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel
 from gsbench.models.classes import pack
@@ -25,6 +24,7 @@ from gsbench.train.density import DensityControl
 from gsbench.train.floor import Floor
 from gsbench.train.gating import NO_GATES, Gating
 from gsbench.train.optim import Optimizer
+from gsbench.train.psnr import mean_psnr
 from gsbench.train.schedule import Schedule, batch, generator
 from gsbench.train.step import Step, fitting_threads
 from gsbench.train.watch import DivergedError, Watch
@@ -168,10 +168,9 @@ class Trainer:
         if leak and (self.best.eval is None or now > self.best.eval):
             self.best.eval = now
 
-    @torch.no_grad()
     def psnr(self, views: list[View]) -> float:
         """Measure the mean PSNR over views, dB."""
-        return sum(psnr(self.render(view), view.image) for view in views) / len(views)
+        return mean_psnr(self.model, views, self.background, self.config.raster.antialias)
 
     @torch.no_grad()
     def render(self, view: View) -> Tensor:

@@ -4,10 +4,8 @@ Threads share the views, not the kernels: a batch has few views and each of them
 gradient is added in the order of the views, so that any number of threads gives the same bits.
 """
 
-import functools
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -16,6 +14,7 @@ from torch import Tensor, nn
 
 from gsbench.errors import InputError
 from gsbench.kernels.tape import Tape, add_to
+from gsbench.lanes import side_by_side
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
@@ -72,20 +71,19 @@ class Step:
             InputError: the rasterizer refuses a slice for another reason; TooLargeError: memory would not suffice.
         """
         sources = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
-        # Only the kernels' time is worth threads of Python's, and a GPU does one thing after the other anyway.
-        place, threads = self.model.splats["means"], torch.get_num_threads()
+        lanes = min(len(views), self.model.backend.lanes(self.model.splats["means"]))
         total: Sums = {}
-        if threads == 1 or place.device.type != "cpu" or not self.model.backend.serves(place):
+        if lanes == 1:
             seen = [self._see(view, sources, total, len(views), self.stages) for view in views]
         else:
-            seen = self._side_by_side(views, sources, total, min(len(views), threads))
+            seen = self._in_lanes(views, sources, total, lanes)
         with self.stages("backward"):
             for parameter in sources:
                 parameter.grad = total.get(id(parameter))
         return seen
 
-    def _side_by_side(self, views: Sequence[View], sources: list[nn.Parameter], total: Sums, lanes: int) -> list[Seen]:
-        """Deal the views to threads: those of the first lane go into `total`, each other into sums of its own."""
+    def _in_lanes(self, views: Sequence[View], sources: list[nn.Parameter], total: Sums, lanes: int) -> list[Seen]:
+        """Deal the views to lanes: those of the first lane go into `total`, each other into sums of its own."""
         started = time.perf_counter()
         bounds = [len(views) * lane // lanes for lane in range(lanes + 1)]
         sums = [total if i < bounds[1] else {} for i in range(len(views))]
@@ -95,8 +93,7 @@ class Step:
             return [self._see(views[i], sources, sums[i], len(views), clocks[lane])
                     for i in range(bounds[lane], bounds[lane + 1])]  # fmt: skip
 
-        pool = _pool(lanes, max(1, torch.get_num_threads() // lanes))
-        seen = [one for part in pool.map(run, range(lanes)) for one in part]
+        seen = [one for part in side_by_side(run, range(lanes), lanes) for one in part]
         for own in sums[bounds[1] :]:
             for key, gradient in own.items():
                 add_to(total, key, gradient)
@@ -126,14 +123,3 @@ class Step:
         if g_means2d is None:
             g_means2d = torch.zeros_like(means2d)
         return Seen(loss.detach() / views, output.info.radii, g_means2d)
-
-
-@functools.cache
-def _pool(lanes: int, threads: int) -> ThreadPoolExecutor:
-    """Start lanes whose kernels and torch operations run on `threads` threads each."""
-    before = torch.get_num_threads()
-    pool = ThreadPoolExecutor(lanes, "gsbench-view", lambda: torch.set_num_threads(threads))
-    # A lane is started by each call that finds none idle, and setting its own number sets that of threads to come.
-    list(pool.map(lambda _: time.sleep(0.01), range(lanes)))
-    torch.set_num_threads(before)
-    return pool

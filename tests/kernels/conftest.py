@@ -10,7 +10,6 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-import torch
 
 from gsbench import kernels
 from gsbench.kernels import cuda, library
@@ -30,14 +29,6 @@ def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
     kernels.use_instruction_set(request.param)
     yield request.param
     kernels.use_instruction_set(best)
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """Puts the number of threads back."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,50 @@
+"""Run independent pieces of work side by side, each on a thread of Python with its share of the kernels' threads."""
+
+import functools
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import torch
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], lanes: int) -> Iterator[Result]:
+    """Yield what `work` makes of each item, in the order of the items, with `lanes` of them at work at a time.
+
+    Kernels give the same bits for any number of threads, so the results do not depend on `lanes`.
+
+    Args:
+        work: must not write to what another item reads. Gradients are on or off as for the caller.
+        items: are all begun as soon as a lane is free, however slowly the results are taken.
+        lanes: see `gsbench.backends.Backend.lanes`.
+    """
+    lanes = min(lanes, len(items))
+    if lanes <= 1:
+        return map(work, items)
+    gradients = torch.is_grad_enabled()
+
+    def run(item: Item) -> Result:
+        with torch.set_grad_enabled(gradients):
+            return work(item)
+
+    return _pool(lanes, max(1, torch.get_num_threads() // lanes)).map(run, items)
+
+
+@functools.cache
+def _pool(lanes: int, threads: int) -> ThreadPoolExecutor:
+    """Start lanes whose kernels and torch operations run on `threads` threads each."""
+    before = torch.get_num_threads()
+
+    def settle() -> None:
+        torch.get_num_threads()  # in a thread that has not asked yet, asking puts the process's number in place
+        torch.set_num_threads(threads)
+
+    pool = ThreadPoolExecutor(lanes, "gsbench-lane", settle)
+    # A lane is started by each call that finds none idle, and setting its own number sets that of threads to come.
+    list(pool.map(lambda _: time.sleep(0.01), range(lanes)))
+    torch.set_num_threads(before)
+    return pool

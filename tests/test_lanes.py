@@ -1,0 +1,38 @@
+"""Independent pieces of work on threads of Python."""
+
+import pytest
+import torch
+
+from gsbench.lanes import side_by_side
+
+
+def slowly(item: int) -> tuple[int, int, bool]:
+    """Work whose later pieces are done sooner."""
+    torch.rand(40 - item, 1000).sort()
+    return item, torch.get_num_threads(), torch.is_grad_enabled()
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize("lanes", [1, 2, 5])
+def test_results_come_in_the_order_of_the_items(lanes: int) -> None:
+    """Catches results in the order that threads come by, and lanes that compute gradients for a caller without them."""
+    torch.set_num_threads(4)
+    with torch.no_grad():
+        found = list(side_by_side(slowly, range(40), lanes))
+    assert [one[0] for one in found] == list(range(40))
+    assert {one[1] for one in found} == {{1: 4, 2: 2, 5: 1}[lanes]}, "lanes that take more than their share of threads"
+    assert not any(one[2] for one in found)
+    assert torch.get_num_threads() == 4
+    assert all(one[2] for one in side_by_side(slowly, range(2), lanes))
+
+
+def test_an_error_in_a_lane_is_the_caller_s() -> None:
+    """Catches a piece of work that fails in silence."""
+
+    def fail(item: int) -> int:
+        if item == 3:
+            raise ValueError("three")
+        return item
+
+    with pytest.raises(ValueError, match="three"):
+        list(side_by_side(fail, range(5), 2))
