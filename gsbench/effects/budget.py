@@ -33,6 +33,7 @@ def gate_within(
     strength: Strength,
     budget_db: float,
     measure: Callable[[GaussianModel], float],
+    spans: Tensor | None = None,  # [N, 2]
 ) -> Gated | None:
     """Apply the largest of SHARES whose measured loss is within the budget; None where none is.
 
@@ -43,6 +44,7 @@ def gate_within(
         strength: of its cuts.
         budget_db: dB that `measure` may fall by.
         measure: the PSNR of a model, dB, on views that the probe did not look at.
+        spans: when each Gaussian can be seen, for AGR to rest at other times.
     """
     before = measure(model)
     for share in SHARES:
@@ -50,7 +52,7 @@ def gate_within(
             continue
         gated = copy.deepcopy(model)
         choice = choose(strength, gated, share)
-        rows, changed = apply(gated, strength, choice)
+        rows, changed = apply(gated, strength, choice, spans)
         loss = before - measure(gated)
         if loss <= budget_db and len(gated):
             gate = Gate(

@@ -34,7 +34,7 @@ def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianMo
         if key != "directions":  # AGR reads them
             changed.splats[key].data = value.clone()
     if name == STILL:
-        changed.classes = classes_of(model)._replace(refined=0, sliced=0)
+        changed.classes = classes_of(model)._replace(refined=0, sliced=0, spans=None)
     return changed
 
 

@@ -118,8 +118,19 @@ def classes_of(model: GaussianModel) -> Classes:
 
 
 @torch.no_grad()
-def apply(model: GaussianModel, strength: Strength, choice: Choice) -> tuple[Tensor, Tensor]:
+def apply(
+    model: GaussianModel,
+    strength: Strength,
+    choice: Choice,
+    spans: Tensor | None = None,  # [N, 2]
+) -> tuple[Tensor, Tensor]:
     """Turn each Gaussian of a model into its cut, drop the removed ones, sort the others by class.
+
+    Args:
+        model: becomes the gated one.
+        strength: of its cuts.
+        choice: one of them for each Gaussian.
+        spans: when each Gaussian can be seen, see `Classes.spans`.
 
     Returns:
         The rows [M] that the Gaussians which are left had before, and which of them were changed, [M] bool.
@@ -148,11 +159,17 @@ def apply(model: GaussianModel, strength: Strength, choice: Choice) -> tuple[Ten
     kind = torch.where(refined, 0, torch.where(still, 2, 1))
     # Rows of a class are sorted by what is frozen and by level, and otherwise stay in order: equal work lies together.
     rank = (kind * 4 + frozen) * (MOST_LEVEL + 1) + MOST_LEVEL - choice.levels
-    order = rank.argsort(stable=True)
+    if spans is None:
+        order = rank.argsort(stable=True)
+    else:  # those that AGR moves at the same times lie together too: a GPU's warps rest as a whole
+        order = spans[:, 0].argsort(stable=True)
+        order = order[rank[order].argsort(stable=True)]
     rows = order[~choice.geometry[REMOVED][order]]
     changed = (~choice.geometry[LIVE] | (choice.levels != now.levels))[rows]
     model.select(rows)
     counts = [int((kind[rows] <= most).sum()) for most in (0, 1)]
-    model.classes = Classes(counts[0], counts[1], choice.levels[rows].contiguous(), frozen[rows].contiguous())
+    own = now.spans if spans is None else spans
+    own = None if own is None else own[rows[: counts[0]]].contiguous()
+    model.classes = Classes(counts[0], counts[1], choice.levels[rows].contiguous(), frozen[rows].contiguous(), own)
     model.fill(model.classes)
     return rows, changed

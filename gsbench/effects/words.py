@@ -35,6 +35,8 @@ def of_gate(gate: Gate) -> str:
     kept = ", ".join(f"{gate.rows[name]} {words}" for name, words in _KEEP.items() if gate.rows.get(name))
     text = (f"gated {when}: of {left + gate.rows.get('removed', 0)} Gaussians {left} are left, of which {kept}; "
             f"PSNR on {gate.checked_on} {-gate.measured_db:+.3f} dB")  # fmt: skip
+    if gate.asleep:
+        text += f", AGR rests for {gate.asleep:.0%} of them, which no training view shows at its time"
     if gate.eval_loss_db is not None:
         text += f", evaluated {-gate.eval_loss_db:+.3f} dB"
     if gate.frame_ms_before and gate.frame_ms:
@@ -50,7 +52,6 @@ def of_direction(found: Direction) -> str:
 
 
 def lines(found: OnDemand) -> list[str]:
-    """Say everything that was decided, a sentence a line."""
-    said = [of_screen(found.screen)] if found.screen else []
-    said += [of_gate(gate) for gate in found.gates]
+    """Say what the gates decided, a sentence a line; `of_screen` says what the screen did, before the training."""
+    said = [of_gate(gate) for gate in found.gates]
     return said + ([of_direction(found.direction)] if found.direction else []) + found.notes

@@ -10,6 +10,7 @@
 #include <cstdint>
 
 #include "math/off_diagonal.h"
+#include "math/sizes.h"
 
 #ifndef GSB_FIELDS  // bindings.h reads them; to everything else they are nothing
 #define GSB_FIELDS(Structure, role, ...)
@@ -125,9 +126,7 @@ GSB_FIELDS(ColorGrads, GRADS, sh0, shN, means, times)
 
 // ---- gsbench/kernels/refine.py
 
-constexpr int MAX_NETWORKS = 4, MAX_VALUES = 12;
-
-// Perceptrons features x 64 x width, one for each of `networks`, on every Gaussian (AGR). They read the values of the
+// Perceptrons features x HIDDEN x width, one for each of `networks`, on every Gaussian (AGR). They read the values of the
 // first `networks - 1` arrays, each of which one of them moves; the last moves all the others.
 struct RefineArgs {
     int64_t N, refined;  // rows from `refined` on stay where they are
@@ -136,10 +135,12 @@ struct RefineArgs {
     const float* values[MAX_VALUES];     // [arrays] of [N, value_widths]
     const float *weight_in, *bias_in;    // [networks * 64, features] [networks * 64]
     const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
+    // [refined, 2] [], or both null: outside its span of time a row stays where it is, see is_awake.
+    const float *spans, *time;
     int threads;
 };
 GSB_FIELDS(RefineArgs, INPUTS, N, refined, features, networks, arrays, outputs, widths, value_widths, values, weight_in,
-           bias_in, weight_out, bias_out, threads)
+           bias_in, weight_out, bias_out, spans, time, threads)
 
 struct Refined {
     float* values[MAX_VALUES];  // [arrays] of [N, value_widths]

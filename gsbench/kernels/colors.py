@@ -8,9 +8,8 @@ from typing import Any
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.headers import MAX_WAVES
 from gsbench.kernels.operation import Operation
-
-MAX_WAVES = 8  # as math/harmonics.h has it
 
 
 def _bases(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:

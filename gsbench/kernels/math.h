@@ -5,6 +5,7 @@
 // that by its inputs. Names of gradients start with g_.
 #pragma once
 
+#include "math/awake.h"
 #include "math/blending.h"
 #include "math/harmonics.h"
 #include "math/parameters.h"

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.headers import TILE
 from gsbench.kernels.library import Library, allocate, library_of
 from gsbench.kernels.operation import Operation, address, in_rows
 from gsbench.memory import require
 
-TILE = 16  # pixels a side, as cpu/kernels.h and cuda/launch.h have it
 TILE_PIXELS = TILE * TILE
 MAX_PAIRS = (1 << 31) - 1  # splats, and pairs of a tile and a splat, are numbered by int32
 GEOMETRY = 6  # of a splat: x, y, p, q, r, opacity

@@ -99,6 +99,7 @@ class Gate:
     eval_loss_db: float | None = None  # PSNR lost on the evaluated split, where that was measured
     frame_ms_before: float | None = None  # medians of frames, rendered in turns with those after
     frame_ms: float | None = None
+    asleep: float | None = None  # share of AGR's work left out: Gaussians that no training view shows at its time
 
 
 @dataclass(frozen=True)

@@ -249,7 +249,9 @@ class GaussianModel(nn.Module, ABC):
             return raw
         names = (*self.centers, *self.geometry)
         by_kernel = self.backend.serves(raw["means"])
-        moved = self.refinement([raw[name] for name in names], query.time, by_kernel=by_kernel, rows=rows)
+        spans = None if self.classes is None else self.classes.spans
+        values = [raw[name] for name in names]
+        moved = self.refinement(values, query.time, by_kernel=by_kernel, rows=rows, spans=spans)
         return raw | dict(zip(names, moved, strict=True))
 
     def modulate(self, name: str, value: float) -> None:

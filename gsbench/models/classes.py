@@ -29,6 +29,7 @@ class Classes(NamedTuple):
     sliced: int  # this many first rows (refined <= sliced) change with the query; the others are still
     levels: Tensor | None  # [N] int32: the harmonics of a row's colours, degree + 4 (waves - 1); None: all of them
     frozen: Tensor | None = None  # [N] uint8: TIME + DIRECTION, what a sliced row does not change with; None: nothing
+    spans: Tensor | None = None  # [refined, 2] clips: AGR moves a row only from a first to a last time; None: always
 
 
 def count(model: GaussianModel) -> dict[str, int]:
@@ -57,8 +58,9 @@ def pack(model: GaussianModel) -> dict[str, Tensor]:
         value = state[f"splats.{name}"]
         state[f"splats.{name}"] = value[mask.expand_as(value)]
     counts = torch.tensor([classes.refined, classes.sliced])
-    return state | {f"{_STATE}counts": counts, f"{_STATE}levels": classes.levels.to(torch.uint8),
-                    f"{_STATE}frozen": classes.frozen}  # fmt: skip
+    spans = {} if classes.spans is None else {f"{_STATE}spans": classes.spans}
+    return state | spans | {f"{_STATE}counts": counts, f"{_STATE}levels": classes.levels.to(torch.uint8),
+                            f"{_STATE}frozen": classes.frozen}  # fmt: skip
 
 
 def unpack(model: GaussianModel, state: dict[str, Any]) -> tuple[dict[str, Any], Classes | None]:
@@ -72,20 +74,21 @@ def unpack(model: GaussianModel, state: dict[str, Any]) -> tuple[dict[str, Any],
         return state, None
     opacities = state.get("splats.opacities")
     N = len(opacities) if isinstance(opacities, Tensor) and opacities.dim() == 1 else 0
-    expected = {"counts": ((2,), torch.int64), "levels": ((N,), torch.uint8), "frozen": ((N,), torch.uint8)}
-    parts: list[Tensor] = []
-    for name, (shape, dtype) in expected.items():
+
+    def part(name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         value = own.pop(f"{_STATE}{name}", None)
         if not isinstance(value, Tensor) or tuple(value.shape) != shape or value.dtype != dtype:
             raise InputError(f"checkpoint: expected {_STATE}{name} as {dtype} of shape {list(shape)}")
-        parts.append(value)
-    refined, sliced = parts[0].tolist()
-    levels, frozen = parts[1].to(torch.int32), parts[2]
-    known = all(bool((part <= most).all()) for part, most in ((levels, MOST_LEVEL), (frozen, TIME + DIRECTION)))
+        return value
+
+    refined, sliced = part("counts", (2,), torch.int64).tolist()
+    levels, frozen = part("levels", (N,), torch.uint8).to(torch.int32), part("frozen", (N,), torch.uint8)
+    spans = part("spans", (refined, 2), torch.float32) if f"{_STATE}spans" in own else None
+    known = bool((levels <= MOST_LEVEL).all()) and bool((frozen <= TIME + DIRECTION).all())
     if own or not known or not 0 <= refined <= sliced <= N:
         raise InputError(f"checkpoint: expected classes of {N} rows, got {refined}, {sliced} and levels or frozen "
                          f"effects that there are not")  # fmt: skip
-    classes = Classes(refined, sliced, levels, frozen)
+    classes = Classes(refined, sliced, levels, frozen, spans)
     whole = {key: value for key, value in state.items() if not key.startswith(_STATE)}
     for name, mask in model.kept(classes).items():
         packed, key = state.get(f"splats.{name}"), f"splats.{name}"

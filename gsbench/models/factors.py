@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
-from gsbench.kernels.thresholds import LOG_SIZE_MAX
+from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models.slicing import triangularise
 
 OFF_DIAGONALS = ("relative", "raw", "row_scaled")  # forms of `Triangle`; math/off_diagonal.h has them in this order

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.colors import MAX_WAVES, show_colors
+from gsbench.kernels.colors import show_colors
+from gsbench.kernels.headers import LOG_SIZE_MAX, MAX_WAVES, TIME_GATE_MIN
 from gsbench.kernels.slices import observe_rotated
-from gsbench.kernels.thresholds import LOG_SIZE_MAX, TIME_GATE_MIN
 from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
 from gsbench.models.classes import Classes

@@ -7,10 +7,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from gsbench.kernels.headers import HIDDEN
 from gsbench.kernels.refine import refine
 
 OCTAVES = 10  # K of the time encoding in the 7DGS paper
-HIDDEN = 64
 
 
 def encode_time(time: Tensor, octaves: int = OCTAVES) -> Tensor:
@@ -61,18 +61,25 @@ class Refinement(nn.Module):
         self.biases_out = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in outputs])
 
     def forward(
-        self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False, rows: int | None = None
-    ) -> list[Tensor]:
+        self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False, rows: int | None = None,
+        spans: Tensor | None = None,
+    ) -> list[Tensor]:  # fmt: skip
         """Move raw parameters [N, c], those that are read and then the others, to a time [].
 
-        The kernel (float32) writes no hidden layer to memory. With `rows` only so many first Gaussians are moved.
+        The kernel (float32) writes no hidden layer to memory. With `rows` only so many first Gaussians are moved, with
+        `spans` [rows, 2] each of them only from a first to a last time.
         """
         if by_kernel:
             gamma = encode_time(time, self.octaves)
             return refine(values, self.weight_in, self.bias_in, list(self.weights_out), list(self.biases_out),
-                          self.units, gamma, rows=rows)  # fmt: skip
+                          self.units, gamma, rows=rows, spans=spans,
+                          time=None if spans is None else time)  # fmt: skip
         if rows is not None:
-            moved = self([x[:rows] for x in values], time)
+            still = [x[:rows] for x in values]
+            moved = self(still, time)
+            if spans is not None:
+                awake = ((spans[:, 0] <= time) & (time <= spans[:, 1]))[:, None]
+                moved = [torch.where(awake, x, y) for x, y in zip(moved, still, strict=True)]
             return [torch.cat([x, rest[rows:]]) for x, rest in zip(moved, values, strict=True)]
         # The units scale rows and columns of the layers instead of the parameters of every Gaussian.
         weight_in, bias_in = self.weight_in[:, : self.features] / self.units[: self.features], self.at_time(time)

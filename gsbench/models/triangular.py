@@ -9,8 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
+from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.kernels.slices import observe_triangular
-from gsbench.kernels.thresholds import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
 from gsbench.models.classes import DIRECTION, TIME, Classes
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle

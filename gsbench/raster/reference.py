@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from gsbench.kernels.raster import Viewport
-from gsbench.kernels.thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from gsbench.raster.output import RasterInfo, RasterOutput
 
 TILE = 8  # pixels a side; small tiles waste fewer of the pairs that blending evaluates

@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.raster import EPS2D, NEAR, rasterize
 from gsbench.stability import brute, oracle
 from gsbench.stability.cases import Case, Cell, device_of
-from gsbench.stability.slices import ALPHA_MIN, fastest, worst
+from gsbench.stability.slices import fastest, worst
 
 UNDECIDED = 1e-3  # a pixel relatively nearer to a threshold may fall to either side of it in float32
 Arguments = dict[str, Any]

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from gsbench.backends import BACKENDS
+from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import GaussianModel, Query, build
 from gsbench.models.slicing import SCHEMES
 from gsbench.stability import oracle
@@ -21,7 +22,6 @@ OPTIONS = {
     "6dgs": {"lambda_d": 0.35, "directional_half": False},
     "7dgs": {"lambda_d": 0.35, "lambda_t": 0.35},
 }
-ALPHA_MIN = 1 / 255  # a fainter Gaussian is culled, so its place and shape do not matter
 SLOW_MS = 500.0
 COPIES = 1024  # of a case's Gaussians, for its timing
 
@@ -61,7 +61,7 @@ def truth(observed: Observed) -> Truth:
         scale = mean.norm() + (values[:3] - mean).norm() + values[[3, 7, 11]].sum().sqrt()
         weights[i, :3] /= scale
         weights[i, 3:12] /= values[3:12].norm()
-        if values[12] < ALPHA_MIN:
+        if values[12] < ALPHA_MIN:  # it is culled, so its place and shape do not matter
             weights[i, :12] = 0
         outputs.append(values)
         scales.append(scale)

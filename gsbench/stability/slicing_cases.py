@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Generator, Tensor
 
-from gsbench.kernels.thresholds import LOG_SIZE_MAX
+from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models.factors import Triangle
 from gsbench.stability.cases import case
 

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from gsbench.kernels.thresholds import LOG_SIZE_MAX
+from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models import GaussianModel
 
 THIN = -10.0  # log of a size in time: e^-10 of the clip is less than a frame of any scene

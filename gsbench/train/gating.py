@@ -13,8 +13,8 @@ from gsbench.config import Config
 from gsbench.effects.budget import Gated, gate_within
 from gsbench.effects.direction import share_with_direction, without_direction
 from gsbench.effects.strength import MOST_VIEWS, probe
+from gsbench.effects.visible import seen_times, share_asleep
 from gsbench.errors import InputError
-from gsbench.measure.quality import psnr
 from gsbench.measure.record import Direction, Gate
 from gsbench.measure.schema import parse
 from gsbench.measure.speed import synchroniser, time_in_turns
@@ -25,6 +25,7 @@ from gsbench.scenes import Scene, View
 from gsbench.train.density import DensityControl
 from gsbench.train.floor import Floor
 from gsbench.train.optim import Optimizer
+from gsbench.train.psnr import mean_psnr
 
 GATES = ("off", "end", "both")
 LOSS_IN_TRAINING = 0.5  # dB on val at once: the rest of the training makes up for it (docs/effects.md)
@@ -118,25 +119,31 @@ class Gating:
         times = time_in_turns(frames, count, synchroniser(self.config.device))
         return self._psnr(one, views) - self._psnr(other, views), [one.p50 for one in times]
 
+    @torch.no_grad()
     def _frame(self, model: GaussianModel, views: list[View], i: int) -> Tensor:
-        return self._render(model, views[i % len(views)])
+        view = views[i % len(views)]
+        return render(model, view.camera, view.time, self.background, self.config.raster.antialias)
 
     @torch.no_grad()
     def _gate(self, step: int | None, budget_db: float, most: int) -> None:
         """Probe, choose and apply; where nothing is within the budget, note that."""
         started = time.perf_counter()
+        at_end = step is None
         # In training nothing is frozen by halves: kernels keep the entries of still rows, but these would learn on.
+        # Nor does AGR rest: when a Gaussian can be seen still changes.
+        spans = seen_times(self.model, self.probed) if at_end else None
+        hidden = None if spans is None else spans[:, 0].isinf()
         strength = probe(self.model, self.probed, self.background, seed=self.config.seed, most=most,
-                         antialias=self.config.raster.antialias, by_halves=step is None)  # fmt: skip
-        found = gate_within(self.model, strength, budget_db, lambda model: self._psnr(model, self.checked))
+                         antialias=self.config.raster.antialias, by_halves=at_end, hidden=hidden)  # fmt: skip
+        found = gate_within(self.model, strength, budget_db, lambda model: self._psnr(model, self.checked), spans)
         if found is None:
-            self.notes.append(f"{'at the end' if step is None else f'at step {step}'} no simplification cost at most "
+            self.notes.append(f"{'at the end' if at_end else f'at step {step}'} no simplification cost at most "
                               f"{budget_db} dB on {self.checked_on}")  # fmt: skip
             return
         self._adopt(found)
-        self.gates.append(
-            replace(found.gate, step=step, checked_on=self.checked_on, seconds=time.perf_counter() - started)
-        )
+        seconds = time.perf_counter() - started
+        self.gates.append(replace(found.gate, step=step, checked_on=self.checked_on, seconds=seconds,
+                                  asleep=share_asleep(self.model, self.probed)))  # fmt: skip
 
     def _adopt(self, found: Gated) -> None:
         become(self.model, shape_of(found.model))
@@ -144,12 +151,8 @@ class Gating:
         self.density.follow(found.rows)
         self.floor.update()
 
-    @torch.no_grad()
-    def _render(self, model: GaussianModel, view: View) -> Tensor:
-        return render(model, view.camera, view.time, self.background, self.config.raster.antialias)
-
     def _psnr(self, model: GaussianModel, views: list[View]) -> float:
-        return sum(psnr(self._render(model, view), view.image) for view in views) / len(views)
+        return mean_psnr(model, views, self.background, self.config.raster.antialias)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what was decided, for the checkpoint; the classes are the model's."""

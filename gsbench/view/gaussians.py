@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.thresholds import ALPHA_MIN
+from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models.base import GaussianModel
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.query import Query

@@ -14,7 +14,7 @@ from gsbench.effects.budget import gate_within
 from gsbench.effects.gate import apply, choose
 from gsbench.effects.strength import Strength, probe
 from gsbench.errors import InputError
-from gsbench.kernels.thresholds import LOG_SIZE_MAX
+from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.measure.quality import psnr
 from gsbench.models import GaussianModel, Query
 from gsbench.models.classes import count, pack, packed_bytes
@@ -132,7 +132,7 @@ def test_only_what_matters_is_stored(name: str) -> None:
     assert other.classes[:2] == after.classes[:2]
 
 
-@pytest.mark.parametrize("fault", ["counts", "levels", "frozen", "short", "extra", "no_opacities", "missing"])
+@pytest.mark.parametrize("fault", ["counts", "levels", "frozen", "spans", "short", "extra", "no_opacities", "missing"])
 def test_classes_of_a_checkpoint_are_checked(fault: str) -> None:
     """Catches a damaged checkpoint that reaches the kernels with rows that there are not."""
     _, after = gated("7dgs", 3.0)
@@ -143,6 +143,8 @@ def test_classes_of_a_checkpoint_are_checked(fault: str) -> None:
         state["classes.levels"] = torch.full_like(state["classes.levels"], 77)
     elif fault == "frozen":
         state["classes.frozen"] = state["classes.frozen"][1:]
+    elif fault == "spans":
+        state["classes.spans"] = torch.zeros(int(state["classes.counts"][0]) + 1, 2)
     elif fault == "short":
         state["splats.motion"] = state["splats.motion"][:-1]
     elif fault == "extra":

@@ -8,7 +8,7 @@ import pytest
 import test_tape
 import torch
 from test_observe import VARIANTS, assert_same, color_inputs, model_and_raw, rotated, still
-from test_prefixes import SHARES, gradients, kept
+from test_prefixes import SHARES, gradients, kept, spans_around
 from torch import Tensor
 
 from gsbench.backends import AUTO, REFERENCE, Backend
@@ -146,20 +146,26 @@ def test_refinement(N: int, widths: list[int], move: Move) -> None:
                 gradients(expected, [*values, *exact.parameters()]))  # fmt: skip
 
 
+@pytest.mark.parametrize("rests", [False, True])
 @pytest.mark.parametrize("share", SHARES)
-def test_rows_that_agr_does_not_move(share: float, move: Move) -> None:
-    """Catches a row past the prefix that is moved, or counted in a weight's gradient, or not copied, forth or back."""
+def test_rows_that_agr_does_not_move(share: float, rests: bool, move: Move) -> None:
+    """Catches a row past the prefix, or outside its span of time, that is moved, or counted in a weight's gradient, or
+    not copied, forth or back."""
     g, count = torch.Generator().manual_seed(1), round(share * 300)
     exact = Refinement([3, 1, 9], g, units=0.5 + torch.rand(13, generator=g)).double()
     with torch.no_grad():
         for parameter in exact.parameters():
             parameter.add_(0.2 * torch.randn(parameter.shape, generator=g))
     values = [torch.randn(300, c, generator=g, dtype=torch.float64).requires_grad_() for c in (3, 1, 2, 7)]
-    expected = exact(values, torch.tensor(0.37, dtype=torch.float64), rows=count)
+    time = torch.tensor(0.37)
+    awake, spans = spans_around(time, count) if rests else (torch.arange(count) < count, None)
+    expected = exact(values, time.double(), rows=count, spans=spans)
     single, inputs = deepcopy(exact).to(move(values[0])), [move(x) for x in values]
-    actual = single(inputs, move(torch.tensor(0.37)), by_kernel=True, rows=count)
+    actual = single(inputs, move(time), by_kernel=True, rows=count, spans=None if spans is None else move(spans))
     assert_same(back(actual), expected)
-    assert all(torch.equal(x[count:], y[count:]) for x, y in zip(actual, inputs, strict=True))
+    at_rest = torch.cat([~awake, torch.ones(300 - count, dtype=torch.bool)])
+    for x, y in zip(back(actual), back(inputs), strict=True):
+        assert torch.equal(x[at_rest], y[at_rest])
     assert_same(back(gradients(actual, [*inputs, *single.parameters()])),
                 gradients(expected, [*values, *exact.parameters()]))  # fmt: skip
 

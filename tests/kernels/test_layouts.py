@@ -10,7 +10,8 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
-from gsbench.kernels.refine import HIDDEN, refine
+from gsbench.kernels.headers import HIDDEN
+from gsbench.kernels.refine import refine
 from gsbench.kernels.slices import observe_still, observe_triangular
 from gsbench.raster import rasterize
 

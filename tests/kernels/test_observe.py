@@ -242,7 +242,7 @@ def test_refinement(N: int, widths: list[int]) -> None:
                 gradients(expected, [*values, *exact.parameters()]))  # fmt: skip
 
 
-COMMON = torch.ones(16), torch.empty(0)  # units, and no encoded time
+COMMON = torch.ones(16), *[torch.empty(0)] * 3  # units, no encoded time, no spans
 
 
 def nan_memory(what: str, like: Tensor, shape: tuple[int, ...]) -> Tensor:  # noqa: ARG001

@@ -1,5 +1,6 @@
 """Kernels that leave out what a row does without: a query, AGR, or some of its harmonics."""
 
+import math
 from typing import Any
 
 import pytest
@@ -7,10 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_observe import SUBTRACTING, VARIANTS, assert_same, color_inputs, model_and_raw, nan_memory, rotated
+from test_tape import fitted
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsbench.errors import InputError
-from gsbench.kernels import operation
 from gsbench.kernels import refine as refining
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.slices import observe_rotated
@@ -27,6 +29,14 @@ SHARES = (0.0, 0.03, 0.5, 0.98, 1.0)  # of the rows that change: of 37 rows 0, 1
 def weights_of(outputs: list[Tensor]) -> list[Tensor]:
     g = torch.Generator().manual_seed(2)
     return [torch.randn(x.shape, generator=g).to(x) for x in outputs]
+
+
+def spans_around(time: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Which of so many rows are moved at a time, and their spans: some begin or end with it, some are never moved."""
+    spans = torch.rand(count, 2, generator=torch.Generator().manual_seed(count)).sort(-1).values
+    spans[::7, 0], spans[1::7, 1] = time, time
+    spans[2::7] = torch.tensor([math.inf, -math.inf])
+    return (spans[:, 0] <= time) & (time <= spans[:, 1]), spans
 
 
 def gradients(outputs: list[Tensor], inputs: list[Tensor]) -> list[Tensor]:
@@ -137,8 +147,10 @@ def test_levels_that_leave_nothing_out_change_no_bit(N: int, degree: int, waves:
 @pytest.mark.usefixtures("instruction_set", "threads")
 @pytest.mark.parametrize("N", [1, 127, 5000])
 @pytest.mark.parametrize("share", SHARES)
-def test_rows_that_agr_does_not_move(N: int, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a row past the prefix that is moved, or counted in a weight's gradient, or not copied, forth or back."""
+@pytest.mark.parametrize("rests", [False, True])
+def test_rows_that_agr_does_not_move(N: int, share: float, rests: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a row past the prefix, or outside its span of time, that is moved, or counted in a weight's gradient, or
+    not copied, forth or back."""
     monkeypatch.setattr(refining, "allocate", nan_memory)
     widths, parts, count, g = [3, 1, 9], [3, 1, 2, 7], round(share * N), torch.Generator().manual_seed(N)
     exact = Refinement(widths, g, units=0.5 + torch.rand(sum(widths), generator=g)).double()
@@ -147,7 +159,8 @@ def test_rows_that_agr_does_not_move(N: int, share: float, monkeypatch: pytest.M
             parameter.add_(0.2 * torch.randn(parameter.shape, generator=g))
     values = [torch.randn(N, c, generator=g, dtype=torch.float64).requires_grad_() for c in parts]
     time = torch.tensor(0.37)
-    expected = exact(values, time.double(), rows=count)
+    awake, spans = spans_around(time, count) if rests else (torch.arange(count) < count, None)
+    expected = exact(values, time.double(), rows=count, spans=spans)
     want = gradients(expected, [*values, *exact.parameters()])
     single = Refinement(widths, g)
     single.load_state_dict(exact.state_dict())
@@ -155,17 +168,19 @@ def test_rows_that_agr_does_not_move(N: int, share: float, monkeypatch: pytest.M
     found = []
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
-        moved = single(inputs, time, by_kernel=True, rows=count)
+        moved = single(inputs, time, by_kernel=True, rows=count, spans=spans)
         found.append([*moved, *gradients(moved, [*inputs, *single.parameters()])])
     moved, got = found[0][: len(parts)], found[0][len(parts) :]
     assert_same(moved, expected)
     assert_same(got, want)
+    at_rest = torch.cat([~awake, torch.ones(N - count, dtype=torch.bool)])
     for x, y, gradient, weight in zip(inputs, moved, got, weights_of(moved), strict=False):
-        assert torch.equal(x[count:], y[count:])
-        assert torch.equal(gradient[count:], weight[count:])
+        assert torch.equal(x[at_rest], y[at_rest])
+        assert torch.equal(gradient[at_rest], weight[at_rest])
+        assert (x[~at_rest] != y[~at_rest]).any(-1).all()
     assert all(torch.equal(x, y) for other in found[1:] for x, y in zip(found[0], other, strict=True))
-    if share == 1:
-        assert all(torch.equal(x, y) for x, y in zip(moved, single(inputs, time, by_kernel=True), strict=True))
+    always = single(inputs, time, by_kernel=True)
+    assert all(torch.equal(x[~at_rest], y[~at_rest]) for x, y in zip(moved, always, strict=True)), "bits of the others"
 
 
 # ---- the door
@@ -183,6 +198,14 @@ def test_rows_that_there_are_not() -> None:
         observe_rotated(*single.values(), rotating.clock, TIME, rotating.log_modulation["time"], sliced=46)
     with pytest.raises(InputError, match="refine: rows"):
         Refinement([3, 4], torch.Generator())([torch.ones(2, 3), torch.ones(2, 4)], TIME, by_kernel=True, rows=3)
+    for spans in (torch.ones(3, 2), torch.ones(2, 3), torch.ones(2, 2).double()):
+        with pytest.raises(InputError, match="spans"):
+            Refinement([3, 4], torch.Generator())([torch.ones(2, 3), torch.ones(2, 4)], TIME, by_kernel=True, rows=2,
+                                                  spans=spans)  # fmt: skip
+    with pytest.raises(InputError, match="spans and time together"):
+        refining.refine([torch.ones(2, 3), torch.ones(2, 4)], torch.ones(128, 3), torch.ones(128), [torch.ones(3, 64),
+                        torch.ones(4, 64)], [torch.ones(3), torch.ones(4)], torch.ones(7), torch.empty(0),
+                        spans=torch.ones(2, 2))  # fmt: skip
     sh0, shN, means, _ = color_inputs(1, torch.float32)
     for levels in (torch.zeros(21), torch.zeros(20, dtype=torch.int32), torch.zeros(21, dtype=torch.int64)):
         with pytest.raises(InputError, match="levels"):
@@ -196,17 +219,29 @@ def test_any_number_is_a_level() -> None:
     show_colors(sh0, shN, means, torch.ones(21), torch.zeros(3), 3, levels=levels).sum().backward()
 
 
-def test_torch_is_told_the_truth() -> None:
-    """Catches an operation with prefixes or levels whose fake has other shapes than it has."""
-    checks = "test_schema", "test_faketensor"
-    nothing, ops = torch.empty(0), torch.ops.gsbench
-    inputs = color_inputs(1, torch.float32)
-    torch.library.opcheck(
-        ops.show_colors,
-        ([*inputs[:3], torch.ones(21), nothing, CENTER, nothing, torch.zeros(21).int()], 2, 1),
-        test_utils=checks,
-    )
-    model, raw = rotated(torch.float32)
-    given_raw = [*raw.values(), model.clock, TIME, model.log_modulation["time"]]
-    for count in (7, operation.EVERY_ROW):
-        torch.library.opcheck(ops.observe_rotated, (given_raw, count), test_utils=checks)
+class Calls(TorchDispatchMode):
+    """Collects the operations of the kernels that are called, with their arguments."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: dict[str, tuple[Any, tuple[Any, ...]]] = {}
+
+    def __torch_dispatch__(self, operator: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if operator.namespace == "gsbench":
+            self.found[operator.name()] = operator, args
+        return operator(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", ["4dgs", "7dgs"])
+@pytest.mark.parametrize("classed", [False, True])
+def test_torch_is_told_the_truth(name: str, classed: bool) -> None:
+    """Catches an operation with prefixes, spans or levels whose fake has other shapes than it has."""
+    model = fitted(name, 30, agr=True, classed=classed)
+    if model.classes is not None:
+        model.classes = model.classes._replace(spans=spans_around(TIME, model.classes.refined)[1])
+    with torch.no_grad(), Calls() as calls:
+        model.slice(Query(CENTER, TIME))
+    observe = "observe_triangular" if name == "7dgs" else "observe_rotated"
+    assert {f"gsbench::{one}" for one in ("refine", observe, "show_colors")} <= calls.found.keys()
+    for operator, arguments in calls.found.values():
+        torch.library.opcheck(operator, arguments, test_utils=("test_schema", "test_faketensor"))

@@ -5,7 +5,7 @@ import torch
 from small import CAMERA, VARIANTS, N, lively, seeded
 from torch import Tensor
 
-from gsbench.kernels.thresholds import LOG_SIZE_MAX
+from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models import GaussianModel, Phase, Query
 from gsbench.models.base import Classes
 from gsbench.models.factors import rotation, rotation4d, turn_of_space

@@ -7,7 +7,6 @@
 
 namespace gsb {
 
-constexpr int TILE = 16;  // pixels a side
 inline int tiles_along(int pixels) { return (pixels + TILE - 1) / TILE; }
 
 struct BinArgs {

@@ -1,8 +1,9 @@
 // AGR (7DGS, section 4.3): four perceptrons of two layers move every Gaussian, a block of Gaussians at a time.
 //
 // Gaussians lie along the vectors, so each layer is a product of a small matrix with a tall one that stays in cache:
-// hidden layers are never written to memory, and backward computes them again. Backward packs the Gaussians that have a
-// gradient into blocks: many are not seen in a view.
+// hidden layers are never written to memory, and backward computes them again. Blocks are packed: at this time many
+// Gaussians may stay where they are, and backward many are not seen in a view.
+#include "../math/awake.h"
 #include "buffer.h"
 #include "isa.h"
 #include "rows.h"
@@ -12,8 +13,8 @@ inline namespace GSB_ISA {
 namespace {
 
 constexpr int BLOCK = 128;             // Gaussians
-constexpr int64_t CHUNK = 32 * BLOCK;  // a task; the weights' gradients are summed by chunks
-constexpr int HIDDEN = 64;
+constexpr int64_t TASK = 8 * BLOCK;    // of the forward pass
+constexpr int64_t CHUNK = 32 * BLOCK;  // a task of the backward pass; the weights' gradients are summed by chunks
 // Tiles of `product` and `outer`: as many sums as registers hold.
 #if defined(__AVX512F__)
 constexpr int TILE_ROWS = 8, TILE_SUMS = 16, OUTER_ROWS = 4;
@@ -165,6 +166,14 @@ void store_blocks(const RefineArgs& a, const Block& block, const float* moved, c
     }
 }
 
+// Row i of the first `count` of several arrays, which stays as it is.
+void copy_row(const RefineArgs& a, const float* const* arrays, int count, float* const* out, int64_t i) {
+    for (int k = 0; k < count; ++k) {
+        const int width = a.value_widths[k];
+        for (int c = 0; c < width; ++c) out[k][i * width + c] = arrays[k][i * width + c];
+    }
+}
+
 // The first `count` of several arrays, of the rows that stay where they are.
 void copy_rest(const RefineArgs& a, const float* const* arrays, int count, float* const* out) {
     for (int i = 0; i < count; ++i) copy_rows(arrays[i], out[i], a.value_widths[i], a.refined, a.N);
@@ -241,19 +250,41 @@ bool has_gradient(const RefineArgs& a, const float* const* grads, int64_t i) {
     return false;
 }
 
-// Writes the rows of [first, last) that have a gradient, less `first`, and returns their number; the features' gradient
-// of the others is zero.
+// Writes the rows of [first, last) that are moved and have a gradient, less `first`, and returns their number; the
+// features' gradient of the others is what is given.
 int rows_with_gradient(const RefineArgs& a, const float* const* grads, int64_t first, int64_t last,
                        float* const* g_features, int32_t* rows) {
     int count = 0;
     for (int64_t i = first; i < last; ++i) {
-        if (has_gradient(a, grads, i)) {
+        if (is_awake(a.spans, a.time, i) && has_gradient(a, grads, i)) {
             rows[count++] = static_cast<int32_t>(i - first);
         } else {
-            for (int k = 0; k < a.networks - 1; ++k) {
-                const int width = a.value_widths[k];
-                for (int c = 0; c < width; ++c) g_features[k][i * width + c] = 0.0f;
-            }
+            copy_row(a, grads, a.networks - 1, g_features, i);
+        }
+    }
+    return count;
+}
+
+void refine_block(const RefineArgs& a, const Block& block, float* const* out, const Scratch& s) {
+    load_blocks(a, block, a.values, a.networks - 1, s.X);
+    int output = 0;
+    for (int network = 0; network < a.networks; ++network) {
+        hidden_layer(a, network, s.X, s.H);
+        product(a.weight_out + output * HIDDEN, a.widths[network], HIDDEN, a.bias_out + output, false, s.H,
+                s.G + output * BLOCK, as_it_is);
+        output += a.widths[network];
+    }
+    store_blocks(a, block, s.G, a.values, a.arrays, out);
+}
+
+// Writes the rows of [first, last) that are moved, less `first`, and returns their number; the others are copied.
+int rows_awake(const RefineArgs& a, int64_t first, int64_t last, float* const* out, int32_t* rows) {
+    int count = 0;
+    for (int64_t i = first; i < last; ++i) {
+        if (is_awake(a.spans, a.time, i)) {
+            rows[count++] = static_cast<int32_t>(i - first);
+        } else {
+            copy_row(a, a.values, a.arrays, out, i);
         }
     }
     return count;
@@ -264,21 +295,15 @@ int rows_with_gradient(const RefineArgs& a, const float* const* grads, int64_t f
 void refine(const RefineArgs& a, const Refined& out) {
     const size_t scratch_size = Scratch::size(a);
     Buffer<float> scratch(scratch_size * static_cast<size_t>(a.threads));
-    int32_t rows[BLOCK];
-    for (int i = 0; i < BLOCK; ++i) rows[i] = i;
-#pragma omp parallel for num_threads(a.threads) schedule(dynamic, 8) if (a.refined > CHUNK)
-    for (int64_t first = 0; first < a.refined; first += BLOCK) {
+#pragma omp parallel for num_threads(a.threads) schedule(dynamic, 1) if (a.refined > CHUNK)
+    for (int64_t first = 0; first < a.refined; first += TASK) {
         const Scratch s(a, scratch.data() + scratch_size * static_cast<size_t>(thread_index()));
-        const Block block{first, rows, static_cast<int>(a.refined - first < BLOCK ? a.refined - first : BLOCK)};
-        load_blocks(a, block, a.values, a.networks - 1, s.X);
-        int output = 0;
-        for (int network = 0; network < a.networks; ++network) {
-            hidden_layer(a, network, s.X, s.H);
-            product(a.weight_out + output * HIDDEN, a.widths[network], HIDDEN, a.bias_out + output, false, s.H,
-                    s.G + output * BLOCK, as_it_is);
-            output += a.widths[network];
+        int32_t rows[TASK];
+        const int64_t last = first + TASK < a.refined ? first + TASK : a.refined;
+        const int count = rows_awake(a, first, last, out.values, rows);
+        for (int i = 0; i < count; i += BLOCK) {
+            refine_block(a, {first, rows + i, count - i < BLOCK ? count - i : BLOCK}, out.values, s);
         }
-        store_blocks(a, block, s.G, a.values, a.arrays, out.values);
     }
     copy_rest(a, a.values, a.arrays, out.values);
 }

@@ -32,7 +32,6 @@ void launch(void (*kernel)(Parameters...), dim3 grid, dim3 block, Stream stream,
 
 namespace gsb::cuda {
 
-constexpr int TILE = 16;  // pixels a side
 GSB_HD constexpr int tiles_along(int pixels) { return (pixels + TILE - 1) / TILE; }
 
 constexpr int THREADS = 256;  // of a block, where one thread does one thing

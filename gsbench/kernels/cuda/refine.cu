@@ -11,7 +11,6 @@
 namespace gsb::cuda {
 namespace {
 
-constexpr int HIDDEN = 64;
 constexpr int INPUTS = MAX_FEATURES + 1;  // a one comes last, whose weight is the bias
 
 // A column of a value [N, stride]: what is read, and where what comes of it goes.
@@ -27,7 +26,9 @@ struct Networks {
     int features, count, widths[MAX_NETWORKS];
     Column read[MAX_FEATURES];              // what the networks read
     Column moved[MAX_NETWORKS][MAX_WIDTH];  // what each network moves; backward: the gradient of what it was moved to
-    const float *weight_in, *bias_in, *weight_out, *bias_out;  // as in RefineArgs
+    const float *weight_in, *bias_in, *weight_out, *bias_out, *spans, *time;  // as in RefineArgs
+
+    __device__ bool moves(int64_t i) const { return i < N && is_awake(spans, time, i); }
 };
 
 // The features as columns of gradients.
@@ -88,11 +89,14 @@ __global__ void __launch_bounds__(MOVERS) refine_kernel(const __grid_constant__ 
     __syncthreads();
     const int64_t begin = static_cast<int64_t>(blockIdx.x) * MOVERS * AT_ONCE + threadIdx.x;
     float x[AT_ONCE][INPUTS], sums[AT_ONCE][MAX_WIDTH];
+    bool moves[AT_ONCE], any = false;
     GSB_UNROLL for (int n = 0; n < AT_ONCE; ++n) {
+        moves[n] = a.moves(begin + n * MOVERS);
+        any |= moves[n];
         load_features(a, begin + n * MOVERS, x[n]);
         GSB_UNROLL for (int c = 0; c < MAX_WIDTH; ++c) sums[n][c] = c < width ? a.bias_out[first + c] : 0.0f;
     }
-    for (int unit = 0; unit < HIDDEN; ++unit) {
+    for (int unit = 0; unit < (any ? HIDDEN : 0); ++unit) {
         float h[AT_ONCE];
         GSB_UNROLL for (int n = 0; n < AT_ONCE; ++n) h[n] = net.hidden(unit, x[n]);
         GSB_UNROLL for (int c = 0; c < MAX_WIDTH; ++c) {
@@ -105,7 +109,7 @@ __global__ void __launch_bounds__(MOVERS) refine_kernel(const __grid_constant__ 
         const Column column = a.moved[network][c];
         GSB_UNROLL for (int n = 0; n < AT_ONCE; ++n) {
             const int64_t i = begin + n * MOVERS, at = i * column.stride;
-            if (i < a.N) column.to[at] = column.from[at] + sums[n][c];
+            if (i < a.N) column.to[at] = moves[n] ? column.from[at] + sums[n][c] : column.from[at];
         }
     }
 }
@@ -136,11 +140,12 @@ __global__ void __launch_bounds__(BATCH * PARTS)
     for (int64_t begin = static_cast<int64_t>(blockIdx.x) * BATCH; begin < a.N; begin += int64_t{gridDim.x} * BATCH) {
         __syncthreads();  // the weights are there, and the last batch is done with
         const int64_t i = begin + lane;
+        const bool moves = a.moves(i);
         float x[INPUTS], g[MAX_WIDTH], g_x[INPUTS] = {};
         load_features(a, i, x);
         GSB_UNROLL for (int c = 0; c < MAX_WIDTH; ++c) {
             const Column& column = a.moved[network][c];
-            g[c] = i < a.N && c < width ? column.from[i * column.stride] : 0.0f;
+            g[c] = moves && c < width ? column.from[i * column.stride] : 0.0f;
         }
         if (part == 0) {
             GSB_UNROLL for (int f = 0; f < INPUTS; ++f) batch.x[lane][f] = x[f];
@@ -238,7 +243,8 @@ Column column_of(const RefineArgs& a, const float* const* from, float* const* to
 
 // `from` and `to` are what the networks move. Each moves the columns that follow those of the network before it.
 Networks networks_of(const RefineArgs& a, const float* const* from, float* const* to) {
-    Networks all{a.refined, a.features, a.networks, {}, {}, {}, a.weight_in, a.bias_in, a.weight_out, a.bias_out};
+    Networks all{a.refined,   a.features, a.networks,   {},         {},      {},
+                 a.weight_in, a.bias_in,  a.weight_out, a.bias_out, a.spans, a.time};
     const int widest = *std::max_element(a.widths, a.widths + MAX_NETWORKS);
     if (a.features > MAX_FEATURES || widest > MAX_WIDTH) {
         throw std::invalid_argument("refine: expected on a GPU at most " + std::to_string(MAX_FEATURES) +

@@ -4,12 +4,10 @@
 #include <cstdint>
 
 #include "scalar.h"
+#include "sizes.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
-
-constexpr int MAX_BASIS = 16;  // degree 3
-constexpr int MAX_WAVES = 8;   // frequencies of time, the constant one included
 
 constexpr float SH_0 = 0.28209479177387814f, SH_1 = 0.4886025119029199f;
 

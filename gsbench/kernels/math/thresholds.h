@@ -1,5 +1,5 @@
-// Where the mathematics of a slice stops following a number further, and where blending stops. gsbench/kernels/thresholds.py reads these lines, so
-// that torch's twin of the kernels stops at the same places.
+// Where the mathematics of a slice stops following a number further, and where blending stops.
+// gsbench/kernels/headers.py reads these lines, so that torch's twin of the kernels stops at the same places.
 #pragma once
 
 namespace gsb {

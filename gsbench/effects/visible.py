@@ -1,0 +1,55 @@
+"""Find when each Gaussian can be seen: at other times AGR need not move it."""
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gsbench.kernels.headers import ALPHA_MIN
+from gsbench.lanes import side_by_side
+from gsbench.models import GaussianModel, Query
+from gsbench.scenes import View
+
+
+@torch.no_grad()
+def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
+    """Return the first and the last time at which a view can show each Gaussian, clips; (inf, -inf) where none can.
+
+    It can where the opacity in the slice, moved by AGR or not, reaches ALPHA_MIN: below, nothing is drawn. Both times
+    are the largest gap between the times of neighbouring views apart from those of the views, for what lies between.
+
+    Args:
+        model: trained.
+        views: training views.
+    """
+    own = dict(model.splats.items())
+
+    def shown(view: View) -> Tensor:
+        query = Query.of(view.camera, view.time)
+        moved = model.refined(query)
+        opacities = model.observe(moved, query)[2]
+        if model.refinement is not None:
+            opacities = torch.maximum(opacities, model.observe(own, query)[2])
+        return opacities >= ALPHA_MIN
+
+    times = [view.time or 0.0 for view in views]
+    ordered = sorted(times)
+    gap = max((later - earlier for earlier, later in itertools.pairwise(ordered)), default=0.0)
+    first = torch.full_like(model.splats["opacities"], math.inf)
+    last = -first
+    lanes = model.backend.lanes(first)
+    for time, seen in zip(times, side_by_side(shown, views, lanes), strict=True):
+        first = torch.where(seen, first.clamp(max=time - gap), first)
+        last = torch.where(seen, last.clamp(min=time + gap), last)
+    return torch.stack([first, last], -1)
+
+
+def share_asleep(model: GaussianModel, views: Sequence[View]) -> float | None:
+    """Return the share of AGR's work that spans leave out, mean over views; None without spans."""
+    spans = None if model.classes is None else model.classes.spans
+    if spans is None or not len(spans):
+        return None
+    times = spans.new_tensor([view.time or 0.0 for view in views])[:, None]
+    return float(((times < spans[:, 0]) | (times > spans[:, 1])).float().mean())

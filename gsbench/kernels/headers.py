@@ -1,0 +1,29 @@
+"""Read the constants of the kernels' headers: one source for the kernels and for what torch and Python do with them."""
+
+import re
+from importlib import resources
+
+_LINE = re.compile(r"^constexpr (int|float) (\w+) = ([\d.e-]+)f?(?: / ([\d.]+)f)?;", re.MULTILINE)
+
+
+def _constants(header: str, kind: str) -> dict[str, float]:
+    """Return the constants of one type in a header of this package, by name."""
+    text = resources.files("gsbench.kernels").joinpath(header).read_text()
+    return {name: float(value) / float(divisor or 1)
+            for type_, name, value, divisor in _LINE.findall(text) if type_ == kind}  # fmt: skip
+
+
+_thresholds = _constants("math/thresholds.h", "float")
+LOG_SIZE_MAX = _thresholds["LOG_SIZE_MAX"]
+EXPONENT_MAX = _thresholds["EXPONENT_MAX"]
+TIME_GATE_MIN = _thresholds["TIME_GATE_MIN"]
+ALPHA_MIN = _thresholds["ALPHA_MIN"]
+ALPHA_MAX = _thresholds["ALPHA_MAX"]
+TRANSMITTANCE_MIN = _thresholds["TRANSMITTANCE_MIN"]
+
+_sizes = _constants("math/sizes.h", "int")
+TILE = int(_sizes["TILE"])
+MAX_WAVES = int(_sizes["MAX_WAVES"])
+HIDDEN = int(_sizes["HIDDEN"])
+MAX_NETWORKS = int(_sizes["MAX_NETWORKS"])
+MAX_VALUES = int(_sizes["MAX_VALUES"])

@@ -1,0 +1,104 @@
+"""When Gaussians can be seen, and what AGR leaves out at other times."""
+
+import copy
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from test_strength import BLACK, N, trained_a_little, views_of
+
+from gsbench.effects.gate import apply, choose, classes_of
+from gsbench.effects.strength import probe
+from gsbench.effects.visible import seen_times, share_asleep
+from gsbench.kernels.headers import ALPHA_MIN
+from gsbench.models import GaussianModel, Query
+from gsbench.models.classes import pack, packed_bytes
+from gsbench.models.render import render
+
+
+def fleeting() -> GaussianModel:
+    """A model of 7D Gaussians, most of which are there for a part of the clip; the first five are never."""
+    model = trained_a_little("7dgs", 0)
+    model.splats["log_diagonal"].data[:, 3] = math.log(0.02)
+    model.splats["coupling"].data *= 0.02
+    model.splats["opacities"].data[:5] = -20.0
+    return model
+
+
+def test_when_a_gaussian_is_seen() -> None:
+    """Catches a span that leaves out a view which shows the Gaussian, moved by AGR or not, and one that is too long."""
+    model = fleeting()
+    views = views_of(model, 1)
+    times = sorted(view.time for view in views if view.time is not None)
+    gap = max(b - a for a, b in itertools.pairwise(times))
+    spans = seen_times(model, views)
+    shown = torch.zeros(N, len(views), dtype=torch.bool)
+    for i, view in enumerate(views):
+        query = Query.of(view.camera, view.time)
+        for raw in (model.refined(query), dict(model.splats.items())):
+            shown[:, i] |= model.observe(raw, query)[2] >= ALPHA_MIN
+    at = torch.tensor([view.time for view in views])
+    for row in range(N):
+        seen = at[shown[row]]
+        if not len(seen):
+            assert spans[row].tolist() == [math.inf, -math.inf]
+            continue
+        torch.testing.assert_close(spans[row], torch.stack([seen.min() - gap, seen.max() + gap]))
+    assert spans[:5, 0].isinf().all()
+    assert not spans[5:, 0].isinf().all()
+    assert (spans[:, 1] - spans[:, 0]).max() < 1 or shown.float().mean() < 0.9, "a model whose Gaussians never sleep"
+
+
+def test_a_scene_without_times() -> None:
+    """Catches a Gaussian of a still scene that is taken for hidden because there is no time."""
+    model = trained_a_little("6dgs", 0)
+    still = [replace(view, time=None) for view in views_of(model, 1)[:8]]
+    spans = seen_times(model, still)
+    assert not spans[:, 0].isinf().all()
+    assert set(spans[:, 0].tolist()) <= {0.0, math.inf}
+
+
+def test_agr_rests_unseen() -> None:
+    """Catches spans of other rows than their own, that change a training view, or that no checkpoint holds."""
+    model = fleeting()
+    views = views_of(model, 1)
+    spans = seen_times(model, views)
+    strength = probe(model, views, BLACK)
+    gated, resting = copy.deepcopy(model), copy.deepcopy(model)
+    choice = choose(strength, model, 0.0)
+    rows, _ = apply(gated, strength, choice)
+    again, _ = apply(resting, strength, choice, spans)
+    assert sorted(rows.tolist()) == sorted(again.tolist())
+    assert resting.classes is not None
+    assert resting.classes.spans is not None
+    assert torch.equal(resting.classes.spans, spans[again[: resting.classes.refined]])
+    assert not (again < 5).any(), "Gaussians that are never seen cost nothing to remove"
+    for view in views:
+        a, b = (render(one, view.camera, view.time, BLACK) for one in (gated, resting))
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
+    asleep = share_asleep(resting, views)
+    assert asleep is not None
+    assert 0.2 < asleep < 1
+    assert share_asleep(gated, views) is None
+    other = trained_a_little("7dgs", 1)
+    other.load_state(pack(resting))
+    assert other.classes is not None
+    assert torch.equal(other.classes.spans, resting.classes.spans)
+    assert packed_bytes(resting) == packed_bytes(gated) + 8 * resting.classes.refined
+    assert len(classes_of(resting).spans) == resting.classes.refined
+
+
+@pytest.mark.parametrize("most", [30, 10])
+def test_what_no_view_shows_is_removed(most: int) -> None:
+    """Catches a Gaussian that is kept, and refined, because the views that were probed are not all there are."""
+    model = fleeting()
+    views = views_of(model, 1)
+    hidden = seen_times(model, views)[:, 0].isinf()
+    errors = probe(model, views, BLACK, most=most, hidden=hidden).errors["removed"]
+    assert (errors[hidden] == 0).all()
+    after = copy.deepcopy(model)
+    strength = probe(model, views, BLACK, most=most, hidden=hidden)
+    rows, _ = apply(after, strength, choose(strength, model, 0.0))
+    assert not hidden[rows].any()
