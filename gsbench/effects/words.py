@@ -35,13 +35,14 @@ def of_gate(gate: Gate) -> str:
     kept = ", ".join(f"{gate.rows[name]} {words}" for name, words in _KEEP.items() if gate.rows.get(name))
     text = (f"gated {when}: of {left + gate.rows.get('removed', 0)} Gaussians {left} are left, of which {kept}; "
             f"PSNR on {gate.checked_on} {-gate.measured_db:+.3f} dB")  # fmt: skip
-    if gate.asleep:
-        text += f", AGR rests for {gate.asleep:.0%} of them, which no training view shows at its time"
     if gate.eval_loss_db is not None:
         text += f", evaluated {-gate.eval_loss_db:+.3f} dB"
     if gate.frame_ms_before and gate.frame_ms:
         text += f", a frame {gate.frame_ms_before:.2f} -> {gate.frame_ms:.2f} ms"
-    return f"{text}, {gate.bytes_before / 1e6:.2f} -> {gate.bytes / 1e6:.2f} MB"
+    text += f", {gate.bytes_before / 1e6:.2f} -> {gate.bytes / 1e6:.2f} MB"
+    if gate.asleep:
+        text += f"; at any one time AGR moves {1 - gate.asleep:.0%} of its Gaussians, as the others cannot be seen then"
+    return text
 
 
 def of_direction(found: Direction) -> str:

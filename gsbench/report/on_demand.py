@@ -36,6 +36,7 @@ class Decided:
     mb_before: float  # of the model before the first gate
     mb: float
     predicted: float  # change of PSNR that the gate at the end foresaw, dB
+    asleep: float  # share of AGR's work that a frame leaves out, as the Gaussians cannot be seen at its time
 
     @property
     def before(self) -> float:
@@ -84,6 +85,7 @@ def _average(group: Group, scene: str, arm: Arm, name: str, runs: list[Record]) 
         fmean(one[0].bytes_before for one in gates) / 1e6 if gates else math.nan,
         fmean(one[-1].bytes for one in gates) / 1e6 if gates else math.nan,
         fmean(-gate.predicted_db for _, gate in at_end) if at_end else math.nan,
+        fmean(gate.asleep or 0.0 for _, gate in at_end) if at_end else math.nan,
     )
 
 

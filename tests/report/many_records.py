@@ -79,7 +79,8 @@ def gates(seed: int = 0) -> list[Gate]:
     levels = {"degree 0": 350, "degree 1": 50, "degree 2": 100, "degree 3, 2 waves": 200 + 10 * seed}
     return [
         Gate(0.1, 0.4, 0.3, first, {"degree 3": 800}, 400_000, 300_000, step=600, seconds=1.0),
-        Gate(0.01, 0.04, 0.03, last, levels, 300_000, 200_000, None, "val", 2.0, 0.02 + 0.01 * seed, 4.0, 3.0),
+        Gate(0.01, 0.04, 0.03, last, levels, 300_000, 200_000, None, "val", 2.0, 0.02 + 0.01 * seed, 4.0, 3.0,
+             asleep=0.25),
     ]  # fmt: skip
 
 

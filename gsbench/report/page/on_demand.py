@@ -87,6 +87,9 @@ def _gate_words(one: Decided) -> list[str]:
     where = "" if one.gated == len(one.runs) else f" On {one.gated} of {len(one.runs)} seeds:"
     text = f"{where} Of {one.before:,.0f} Gaussians the gates left {one.left:,.0f}{share}"
     said = [(f"{text}: {words.listing(kept)}." if kept else f"{text}.").strip()]
+    if one.asleep > 0:
+        moves = 100 * (1 - one.asleep)
+        said.append(f"At any one time AGR moves {moves:.0f} % of its Gaussians; the others cannot be seen then.")
     if one.psnr.scenes:
         text = f"The gate at the end changed PSNR on {words.cut(one.views, 40)} by {_change(one.psnr, 'dB', 3)}"
         if one.ms.scenes:
@@ -182,7 +185,7 @@ def _table(found: list[Decided]) -> Table:
     columns = [Column("scene"), Column("model"), Column("variant"), Column("seeds"), Column("time")]
     columns += [Column("largest p", 3), Column("% free of the camera", 0), Column("screen s", 1), Column("seeds gated")]
     columns += [Column("Gaussians before", 0), *(Column(said, 0) for said in NAMES.values())]
-    columns += [Column(f"degree {i}", 0) for i in range(DEGREES)]
+    columns += [Column(f"degree {i}", 0) for i in range(DEGREES)] + [Column("% of AGR left out of a frame", 0)]
     columns += [Column("predicted dB", 3), Column("PSNR measured on"), Column("PSNR dB", 3), Column("95 % low", 3)]
     columns += [Column("95 % high", 3), Column("ms a frame before", 2), Column("change in ms", 2), Column("low", 2)]
     columns += [Column("high", 2), Column("MB before", 2), Column("MB", 2)]
@@ -208,6 +211,7 @@ def _row(one: Decided) -> list[Value]:
         one.before if one.gated else math.nan,
         *rows,
         *(one.degrees or [math.nan] * DEGREES),
+        100 * one.asleep,
         one.predicted,
         one.views or None,
         *(one.psnr.mean, one.psnr.low, one.psnr.high),
