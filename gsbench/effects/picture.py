@@ -13,7 +13,7 @@ from torch import Tensor
 from gsbench.effects.gate import classes_of, cost_of, most_cost
 from gsbench.effects.words import CLASSES
 from gsbench.models import GaussianModel, Query
-from gsbench.models.classes import NAMES
+from gsbench.models.classes import NAMES, count
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes import Camera
 
@@ -51,13 +51,10 @@ def draw(
         InputError: the model observes time and there is none.
     """
     seen = model.slice(Query.of(camera, time))
-    kinds = kinds_of(model)
-    hues = torch.tensor([COLOURS[name] for name in NAMES]).to(seen.colors) / 255
-    pays = (cost_of(model) / most_cost(model)).to(seen.colors)
     layers = (
         (seen.colors, background),
-        (hues[kinds], torch.ones_like(background)),
-        (pays[:, None].expand(-1, 3).contiguous(), torch.zeros_like(background)),
+        (class_colors(model), torch.ones_like(background)),
+        (cost_colors(model, most_cost(model)), torch.zeros_like(background)),
     )
     images = [
         rasterize_slice(seen._replace(colors=colors), camera, behind, model.backend, antialias).image[0]
@@ -65,8 +62,17 @@ def draw(
     ]
     panels = [_bytes(image) for image in images]
     panels[2] = _heat(panels[2][..., 0])
-    counts = torch.bincount(kinds, minlength=len(NAMES)).tolist()
-    return _arranged(panels, dict(zip(NAMES, counts, strict=True)), most_cost(model))
+    return _arranged(panels, count(model), most_cost(model))
+
+
+def class_colors(model: GaussianModel) -> Tensor:
+    """Return the colour of each Gaussian's class, [N, 3] in [0, 1]."""
+    return torch.tensor([COLOURS[name] for name in NAMES]).to(model.splats["means"])[kinds_of(model)] / 255
+
+
+def cost_colors(model: GaussianModel, most: float) -> Tensor:
+    """Return the cost of each Gaussian as a grey level, [N, 3]: 1 stands for `most` nanoseconds of a frame."""
+    return (cost_of(model).to(model.splats["means"]) / most)[:, None].repeat(1, 3)
 
 
 def kinds_of(model: GaussianModel) -> Tensor:

@@ -11,7 +11,7 @@ import threading
 from collections import Counter
 from collections.abc import Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -50,7 +50,7 @@ class Tape:
         """An empty one."""
         self._notes: list[_Note] = []
 
-    def __enter__(self) -> Tape:
+    def __enter__(self) -> Self:
         self._outer = current()
         _in_charge.tape = self
         return self

@@ -115,7 +115,7 @@ class StageClock:
 
     def __init__(self, device: str = "cpu") -> None:
         self._seconds: dict[str, float] = {}
-        self._clock: _Clock = _DeviceClock(device) if device.startswith("cuda") else _HostClock()
+        self._clock = _clock_of(device)
         self._ended: deque[tuple[str, Any, Any]] = deque()  # name, start and end, not yet in the sums
         self._current: str | None = None
 
@@ -166,6 +166,37 @@ class StageClock:
         self._seconds = {name: float(seconds) for name, seconds in state.items()}
 
 
+class Laps:
+    """Divides one stretch of work into stages, each of which begins where the one before it ended.
+
+    Ends are marked as those of `StageClock`, so nothing waits for a GPU before the seconds are read.
+    """
+
+    def __init__(self, device: str = "cpu") -> None:
+        """Begin the first stage."""
+        self._clock = _clock_of(device)
+        self._last = self._clock.mark()
+        self._ended: list[tuple[str, Any, Any]] = []  # name, start and end
+
+    def end(self, name: str) -> None:
+        """End a stage, whose name is known only now; a name that comes again adds to its stage."""
+        end = self._clock.mark()
+        self._ended.append((name, self._last, end))
+        self._last = end
+
+    def has(self, name: str) -> bool:
+        """Tell whether a stage of that name has ended."""
+        return any(name == ended for ended, _, _ in self._ended)
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """The seconds by stage, in the order in which they first ended; reading them waits for the device."""
+        sums: dict[str, float] = {}
+        for name, start, end in self._ended:
+            sums[name] = sums.get(name, 0.0) + self._clock.seconds(start, end)
+        return sums
+
+
 class _Clock(Protocol):
     """A clock that marks moments and tells the seconds between two of its marks."""
 
@@ -204,6 +235,10 @@ class _DeviceClock:
     def seconds(self, start: Any, end: Any) -> float:
         end.synchronize()
         return float(start.elapsed_time(end)) / 1000
+
+
+def _clock_of(device: str) -> _Clock:
+    return _DeviceClock(device) if device.startswith("cuda") else _HostClock()
 
 
 def reset_peak_memory(device: str = "cpu") -> None:

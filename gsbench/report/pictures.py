@@ -35,12 +35,26 @@ def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
         if image.shape != shape or image.ndim != 3 or shape[2] != 3 or 0 in shape:
             raise InputError(f"strip: expected images [H, W, 3] of one size, got {image.shape} beside {shape}")
     factor = -(-LEAST_WIDTH // shape[1])
-    lines = [_beside([_bytes(render), _bytes(truth), _error(render, truth)], factor) for render, truth in pairs]
+    lines = [_beside([_bytes(render), _bytes(truth), error_image(render, truth)], factor) for render, truth in pairs]
     gap = np.full((GAP, lines[0].shape[1], 3), GREY, np.uint8)
     picture = [_header(shape[1] * factor)]
     for line in lines:
         picture += [line, gap]
     return np.concatenate(picture[:-1])
+
+
+def error_image(render: npt.NDArray[np.float32], truth: npt.NDArray[np.float32]) -> Pixels:  # [H, W, 3], each
+    """Map the absolute error, the mean over RGB, to colours: black is none, bright yellow 0.2 or more, magenta NaN."""
+    error = np.abs(np.clip(render, 0, 1) - np.clip(truth, 0, 1)).mean(-1)
+    shown = inferno(np.nan_to_num(error) / ERROR_SCALE)
+    shown[np.isnan(error)] = (255, 0, 255)
+    return shown
+
+
+def inferno(values: npt.NDArray[np.floating]) -> Pixels:  # [H, W]
+    """Map values from [0, 1], clamped, to OpenCV's inferno colours, [H, W, 3] RGB."""
+    levels = (np.clip(values, 0, 1) * 255).round().astype(np.uint8)
+    return np.asarray(cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB
@@ -58,20 +72,6 @@ def _bytes(image: npt.NDArray[np.float32]) -> Pixels:
     return shown
 
 
-def _error(render: npt.NDArray[np.float32], truth: npt.NDArray[np.float32]) -> Pixels:
-    """Map the absolute error to colours, NaN to magenta."""
-    error = np.abs(np.clip(render, 0, 1) - np.clip(truth, 0, 1)).mean(-1)
-    shown = _colours(np.nan_to_num(error) / ERROR_SCALE)
-    shown[np.isnan(error)] = (255, 0, 255)
-    return shown
-
-
-def _colours(values: npt.NDArray[np.floating]) -> Pixels:  # [H, W]
-    """Map values from [0, 1], clamped, to OpenCV's inferno colours, [H, W, 3] RGB."""
-    levels = (np.clip(values, 0, 1) * 255).round().astype(np.uint8)
-    return np.asarray(cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), np.uint8)
-
-
 def _beside(images: list[Pixels], factor: int) -> Pixels:
     """Put enlarged images side by side, with gaps between them."""
     large = [image.repeat(factor, 0).repeat(factor, 1) for image in images]
@@ -86,7 +86,7 @@ def _header(width: int) -> Pixels:
     for column, title in enumerate(titles):
         _write(header, title, column * (width + GAP) + 6, 16)
     left, right = 2 * (width + GAP) + 6, 3 * width + 2 * GAP - 64
-    header[26:38, left + 16 : right] = _colours(np.linspace(0, 1, right - left - 16)[None].repeat(12, 0))
+    header[26:38, left + 16 : right] = inferno(np.linspace(0, 1, right - left - 16)[None].repeat(12, 0))
     _write(header, "0", left, 37)
     _write(header, f">= {ERROR_SCALE}", right + 6, 37)
     return header

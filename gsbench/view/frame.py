@@ -1,7 +1,6 @@
-"""Render one frame of the viewer: slice and rasterize a model, time both, and put two models into one image."""
+"""Render one frame of the viewer: a model as a browser's controls ask for it, timed; or two models in one image."""
 
 import threading
-import time
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,15 +8,21 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from gsbench.measure.speed import synchroniser
+from gsbench.effects.picture import class_colors, cost_colors
+from gsbench.models.base import Phase
+from gsbench.models.classes import count
 from gsbench.models.query import Query
 from gsbench.models.render import rasterize_slice
+from gsbench.report.pictures import inferno
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
 from gsbench.view.film import pixels
+from gsbench.view.stages import RASTER, SLICE, StageWatch, part_of
 
 Pixels = npt.NDArray[np.uint8]
 DIVIDER = (255, 255, 255)  # RGB of the line between two models
+IMAGE, CLASS, COST = COLOURS = ("image", "class", "cost")  # what the colours of the Gaussians may say
+EVERY_DEGREE = 3  # of the harmonics
 
 
 class Asked(NamedTuple):
@@ -26,54 +31,91 @@ class Asked(NamedTuple):
     time: float | None  # in [0, 1]; None where the scene has none
     center: torch.Tensor | None = None  # [3] where the slice is seen from; None: from the camera
     agr: bool = True  # whether AGR acts, in a model that has it
+    sh_degree: int = EVERY_DEGREE  # of the harmonics, at most
+    colours: str = IMAGE
+
+
+class Cost(NamedTuple):
+    """What a frame of one model took."""
+
+    name: str  # of the model
+    ms: dict[str, float]  # by stage, in their order
+
+    def of(self, part: str) -> float:
+        """Return the milliseconds of the slice or of the raster."""
+        return sum(ms for stage, ms in self.ms.items() if part_of(stage) == part)
 
 
 class Frame(NamedTuple):
     """A rendered image and what it cost."""
 
     image: Pixels  # [H, W, 3] RGB
-    slice_ms: float  # conditioning, colours and AGR
-    raster_ms: float
+    costs: tuple[Cost, ...]  # of each model in it
+
+    def ms(self, part: str) -> float:
+        """Return the milliseconds of the slices or of the rasters."""
+        return sum(cost.of(part) for cost in self.costs)
 
 
 class Painter:
     """Renders the frames of one run. Its model is switched for each frame, so it does one at a time for all clients."""
 
-    def __init__(self, run: LoadedRun) -> None:
-        """Take a run; nothing is rendered yet."""
+    def __init__(self, run: LoadedRun, most_cost: float) -> None:
+        """Take a run; nothing is rendered yet.
+
+        Args:
+            run: with the model.
+            most_cost: nanoseconds of a Gaussian that are shown brightest, the same for all models to be compared.
+        """
         self.run = run
         self.name = f"{run.folder.parent.name} {run.folder.name}"  # such as "7dgs seed0"
         self.trained_phase = run.model.phase
         self.has_agr = run.model.refinement is not None
-        self._background = torch.tensor(run.scene.background).to(run.config.device)
-        self._synchronise = synchroniser(run.config.device)
+        self.counts = count(run.model)  # of Gaussians, by class
+        background = torch.tensor(run.scene.background).to(run.config.device)
+        self._backgrounds = {IMAGE: background, CLASS: torch.ones_like(background), COST: torch.zeros_like(background)}
+        self._colors = {CLASS: class_colors(run.model), COST: cost_colors(run.model, most_cost)}
         self._lock = threading.Lock()
 
     def paint(self, camera: Camera, asked: Asked) -> Frame:
         """Render what a camera sees; raises InputError where it cannot be one."""
-        camera = camera.to(self.run.config.device)
-        center = camera.center if asked.center is None else asked.center.to(self.run.config.device)
-        with self._lock, torch.inference_mode():
-            self.run.model.phase = replace(self.trained_phase, refine=asked.agr and self.trained_phase.refine)
-            started = self._now()
-            gaussians = self.run.model.slice(Query.at(center, asked.time))
-            sliced = self._now()
-            backend, antialias = self.run.model.backend, self.run.config.raster.antialias
-            image = rasterize_slice(gaussians, camera, self._background, backend, antialias).image[0]
-            drawn = self._now()
-        return Frame(pixels(image), 1000 * (sliced - started), 1000 * (drawn - sliced))
+        image, ms = self._render(camera, asked)
+        shown = inferno(image[..., 0].cpu().numpy()) if asked.colours == COST else pixels(image)
+        return Frame(shown, (Cost(self.name, ms),))
 
-    def _now(self) -> float:
-        """Return the time in seconds at which everything that was asked of the device is done."""
-        self._synchronise()
-        return time.perf_counter()
+    def image(self, camera: Camera, asked: Asked) -> torch.Tensor:
+        """Render what a camera sees as floats, [H, W, 3], to be measured."""
+        return self._render(camera, asked)[0].cpu()
+
+    def _render(self, camera: Camera, asked: Asked) -> tuple[torch.Tensor, dict[str, float]]:
+        """Render an image; return it with the milliseconds by stage."""
+        run, device = self.run, self.run.config.device
+        camera = camera.to(device)
+        center = camera.center if asked.center is None else asked.center.to(device)
+        query = Query.at(center, asked.time)
+        with self._lock, torch.inference_mode(), StageWatch(device) as watch:
+            run.model.phase = self._phase(asked)
+            gaussians = run.model.slice(query)
+            watch.end(SLICE)
+            if asked.colours in self._colors:
+                gaussians = gaussians._replace(colors=self._colors[asked.colours])
+            background = self._backgrounds[asked.colours]
+            image = rasterize_slice(gaussians, camera, background, run.model.backend, run.config.raster.antialias).image
+            watch.end(RASTER)
+            return image[0], watch.ms
+
+    def _phase(self, asked: Asked) -> Phase:
+        """Return the phase of the training's end, less what is switched off."""
+        trained = self.trained_phase
+        degree = min(asked.sh_degree, trained.sh_degree)
+        return replace(trained, refine=asked.agr and trained.refine, sh_degree=degree)
 
 
 def beside(left: Frame, right: Frame) -> Frame:
     """Put two frames side by side, with a line between them."""
     image = np.concatenate([left.image, right.image], axis=1)
     image[:, left.image.shape[1] - 1] = DIVIDER
-    return Frame(image, left.slice_ms + right.slice_ms, left.raster_ms + right.raster_ms)
+    return Frame(image, left.costs + right.costs)
 
 
 def wiped(left: Frame, right: Frame, part: float) -> Frame:
@@ -82,4 +124,4 @@ def wiped(left: Frame, right: Frame, part: float) -> Frame:
     image[:, :edge] = left.image[:, :edge]
     if 0 < edge < image.shape[1]:
         image[:, edge] = DIVIDER
-    return Frame(image, left.slice_ms + right.slice_ms, left.raster_ms + right.raster_ms)
+    return Frame(image, left.costs + right.costs)

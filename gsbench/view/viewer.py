@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import viser
 
+from gsbench.effects.gate import most_cost
 from gsbench.errors import InputError
 from gsbench.run.load import LoadedRun, scene_of
 from gsbench.scenes import Scene
@@ -34,7 +35,8 @@ class Viewer:
             if run.scene.fingerprint != first.scene.fingerprint:
                 raise InputError(f"expected runs of one scene to look at together, got {first.scene.name} in "
                                  f"{first.folder} and other data in {run.folder}")  # fmt: skip
-        self.painters = [Painter(run) for run in runs]
+        self._most_cost = max(most_cost(run.model) for run in runs)
+        self.painters = [Painter(run, self._most_cost) for run in runs]
         names = [painter.name for painter in self.painters]
         for painter in (painter for painter in self.painters if names.count(painter.name) > 1):
             painter.name = str(painter.run.folder)
@@ -43,6 +45,7 @@ class Viewer:
         self._lock = threading.Lock()
         self.server = viser.ViserServer(host, port, label=f"gsbench: {first.scene.name}", verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.server.gui.main_panel.dock_right()  # beside the images, not above them
         self._stand(first)
         self.server.on_client_disconnect(self._forget)
         self.server.on_client_connect(self._welcome)
@@ -65,7 +68,7 @@ class Viewer:
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         with self._lock:
-            self.clients[client.client_id] = Client(client, self.painters, self.scene)
+            self.clients[client.client_id] = Client(client, self.painters, self.scene, self._most_cost)
         if client.client_id not in self.server.get_clients():  # it has left before its controls were there
             self._forget(client)
 

@@ -57,6 +57,18 @@ def test_stages_add_up_and_survive_a_resume(monkeypatch):
     assert stages.seconds["slice"] == 2.0
 
 
+def test_laps_are_all_of_the_time(monkeypatch):
+    """Would catch time between two stages that counts for neither, and a stage that comes again and starts anew."""
+    now = iter([0.0, 1.0, 3.0, 7.0, 15.0])
+    monkeypatch.setattr(time, "perf_counter", lambda: next(now))
+    laps = speed.Laps()
+    for name in ("slice", "raster", "slice", "loss"):
+        assert not laps.has("loss")
+        laps.end(name)
+    assert laps.has("loss")
+    assert list(laps.seconds.items()) == [("slice", 5.0), ("raster", 2.0), ("loss", 8.0)]
+
+
 def test_stages_wait_for_no_device_until_they_are_read(monkeypatch):
     """Would catch a GPU that is waited for at every stage, and a stage that is lost or charged to another meanwhile."""
     waits, done = [], 0

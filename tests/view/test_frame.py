@@ -1,5 +1,6 @@
-"""A frame of the viewer: what is frozen stays, what is switched is the client's own, two models share an image."""
+"""A frame of the viewer: what is switched is one client's, colours and costs are right, two models share an image."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,9 +9,13 @@ import pytest
 import torch
 from models.small import lively
 
-from gsbench.backends import AUTO
+from gsbench.backends import AUTO, REFERENCE, Backend
 from gsbench.config import Config
+from gsbench.effects import picture
+from gsbench.effects.gate import most_cost
+from gsbench.kernels.library import Library
 from gsbench.models import Phase, Query
+from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes, count
 from gsbench.models.render import rasterize_slice, render
 from gsbench.run.load import LoadedRun, SceneDescription
 from gsbench.scenes import Camera
@@ -18,18 +23,27 @@ from gsbench.view import paths
 from gsbench.view.__main__ import main
 from gsbench.view.client import camera_at
 from gsbench.view.film import pixels
-from gsbench.view.frame import Asked, Frame, Painter, beside, wiped
+from gsbench.view.frame import CLASS, COST, Asked, Cost, Frame, Painter, beside, wiped
 from gsbench.view.resolution import LEAST_PIXELS, MOST_PIXELS, MOVING_MS, Resolution
+from gsbench.view.stages import RASTER, SLICE, STAGES
 
 SIZE = 40
 
 
-def painter() -> Painter:
+def painter(backend: Backend = AUTO, classes: Classes | None = None) -> Painter:
     """Of 7DGS with AGR, in the midst of a training."""
-    model = lively("7dgs_agr", count=80).float()
+    model = lively("7dgs_agr", count=80, backend=backend).float()
     model.set_phase(Phase(3, True, True))
+    model.classes = classes
     scene = SceneDescription("small", "0", 4.0, [0.0, 0.0, 0.0], True, SIZE, SIZE)
-    return Painter(LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0")))
+    return Painter(LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0")), most_cost(model))
+
+
+def of_every_class() -> Classes:
+    """Of 80 Gaussians, 16 of each class."""
+    frozen = torch.zeros(80, dtype=torch.uint8)
+    frozen[32:48], frozen[48:64] = TIME, DIRECTION
+    return Classes(16, 64, torch.full((80,), 3, dtype=torch.int32), frozen)
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +61,8 @@ def test_a_frame_is_the_models_image(one: Painter) -> None:
     frame = one.paint(camera, Asked(0.4))
     assert (frame.image == pixels(render(one.run.model, camera, 0.4, torch.zeros(3)))).all()
     assert frame.image.max() > 30
-    assert frame.slice_ms > 0
-    assert frame.raster_ms > 0
+    assert frame.ms(SLICE) > 0
+    assert frame.ms(RASTER) > 0
 
 
 def test_a_frozen_direction_slices_from_there_and_draws_from_here(one: Painter) -> None:
@@ -72,14 +86,84 @@ def test_agr_is_switched_for_one_frame(one: Painter) -> None:
     assert (early.paint(camera, Asked(0.4)).image == off).all()
 
 
+def test_harmonics_are_cut_for_one_frame(one: Painter) -> None:
+    """Catches colours that still change with the direction at degree 0, and a cut that the next frame still has."""
+    camera = seen_from(0.5, one)
+    images = [one.paint(camera, Asked(0.4, sh_degree=degree)).image for degree in (0, 1, 3)]
+    assert (one.paint(camera, Asked(0.4)).image == images[2]).all()
+    flat = lively("7dgs_agr", count=80).float()
+    flat.splats["shN"].data.zero_()
+    assert (pixels(render(flat.requires_grad_(False), camera, 0.4, torch.zeros(3))) == images[0]).all()
+    assert len({image.tobytes() for image in images}) == 3
+    early = painter()
+    early.trained_phase = replace(early.trained_phase, sh_degree=1)
+    assert (early.paint(camera, Asked(0.4)).image == images[1]).all()
+
+
+@pytest.mark.parametrize("classes", [None, of_every_class()], ids=["without classes", "with classes"])
+def test_colours_are_those_of_the_picture_of_classes(classes: Classes | None) -> None:
+    """Catches a viewer whose colours mean something else than those of classes.png, or stand on another background."""
+    made = painter(classes=classes)
+    camera = seen_from(0.5, made)
+    panels = picture.draw(made.run.model, camera, 0.4, torch.zeros(3))[picture.LINE :]
+    factor = -(-picture.LEAST_WIDTH // SIZE)
+    step = factor * SIZE + picture.GAP
+    for i, colours in enumerate(("image", CLASS, COST)):
+        panel = panels[: factor * SIZE : factor, i * step :][:, : factor * SIZE : factor]
+        assert (made.paint(camera, Asked(0.4, colours=colours)).image == panel).all()
+    assert made.counts == count(made.run.model)
+    assert all(made.counts[name] == 16 for name in NAMES) == (classes is not None)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "stage"),
+    [
+        ("refine", "AGR"),
+        ("observe_triangular", "conditioning"),
+        ("show_colors", "colours"),
+        ("project", "projection"),
+        ("count_tiles", "binning"),
+        ("fill_tiles", "binning"),
+        ("blend", "blending"),
+    ],
+)
+def test_a_kernels_time_is_its_stages(one: Painter, kernel: str, stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches time that counts for another stage, or for none."""
+    run, slow = Library._run, 0.02
+
+    def run_slowly(library: Library, name: str, *values: object) -> None:
+        if name == kernel:
+            time.sleep(slow)
+        run(library, name, *values)
+
+    monkeypatch.setattr(Library, "_run", run_slowly)
+    (cost,) = one.paint(seen_from(0.5, one), Asked(0.4)).costs
+    assert tuple(cost.ms) == (*STAGES[SLICE], *STAGES[RASTER])
+    assert max(cost.ms, key=lambda name: cost.ms[name]) == stage
+    assert cost.ms[stage] >= 1000 * slow
+
+
+def test_what_torch_computes_alone_is_not_divided() -> None:
+    """Catches stages of zero milliseconds, and time that is not counted, without kernels."""
+    made = painter(REFERENCE)
+    (cost,) = made.paint(seen_from(0.5, made), Asked(0.4)).costs
+    assert list(cost.ms) == [SLICE, RASTER]
+    assert cost.of(SLICE) == cost.ms[SLICE] > 0
+    assert cost.of(RASTER) == cost.ms[RASTER] > 0
+    (without_agr,) = painter().paint(seen_from(0.5, made), Asked(0.4, agr=False)).costs
+    assert "AGR" not in without_agr.ms
+
+
 def test_two_models_share_an_image() -> None:
     """Catches swapped sides, an edge at the wrong place and costs that are not added."""
-    left, right = (Frame(np.full((4, 8, 3), value, np.uint8), 1.0, 2.0) for value in (10, 20))
+    ms = {"AGR": 0.25, "conditioning": 0.75, "blending": 2.0}
+    left, right = (Frame(np.full((4, 8, 3), value, np.uint8), (Cost(str(value), ms),)) for value in (10, 20))
     both = beside(left, right)
     assert both.image.shape == (4, 16, 3)
     assert (both.image[:, :7] == 10).all()
     assert (both.image[:, 8:] == 20).all()
-    assert (both.slice_ms, both.raster_ms) == (2, 4)
+    assert (both.ms(SLICE), both.ms(RASTER)) == (2, 4)
+    assert [cost.name for cost in both.costs] == ["10", "20"]
     part = wiped(left, right, 0.25).image
     assert (part[:, :2] == 10).all()
     assert (part[:, 3:] == 20).all()

@@ -11,6 +11,7 @@ from chromium import launched
 
 from gsbench.errors import InputError
 from gsbench.run.load import load_run
+from gsbench.view.stages import STAGES
 from gsbench.view.viewer import Viewer
 
 pytestmark = pytest.mark.slow
@@ -42,7 +43,7 @@ def visit(browser, viewer):
     """Opens the viewer and waits for its first picture at rest; returns the page with what it complained of."""
     contexts = []
 
-    def open_page():
+    def open_page(viewer=viewer):
         context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
         contexts.append(context)
         page = context.new_page()
@@ -109,7 +110,11 @@ def test_it_opens_and_stays_on_this_machine(visit, viewer):
     assert page.complaints == []
     foreign = [url for url in page.asked if not re.match(r"data:|(blob:)?(http|ws)://localhost:", url)]
     assert foreign == []
-    assert re.search(r"slice [\d.]+ ms, raster [\d.]+ ms: \d+ FPS", page.content())
+    said = page.locator("table").first.inner_text()
+    numbers = {line.split("\t")[0].strip(): line.split("\t")[-1] for line in said.splitlines()}
+    assert list(numbers) == ["ms", "slice", *STAGES["slice"], "raster", *STAGES["raster"], "FPS"]
+    assert numbers.pop("ms") == "7dgs,iterations=20 seed0"
+    assert all(float(number) >= 0 for number in numbers.values())
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(("192.0.2.1", 9))  # sends nothing; it tells this machine's own address
         address = probe.getsockname()[0]
@@ -153,6 +158,73 @@ def test_the_camera_turns_and_a_frozen_direction_is_another_picture(visit):
     switch(page, "freeze direction")
     free = settle(page)
     assert len({start, frozen, free}) == 3
+
+
+def test_effects_are_switched_off_and_on(visit):
+    """Catches a switch without effect, and one that cannot be undone."""
+    page = visit()
+    start = settle(page)
+    switch(page, "AGR")
+    without_agr = settle(page)
+    switch(page, "AGR")
+    slide(page, "harmonics", 0)
+    flat = settle(page)
+    slide(page, "harmonics", 3)
+    assert settle(page) == start
+    assert len({start, without_agr, flat}) == 3
+
+
+def test_gaussians_have_the_colours_of_their_classes_or_costs(visit):
+    """Catches colours that nothing explains, and a legend that stays when the colours are gone."""
+    page = visit()
+    pictures = [settle(page)]
+    for colours, said, unsaid in (("class", "refined by AGR", "ns"), ("cost", "ns", "refined by AGR")):
+        choose(page, "colours", colours)
+        pictures.append(settle(page))
+        assert page.get_by_text(said).count()
+        assert not page.get_by_text(unsaid, exact=True).count()
+    choose(page, "colours", "image")
+    assert settle(page) == pictures[0]
+    choose(page, "show", "wipe")
+    choose(page, "second model", "7dgs,iterations=20 seed0")
+    assert settle(page) != pictures[0]  # but for the line of the wipe the same
+    slide(page, "wipe at", 1)
+    assert settle(page) == pictures[0]
+    choose(page, "second colours", "class")
+    assert settle(page) == pictures[0]
+    slide(page, "wipe at", 0)
+    assert settle(page) == pictures[1]
+    choose(page, "second colours", "image")
+    assert not page.get_by_text("ns", exact=True).count()
+    assert len(set(pictures)) == 3
+
+
+def nearest(page):
+    """The name of the nearest training view, and what is said below its images."""
+    settle(page)
+    return page.locator("b").first.inner_text(), page.locator("figcaption").all_inner_texts()
+
+
+def test_the_error_against_the_nearest_training_view_is_shown(visit):
+    """Catches a view that stays when the camera moves on, and an error of another model or of other effects."""
+    page = visit()
+    switch(page, "nearest training view")
+    view, (truth, model, error) = nearest(page)
+    assert (truth, model) == ("training image", "7dgs,iterations=20 seed0")
+    assert re.fullmatch(r"[\d.]+ dB", error)
+    switch(page, "AGR")
+    assert nearest(page)[1][2] != error
+    choose(page, "show", "side by side")
+    assert len(nearest(page)[1]) == 6
+    for _ in range(6):
+        turn(page)
+        if nearest(page)[0] != view:
+            break
+    else:
+        raise AssertionError(f"{view} is nearest from everywhere")
+    switch(page, "nearest training view")
+    page.wait_for_timeout(300)
+    assert not page.locator("figcaption").first.is_visible()
 
 
 def test_two_models_are_compared(visit):
@@ -201,11 +273,14 @@ def test_two_browsers_have_controls_of_their_own_and_one_may_leave(visit, viewer
     assert settle(two) != start
 
 
-def test_without_data_there_are_no_cameras_and_runs_of_two_scenes_are_refused(folder, other_folder):
+def test_without_data_there_are_no_cameras_and_runs_of_two_scenes_are_refused(folder, other_folder, visit):
     """Catches a viewer that needs the data set, and models of two scenes under one camera."""
     run, other = load_run(folder), load_run(other_folder)
     run.config.data.root = "/nowhere"
     made = Viewer([run], "localhost", free_port())
+    page = visit(made)
+    for label in ("training cameras", "nearest training view"):
+        assert control(page, label, "checkbox").is_disabled()
     made.stop()
     assert "--data-root" in made.scene
     elsewhere = replace(other, scene=replace(other.scene, fingerprint="0"), folder=Path("elsewhere"))

@@ -1,0 +1,178 @@
+"""Offer the controls of one browser of the viewer, and say what they ask of a model."""
+
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import viser
+
+from gsbench.scenes import Scene, View
+from gsbench.view.frame import CLASS, COLOURS, IMAGE, Asked, Painter
+from gsbench.view.frusta import Frusta
+
+PLAYED_S = 4.0  # a clip takes that long
+ONE, SIDE, WIPE = "one image", "side by side", "wipe"
+NEAREST = "nearest training view"
+PANEL = {"x": 15.0, "y": -15.0, "width": 460.0}  # pixels: where it floats, from the left and from the bottom
+
+
+class Shown(NamedTuple):
+    """One of the images that are shown."""
+
+    painter: Painter  # of the model
+    colours: str  # what those of its Gaussians say
+
+
+class Controls:
+    """What one browser has chosen. The event `changed` is set whenever that is something else."""
+
+    def __init__(self, client: viser.ClientHandle, painters: Sequence[Painter], scene: Scene | str) -> None:
+        """Show the controls.
+
+        Args:
+            client: the browser, as viser has it.
+            painters: of the models that can be shown, one or more of one scene.
+            scene: with the training views; or why there are none.
+        """
+        self.client = client
+        self.changed = threading.Event()
+        self._painters = {painter.name: painter for painter in painters}
+        self._has_time = painters[0].run.scene.has_time
+        self._frozen: torch.Tensor | None = None  # the place that slices are seen from
+        self._held: float | None = None  # the time that slices are of
+        self._played_at = time.monotonic()
+        self.costs = client.gui.add_html("")
+        self._add_time()
+        self._add_effects()
+        self._add_images()
+        self._add_views(scene)
+
+    def _add_time(self) -> None:
+        """Add the slider of time, and the box that moves it."""
+        gui = self.client.gui
+        self.time = gui.add_slider("time", 0.0, 1.0, 0.005, 0.0, disabled=not self._has_time)
+        self.play = gui.add_checkbox("play", False, disabled=not self._has_time)
+        self.time.on_update(self._change)
+        self.play.on_update(self._start_clock)
+
+    def _add_effects(self) -> None:
+        """Add what switches the effects of the models off, one by one."""
+        gui, painters = self.client.gui, self._painters.values()
+        degree = max(painter.trained_phase.sh_degree for painter in painters)
+        with gui.add_folder("effects"):
+            self.agr = gui.add_checkbox("AGR", True, disabled=not any(painter.has_agr for painter in painters))
+            hold = gui.add_checkbox("freeze time", False, disabled=not self._has_time, hint="slices stay those of now")
+            freeze = gui.add_checkbox("freeze direction", False, hint="slices stay those seen from here")
+            self.degree = gui.add_slider("harmonics", 0, max(degree, 1), 1, degree, disabled=degree == 0,
+                                         hint="degree of the colours; 0: the same from everywhere")  # fmt: skip
+        self.agr.on_update(self._change)
+        self.degree.on_update(self._change)
+        hold.on_update(lambda _: self._hold(hold.value))
+        freeze.on_update(lambda _: self._freeze(freeze.value))
+
+    def _add_images(self) -> None:
+        """Add what chooses the models, and what the colours of their Gaussians say."""
+        gui, names = self.client.gui, list(self._painters)
+        several = len(names) > 1
+        self.mode = gui.add_dropdown("show", (ONE, SIDE, WIPE))
+        first = gui.add_dropdown("model", names, visible=several)
+        colours = gui.add_dropdown("colours", COLOURS, hint="of the Gaussians: their own, or what they pay for")
+        second = gui.add_dropdown("second model", names, initial_value=names[-1], visible=False)
+        others = gui.add_dropdown("second colours", COLOURS, initial_value=IMAGE if several else CLASS, visible=False)
+        self.wipe = gui.add_slider("wipe at", 0.0, 1.0, 0.01, 0.5, visible=False)
+        self.legend = gui.add_html("")
+        self._choices = (first, colours), (second, others)
+
+        def show(_: object) -> None:
+            second.visible = several and self.mode.value != ONE
+            others.visible, self.wipe.visible = self.mode.value != ONE, self.mode.value == WIPE
+            self.changed.set()
+
+        self.mode.on_update(show)
+        watched: list[Any] = [first, colours, second, others, self.wipe]
+        for control in watched:
+            control.on_update(self._change)
+
+    def _add_views(self, scene: Scene | str) -> None:
+        """Add what shows the training views, where they are there."""
+        gui, why = self.client.gui, scene if isinstance(scene, str) else None
+        frusta = gui.add_checkbox("training cameras", False, disabled=why is not None,
+                                  hint=why or "click on one to stand there")  # fmt: skip
+        self.compare = gui.add_checkbox(NEAREST, False, disabled=why is not None,
+                                        hint=why or "its image, the model's, and the error")  # fmt: skip
+        if isinstance(scene, str):
+            return
+        handles = Frusta(self.client, scene, self._go_to)
+        frusta.on_update(lambda _: handles.show(frusta.value))
+        panel = gui.add_panel(visible=False)
+        with panel.add_tab(NEAREST):
+            self.comparison = gui.add_html("")
+        panel.float(**PANEL)
+
+        def show(_: object) -> None:
+            panel.visible = self.compare.value
+            self.changed.set()
+
+        self.compare.on_update(show)
+
+    # ---- what happens in the browser
+
+    def _change(self, _: object) -> None:
+        self.changed.set()
+
+    def _hold(self, on: bool) -> None:
+        """Keep the time that slices are of, or let it be the slider's again."""
+        self._held = self.time.value if on else None
+        self.changed.set()
+
+    def _freeze(self, on: bool) -> None:
+        """Keep the place from which slices are seen, or let it be the camera's again."""
+        position = torch.tensor(np.asarray(self.client.camera.position), dtype=torch.float32)
+        self._frozen = position if on else None
+        self.changed.set()
+
+    def _start_clock(self, _: object) -> None:
+        self._played_at = time.monotonic()
+        self.changed.set()
+
+    def _go_to(self, position: npt.NDArray[np.float64], wxyz: npt.NDArray[np.float64], time: float | None) -> None:
+        """Stand where a training camera stood, at its time."""
+        with self.client.atomic():
+            self.client.camera.position, self.client.camera.wxyz = position, wxyz
+        if time is not None:
+            self.time.value = time  # type: ignore[misc]  # viser declares it read-only to mypy
+        self.changed.set()
+
+    def advance(self) -> None:
+        """Move the slider of time on while a clip is played."""
+        now = time.monotonic()
+        if self.play.value:
+            on = (now - self._played_at) / PLAYED_S
+            self.time.value = (self.time.value + on) % 1.0  # type: ignore[misc]  # as above
+        self._played_at = now
+
+    # ---- what that asks for
+
+    def shown(self) -> list[Shown]:
+        """Return the one or two images that are shown."""
+        choices = self._choices[:1] if self.mode.value == ONE else self._choices
+        return [Shown(self._painters[model.value], colours.value) for model, colours in choices]
+
+    def asked(self, colours: str) -> Asked:
+        """Return what is asked of a model now, in some colours."""
+        return self._asked_at(self.time.value, colours)
+
+    def asked_of(self, view: View) -> Asked:
+        """Return what is asked of a model at a training view: the same effects in the view's own time."""
+        return self._asked_at(view.time, IMAGE)
+
+    def _asked_at(self, time: float | None, colours: str) -> Asked:
+        if not self._has_time:
+            time = None
+        elif self._held is not None:
+            time = self._held
+        return Asked(time, self._frozen, self.agr.value, self.degree.value, colours)

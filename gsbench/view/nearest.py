@@ -1,0 +1,89 @@
+"""Compare models with the training view nearest to a camera: its image, what they make of it, and the error."""
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from gsbench.measure.quality import psnr, quantise
+from gsbench.report.pictures import error_image
+from gsbench.scenes import Camera, Scene, View
+from gsbench.view.film import pixels
+from gsbench.view.frame import Asked, Painter
+
+Pixels = npt.NDArray[np.uint8]
+SAME = 1e-3  # extents and radians: views that are nearer to one another than that differ in their times only
+MOST_WIDTH = 480  # pixels of an image that is shown; larger ones are made smaller
+
+
+class Nearest(NamedTuple):
+    """A training view, and how far it is from a camera."""
+
+    view: View
+    distance: float  # world units
+    degrees: float  # between the directions in which the two look
+
+
+class Compared(NamedTuple):
+    """What a model makes of a training view."""
+
+    name: str  # of the model
+    truth: Pixels  # [H, W, 3] RGB, as the others
+    render: Pixels
+    error: Pixels  # in the colours of `gsbench.report.pictures.error_image`
+    psnr: float  # dB, of all pixels
+
+
+class TrainingViews:
+    """The training views of a scene, by where they stand and where they look."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Take a scene; no image is read."""
+        self._views, self._extent = scene.train, max(scene.extent, 1e-12)
+        cameras = [view.camera.to("cpu") for view in scene.train]
+        self._centers = torch.stack([camera.center for camera in cameras])  # [V, 3]
+        self._forwards = torch.stack([camera.viewmat[2, :3] for camera in cameras])  # [V, 3]
+        self._times = torch.tensor([view.time or 0.0 for view in scene.train])  # [V]
+
+    def nearest(self, camera: Camera, time: float | None) -> Nearest:
+        """Find the view with the least distance in extents plus angle in radians; among equal ones, in time.
+
+        Args:
+            camera: that looks at the scene.
+            time: in [0, 1]; None where the scene has none.
+        """
+        distances = (self._centers - camera.center).norm(dim=-1)
+        angles = torch.arccos((self._forwards @ camera.viewmat[2, :3]).clamp(-1, 1))
+        far = distances / self._extent + angles
+        away = (self._times - (time or 0.0)).abs()
+        best = int(torch.where(far <= far.min() + SAME, away, math.inf).argmin())
+        return Nearest(self._views[best], float(distances[best]), math.degrees(angles[best]))
+
+
+def compare(painter: Painter, view: View, asked: Asked) -> Compared:
+    """Render what a view's camera sees and measure it as the run was measured.
+
+    Args:
+        painter: of the model.
+        view: to be compared with.
+        asked: the query and the effects.
+    """
+    view = view.to("cpu")
+    image = painter.image(view.camera, asked)
+    shown = quantise(image) if painter.run.config.protocol.quantise else image
+    error = error_image(shown.numpy(), view.image.numpy())
+    return Compared(
+        painter.name, _small(pixels(view.image)), _small(pixels(shown)), _small(error), psnr(shown, view.image)
+    )
+
+
+def _small(image: Pixels) -> Pixels:
+    """Make an image smaller that is wider than it is shown."""
+    height, width = image.shape[:2]
+    if width <= MOST_WIDTH:
+        return image
+    size = MOST_WIDTH, max(1, round(height * MOST_WIDTH / width))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

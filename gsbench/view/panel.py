@@ -1,0 +1,102 @@
+"""Write what the viewer's panel says: a frame's milliseconds by stage, the legend of colours, errors against a view."""
+
+import base64
+import html
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from gsbench.effects.picture import COLOURS
+from gsbench.effects.words import CLASSES
+from gsbench.report.pictures import ERROR_SCALE, inferno
+from gsbench.view.controls import Shown
+from gsbench.view.frame import CLASS, COST, Cost
+from gsbench.view.nearest import Compared, Nearest
+from gsbench.view.stages import STAGES
+
+STOPS = 9  # of a gradient
+_STYLE = "width:100%;border-collapse:collapse;table-layout:fixed"
+_NUMBER = "text-align:right;padding:0 0 0 0.5em;vertical-align:bottom"
+_BOX = "margin:0 1em 0.5em;font-size:0.75em;line-height:1.35;overflow-wrap:anywhere"
+
+
+def cost_table(costs: Sequence[Cost], width: int, height: int) -> str:
+    """Write the milliseconds of a frame: a column for each model, a row for each stage, and frames a second."""
+    rows = [_row("ms", [cost.name for cost in costs], bold=True)]
+    for part, stages in STAGES.items():
+        rows.append(_row(part, [f"{cost.of(part):.1f}" for cost in costs], bold=True))
+        there = [stage for stage in stages if any(stage in cost.ms for cost in costs)]
+        rows += [_row(stage, [_ms(cost, stage) for cost in costs], inside=True) for stage in there]
+    rows.append(_row("FPS", [f"{1000 / sum(cost.ms.values()):.0f}" for cost in costs], bold=True))
+    return _box(_table(rows) + f"<div>at {width} x {height}</div>")
+
+
+def legend(shown: Sequence[Shown], most_cost: float) -> str:
+    """Say what the colours of the Gaussians mean where they are not the models' own.
+
+    Args:
+        shown: the images.
+        most_cost: nanoseconds that are shown brightest.
+    """
+    text = ""
+    if by_class := {painter.name: painter.counts for painter, colours in shown if colours == CLASS}:
+        rows = [_row("Gaussians", list(by_class), bold=True)]
+        for name, words in CLASSES.items():
+            counts = [counts[name] for counts in by_class.values()]
+            if any(counts):
+                swatch = f'<span style="color:rgb{COLOURS[name]}">&#9632;</span> {words}'
+                rows.append(_row(swatch, [f"{number:,}" for number in counts], escaped=True))
+        text += _box(_table(rows))
+    if any(colours == COST for _, colours in shown):
+        text += _box(f"What the Gaussians that a pixel shows add to a frame before they are drawn, each"
+                     f"{_gradient('0', f'{most_cost:.0f} ns')}")  # fmt: skip
+    return text
+
+
+def comparison(nearest: Nearest, compared: Sequence[Compared]) -> str:
+    """Show a training view beside what models make of it, and where they differ."""
+    view = nearest.view
+    when = "" if view.time is None else f", time {view.time:.2f}"
+    text = f"<b>{html.escape(view.name)}</b>{when}: {nearest.distance:.2f} world units and {nearest.degrees:.0f}° from here"
+    for one in compared:
+        pictures = {"training image": one.truth, html.escape(one.name): one.render, f"{one.psnr:.2f} dB": one.error}
+        cells = "".join(f'<figure style="flex:1;margin:0;min-width:0">{_image(image)}<figcaption>{caption}</figcaption>'
+                        f"</figure>" for caption, image in pictures.items())  # fmt: skip
+        text += f'<div style="display:flex;gap:4px;margin-top:4px">{cells}</div>'
+    return _box(f"{text}<div>absolute error, mean of RGB</div>{_gradient('0', f'{ERROR_SCALE} or more')}")
+
+
+def _ms(cost: Cost, stage: str) -> str:
+    return f"{cost.ms[stage]:.1f}" if stage in cost.ms else ""
+
+
+def _row(label: str, values: Sequence[str], *, bold: bool = False, inside: bool = False, escaped: bool = False) -> str:
+    """Write a row of a table: a label, then a number for each model."""
+    weight = "font-weight:600;" if bold else ""
+    indent = "padding-left:1em;" if inside else ""
+    cells = "".join(f'<td style="{_NUMBER}">{html.escape(value)}</td>' for value in values)
+    return f'<tr style="{weight}"><td style="{indent}">{label if escaped else html.escape(label)}</td>{cells}</tr>'
+
+
+def _table(rows: Sequence[str]) -> str:
+    return f'<table style="{_STYLE}">{"".join(rows)}</table>'
+
+
+def _box(content: str) -> str:
+    return f'<div style="{_BOX}">{content}</div>'
+
+
+def _gradient(low: str, high: str) -> str:
+    """Draw the scale of the inferno colours between two words."""
+    stops = ",".join(f"rgb{tuple(color)}" for color in inferno(np.linspace(0, 1, STOPS)[None])[0].tolist())
+    bar = f'<span style="flex:1;height:0.8em;background:linear-gradient(to right,{stops})"></span>'
+    return f'<div style="display:flex;gap:0.5em;align-items:center">{low}{bar}{html.escape(high)}</div>'
+
+
+def _image(image: npt.NDArray[np.uint8]) -> str:
+    """Embed an image as PNG, as wide as there is room; pixels that are enlarged stay sharp."""
+    data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+    source = f"data:image/png;base64,{base64.b64encode(data).decode()}"
+    return f'<img src="{source}" style="width:100%;display:block;image-rendering:pixelated">'

@@ -1,0 +1,83 @@
+"""The training view nearest to a camera: which one it is, and how a model is compared with it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsbench.effects.gate import most_cost
+from gsbench.measure.quality import psnr, quantise
+from gsbench.models.render import render
+from gsbench.report.pictures import error_image
+from gsbench.run.load import load_run, scene_of
+from gsbench.scenes import Camera, Scene, View
+from gsbench.view import paths
+from gsbench.view.film import pixels
+from gsbench.view.frame import Asked, Painter
+from gsbench.view.nearest import MOST_WIDTH, TrainingViews, compare
+
+EXTENT = 4.0
+
+
+def camera(x: float, *, towards: float = 0.0) -> Camera:
+    """At x on a line, looking along y and as far aside."""
+    eye = torch.tensor([x, -5.0, 0.0])
+    return Camera(paths.look_at(eye, eye + torch.tensor([towards, 1.0, 0.0])), paths.intrinsics(8, 8), 8, 8)
+
+
+def scene(*seen: tuple[Camera, float | None]) -> Scene:
+    """A scene with these training views, called by their number."""
+    views = [View(str(i), one, time, torch.zeros(8, 8, 3)) for i, (one, time) in enumerate(seen)]
+    return Scene("line", views, [], [], (0.0, 0.0, 0.0), EXTENT, None, "0")
+
+
+def test_the_nearest_view_stands_and_looks_as_the_camera_does() -> None:
+    """Catches a choice by place alone or by direction alone, a rotation that is inverted, and wrong distances."""
+    views = TrainingViews(scene((camera(0.0), 0.0), (camera(1.0), 0.0), (camera(0.0, towards=0.5), 0.0)))
+    assert views.nearest(camera(0.2), 0.0).view.name == "0"
+    assert views.nearest(camera(0.9), 0.0).view.name == "1"
+    found = views.nearest(camera(0.5, towards=0.6), 0.0)
+    assert found.view.name == "2"
+    assert found.distance == pytest.approx(0.5)
+    assert found.degrees == pytest.approx(30.96 - 26.57, abs=0.02)
+
+
+def test_of_views_of_one_camera_the_nearest_in_time_is_chosen() -> None:
+    """Catches a rig whose first frame is always shown, and a time that outweighs the place."""
+    views = TrainingViews(scene(*[(camera(x), time) for time in (0.0, 0.5, 1.0) for x in (0.0, 1.0)]))
+    assert [views.nearest(camera(0.1), time).view.name for time in (0.0, 0.4, 0.9)] == ["0", "2", "4"]
+    assert views.nearest(camera(0.9), 0.4).view.name == "3"
+
+
+def test_a_scene_without_times_has_a_nearest_view() -> None:
+    """Catches a time that has to be there."""
+    assert TrainingViews(scene((camera(0.0), None), (camera(1.0), None))).nearest(camera(0.9), None).view.name == "1"
+
+
+def test_a_model_is_compared_as_it_is_measured(folder: Path) -> None:
+    """Catches another PSNR than the run's own measure, swapped images, and a protocol's rounding that is left out."""
+    run = load_run(folder)
+    view = scene_of(run).train[1]
+    painter = Painter(run, most_cost(run.model))
+    image = render(run.model, view.camera, view.time, torch.tensor(run.scene.background))
+    compared = compare(painter, view, Asked(view.time))
+    assert compared.psnr == psnr(image, view.image)
+    assert (compared.truth == pixels(view.image)).all()
+    assert (compared.render == pixels(image)).all()
+    assert (compared.error == error_image(image.numpy(), view.image.numpy())).all()
+    run.config.protocol.quantise = True
+    assert compare(painter, view, Asked(view.time)).psnr == psnr(quantise(image), view.image) != compared.psnr
+    assert compare(painter, view, Asked(view.time, agr=False)).psnr != compared.psnr
+
+
+def test_large_images_are_made_smaller_after_they_are_measured(folder: Path) -> None:
+    """Catches megabytes for each movement of the camera, and a PSNR of images that were made smaller."""
+    run = load_run(folder)
+    small = scene_of(run).train[0]
+    wide = Camera(small.camera.viewmat, paths.intrinsics(960, 32), 960, 32)
+    truth = torch.rand(32, 960, 3, generator=torch.Generator().manual_seed(0))
+    view = replace(small, camera=wide, pixels=truth)
+    compared = compare(Painter(run, most_cost(run.model)), view, Asked(view.time))
+    assert {image.shape for image in compared[1:4]} == {(16, MOST_WIDTH, 3)}
+    assert compared.psnr == psnr(render(run.model, wide, view.time, torch.tensor(run.scene.background)), truth)

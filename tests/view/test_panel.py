@@ -1,0 +1,88 @@
+"""What the viewer's panel says: milliseconds by stage, what colours mean, and untrusted names as text."""
+
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.effects.picture import COLOURS
+from gsbench.effects.words import CLASSES
+from gsbench.models.classes import NAMES
+from gsbench.scenes import Camera, View
+from gsbench.view.frame import CLASS, COST, IMAGE, Cost
+from gsbench.view.nearest import Compared, Nearest
+from gsbench.view.panel import comparison, cost_table, legend
+
+SEVEN = Cost("7dgs seed0", {"AGR": 2.0, "conditioning": 1.0, "colours": 0.5, "projection": 0.5, "blending": 4.0})
+THREE = Cost("3dgs seed0", {"conditioning": 0.25, "raster": 3.75})
+
+
+def rows(text: str) -> dict[str, list[str]]:
+    """The rows of a table by their labels."""
+    found = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr.*?</tr>", text)]
+    return {re.sub("<.*?>|&#9632;", "", cells[0]).strip(): cells[1:] for cells in found}
+
+
+def test_the_table_splits_a_frame_by_stage() -> None:
+    """Catches a sum without one of its stages, another model's column, and FPS of half a frame."""
+    table = rows(cost_table([SEVEN, THREE], 90, 60))
+    assert list(table) == ["ms", "slice", "AGR", "conditioning", "colours", "raster", "projection", "blending", "FPS"]
+    assert table["ms"] == ["7dgs seed0", "3dgs seed0"]
+    assert table["slice"] == ["3.5", "0.2"]
+    assert table["AGR"] == ["2.0", ""]
+    assert table["raster"] == ["4.5", "3.8"]
+    assert table["FPS"] == ["125", "250"]
+    assert "90 x 60" in cost_table([SEVEN], 90, 60)
+
+
+def shown(colours: str, name: str, *counts: int) -> Any:
+    """An image of a model with so many Gaussians of each class."""
+    return SimpleNamespace(name=name, counts=dict(zip(NAMES, counts, strict=True))), colours
+
+
+def test_the_legend_counts_the_classes_that_there_are() -> None:
+    """Catches a count beside another class's name or colour, and classes that nothing shown has."""
+    text = legend([shown(CLASS, "7dgs", 1200, 5, 0, 0, 30), shown(CLASS, "4dgs", 0, 700, 0, 0, 0)], 250.0)
+    table = rows(text)
+    assert list(table) == ["Gaussians", CLASSES["refined"], CLASSES["sliced"], CLASSES["still"]]
+    assert list(table.values()) == [["7dgs", "4dgs"], ["1,200", "0"], ["5", "700"], ["30", "0"]]
+    colours = re.findall(r"color:rgb(\(.*?\))", text)
+    assert colours == [str(COLOURS[name]) for name in ("refined", "sliced", "still")]
+
+
+def test_the_legend_of_costs_has_its_scale() -> None:
+    """Catches a scale that is not the one the image was drawn on, and a legend of colours that need none."""
+    one = "7dgs", 1, 0, 0, 0, 0
+    both = legend([shown(CLASS, *one), shown(COST, *one)], 251.0)
+    assert "251 ns" in both
+    assert CLASSES["refined"] in both
+    assert CLASSES["refined"] not in legend([shown(IMAGE, *one), shown(COST, *one)], 251.0)
+    assert legend([shown(IMAGE, *one)], 251.0) == ""
+
+
+@pytest.mark.parametrize("time", [0.5, None])
+def test_a_comparison_says_with_what_and_how_far(time: float | None) -> None:
+    """Catches a number without its model, and a view of a static scene that has no time to print."""
+    view = View("train/r_7", Camera(torch.eye(4), torch.eye(3), 4, 4), time, torch.zeros(4, 4, 3))
+    image = np.zeros((4, 4, 3), np.uint8)
+    text = comparison(Nearest(view, 0.5, 12.3), [Compared("a", image, image, image, 31.256)])
+    for said in ("train/r_7", "0.50", "12°", "31.26 dB", "0.2 or more"):
+        assert said in text
+    assert ("time 0.50" in text) == (time is not None)
+    assert text.count("data:image/png;base64,") == 3
+
+
+def test_names_of_folders_are_text() -> None:
+    """Catches a folder or a view whose name is run as a script."""
+    bad = "<script>alert(1)</script>"
+    image = np.zeros((2, 2, 3), np.uint8)
+    view = View(bad, Camera(torch.eye(4), torch.eye(3), 2, 2), None, torch.zeros(2, 2, 3))
+    texts = (
+        cost_table([Cost(bad, {"AGR": 1.0})], 1, 1),
+        legend([shown(CLASS, bad, 1, 0, 0, 0, 0)], 1.0),
+        comparison(Nearest(view, 0.0, 0.0), [Compared(bad, image, image, image, 1.0)]),
+    )
+    assert not any("<script" in text for text in texts)
