@@ -17,7 +17,7 @@ from gsbench.view.frusta import Frusta
 PLAYED_S = 4.0  # a clip takes that long
 ONE, SIDE, WIPE = "one image", "side by side", "wipe"
 NEAREST = "nearest training view"
-PANEL = {"x": 15.0, "y": -15.0, "width": 460.0}  # pixels: where it floats, from the left and from the bottom
+PANEL = {"x": 15.0, "y": -15.0, "width": 400.0}  # pixels: where it floats, from the left and from the bottom
 
 
 class Shown(NamedTuple):
