@@ -59,7 +59,8 @@ def comparison(nearest: Nearest, compared: Sequence[Compared]) -> str:
     """Show a training view beside what models make of it, and where they differ."""
     view = nearest.view
     when = "" if view.time is None else f", time {view.time:.2f}"
-    text = f"<b>{html.escape(view.name)}</b>{when}: {nearest.distance:.2f} world units and {nearest.degrees:.0f}° from here"
+    away = f"{nearest.distance:.2f} world units and {nearest.degrees:.0f}° from here"
+    text = f"<b>{html.escape(view.name)}</b>{when}: {away}"
     for one in compared:
         pictures = {"training image": one.truth, html.escape(one.name): one.render, f"{one.psnr:.2f} dB": one.error}
         cells = "".join(f'<figure style="flex:1;margin:0;min-width:0">{_image(image)}<figcaption>{caption}</figcaption>'
