@@ -19,6 +19,7 @@ from gsbench.view.stages import STAGES
 STOPS = 9  # of a gradient
 _STYLE = "width:100%;border-collapse:collapse;table-layout:fixed"
 _NUMBER = "text-align:right;padding:0 0 0 0.5em;vertical-align:bottom"
+_SWATCH = "display:inline-block;width:0.8em;height:0.8em"
 _BOX = "margin:0 1em 0.5em;font-size:0.75em;line-height:1.35;overflow-wrap:anywhere"
 
 
@@ -46,7 +47,7 @@ def legend(shown: Sequence[Shown], most_cost: float) -> str:
         for name, words in CLASSES.items():
             counts = [counts[name] for counts in by_class.values()]
             if any(counts):
-                swatch = f'<span style="color:rgb{COLOURS[name]}">&#9632;</span> {words}'
+                swatch = f'<span style="{_SWATCH};background-color:rgb{COLOURS[name]}"></span> {words}'
                 rows.append(_row(swatch, [f"{number:,}" for number in counts], escaped=True))
         text += _box(_table(rows))
     if any(colours == COST for _, colours in shown):

@@ -23,7 +23,7 @@ THREE = Cost("3dgs seed0", {"conditioning": 0.25, "raster": 3.75})
 def rows(text: str) -> dict[str, list[str]]:
     """The rows of a table by their labels."""
     found = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr.*?</tr>", text)]
-    return {re.sub("<.*?>|&#9632;", "", cells[0]).strip(): cells[1:] for cells in found}
+    return {re.sub("<.*?>", "", cells[0]).strip(): cells[1:] for cells in found}
 
 
 def test_the_table_splits_a_frame_by_stage() -> None:
