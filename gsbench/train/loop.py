@@ -141,7 +141,8 @@ class Trainer:
                 self.density.observe(one.radii, one.g_means2d, view.camera.width, view.camera.height, len(views))
         self.watch.see(step, torch.stack([one.loss for one in seen]).sum(), self.model.groups())
         with stages("optimizer"):
-            self.optimizer.step(step, drawn=self.density.unseen < len(views))
+            drawn = self.density.unseen < len(views)
+            self.optimizer.step(step, drawn, slowed=self.gating.slows_agr(step))
             self.floor.hold()
         with stages("density"):
             if self.schedule.densifies(step):

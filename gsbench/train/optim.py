@@ -61,11 +61,16 @@ class Optimizer:
         self,
         step: int,
         drawn: Tensor,  # [N] bool
+        slowed: float = 1.0,
     ) -> None:
         """Update the parameters that have a gradient, at the rates of this step, and drop the gradients.
 
-        `drawn` marks the Gaussians that some view of the batch sees; the others have no gradient. Where
-        `adam.found_inf` [] is 1, nothing is updated.
+        Where `adam.found_inf` [] is 1, nothing is updated.
+
+        Args:
+            step: counted from 0.
+            drawn: the Gaussians that some view of the batch sees; the others have no gradient.
+            slowed: a factor of AGR's rate.
         """
         skip: Tensor | None = getattr(self.adam, "found_inf", None)
         if skip is not None:  # used as a mask: reading its value would wait for the GPU
@@ -73,6 +78,8 @@ class Optimizer:
         counts = 1 if skip is None else 1 - skip
         for group in self.adam.param_groups:
             group["lr"] = rate_at(self.rates[group["name"]], step, self.train, self.extent)
+            if group["name"] == "refinement":
+                group["lr"] *= slowed
             if self.is_sparse and group["name"] in self.model.splats:
                 self._step_rows(group, drawn, counts)
         self.adam.step()

@@ -13,7 +13,7 @@ from gsbench.run.load import load_run
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene
 from gsbench.stability.training_cases import compose, moving_square
-from gsbench.train.gating import Gating
+from gsbench.train.gating import LAST_RATE, Gating
 from gsbench.train.loop import Trainer
 from gsbench.train.schedule import Schedule, generator
 
@@ -110,6 +110,26 @@ def test_when_a_model_is_gated() -> None:
     assert due() == [59]
     assert due("train.densify.stop=21000") == [69]
     assert due("train.densify.stop=29000") == []
+
+
+@pytest.mark.parametrize("words", [(), ("effects.gate=both",)])
+def test_agr_slows_down_after_a_gate(words: tuple[str, ...]) -> None:
+    """Catches a gated training whose AGR swings to the end, an ungated one that is slowed, and rates of others."""
+    one, rates = trainer(*words), []
+
+    def note(step: int, drawn: torch.Tensor, slowed: float = 1.0) -> None:
+        original(step, drawn, slowed)
+        rates.append({group["name"]: group["lr"] for group in one.optimizer.adam.param_groups})
+
+    original, one.optimizer.step = one.optimizer.step, note
+    end(one)
+    agr, others = [rate["refinement"] for rate in rates], [rate["opacities"] for rate in rates]
+    assert agr[0] == agr[59] == pytest.approx(2e-4)
+    assert others[0] == others[-1]
+    gated = bool(words) and one.gating.gates[0].step == 60
+    assert gated == bool(words)
+    assert agr[60] == pytest.approx(2e-4)
+    assert agr[-1] == pytest.approx(2e-4 * LAST_RATE ** (39 / 40) if gated else 2e-4)
 
 
 @pytest.fixture(scope="module")

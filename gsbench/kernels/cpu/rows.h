@@ -45,12 +45,14 @@ GSB_HD inline void scatter_columns(const Vec (&x)[W], float* rows, int width, in
     GSB_UNROLL for (int k = 0; k < W; ++k) scatter(x[k], rows + i * width + first + k, width, n);
 }
 
-// Rows [first, end).
+// Rows [first, end). Arrays of no rows have no address, which memcpy and memset do not take.
 GSB_HD inline void copy_rows(const float* from, float* to, int width, int64_t first, int64_t end) {
+    if (first == end) return;
     __builtin_memcpy(to + first * width, from + first * width, sizeof(float) * static_cast<size_t>((end - first) * width));
 }
 
 GSB_HD inline void fill_zero(float* rows, int width, int64_t first, int64_t end) {
+    if (first == end) return;
     __builtin_memset(rows + first * width, 0, sizeof(float) * static_cast<size_t>((end - first) * width));
 }
 
