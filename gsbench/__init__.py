@@ -7,7 +7,7 @@ from gsbench.openmp import sleep_when_idle
 
 sleep_when_idle()  # before anything of gsbench imports torch or the kernels
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"  # the only place: pyproject.toml reads it here, and a test holds CITATION.cff to it
 
 _PUBLIC = {"load_run": "gsbench.run.load"}  # public names and the modules that define them
 

@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import warnings
 from pathlib import Path
 
 import hydra
@@ -10,7 +11,7 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.config import CONF, register_schema
+from gsbench.config import CONF, HERE, register_schema
 from gsbench.errors import InputError, did_you_mean
 from gsbench.run.stop import Stopped, stop_at_once
 from gsbench.sweep.axes import expand
@@ -49,6 +50,7 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="replace")  # type: ignore[union-attr]  # a terminal in ASCII shows ? for other letters
     signal.signal(signal.SIGTERM, stop_at_once)
+    warnings.formatwarning = _in_one_line
     try:
         sys.argv[1:] = expand(sys.argv[1:])
         broken = see_through(entry, started)
@@ -65,6 +67,18 @@ def main() -> None:
         print(f"gsbench: {len(broken)} runs did not end well: python -m gsbench.sweep status "
               f"{started[0].parents[1]}", file=sys.stderr)  # fmt: skip
     sys.exit(1 if _failures or broken else 0)
+
+
+_in_two_lines = warnings.formatwarning
+
+
+def _in_one_line(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """Format a warning of gsbench as its errors are, without the line of code that Python adds."""
+    if not Path(filename).is_relative_to(HERE):
+        return _in_two_lines(message, category, filename, lineno, line)
+    return f"gsbench: warning: {message}\n"
 
 
 def _group(name: str) -> list[str]:

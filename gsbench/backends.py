@@ -71,6 +71,9 @@ def _warn(device: str) -> None:
     """Warn where `auto` falls back to a slower backend."""
     if cuda.built() and not cuda.available():
         _warn_once("no CUDA device was found: the CUDA kernels of this installation are idle, the CPU renders")
+    if device == "cpu" and not kernels.available():
+        _warn_once("the native kernels are not built in this installation: the CPU renders by the reference backend, "
+                   "which is slow; reinstall with a C++20 compiler, see docs/install.md")  # fmt: skip
     if device == "cuda" and not cuda.built():
         _warn_once("the CUDA kernels are not built in this installation: the GPU renders by the reference backend, "
                    "which is slow; see docs/gpu.md")  # fmt: skip

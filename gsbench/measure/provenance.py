@@ -9,9 +9,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from gsbench import __version__
 from gsbench.measure.record import Provenance
 
-PACKAGES = ("gsbench", "torch", "numpy", "scikit-image", "lpips", "opencv-contrib-python-headless")
+PACKAGES = ("torch", "numpy", "scikit-image", "lpips", "opencv-contrib-python-headless")
 
 
 def provenance(*, config: dict[str, Any], data_hash: str, threads: int, device: str | None = None) -> Provenance:
@@ -42,8 +43,8 @@ def config_hash(config: dict[str, Any]) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of python and of the installed packages that the numbers depend on."""
-    found = {"python": platform.python_version()}
+    """Return the versions of python, of gsbench and of the installed packages that the numbers depend on."""
+    found = {"python": platform.python_version(), "gsbench": __version__}
     for package in PACKAGES:
         try:
             found[package] = metadata.version(package)

@@ -9,7 +9,7 @@ import torch
 from cases import case
 from torch import Tensor
 
-from gsbench import backends
+from gsbench import backends, kernels
 from gsbench.backends import AUTO, REFERENCE, resolve
 from gsbench.errors import InputError
 from gsbench.kernels import cuda
@@ -165,6 +165,19 @@ def test_auto_says_once_that_the_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(cuda, "built", lambda: False)
     with pytest.warns(UserWarning, match="the CUDA kernels are not built"):
         assert resolve("auto", "cuda") is REFERENCE
+    backends._warn_once.cache_clear()
+
+
+def test_auto_says_once_that_there_are_no_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches an installation without a compiler that is slow without a word, or says so at every picture."""
+    backends._warn_once.cache_clear()
+    monkeypatch.setattr(kernels, "available", lambda: False)
+    monkeypatch.setattr(cuda, "built", lambda: False)
+    with pytest.warns(UserWarning, match="kernels are not built .* is slow; reinstall with a C\\+\\+20 compiler"):
+        assert resolve("auto", "cpu") is REFERENCE
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert resolve("auto", "cpu") is REFERENCE
     backends._warn_once.cache_clear()
 
 

@@ -1,0 +1,67 @@
+"""The sdist and a wheel of it, made offline where there is no compiler: what is in them, and that they run."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+from tiny_run import ROOT, environment
+
+MB = 1e6
+HOOK = """
+import sys
+from scikit_build_core import build
+hook, out, *settings = sys.argv[1:]
+print(getattr(build, hook)(out, dict(setting.split("=", 1) for setting in settings)))
+"""
+
+
+def built(hook: str, project: Path, out: Path, *settings: str, **environment: str) -> tuple[Path, str]:
+    """Call a hook of the build backend as pip does; returns the file it made and what it said."""
+    done = subprocess.run([sys.executable, "-c", HOOK, hook, str(out), *settings], cwd=project, capture_output=True,
+                          text=True, check=False, env={**os.environ, **environment})  # fmt: skip
+    assert done.returncode == 0, done.stderr + done.stdout
+    return out / done.stdout.splitlines()[-1], done.stderr + done.stdout
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built("build_sdist", ROOT, tmp_path_factory.mktemp("sdist"))[0]
+
+
+def test_the_sdist_has_what_builds_and_tests_it(sdist: Path) -> None:
+    """Catches an sdist without sources or scenes, or one that records, builds and trials have bloated."""
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    for name in ("CMakeLists.txt", "conf/exp/mini.yaml", "gsbench/kernels/cpu/triangular.cpp", "tests/smoke.py",
+                 "gsbench/scenes/sample/suzanne/transforms_train.json", "constraints.txt", "LICENSE"):  # fmt: skip
+        assert name in names
+    assert not [name for name in names if re.match(r"results/|build/|\.venv/|dist/", name) or name.endswith(".so")]
+    assert sdist.stat().st_size < 6 * MB
+
+
+@pytest.mark.skipif(not all(map(shutil.which, ("cmake", "ninja"))), reason="needs cmake and ninja")
+def test_without_a_compiler_it_installs_and_says_that_it_is_slow(sdist: Path, tmp_path: Path) -> None:
+    """Catches an install that fails for want of a compiler, a wheel without configs or scenes, and silence."""
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path / "source", filter="data")
+    (source,) = (tmp_path / "source").iterdir()
+    # Any cmake will do for what is not built.
+    wheel, said = built("build_wheel", source, tmp_path, "cmake.version=>=3.22", CXX="/bin/false")
+    assert "the native kernels are not built, for want of a C++20 compiler" in " ".join(said.split())
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        archive.extractall(tmp_path / "site")
+    assert not [name for name in names if name.endswith((".so", ".cpp", ".cu"))]
+    assert wheel.stat().st_size < 5 * MB
+    # Without `site`, as an editable install would come before the wheel.
+    path = os.pathsep.join([str(tmp_path / "site"), *[entry for entry in sys.path if entry.endswith("-packages")]])
+    smoke = [sys.executable, "-S", str(ROOT / "tests/smoke.py"), "reference"]
+    done = subprocess.run(smoke, capture_output=True, text=True, check=False, env=environment() | {"PYTHONPATH": path})
+    assert done.returncode == 0, done.stderr
+    assert "steps by reference" in done.stdout
