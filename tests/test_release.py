@@ -1,0 +1,69 @@
+"""What a release says in several places: its version, and the Pythons that it runs on."""
+
+import re
+import tomllib
+from typing import Any
+
+import pytest
+import yaml
+from packaging.specifiers import SpecifierSet
+from tiny_run import ROOT
+
+import gsbench
+
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PYTHONS = [f"3.{n}" for n in range(30) if f"3.{n}" in SpecifierSet(PYPROJECT["project"]["requires-python"])]
+MAKEFILE = (ROOT / "Makefile").read_text()
+
+
+def workflow(name: str) -> dict[str, Any]:
+    parsed: dict[str, Any] = yaml.safe_load((ROOT / ".github/workflows" / name).read_text())
+    return parsed
+
+
+def commands(jobs: dict[str, Any]) -> str:
+    """What the steps of a workflow run, one after the other."""
+    return "\n".join(step.get("run", "") for job in jobs.values() for step in job["steps"])
+
+
+def test_the_version_is_one() -> None:
+    """Catches a release whose citation or metadata name another version, and a second place for it."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert str(citation["version"]) == gsbench.__version__
+    assert "version" not in PYPROJECT["project"]
+    (source,) = (one["input"] for one in PYPROJECT["tool"]["dynamic-metadata"] if one["field"] == "version")
+    assert f'__version__ = "{gsbench.__version__}"' in (ROOT / source).read_text()
+
+
+def test_every_python_is_tested() -> None:
+    """Catches a Python that is allowed and not tested, or tested and refused by make."""
+    jobs = workflow("tests.yml")["jobs"]
+    assert jobs["test"]["strategy"]["matrix"]["python"] == PYTHONS
+    low, high = re.search(r"\((3, \d+)\) <= sys.version_info < \((3, \d+)\)", MAKEFILE).groups()  # type: ignore[union-attr]
+    assert PYTHONS[0] == low.replace(", ", ".")
+    assert [int(PYTHONS[-1][2:]) + 1] == [int(high[3:])]
+    assert PYPROJECT["tool"]["ruff"]["target-version"] == f"py{PYTHONS[0].replace('.', '')}"
+    for page in ("CONTRIBUTING.md", "docs/install.md"):
+        assert f"Python {PYTHONS[0]} to {PYTHONS[-1]}" in (ROOT / page).read_text()
+
+
+def test_a_wheel_is_made_for_every_python_and_tried() -> None:
+    """Catches wheels that leave out a Python, or that no one has installed."""
+    settings = PYPROJECT["tool"]["cibuildwheel"]
+    assert settings["build"] == "cp3*-manylinux_*"  # of which cibuildwheel takes those that requires-python allows
+    assert "skip" not in settings
+    assert settings["test-command"].startswith("python {project}/")
+    assert (ROOT / settings["test-command"].partition("{project}/")[2]).is_file()
+
+
+@pytest.mark.parametrize("name", ["tests.yml", "wheels.yml"])
+def test_workflows_run_what_there_is(name: str) -> None:
+    """Catches a target of make, a script or a file of a trigger that has been renamed."""
+    parsed = workflow(name)
+    said = commands(parsed["jobs"])
+    targets = re.findall(r"^make ([a-z-]+)", said, re.MULTILINE)
+    assert all(re.search(rf"^{target}:", MAKEFILE, re.MULTILINE) for target in targets)
+    files = re.findall(r"tests/\w+\.py|constraints\.txt", said)
+    files += (parsed[True].get("pull_request") or {}).get("paths", [])  # YAML 1.1 reads `on` as true
+    assert targets or files
+    assert all(any(ROOT.glob(file)) for file in files)
