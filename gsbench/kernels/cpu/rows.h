@@ -14,24 +14,50 @@ alignas(64) constexpr float INDEX[LANES] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
 // How many of the rows i, i + 1, .. of `size` a vector holds.
 GSB_HD inline int lanes_from(int64_t i, int64_t size) { return static_cast<int>(size - i < LANES ? size - i : LANES); }
 
+// Sixteen rows of `width` floats from row i on, of which there are n: where they lie, or copied, with zeros for the others.
+// One question for an array, not one for each lane of each column: those took the compiler half a minute, and AVX2 up to
+// half of a forward pass.
+GSB_HD inline const float* sixteen_rows(const float* rows, int width, int64_t i, int n, float* copy) {
+    const float* first = rows + i * width;
+    if (n == LANES) return first;
+    __builtin_memset(copy, 0, sizeof(float) * static_cast<size_t>(LANES * width));
+    __builtin_memcpy(copy, first, sizeof(float) * static_cast<size_t>(n * width));
+    return copy;
+}
+
+// Writes the first n of sixteen rows that are not where they belong.
+GSB_HD inline void keep_rows(const float* copy, int width, float* rows, int64_t i, int n) {
+    if (n < LANES) __builtin_memcpy(rows + i * width, copy, sizeof(float) * static_cast<size_t>(n * width));
+}
+
 template <int W>
 GSB_HD inline void gather_row(const float* rows, int64_t i, int n, Vec (&out)[W]) {
-    GSB_UNROLL for (int k = 0; k < W; ++k) out[k] = gather(rows + i * W + k, W, n);
+    float copy[LANES * W];
+    const float* p = sixteen_rows(rows, W, i, n, copy);
+    GSB_UNROLL for (int k = 0; k < W; ++k) out[k] = gather(p + k, W);
 }
 
 template <int W>
 GSB_HD inline void scatter_row(const Vec (&x)[W], float* rows, int64_t i, int n) {
-    GSB_UNROLL for (int k = 0; k < W; ++k) scatter(x[k], rows + i * W + k, W, n);
+    float copy[LANES * W];
+    float* p = n == LANES ? rows + i * W : copy;
+    GSB_UNROLL for (int k = 0; k < W; ++k) scatter(x[k], p + k, W);
+    keep_rows(copy, W, rows, i, n);
 }
 
 template <int H, int W>
 GSB_HD inline void gather_matrix(const float* rows, int64_t i, int n, Vec (&out)[H][W]) {
-    GSB_UNROLL for (int k = 0; k < H * W; ++k) out[k / W][k % W] = gather(rows + i * (H * W) + k, H * W, n);
+    float copy[LANES * H * W];
+    const float* p = sixteen_rows(rows, H * W, i, n, copy);
+    GSB_UNROLL for (int k = 0; k < H * W; ++k) out[k / W][k % W] = gather(p + k, H * W);
 }
 
 template <int H, int W>
 GSB_HD inline void scatter_matrix(const Vec (&x)[H][W], float* rows, int64_t i, int n) {
-    GSB_UNROLL for (int k = 0; k < H * W; ++k) scatter(x[k / W][k % W], rows + i * (H * W) + k, H * W, n);
+    float copy[LANES * H * W];
+    float* p = n == LANES ? rows + i * (H * W) : copy;
+    GSB_UNROLL for (int k = 0; k < H * W; ++k) scatter(x[k / W][k % W], p + k, H * W);
+    keep_rows(copy, H * W, rows, i, n);
 }
 
 // Columns `first` to first + W of rows of any width.
