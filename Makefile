@@ -26,6 +26,8 @@ $(VENV)/installed: pyproject.toml constraints.txt $(NATIVE)
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
 		--config-settings cmake.define.CUDA=$(CUDA) --editable '.[dev,stability]'
+	@$(BIN)/python -c 'import sys; from gsbench import kernels; sys.exit(not kernels.available())' || \
+		echo "gsbench is installed without its kernels, and slow: docs/install.md says what they need"
 	touch $@
 
 table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR, and model=auto, on the embedded scenes; print and write the table
