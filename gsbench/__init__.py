@@ -1,7 +1,7 @@
 """Measure what a dimension of a Gaussian is worth, with one rasterizer, one trainer and one protocol for all models."""
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsbench.openmp import sleep_when_idle
 
@@ -9,11 +9,37 @@ sleep_when_idle()  # before anything of gsbench imports torch or the kernels
 
 __version__ = "0.2.0"  # the only place: pyproject.toml reads it here, and a test holds CITATION.cff to it
 
-_PUBLIC = {"load_run": "gsbench.run.load"}  # public names and the modules that define them
+__all__ = ["Query", "build", "load_run", "load_scene", "lpips", "psnr", "rasterize", "slice_gaussians", "ssim"]
 
+_PUBLIC = {  # names of __all__, and where each is defined
+    "Query": "gsbench.models.query.Query",
+    "build": "gsbench.models.registry.build",
+    "load_run": "gsbench.run.load.load_run",
+    "load_scene": "gsbench.scenes.load",
+    "lpips": "gsbench.measure.quality.lpips",
+    "psnr": "gsbench.measure.quality.psnr",
+    "rasterize": "gsbench.raster.rasterize",
+    "slice_gaussians": "gsbench.models.slicing.slice_gaussians",
+    "ssim": "gsbench.measure.quality.ssim",
+}
 
-def __getattr__(name: str) -> Any:
-    """Import public names when they are first asked for, so that `import gsbench` alone stays quick."""
-    if name in _PUBLIC:
-        return getattr(importlib.import_module(_PUBLIC[name]), name)
-    raise AttributeError(f"module 'gsbench' has no attribute '{name}'")
+if TYPE_CHECKING:  # the same for type checkers and editors, which do not run what is below
+    from gsbench.measure.quality import lpips, psnr, ssim
+    from gsbench.models.query import Query
+    from gsbench.models.registry import build
+    from gsbench.models.slicing import slice_gaussians
+    from gsbench.raster import rasterize
+    from gsbench.run.load import load_run
+    from gsbench.scenes import load as load_scene
+else:
+
+    def __getattr__(name: str) -> Any:
+        """Import a public name when it is first asked for, so that `import gsbench` alone does without torch."""
+        if name not in _PUBLIC:
+            raise AttributeError(f"module 'gsbench' has no attribute '{name}'")
+        module, _, attribute = _PUBLIC[name].rpartition(".")
+        return getattr(importlib.import_module(module), attribute)
+
+    def __dir__() -> list[str]:
+        """List the public names too, which completion would not find before they are imported."""
+        return sorted({*globals(), *__all__})

@@ -34,7 +34,24 @@ def evenly(items: Sequence[T], count: int) -> list[T]:
 
 
 def psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
-    """Compute the PSNR in dB from the mean squared error over H x W x 3; it is infinite for equal images."""
+    """Compute the PSNR in dB from the mean squared error over H x W x 3; it is infinite for equal images.
+
+    Args:
+        a: an image [H, W, 3] of floats, clamped to [0, 1].
+        b: another one of the same size, on the same device.
+
+    Raises:
+        InputError: they are not two images of one size.
+
+    Example:
+        >>> import torch
+        >>> from gsbench import psnr
+        >>> black = torch.zeros(16, 16, 3)
+        >>> round(psnr(black, black + 0.1), 2)
+        20.0
+        >>> psnr(black, black)
+        inf
+    """
     return _decibels(_squared_error(a, b).mean())
 
 
@@ -47,6 +64,22 @@ def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
     """Compute SSIM by scikit-image with the settings of Wang et al. 2004, in float64, as the mean over channels.
 
     data_range is given because scikit-image assumes 2 for floats; use_sample_covariance=False is as in the paper.
+
+    Args:
+        a: an image [H, W, 3] of floats, clamped to [0, 1], of at least 11 pixels a side.
+        b: another one of the same size, on the same device.
+
+    Raises:
+        InputError: they are not two images of one size, or they are too small.
+
+    Example:
+        >>> import torch
+        >>> from gsbench import ssim
+        >>> image = torch.linspace(0, 1, 32 * 32 * 3).reshape(32, 32, 3)
+        >>> ssim(image, image)
+        1.0
+        >>> ssim(image, 1 - image) < 0
+        True
     """
     a, b = _images(a, b, SSIM_LEAST_SIDE, "ssim")
     similarity = structural_similarity(
@@ -63,9 +96,32 @@ def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
 
 @torch.no_grad()
 def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = None) -> float:  # [H, W, 3], each
-    """Compute LPIPS 0.1 with the "alex" or "vgg" backbone, inputs scaled to [-1, 1], on the images' device.
+    """Compute LPIPS 0.1, the distance of two images in the features of a trained network (Zhang et al. 2018).
 
-    `gsbench.measure.perceptual.load` explains `weights`, and the BackboneMissing and InputError that it raises.
+    No package ships the weights of the network's trunk: `python -m gsbench.fetch lpips-alex` fetches them.
+
+    Args:
+        a: an image [H, W, 3] of floats, clamped to [0, 1] and scaled to [-1, 1], of at least 31 pixels a side for
+            `alex` and 16 for `vgg`.
+        b: another one of the same size, on the same device, which computes the distance.
+        backbone: `alex` or `vgg`.
+        weights: a file with the weights of the trunk; None: torchvision's, in $TORCH_HOME/hub/checkpoints.
+
+    Raises:
+        gsbench.measure.perceptual.BackboneMissing: no file is named, and torchvision's is not on this machine.
+        InputError: they are not two images of one size, they are too small, the backbone is unknown, or the file
+            `weights` is missing or holds other weights.
+
+    Example:
+        On a machine without the weights; with them it is 0.0.
+
+        >>> import torch
+        >>> from gsbench import lpips
+        >>> image = torch.zeros(64, 64, 3)
+        >>> lpips(image, image)
+        Traceback (most recent call last):
+        ...
+        gsbench.measure.perceptual.BackboneMissing: no trunk weights: alexnet-owt-7be5be79.pth is not in ...
     """
     network = perceptual.load(backbone, weights, str(a.device))
     a, b = (2 * x.float() - 1 for x in _images(a, b, BACKBONES[backbone].least_side, "lpips"))

@@ -13,19 +13,40 @@ from gsbench.tensors import check_number, check_tensor
 
 
 class Query(NamedTuple):
-    """The place and the time at which slicing, colours and AGR are evaluated."""
+    """The place and the time at which slicing, colours and AGR are evaluated.
+
+    `Query.of` makes one of a camera, `Query.at` of a place; both check what they are given.
+
+    Args:
+        center: where the camera is [3], world units.
+        time: in [0, 1], clips, []; None: the scene has no time.
+
+    Example:
+        >>> import torch
+        >>> from gsbench import Query
+        >>> Query.at(torch.tensor([0.0, -4.0, 0.0]), 0.25)
+        Query(center=tensor([ 0., -4.,  0.]), time=tensor(0.2500))
+        >>> Query.at(torch.zeros(2), 0.25)
+        Traceback (most recent call last):
+        ...
+        gsbench.errors.InputError: query: center: expected shape [3], got [2]
+    """
 
     center: Tensor  # [3] where the camera is, world units
     time: Tensor | None = None  # [] in [0, 1], clips; None: the scene has no time
 
     @classmethod
     def of(cls, camera: Camera, time: float | Tensor | None) -> Query:
-        """Make the query of a camera at a time."""
+        """Make the query of a camera at a time; raises InputError as `at` does."""
         return cls.at(camera.center, time)
 
     @classmethod
     def at(cls, center: Tensor, time: float | Tensor | None) -> Query:
-        """Make the query of a place [3] at a time. A time that is a tensor stays one, so a CUDA graph can read it.
+        """Make the query of a place at a time. A time that is a tensor stays one, so a CUDA graph can read it.
+
+        Args:
+            center: the place [3], world units.
+            time: in [0, 1], clips; None: the scene has no time.
 
         Raises:
             InputError: the place is not a tensor [3], or the time is not a finite number.

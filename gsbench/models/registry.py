@@ -42,9 +42,26 @@ def find(name: str) -> type[GaussianModel]:
 def build(name: str, **options: Any) -> GaussianModel:
     """Build the model registered as `name`, without Gaussians yet.
 
+    Args:
+        name: such as `3dgs`, `4dgs`, `6dgs`, `7dgs`.
+        options: of the model's class and of `GaussianModel`, such as `agr`, `sh_degree`, `lambda_t`.
+
+    Returns:
+        The model. `initialise` gives it Gaussians, `load_state` those of a checkpoint; `load_run` does all of it.
+
     Raises:
         InputError: the model is unknown, does not have an option, needs an option that is missing, or the option has
             another type.
+
+    Example:
+        >>> from gsbench import build
+        >>> model = build("7dgs", agr=True, lambda_t=0.5, lambda_d=0.5)
+        >>> model.observes, len(model)
+        (('time', 'direction'), 0)
+        >>> build("7dsg")
+        Traceback (most recent call last):
+        ...
+        gsbench.errors.InputError: model '7dsg' is not known. Did you mean '7dgs'? Valid: 3dgs, ...
     """
     model = find(name)
     # A constructor passes unknown options on to its base, so the options are those of all base classes.

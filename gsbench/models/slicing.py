@@ -48,14 +48,32 @@ def slice_gaussians(
     """Condition N joint Gaussians on q = query (7DGS eq. 9 and 10).
 
     Args:
-        mean: (mu_p, mu_q).
-        factor: a square F with S = F F^T, rows ordered (p, q).
-        query: the observed q, the same for all Gaussians or one for each.
+        mean: (mu_p, mu_q), [N, 3+k].
+        factor: a square F with S = F F^T, rows ordered (p, q), [N, 3+k, 3+k].
+        query: the observed q in the units of mu_q, the same for all Gaussians [k] or one for each [N, k].
         scheme: `square_root` works on F; `schur` inverts S_qq and subtracts, as published code does; `cholesky` solves
             with a Cholesky factor of S_qq and subtracts. The last two are for comparison: they lose half the digits.
 
+    Returns:
+        The conditional Gaussians: mean [N, 3] and factor [N, 3, 3] in the units of p, gain [N, 3, k].
+
     Raises:
         InputError: types or shapes do not fit, or the scheme is unknown.
+
+    Example:
+        A Gaussian over (x, y, z, t) that moves along x: its covariance of x and t is 0.5.
+
+        >>> import torch
+        >>> from gsbench import slice_gaussians
+        >>> factor = torch.eye(4)[None]
+        >>> factor[0, 0, 3] = 0.5
+        >>> at = slice_gaussians(torch.zeros(1, 4), factor, torch.tensor([2.0]))
+        >>> at.mean
+        tensor([[1., 0., 0.]])
+        >>> at.factor @ at.factor.mT
+        tensor([[[1., 0., 0.],
+                 [0., 1., 0.],
+                 [0., 0., 1.]]])
     """
     for name, x in (("mean", mean), ("factor", factor), ("query", query)):
         check_tensor(x, f"slice_gaussians: {name}")

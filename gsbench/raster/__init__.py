@@ -40,23 +40,40 @@ def rasterize(
     transmittance below 1e-4.
 
     Args:
-        means: centres, world units.
-        factors: F of cov = F F^T, world units.
-        opacities: in [0, 1].
-        colors: any number D of channels, one set for all cameras or one a camera.
-        viewmats: world to camera, rigid, OpenCV axes (x right, y down, z forward).
-        Ks: intrinsics [fx 0 cx; 0 fy cy; 0 0 1] in pixels; the first pixel's centre is (0.5, 0.5).
+        means: centres [N, 3], world units.
+        factors: F of cov = F F^T [N, 3, 3], world units.
+        opacities: in [0, 1], [N].
+        colors: any number D of channels, one set for all cameras [N, D] or one for each [C, N, D].
+        viewmats: world to camera [C, 4, 4], rigid, OpenCV axes (x right, y down, z forward).
+        Ks: intrinsics [fx 0 cx; 0 fy cy; 0 0 1] in pixels, [C, 3, 3]; the first pixel's centre is (0.5, 0.5).
         width: of the image, pixels.
         height: of the image, pixels.
-        background: colour behind everything; None is black.
+        background: colour behind everything [D]; None is black.
         near: Gaussians whose mean is nearer than this are not drawn.
         far: nor are those farther than this.
         eps2d: added to the diagonal of the projected covariance, pixels^2.
         backend: or its name: `reference` (torch), `cpu`, `cuda` (kernels), `auto` (the fastest there is).
         antialias: scale opacities by the area that `eps2d` added (Mip-Splatting's 2D filter).
 
+    Returns:
+        The image [C, H, W, D], how much of it is covered [C, H, W, 1], and what density control asks about.
+
     Raises:
         InputError: a shape, dtype, device or value is not as above, or the backend is unknown or not installed.
+
+    Example:
+        A red ball of radius 0.1, two units in front of the camera.
+
+        >>> import torch
+        >>> from gsbench import rasterize
+        >>> mean, factor = torch.tensor([[0.0, 0.0, 2.0]]), 0.1 * torch.eye(3)[None]
+        >>> opacity, red = torch.tensor([0.9]), torch.tensor([[1.0, 0.0, 0.0]])
+        >>> K = torch.tensor([[[32.0, 0.0, 16.0], [0.0, 32.0, 16.0], [0.0, 0.0, 1.0]]])
+        >>> drawn = rasterize(mean, factor, opacity, red, torch.eye(4)[None], K, 32, 32)
+        >>> drawn.image.shape
+        torch.Size([1, 32, 32, 3])
+        >>> [round(value, 2) for value in drawn.image[0, 16, 16].tolist()]
+        [0.82, 0.0, 0.0]
     """
     if not isinstance(backend, str | Backend) or not isinstance(antialias, bool):
         raise InputError(f"backend, antialias: expected a name or a Backend, and True or False, got {backend!r:.40} "

@@ -62,6 +62,18 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
 
     Raises:
         InputError: the folder has no checkpoint, or the checkpoint is damaged or not of its own config.
+
+    Example:
+        The run of `python -m gsbench +exp=mini model=3dgs scene=moving-matte train.iterations=20`.
+
+        >>> import torch
+        >>> from gsbench import Query, load_run
+        >>> run = load_run("results/mini/moving-matte/3dgs,iterations=20/seed0")
+        >>> run.scene.name, run.step, run.config.seed
+        ('moving-matte', 20, 0)
+        >>> gaussians = run.model.slice(Query.at(torch.tensor([0.0, -4.0, 0.0]), 0.5))
+        >>> gaussians.means.shape == (len(run.model), 3)
+        True
     """
     path = Path(folder) / checkpoint.FILE_NAME
     if not path.exists():

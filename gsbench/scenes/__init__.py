@@ -38,19 +38,37 @@ _LAYOUTS = (
 
 
 def load(
-    path: str | Path,  # the scene's folder
+    path: str | Path,
     *,
     downscale: int = 1,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    frames: Sequence[int] | None = None,  # the first and the last one, of layouts with frames; None: all
+    frames: Sequence[int] | None = None,
 ) -> Scene:
-    """Load the scene in the folder `path` and detect its layout.
+    """Load the scene in a folder and detect its layout.
 
-    Images are composited over `background` (RGB in [0, 1]) once and averaged over downscale x downscale blocks, which
-    must tile them exactly. Everything is float32 on the CPU, in OpenCV axes.
+    Images are composited over the background once, and then averaged over blocks of pixels, which must tile them
+    exactly. Everything is float32 on the CPU, in OpenCV axes.
+
+    Args:
+        path: the scene's folder.
+        downscale: images become smaller by this whole factor.
+        background: RGB in [0, 1].
+        frames: the first and the last one, of a layout that numbers frames; None: all.
 
     Raises:
         InputError: there is no known layout at `path`, or the data has a fault; the message names file and field.
+
+    Example:
+        One of the two embedded scenes.
+
+        >>> from gsbench import load_scene
+        >>> from gsbench.scenes import sample
+        >>> scene = load_scene(sample.folder() / "suzanne", downscale=2)
+        >>> len(scene.train), len(scene.val), len(scene.test)
+        (86, 6, 10)
+        >>> view = scene.test[0]
+        >>> view.image.shape, view.camera.width, scene.has_time
+        (torch.Size([80, 80, 3]), 80, True)
     """
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
         raise InputError(f"downscale: expected a whole number of at least 1, got {downscale!r:.80}")
