@@ -10,7 +10,7 @@ ARGS ?=
 # The CUDA kernels, compiled for five architectures, take minutes: made where a GPU is to run them. CUDA=on|auto|off.
 CUDA := $(if $(shell nvidia-smi -L 2> /dev/null),auto,off)
 
-.PHONY: help table1 frontier tables test test-all stability stability-long bench gpu-check slurm-check sanitize lint format setup clean
+.PHONY: help table1 frontier tables test test-all stability stability-long bench gpu-check slurm-check sanitize lint format docs setup clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
@@ -28,6 +28,11 @@ $(VENV)/installed: pyproject.toml constraints.txt $(NATIVE)
 		--config-settings cmake.define.CUDA=$(CUDA) --editable '.[dev,stability]'
 	@$(BIN)/python -c 'import sys; from gsbench import kernels; sys.exit(not kernels.available())' || \
 		echo "gsbench is installed without its kernels, and slow: docs/install.md says what they need"
+	touch $@
+
+# Sphinx and the kernel of notebooks take pip 13 s more: for those who ask for the site or for all tests.
+$(VENV)/installed-docs: $(VENV)/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt 'gsbench[docs]'
 	touch $@
 
 table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR, and model=auto, on the embedded scenes; print and write the table
@@ -50,7 +55,7 @@ tables: setup  ## write Tables 1 and 2 of the paper from whatever is in results/
 test: lint  ## lint, types and all tests but the slow ones
 	$(BIN)/python -m pytest
 
-test-all: lint  ## the slow tests too
+test-all: lint $(VENV)/installed-docs  ## the slow tests too
 	$(BIN)/python -m pytest -m 'slow or not slow'
 
 stability: setup  ## hard cases against an oracle; results/stability/, fails where a default breaks its bound
@@ -80,6 +85,11 @@ lint: setup  ## ruff and mypy
 format: setup  ## let ruff rewrite the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: $(VENV)/installed-docs  ## build the site from docs/ into build/site
+	$(BIN)/python docs/site/tables.py
+	$(BIN)/python -m sphinx -q -E -W --keep-going -b html -d build/doctrees docs build/site
+	@echo "open build/site/index.html"
 
 clean:  ## remove what was built and installed; results stay
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -33,7 +33,7 @@ class DataConfig:
 class SceneConfig:
     """One scene of the data set."""
 
-    name: str = MISSING
+    name: str = MISSING  # a folder in data.root
     released_as: str | None = None  # the folder's name in the published release, where the paper's `name` differs
     downscale: int = 1  # integer factor by which images are made smaller, by an area filter
     eval_split: str = "test"  # or val, where the test split is wrong (D-NeRF lego)
@@ -62,11 +62,11 @@ class LearningRate:
 class ModelConfig:
     """A model: the keys that every model has, and the options of this model's constructor."""
 
-    name: str = MISSING
+    name: str = MISSING  # of the class in gsbench/models/
     published_with_agr: bool = False  # whether AGR is part of the method as its authors describe it
     agr: bool = "${.published_with_agr}"  # type: ignore[assignment]  # an interpolation, typed when resolved
     agr_octaves: int = 4  # K of AGR's time encoding; the paper's 10 memorise every frame: docs/tuning.md
-    sh_degree: int = 3
+    sh_degree: int = 3  # of the spherical harmonics, 0 to 3
     min_opacity: float = 0.005  # a Gaussian below it is pruned
     gate: str = "off"  # the default of effects.gate
     candidates: dict[str, Any] = field(default_factory=dict)  # of model=auto: other models, of which a run chooses one
@@ -78,8 +78,8 @@ class ModelConfig:
 class DensifyConfig:
     """Adaptive density control (3DGS, section 5.2). All steps but `every` are those of a run of `recipe_iterations`."""
 
-    start: int = 500
-    stop: int = 15_000
+    start: int = 500  # after this step Gaussians are cloned, split and pruned ..
+    stop: int = 15_000  # .. until this one
     every: int = 100  # steps of a run of any length: clones need them to move apart before the next decision
     reset_every: int = 3_000  # opacity reset
     grad_threshold: float = 2e-4  # mean gradient of a 2D mean, in units of half the image
@@ -91,8 +91,8 @@ class DensifyConfig:
 class TrainConfig:
     """The recipe. Steps are stated for a run of `recipe_iterations` and are scaled to the length of the run."""
 
-    iterations: int = 30_000
-    recipe_iterations: int = 30_000
+    iterations: int = 30_000  # steps of this run
+    recipe_iterations: int = 30_000  # steps of the run that all other steps are stated for
     batch_size: int = 4  # views in a step
     ssim_weight: float = 0.2  # loss = (1 - w) L1 + w (1 - SSIM)
     sh_every: int = 1_000  # steps after which the spherical harmonics gain a degree
@@ -107,19 +107,19 @@ class TrainConfig:
 class RasterConfig:
     """How images are rendered."""
 
-    backend: str = "auto"
-    antialias: bool = False
+    backend: str = "auto"  # or reference, cpu, cuda: who computes slices, images and losses
+    antialias: bool = False  # whether opacities are scaled by the area that the 2D filter adds (Mip-Splatting)
 
 
 @dataclass
 class ProtocolConfig:
     """How results are measured; written into every record."""
 
-    name: str = MISSING
+    name: str = MISSING  # gsbench or published
     quantise: bool = False  # round renders to 8 bits before they are measured
     best_on_test: bool = False  # also record the best test PSNR during training, as published code does: it leaks
     lpips_alex: str | None = None  # trunk weights; None: $TORCH_HOME/hub/checkpoints
-    lpips_vgg: str | None = None
+    lpips_vgg: str | None = None  # the same of VGG16
     renders: int = 30  # how many renders are timed, at least
     pictures: int = 3  # test views in pictures.png, as render | ground truth | error
 
@@ -139,7 +139,7 @@ class LaunchConfig:
     at_once: int = -1  # runs at a time; -1: parallel takes one for each CPU, slurm as many as the cluster gives
     partition: str | None = None  # of Slurm, as all below
     minutes: int = 240  # the time limit of a job; a run that needs longer is saved and requeued
-    cpus: int = 4
+    cpus: int = 4  # of a job
     gpus: int | None = None  # they are used with device=cuda
     memory: str = "8G"  # as sbatch has it
     setup: str = ":"  # a shell line before the run, such as `module load cuda`
@@ -153,11 +153,11 @@ class Config:
     """A run, or for scene=all a run for each scene of the data set."""
 
     experiment: str = MISSING  # the name of the +exp= file, a folder in results/
-    seed: int = 0
-    device: str = "cpu"
-    agr: bool = "${model.agr}"  # type: ignore[assignment]
+    seed: int = 0  # of every random draw
+    device: str = "cpu"  # or cuda, cuda:1
+    agr: bool = "${model.agr}"  # type: ignore[assignment]  # whether AGR is wrapped around the model
     optim: str = "adam"  # or sparse_adam: a Gaussian that no view of the batch sees does not move
-    results: str = "results"
+    results: str = "results"  # the folder of all results
     resume: bool = True  # continue from a checkpoint and keep finished runs of the same config; false: start over
     model: ModelConfig = field(default_factory=ModelConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
