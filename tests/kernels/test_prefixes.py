@@ -239,7 +239,7 @@ def test_torch_is_told_the_truth(name: str, classed: bool) -> None:
     model = fitted(name, 30, agr=True, classed=classed)
     if model.classes is not None:
         model.classes = model.classes._replace(spans=spans_around(TIME, model.classes.refined)[1])
-    with torch.no_grad(), Calls() as calls:
+    with Calls() as calls:
         model.slice(Query(CENTER, TIME))
     observe = "observe_triangular" if name == "7dgs" else "observe_rotated"
     assert {f"gsbench::{one}" for one in ("refine", observe, "show_colors")} <= calls.found.keys()
