@@ -102,7 +102,7 @@ def test_what_any_view_of_the_batch_saw_is_moved() -> None:
     seen = [Seen(torch.ones(()), one, torch.zeros(1, N, 2)) for one in radii]
     fitted.gradients = lambda _: seen  # type: ignore[assignment]
     moved = []
-    fitted.optimizer.step = lambda _, drawn: moved.append(drawn)  # type: ignore[method-assign]
+    fitted.optimizer.step = lambda _, drawn, **__: moved.append(drawn)  # type: ignore[method-assign]
     for step in (0, 1):
         fitted.step = step
         fitted._descend()
