@@ -30,7 +30,7 @@ def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
         query = Query.of(view.camera, view.time)
         moved = model.refined(query)
         opacities = model.observe(moved, query)[2]
-        if model.refinement is not None:
+        if model.refines:
             opacities = torch.maximum(opacities, model.observe(own, query)[2])
         return opacities >= ALPHA_MIN
 

@@ -241,6 +241,11 @@ class GaussianModel(nn.Module, ABC):
         """The harmonics of each row's colours, [N] int32 as in `Classes`; None: all of them."""
         return None if self.classes is None else self.classes.levels
 
+    @property
+    def refines(self) -> bool:
+        """Whether AGR is there and acts in this phase."""
+        return self.refinement is not None and self.phase.refine
+
     def refined(self, query: Query) -> Raw:
         """Apply AGR to the raw parameters: raw + phi(f) (7DGS eq. 15), to log-diagonals before the exp."""
         raw: Raw = dict(self.splats.items())

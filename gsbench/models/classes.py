@@ -36,8 +36,7 @@ def count(model: GaussianModel) -> dict[str, int]:
     """Count the Gaussians of each class, by the names of NAMES."""
     N, classes = len(model), model.classes
     if classes is None:
-        refines = model.refinement is not None and model.phase.refine
-        refined, sliced = N if refines else 0, N if model.observes else 0
+        refined, sliced = N if model.refines else 0, N if model.observes else 0
         return dict(
             zip(NAMES, (refined, sliced - refined if sliced else 0, 0, 0, N - max(refined, sliced)), strict=True)
         )

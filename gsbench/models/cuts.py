@@ -44,13 +44,12 @@ def cuts_of(
     weights = shares_of([one.opacities for one in slices])
     found = []
     names = (*model.centers, *model.geometry)
-    refines = model.refinement is not None and model.phase.refine
     raw: Raw = {name: value.detach() for name, value in model.splats.items()}
     fewer = {level: raw | {"shN": raw["shN"] * model.kept(Classes(0, 0, _all(model, level)))["shN"]}
              for level in model.lower_levels()}  # fmt: skip
-    refined, lost = _averages(model, queries, slices, weights, names if refines else (), list(fewer.values()))
+    refined, lost = _averages(model, queries, slices, weights, names if model.refines else (), list(fewer.values()))
     raw = raw | refined
-    if refines:
+    if model.refines:
         found.append(Cut(SLICED, refined))
     for name, frozen in model.frozen(raw, queries, weights).items():
         if name != STILL and not by_halves:
