@@ -26,6 +26,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsbench.kernels.tape import Tape
 from gsbench.lanes import side_by_side
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Gaussians3D
@@ -112,20 +113,24 @@ class Drawn(NamedTuple):
     """A slice that was drawn."""
 
     at: Gaussians3D
-    rendered: Tensor  # [H, W, 3], with its graph
+    tape: Tape  # how
+    images: Tensor  # [1, H, W, 3]
     means2d: Tensor  # [N, 2] pixels
     radii: Tensor  # [N] pixels, three standard deviations; 0 where it is culled
 
     @property
     def image(self) -> Tensor:
         """The image [H, W, 3]."""
-        return self.rendered.detach()
+        return self.images[0].detach()
 
     def products(self, vectors: list[Tensor]) -> list[Gaussians3D]:
-        """Multiply vectors [H, W, 3] by the derivative of the image by the slice, from the left; only once."""
-        last = len(vectors) - 1
-        return [Gaussians3D(*torch.autograd.grad(self.rendered, self.at, vector, retain_graph=i < last))
-                for i, vector in enumerate(vectors)]  # fmt: skip
+        """Multiply vectors [H, W, 3] by the derivative of the image by the slice, from the left."""
+        found = []
+        for vector in vectors:
+            sums: dict[int, Tensor] = {}
+            self.tape.backward(self.images, vector[None], self.at, sums)
+            found.append(Gaussians3D(*(sums[id(x)] for x in self.at)))
+        return found
 
 
 class Drawing(NamedTuple):
@@ -140,8 +145,9 @@ class Drawing(NamedTuple):
     def __call__(self, gaussians: Gaussians3D) -> Drawn:
         """Draw a slice."""
         at = Gaussians3D(*(x.detach().requires_grad_() for x in gaussians))
-        output = rasterize_slice(at, self.camera, self.background, self.model.backend, self.antialias)
-        return Drawn(at, output.image[0], output.info.means2d[0].detach(), output.info.radii[0])
+        with Tape() as tape:
+            output = rasterize_slice(at, self.camera, self.background, self.model.backend, self.antialias)
+        return Drawn(at, tape, output.image, output.info.means2d[0].detach(), output.info.radii[0])
 
 
 class Place(NamedTuple):
@@ -173,7 +179,8 @@ def _error(cut: Cut, here: Place, draw: Drawing) -> Tensor:
     scale = changed.opacities / thin.opacities.clamp(min=1e-12)  # an image of a Gaussian is linear in its opacity
     there = [Gaussians3D(p.means[N:] * scale[:, None], p.factors[N:] * scale[:, None, None], p.opacities[N:],
                          p.colors[N:] * scale[:, None]) for p in both.products(here.vectors)]  # fmt: skip
-    along = [(_dot(a, live, changed) + _dot(b, live, changed)) / 2 for a, b in zip(here.products, there, strict=True)]
+    delta = [to - at for at, to in zip(live, changed, strict=True)]
+    along = [(_dot(a, delta) + _dot(b, delta)) / 2 for a, b in zip(here.products, there, strict=True)]
     added = [product.opacities * changed.opacities for product in there]
     size = torch.maximum(here.drawn.radii, both.radii[N:]).clamp(min=1) / 3
     distance = (both.means2d[N:] - here.drawn.means2d) / (2 * size[:, None])
@@ -188,8 +195,7 @@ def _grown(*changes: list[Tensor]) -> Tensor:
     return (2 * first).clamp(min=0) + second
 
 
-def _dot(product: Gaussians3D, live: Gaussians3D, changed: Gaussians3D) -> Tensor:
-    """Compute <product, changed - live> of each Gaussian, [N]."""
-    parts = [(p * (b - a)).flatten(1).sum(1) if p.dim() > 1 else p * (b - a)
-             for p, a, b in zip(product, live, changed, strict=True)]  # fmt: skip
+def _dot(product: Gaussians3D, delta: list[Tensor]) -> Tensor:
+    """Compute <product, delta> of each Gaussian, [N]."""
+    parts = [(p * d).flatten(1).sum(1) if p.dim() > 1 else p * d for p, d in zip(product, delta, strict=True)]
     return torch.stack(parts).sum(0)

@@ -75,14 +75,13 @@ class Tape:
     def backward(self, loss: Tensor, seed: Tensor, sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
         """Add the gradients of `loss` times `seed` by `sources` to `sums`, which holds them by the tensors' id.
 
-        What is added is the same to the last bit whether `sums` holds other views' already or not. The tape is empty
-        afterwards.
+        What is added is the same to the last bit whether `sums` holds other views' already or not. The tape may run
+        backwards again, for another seed.
         """
         at = _Gradients(self._notes, sources, sums)
         at.give(loss, seed)
         for note in reversed(self._notes):
             at.through(note)
-        self._notes = []
         at.finish()
 
 

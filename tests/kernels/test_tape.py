@@ -53,6 +53,22 @@ def gradients(made: GaussianModel) -> dict[str, Tensor]:
     return found
 
 
+def test_a_tape_runs_backwards_for_several_vectors() -> None:
+    """Catches a second vector whose product has the first one's in it, or is empty: the probe asks for two."""
+    view = views(1)[0]
+    seen = fitted("7dgs").slice(Query.of(view.camera, view.time))
+    at = [x.detach().requires_grad_() for x in seen]
+    with Tape() as tape:
+        images = rasterize_slice(type(seen)(*at), view.camera, BACKGROUND, CPU).image
+    vectors = [torch.randn(images.shape, generator=torch.Generator().manual_seed(i)) for i in range(2)]
+    alone = rasterize_slice(type(seen)(*at), view.camera, BACKGROUND, CPU).image
+    for vector in vectors:
+        sums: dict[int, Tensor] = {}
+        tape.backward(images, vector, at, sums)
+        expected = torch.autograd.grad(alone, at, vector, retain_graph=True)
+        assert all(torch.equal(sums[id(x)], gradient) for x, gradient in zip(at, expected, strict=True))
+
+
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize(
     ("name", "agr", "classed"),
