@@ -44,8 +44,10 @@ table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR, and mode
 frontier: setup  ## train the six models at five lengths and three capacities, three seeds each, two runs at a time; about 70 minutes
 	@status=0; for axis in train.iterations=250,500,1000,2000,4000 train.densify.grad_threshold=1e-4,4e-4; do \
 		$(BIN)/python -m gsbench --multirun +exp=frontier +launch=parallel launch.at_once=2 \
-			model=$(MODELS) seed=0,1,2 $$axis $(ARGS) || status=$$?; \
+			model=$(MODELS),7dgs_nodir seed=0,1,2 $$axis $(ARGS) || status=$$?; \
 	done; \
+	$(BIN)/python -m gsbench --multirun +exp=frontier +launch=parallel launch.at_once=2 \
+		model=3dgs,4dgs,6dgs,7dgs_nodir agr=true seed=0,1,2 $(ARGS) || status=$$?; \
 	$(BIN)/python -m gsbench.report results/frontier || status=$$?; \
 	exit $$status
 

@@ -54,9 +54,19 @@ def test_rates_of_the_authors_code() -> None:
     assert config.model.options["off_diagonal"] == "row_scaled"
 
 
+def test_7dgs_without_direction_learns_as_7dgs_does() -> None:
+    """Catches a price of direction that is one of rates or of options: what both have is the same."""
+    whole, less = composed("model=7dgs"), composed("model=7dgs_nodir")
+    assert whole.model.lr.keys() - less.model.lr.keys() == {"directions", "coupling"}
+    assert all(whole.model.lr[name] == rate for name, rate in less.model.lr.items())
+    assert whole.model.options.keys() - less.model.options.keys() == {"lambda_d", "directional_half"}
+    assert all(whole.model.options[name] == value for name, value in less.model.options.items())
+    assert whole.model.min_opacity == less.model.min_opacity
+
+
 def test_every_model_goes_as_far_in_a_short_run() -> None:
     """Catches a model whose geometry keeps the rates of 30,000 steps at 300: all are ten times faster, colours not."""
-    for model in ("3dgs", "4dgs", "6dgs", "7dgs"):
+    for model in ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_nodir"):
         short, long = (rates(composed(f"model={model}", f"train.iterations={n}"), 0.0) for n in (300, 30_000))
         for name in long.keys() - {"modulation"}:
             expected = 1 if name in ("opacities", "sh0", "shN", "refinement") else 10

@@ -20,14 +20,14 @@ namespace gsb {
 
 // ---- gsbench/kernels/slices.py
 
-// Gaussians with a triangular factor over (p, d) or (p, t, d), observed from a place and at a time (6DGS, 7DGS).
+// Gaussians with a triangular factor over p and d, t or both, observed from a place and at a time (6DGS, 7DGS).
 struct TriangularArgs {
     int64_t N, sliced;  // rows from `sliced` on are still: no query changes them
     bool conditioned_first;
     OffDiagonal form;
     bool subtracts;  // by the scheme that forms S, for comparison; on the CPU only
     float half;
-    const float *means, *directions, *times;  // [N, 3] [N, 3] [N, 1], null: time is not observed
+    const float *means, *directions, *times;  // [N, 3] [N, 3] [N, 1]; one of the last two may be null: not observed
     const float *log_diagonal, *shape, *motion, *coupling;    // [N, k + 3] [N, 3] [N, 3 k] [N, k (k - 1) / 2]
     const float *opacities, *center;                          // [N] logits, [3]
     const float *time, *log_lambda_d, *log_lambda_t;          // [] [] []

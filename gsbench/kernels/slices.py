@@ -4,6 +4,7 @@ from typing import Any
 
 from torch import Tensor
 
+from gsbench.errors import InputError
 from gsbench.kernels.operation import EVERY_ROW, Operation, first_rows
 
 _SLICE = {"means": "N 3", "factors": "N 3 3", "opacities": "N"}
@@ -16,9 +17,9 @@ _triangular = Operation(
     outputs=_SLICE,
     numbers={"half": float, "conditioned_first": bool, "form": int, "subtracts": bool, "sliced": int},
     constant=["center", "time"],
-    optional=["times time log_lambda_t"],
+    optional=["directions log_lambda_d", "times time log_lambda_t"],
     zeroed=["log_lambda_d", "log_lambda_t"],
-    derive=lambda given, numbers: _entries(4 if "times" in given else 3) | _sliced(given, numbers),
+    derive=lambda given, numbers: _entries(given) | _sliced(given, numbers),
     memory="a slice's Gaussians",
 )  # fmt: skip
 
@@ -28,23 +29,26 @@ def _sliced(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]
     return {"sliced": first_rows("sliced", numbers["sliced"], given["means"])}
 
 
-def _entries(k: int) -> dict[str, int]:
+def _entries(given: dict[str, Tensor]) -> dict[str, int]:
     """How many numbers of each kind a factor over p and k conditioned variables has."""
+    k = 3 * ("directions" in given) + ("times" in given)
+    if k == 0:
+        raise InputError("observe_triangular: expected directions, times or both, got neither")
     return {"rows": k + 3, "moves": 3 * k, "couplings": k * (k - 1) // 2}
 
 
 def observe_triangular(
     means: Tensor,  # [N, 3]
-    directions: Tensor,  # [N, 3]
+    directions: Tensor | None,  # [N, 3], None: direction is not observed
     times: Tensor | None,  # [N, 1], None: time is not observed
-    log_diagonal: Tensor,  # [N, k + 3], k = 3 without time, 4 with
+    log_diagonal: Tensor,  # [N, k + 3], k numbers are observed
     shape: Tensor,  # [N, 3]
     motion: Tensor,  # [N, 3 k]
     coupling: Tensor,  # [N, k (k - 1) / 2]
     opacities: Tensor,  # [N] logits
     center: Tensor,  # [3]
     time: Tensor | None,  # []
-    log_lambda_d: Tensor,  # []
+    log_lambda_d: Tensor | None,  # []
     log_lambda_t: Tensor | None,  # []
     *,
     conditioned_first: bool,
@@ -53,7 +57,7 @@ def observe_triangular(
     subtracts: bool = False,
     sliced: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Slice 6D or 7D Gaussians as seen from `center` at `time`: means [N, 3], factors [N, 3, 3], opacities [N].
+    """Slice Gaussians over p and d, t or both at a query: means [N, 3], factors [N, 3, 3], opacities [N].
 
     The square-root scheme of `gsbench.models.slicing` for the parameters of `gsbench.models.triangular`, with
     f_temp and f_dir (7DGS eq. 9 to 12) in the opacities. With `subtracts` by the scheme `cholesky` instead, which is
@@ -82,12 +86,12 @@ def observe_triangular(
         sliced: how many rows change with the query; all by default.
 
     Raises:
-        InputError: not float32 on one device, shapes that do not fit, a gradient by `center` or `time` is asked for, or
-            more rows are sliced than there are.
+        InputError: not float32 on one device, shapes that do not fit, nothing is observed, a gradient by `center` or
+            `time` is asked for, or more rows are sliced than there are.
     """
-    observed = times is not None
+    timed = times is not None
     seen = _triangular(means, directions, times, log_diagonal, shape, motion, coupling, opacities, center,
-                       time if observed else None, log_lambda_d, log_lambda_t if observed else None,
+                       time if timed else None, log_lambda_d, log_lambda_t if timed else None,
                        0.5 if directional_half else 1.0, conditioned_first, form, subtracts,
                        EVERY_ROW if sliced is None else sliced)  # fmt: skip
     return seen[0], seen[1], seen[2]

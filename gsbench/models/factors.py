@@ -49,6 +49,7 @@ class Triangle:
             in_space = (letters[i] + letters[j]).count("p")
             places[("coupling", "motion", "shape")[in_space]].append(place)
         self.places = places  # by kind, the places of its entries among all
+        self.kinds = tuple(kind for kind in KINDS if places[kind])  # a factor over (t, p) has no coupling
         self.rows = [i for i, _ in below]
         order = [place for kind in KINDS for place in places[kind]]
         self.columns = sorted(range(len(order)), key=order.__getitem__)  # of (shape, motion, coupling), for each place
@@ -65,7 +66,7 @@ class Triangle:
 
         Args:
             log_diagonal: [N, n] logarithms of the diagonal.
-            kinds: the parameters of KINDS, [N, 3], [N, 3 k] and [N, k (k - 1) / 2] for n = k + 3.
+            kinds: the parameters of `self.kinds`, [N, 3], [N, 3 k] and [N, k (k - 1) / 2] for n = k + 3.
         """  # [N, n, n]
         n = log_diagonal.shape[-1]
         diagonal = sizes(log_diagonal)
@@ -94,11 +95,11 @@ class Triangle:
 
     def split(self, below: Tensor) -> dict[str, Tensor]:
         """Sort the parameters below the diagonal, [N, n (n - 1) / 2] row by row, by their kind."""
-        return {kind: below[:, self.places[kind]] for kind in KINDS}
+        return {kind: below[:, self.places[kind]] for kind in self.kinds}
 
     def join(self, kinds: dict[str, Tensor]) -> Tensor:
         """Invert `split`."""
-        return torch.cat([kinds[kind] for kind in KINDS], -1)[:, self.columns]
+        return torch.cat([kinds[kind] for kind in self.kinds], -1)[:, self.columns]
 
 
 def rotation(quaternions: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from gsbench.models.gaussians4d import Gaussians4DModel
     from gsbench.models.triangular import TriangularModel
 
+CENTERS = {"time": "times", "direction": "directions"}  # the raw parameters that are means of variables
 OPACITY_MARGIN = 1e-6  # between an opacity and 0 or 1, whose logits are infinite
 
 
@@ -42,58 +43,60 @@ def freeze_triangular(
     """
     blocks = Reduced(*(block.double() for block in reduce(model.factors(raw))))
     gain = gain_of(blocks.T_pq, blocks.T_qq)
-    by_name = {"time": [3], "direction": [0, 1, 2], "still": [0, 1, 2, 3]}
-    if "time" not in model.observes:
-        by_name = {"still": [0, 1, 2]}
+    by_name = {name: [name] for name in model.columns} if len(model.columns) > 1 else {}
+    by_name["still"] = list(model.columns)
     shift, gates = torch.zeros_like(gain[:, 0]), {name: torch.zeros_like(gain[:, 0, 0]) for name in by_name}
     for query, weight in zip(queries, weights.double(), strict=True):
         delta = _delta(model, raw, query)
         shift += weight[:, None] * delta
         exponents = _exponents(model, blocks, delta)
-        for name, columns in by_name.items():
-            parts = [exponents[i] for i in columns if i in exponents]
-            gates[name] += weight * torch.exp(-torch.stack(parts).sum(0))
+        for name, variables in by_name.items():
+            gates[name] += weight * torch.exp(-torch.stack([exponents[x] for x in variables]).sum(0))
     changed = {}
-    for name, columns in by_name.items():
+    for name, variables in by_name.items():
+        columns = [column for x in variables for column in model.columns[x]]
         moved = raw["means"] + (gain[..., columns] @ shift[:, columns, None])[..., 0]
         opacity = (torch.sigmoid(raw["opacities"].double()) * gates[name]).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
-        new = model.triangle.parameters(_without(model, blocks, gain, columns)) | {"means": moved}
+        new = model.triangle.parameters(_without(model, blocks, gain, variables)) | {"means": moved}
         new["opacities"] = torch.logit(opacity)
-        for center, own in (("times", 3), ("directions", 0)):
-            if own in columns and center in raw:
-                new[center] = torch.zeros_like(raw[center])
+        new |= {center: torch.zeros_like(raw[center]) for x in variables for center in [CENTERS[x]]}
         changed[name] = {key: value.to(raw["means"].dtype) for key, value in new.items()}
     return changed
 
 
 def _delta(model: TriangularModel, raw: Raw, query: Query) -> Tensor:
     """Compute q - mu_q, [N, k], ordered (d, t)."""
-    delta = unit(raw["means"] - query.center) - raw["directions"]
+    delta = []
+    if "direction" in model.observes:
+        delta.append(unit(raw["means"] - query.center) - raw["directions"])
     if "time" in model.observes:
         assert query.time is not None
-        delta = torch.cat([delta, query.time - raw["times"]], -1)
-    return delta.double()
+        delta.append(query.time - raw["times"])
+    return torch.cat(delta, -1).double()
 
 
-def _exponents(model: TriangularModel, blocks: Reduced, delta: Tensor) -> dict[int, Tensor]:
-    """Compute -ln f_dir and -ln f_temp [N], by the first column of their variable (7DGS eq. 11 and 12)."""
-    half = 0.5 if model.directional_half else 1.0
-    white = whiten(blocks.T_qq[:, :3, :3], delta[:, :3])
-    found = {0: half * model.modulation("direction").double() * white.square().sum(-1)}
+def _exponents(model: TriangularModel, blocks: Reduced, delta: Tensor) -> dict[str, Tensor]:
+    """Compute -ln f_dir and -ln f_temp [N] (7DGS eq. 11 and 12)."""
+    found = {}
+    if "direction" in model.observes:
+        half = 0.5 if model.directional_half else 1.0
+        white = whiten(blocks.T_qq[:, :3, :3], delta[:, :3])
+        found["direction"] = half * model.modulation("direction").double() * white.square().sum(-1)
     if "time" in model.observes:
-        distance = delta[:, 3] / blocks.T_qq[:, 3].norm(dim=-1)
-        found[3] = 0.5 * model.modulation("time").double() * distance.square()
+        distance = delta[:, -1] / blocks.T_qq[:, -1].norm(dim=-1)
+        found["time"] = 0.5 * model.modulation("time").double() * distance.square()
     return found
 
 
-def _without(model: TriangularModel, blocks: Reduced, gain: Tensor, columns: list[int]) -> Tensor:
+def _without(model: TriangularModel, blocks: Reduced, gain: Tensor, variables: list[str]) -> Tensor:
     """Compute the factor [N, n, n] in the model's own order whose slices depend on no frozen variable."""
     T_qq, kept = blocks.T_qq.clone(), gain.clone()
-    if 0 in columns and T_qq.shape[-1] > 3:  # t is no longer measured by d: its own deviation becomes its whole one
-        deviation = T_qq[:, 3].norm(dim=-1)
-        T_qq[:, 3] = 0
-        T_qq[:, 3, 3] = deviation
-    for column in columns:
+    if "direction" in variables and "time" in model.observes:
+        # t is no longer measured by d: its own deviation becomes its whole one
+        deviation = T_qq[:, -1].norm(dim=-1)
+        T_qq[:, -1] = 0
+        T_qq[:, -1, -1] = deviation
+    for column in [column for x in variables for column in model.columns[x]]:
         T_qq[:, column] = 0
         T_qq[:, column, column] = math.exp(LOG_SIZE_MAX)
         kept[..., column] = 0

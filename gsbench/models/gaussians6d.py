@@ -1,11 +1,11 @@
 """Model view-dependent effects by 6DGS: Gaussians over position and direction (Gao et al. 2024)."""
 
 from gsbench.models.registry import register
-from gsbench.models.triangular import TriangularModel
+from gsbench.models.triangular import DirectionalModel
 
 
 @register("6dgs")
-class Gaussians6DModel(TriangularModel):
+class Gaussians6DModel(DirectionalModel):
     """Gaussians conditioned on q = {d}."""
 
     observes = ("direction",)

@@ -2,15 +2,12 @@
 
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from gsbench.models.registry import register
-from gsbench.models.triangular import TriangularModel
+from gsbench.models.triangular import DirectionalModel
 
 
 @register("7dgs")
-class Gaussians7DModel(TriangularModel):
+class Gaussians7DModel(DirectionalModel):
     """Gaussians conditioned on q = {t, d}."""
 
     observes = ("time", "direction")
@@ -21,15 +18,10 @@ class Gaussians7DModel(TriangularModel):
 
         Args:
             lambda_t: initial sensitivity of f_temp.
-            options: as `TriangularModel`.
+            options: as `DirectionalModel`.
 
         Raises:
             InputError: an option is out of its range.
         """
         super().__init__(**options)
         self.modulate("time", lambda_t)
-
-    @torch.no_grad()
-    def long_in_time(self) -> Tensor:
-        """Test |S_pt| > 0.05 extent and sqrt(S_t) > 0.25 T (7DGS, section 4.4)."""
-        return self.moves_long(self.factors(dict(self.splats.items())))

@@ -1,8 +1,8 @@
-"""Slice 6D and 7D Gaussians by their triangular factor, for 6DGS and 7DGS."""
+"""Slice Gaussians over position and direction, time or both by their triangular factor, for 6DGS and 7DGS."""
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -22,38 +22,36 @@ from gsbench.scenes.scene import Points
 # The order of position, time and direction among the rows of the triangular factor.
 FACTOR_ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
 WIDTH = {"p": 3, "t": 1, "d": 3}
+LETTERS = {"time": "t", "direction": "d"}
 TIME_CORRELATION = 0.05  # split in time where |S_pt| is above this part of the scene's extent ..
 TIME_SCALE = 0.25  # .. and sqrt(S_t) above this part of the clip (7DGS, section 4.4)
 
 
 class TriangularModel(GaussianModel):
-    """Gaussians with means of p, d and t, and one lower triangular factor of their covariance.
+    """Gaussians with means of p and d, t or both, and one lower triangular factor of their covariance.
 
     For slicing, the rows of a factor are ordered (p, d, t): with d before t, the leading block of the reduced factor is
     the marginal of d.
     """
 
-    geometry = ("log_diagonal", *KINDS)
+    geometry: ClassVar[tuple[str, ...]] = ("log_diagonal", *KINDS)
+    directional_half = True  # whether f_dir has the 1/2 of 7DGS eq. 12
 
     def __init__(
         self,
         *,
-        lambda_d: float,
         factor_order: str = "conditioned_first",
         scheme: str = "square_root",
         off_diagonal: str = "relative",
-        directional_half: bool = True,
         split_in_time: bool = True,
         **options: Any,
     ) -> None:
         """Make an empty model.
 
         Args:
-            lambda_d: initial sensitivity of f_dir.
             factor_order: `paper`, the factor triangular over (p, t, d), or `conditioned_first`, over (d, t, p).
             scheme: of `slice_gaussians`.
             off_diagonal: the `form` of `Triangle`, which says what the parameters below the diagonal mean.
-            directional_half: whether f_dir has the 1/2 of 7DGS eq. 12, which 6DGS lacks.
             split_in_time: whether Gaussians that move are also split because of their extent in time.
             options: as `GaussianModel`.
 
@@ -64,14 +62,15 @@ class TriangularModel(GaussianModel):
         if factor_order not in FACTOR_ORDERS:
             raise InputError(f"factor_order '{factor_order}' is not known. {did_you_mean(factor_order, FACTOR_ORDERS)}")
         check_scheme(scheme)
-        self.modulate("direction", lambda_d)
         self.factor_order = factor_order
         self.scheme = scheme
-        self.directional_half = directional_half
         self.split_in_time = split_in_time
-        # Row numbers of p, d and t in the triangular factor, and the order that sorts its rows to (p, d, t).
-        letters = "".join(x * WIDTH[x] for x in FACTOR_ORDERS[factor_order] if x != "t" or "time" in self.observes)
+        # Row numbers of p, d and t in the triangular factor; sorted to (p, d, t), those of d and t among q's.
+        there = "p" + "".join(LETTERS[x] for x in self.observes)
+        letters = "".join(x * WIDTH[x] for x in FACTOR_ORDERS[factor_order] if x in there)
         self.rows = {x: [i for i, letter in enumerate(letters) if letter == x] for x in "pdt"}
+        own = {"time": [len(letters) - 4], "direction": [0, 1, 2]}
+        self.columns = {x: own[x] for x in own if x in self.observes}
         self.triangle = Triangle(letters, off_diagonal)
         self.is_reduced = factor_order == "conditioned_first" and scheme == "square_root"
 
@@ -82,8 +81,9 @@ class TriangularModel(GaussianModel):
         log_diagonal[:, self.rows["p"]] = distances.log()[:, None]
         log_diagonal[:, self.rows["t"]] = 0.5 * math.log(1 / 10)
         raw = {"log_diagonal": log_diagonal}
-        raw |= {kind: torch.zeros(N, len(places)) for kind, places in self.triangle.places.items()}
-        raw["directions"] = F.normalize(torch.randn(N, 3, generator=generator), dim=-1)
+        raw |= {kind: torch.zeros(N, len(self.triangle.places[kind])) for kind in self.triangle.kinds}
+        if "direction" in self.observes:
+            raw["directions"] = F.normalize(torch.randn(N, 3, generator=generator), dim=-1)
         if "time" in self.observes:
             raw["times"] = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
         return raw
@@ -91,11 +91,14 @@ class TriangularModel(GaussianModel):
     def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Slice at d = the unit vector from the camera to mu_p, and t (7DGS, algorithm 1)."""
         factor = self.factors(raw)
-        mean = torch.cat([raw["means"], raw["directions"]], -1)
-        at = unit(raw["means"] - query.center)
+        centers, places = [raw["means"]], []
+        if "direction" in self.observes:
+            centers.append(raw["directions"])
+            places.append(unit(raw["means"] - query.center))
         if query.time is not None and "time" in self.observes:
-            mean = torch.cat([mean, raw["times"]], -1)
-            at = torch.cat([at, query.time.expand(len(at), 1)], -1)
+            centers.append(raw["times"])
+            places.append(query.time.expand(len(factor), 1))
+        mean, at = torch.cat(centers, -1), torch.cat(places, -1)
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
         delta = at - mean[:, 3:]
         # A Gaussian so far from the query that its opacity is zero is replaced by a unit Gaussian at the query, and its
@@ -115,8 +118,7 @@ class TriangularModel(GaussianModel):
     def still(self, raw: Raw) -> Conditioned:
         """Return Gaussians of the block L_pp alone."""
         space = self.rows["p"]
-        kinds = {"shape": raw["shape"], "motion": raw["motion"][:, :0], "coupling": raw["coupling"][:, :0]}
-        factors = Triangle("ppp", self.triangle.form).factor(raw["log_diagonal"][:, space], kinds)
+        factors = Triangle("ppp", self.triangle.form).factor(raw["log_diagonal"][:, space], raw)
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
@@ -126,16 +128,16 @@ class TriangularModel(GaussianModel):
             return super().observe(raw, query)
         return observe_triangular(
             raw["means"],
-            raw["directions"],
+            raw["directions"] if "direction" in self.observes else None,
             raw["times"] if "time" in self.observes else None,
             raw["log_diagonal"],
             raw["shape"],
             raw["motion"],
-            raw["coupling"],
+            raw["coupling"] if "coupling" in raw else raw["motion"].detach()[:, :0],
             raw["opacities"],
             query.center,
             query.time,
-            self.log_modulation["direction"],
+            self.log_modulation["direction"] if "direction" in self.observes else None,
             self.log_modulation["time"] if "time" in self.observes else None,
             conditioned_first=self.factor_order == "conditioned_first",
             form=OFF_DIAGONALS.index(self.triangle.form),
@@ -170,7 +172,7 @@ class TriangularModel(GaussianModel):
         if "time" in self.observes:
             # A child is z standard deviations along t from its parent, at most z clips. At any (t, d) it is where its
             # parent was, since K (q - mu_q) loses K_t dt and mu_p gains it.
-            sigma = factor[:, 6].norm(dim=-1, keepdim=True).clamp(max=1)
+            sigma = factor[:, -1].norm(dim=-1, keepdim=True).clamp(max=1)
             dt = torch.where(in_time, z[:, :1] * sigma, 0)
             children["means"] = children["means"] + gain[..., -1] * dt
             children["times"] = raw["times"] + dt
@@ -189,10 +191,11 @@ class TriangularModel(GaussianModel):
         gone = {"p": torch.zeros_like(still), "t": still | (classes.frozen & TIME > 0),
                 "d": still | (classes.frozen & DIRECTION > 0)}  # fmt: skip
         masks["log_diagonal"] = ~torch.stack([gone[x] for x in self.triangle.letters], -1)
-        for kind in ("motion", "coupling"):
+        for kind in self.triangle.kinds[1:]:  # all but shape
             pairs = [self.triangle.pair(place) for place in self.triangle.places[kind]]
             masks[kind] = ~torch.stack([gone[a] | gone[b] for a, b in pairs], -1)
-        masks["directions"] = ~gone["d"][:, None]
+        if "direction" in self.observes:
+            masks["directions"] = ~gone["d"][:, None]
         if "time" in self.observes:
             masks["times"] = ~gone["t"][:, None]
         return masks
@@ -203,7 +206,7 @@ class TriangularModel(GaussianModel):
 
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Freeze t, d and both, by `gsbench.models.freezing.freeze_triangular`."""
+        """Freeze t, d and both, as far as they are observed, by `gsbench.models.freezing.freeze_triangular`."""
         return freeze_triangular(self, raw, queries, weights)
 
     def factors(self, raw: Raw) -> Tensor:
@@ -213,10 +216,12 @@ class TriangularModel(GaussianModel):
 
     def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
         """Compute (lambda_d |white_d|^2 + lambda_t (t - mu_t)^2 / S_t) / 2 = -ln(f_dir f_temp), [N] (eq. 11 and 12)."""
-        half = 0.5 if self.directional_half else 1.0
-        exponent = half * self.modulation("direction") * white[:, :3].square().sum(-1)
+        exponent = torch.zeros_like(delta[:, 0])
+        if "direction" in self.observes:
+            half = 0.5 if self.directional_half else 1.0
+            exponent = half * self.modulation("direction") * white[:, :3].square().sum(-1)
         if "time" in self.observes:
-            distance = delta[:, 3] / T_qq[:, 3].norm(dim=-1)  # in standard deviations, sqrt(S_t)
+            distance = delta[:, -1] / T_qq[:, -1].norm(dim=-1)  # in standard deviations, sqrt(S_t)
             exponent = exponent + 0.5 * self.modulation("time") * distance.square()
         return exponent
 
@@ -234,5 +239,29 @@ class TriangularModel(GaussianModel):
         """Tell whether Gaussians move with time and are long in it, [N, n, n] -> [N] bool (7DGS, section 4.4)."""
         if "time" not in self.observes or not self.split_in_time:
             return torch.zeros(len(factor), dtype=torch.bool, device=factor.device)
-        S_pt = (factor[:, :3] @ factor[:, 6:].mT)[..., 0]
-        return (S_pt.norm(dim=-1) > TIME_CORRELATION * self.extent) & (factor[:, 6].norm(dim=-1) > TIME_SCALE)
+        S_pt = (factor[:, :3] @ factor[:, -1:].mT)[..., 0]
+        return (S_pt.norm(dim=-1) > TIME_CORRELATION * self.extent) & (factor[:, -1].norm(dim=-1) > TIME_SCALE)
+
+    @torch.no_grad()
+    def long_in_time(self) -> Tensor:
+        """Test |S_pt| > 0.05 extent and sqrt(S_t) > 0.25 T (7DGS, section 4.4)."""
+        return self.moves_long(self.factors(dict(self.splats.items())))
+
+
+class DirectionalModel(TriangularModel):
+    """Gaussians conditioned on d, and maybe on t."""
+
+    def __init__(self, *, lambda_d: float, directional_half: bool = True, **options: Any) -> None:
+        """Make an empty model.
+
+        Args:
+            lambda_d: initial sensitivity of f_dir.
+            directional_half: whether f_dir has the 1/2 of 7DGS eq. 12, which 6DGS lacks.
+            options: as `TriangularModel`.
+
+        Raises:
+            InputError: an option is out of its range.
+        """
+        super().__init__(**options)
+        self.modulate("direction", lambda_d)
+        self.directional_half = directional_half

@@ -11,8 +11,10 @@ from gsbench.report.intervals import LEVEL, Estimate, estimate, holm
 
 Cell = tuple[bool, bool, bool]  # simulates time, direction, AGR
 FACTORS = ("time", "direction", "AGR")
+MEAN = "mean over the others"
 PRICES = ("psnr", "seconds", "ms", "mb")
 PUBLISHED = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")  # first where two models simulate the same effects
+NESTED = ("7dgs_nodir", "7dgs_nodir_agr")  # 7dgs less direction: differ from it in nothing else, as 4dgs does
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ class Cube:
 
     cells: dict[Cell, Arm]
     prices: list[Price]
+    nested: list[Price]  # of effects within one parametrisation, with a model of NESTED in the place of another's
     missing: list[str]  # the cells that no finished run fills, in words
     left_out: list[str]  # models that simulate the same effects as one that is used
     on_demand: list[str]  # models whose Gaussians do not all have the effects, so that they price none
@@ -105,12 +108,21 @@ def cube(group: Group) -> Cube:
     rank = {name: i for i, name in enumerate(PUBLISHED)}
     whole = [arm for arm in group.main_arms if not arm.on_demand]
     for arm in sorted(whole, key=lambda arm: (rank.get(arm.model, len(rank)), arm.model)):
-        if cells.setdefault(_cell(arm), arm) is not arm:
+        if cells.setdefault(_cell(arm), arm) is not arm and arm.model not in NESTED:
             left_out.append(arm.model)
     every: list[Cell] = list(itertools.product((False, True), (False, True), (False, True)))
     missing = [_words(cell) for cell in every if cell not in cells]
     prices = [price for weights in _contrasts() if (price := _price(group, cells, *weights))]
-    return Cube(cells, prices, missing, left_out, [arm.model for arm in group.main_arms if arm.on_demand])
+    own = cells | {_cell(arm): arm for arm in whole if arm.model in NESTED}
+    nested = [
+        price
+        for name, weights in _contrasts()
+        if any(own.get(cell) is not cells.get(cell) for cell in weights)
+        and (price := _price(group, own, name, weights))
+        and price.order == 1
+        and MEAN not in price.name
+    ]
+    return Cube(cells, prices, nested, missing, left_out, [arm.model for arm in group.main_arms if arm.on_demand])
 
 
 def _cell(arm: Arm) -> Cell:
@@ -135,7 +147,7 @@ def _contrasts() -> list[tuple[str, dict[Cell, float]]]:
             each = [(_given(name, held, values), _weights(varied, held, [values], 1.0)) for values in given]
             found += each
             if size == 1:
-                found.append((f"{name}, mean over the others", _weights(varied, held, given, 1 / len(given))))
+                found.append((f"{name}, {MEAN}", _weights(varied, held, given, 1 / len(given))))
     return found
 
 

@@ -50,10 +50,10 @@ def assert_slices_agree(exact: GaussianModel, raw: dict[str, Tensor], move: Move
     assert_same(back(gradients(actual, inputs)), gradients(expected, [*raw.values(), *lambdas]))
 
 
-@pytest.mark.parametrize(("timed", "options"), VARIANTS)
-def test_slice(timed: bool, options: dict[str, Any], move: Move) -> None:
+@pytest.mark.parametrize(("name", "options"), VARIANTS)
+def test_slice(name: str, options: dict[str, Any], move: Move) -> None:
     """Catches a wrong row order, reflection, gate or derivative of any parameter."""
-    assert_slices_agree(*model_and_raw(timed, options, torch.float64), move)
+    assert_slices_agree(*model_and_raw(name, options, torch.float64), move)
 
 
 def test_rotated_slice(move: Move) -> None:
@@ -69,10 +69,10 @@ def test_still_slice(move: Move) -> None:
 
 
 @pytest.mark.parametrize("share", SHARES)
-@pytest.mark.parametrize(("timed", "options"), VARIANTS)
-def test_still_rows(timed: bool, options: dict[str, Any], share: float, move: Move) -> None:
+@pytest.mark.parametrize(("name", "options"), VARIANTS)
+def test_still_rows(name: str, options: dict[str, Any], share: float, move: Move) -> None:
     """Catches a still row that reads a column of time or direction, or leaves a gradient unwritten."""
-    exact, raw = model_and_raw(timed, options, torch.float64)
+    exact, raw = model_and_raw(name, options, torch.float64)
     exact.classes = Classes(0, round(share * 37), None)
     assert_slices_agree(exact, raw, move)
 

@@ -12,39 +12,39 @@ from gsbench.kernels.colors import show_colors
 from gsbench.kernels.operation import EVERY_ROW
 from gsbench.kernels.refine import refine
 from gsbench.kernels.slices import observe_rotated, observe_still, observe_triangular
-from gsbench.models import Query
+from gsbench.models import Query, build
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.factors import OFF_DIAGONALS
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.gaussians4d import Gaussians4DModel
-from gsbench.models.gaussians6d import Gaussians6DModel
-from gsbench.models.gaussians7d import Gaussians7DModel
 from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement
 from gsbench.models.triangular import TriangularModel
 
-VARIANTS: list[tuple[bool, dict[str, Any]]] = [
-    (True, {}),
-    (True, {"factor_order": "paper"}),
-    (True, {"off_diagonal": "raw"}),
-    (True, {"off_diagonal": "row_scaled"}),
-    (False, {}),
-    (True, {"factor_order": "paper", "off_diagonal": "raw"}),
-    (False, {"factor_order": "paper", "off_diagonal": "row_scaled", "directional_half": False}),
+VARIANTS: list[tuple[str, dict[str, Any]]] = [
+    ("7dgs", {}),
+    ("7dgs", {"factor_order": "paper"}),
+    ("7dgs", {"off_diagonal": "raw"}),
+    ("7dgs", {"off_diagonal": "row_scaled"}),
+    ("6dgs", {}),
+    ("7dgs", {"factor_order": "paper", "off_diagonal": "raw"}),
+    ("6dgs", {"factor_order": "paper", "off_diagonal": "row_scaled", "directional_half": False}),
+    ("7dgs_nodir", {}),
+    ("7dgs_nodir", {"factor_order": "paper"}),
+    ("7dgs_nodir", {"off_diagonal": "row_scaled"}),
 ]
 # The scheme that is there for comparison, where it keeps its digits.
-SUBTRACTING: list[tuple[bool, dict[str, Any]]] = [
-    (True, {"scheme": "cholesky"}),
-    (True, {"scheme": "cholesky", "factor_order": "paper"}),
-    (False, {"scheme": "cholesky", "off_diagonal": "row_scaled"}),
+SUBTRACTING: list[tuple[str, dict[str, Any]]] = [
+    ("7dgs", {"scheme": "cholesky"}),
+    ("7dgs", {"scheme": "cholesky", "factor_order": "paper"}),
+    ("6dgs", {"scheme": "cholesky", "off_diagonal": "row_scaled"}),
+    ("7dgs_nodir", {"scheme": "cholesky"}),
 ]
 
 
-def model_and_raw(
-    timed: bool, options: dict[str, Any], dtype: torch.dtype
-) -> tuple[TriangularModel, dict[str, Tensor]]:
+def model_and_raw(name: str, options: dict[str, Any], dtype: torch.dtype) -> tuple[TriangularModel, dict[str, Tensor]]:
     g = torch.Generator().manual_seed(1)
-    k, N = 4 if timed else 3, 37
+    k, N = {"7dgs": 4, "6dgs": 3, "7dgs_nodir": 1}[name], 37
     raw = {"means": torch.randn(N, 3, generator=g), "directions": torch.randn(N, 3, generator=g),
            "log_diagonal": 0.3 * torch.randn(N, k + 3, generator=g) - 0.5,
            "shape": 0.5 * torch.randn(N, 3, generator=g), "motion": 0.5 * torch.randn(N, 3 * k, generator=g),
@@ -53,13 +53,21 @@ def model_and_raw(
     if options.get("scheme") != "cholesky":
         raw["log_diagonal"][3:6] = -4.0  # so narrow that next to nothing is left of them
         raw["log_diagonal"][7:9, 0] = torch.tensor([17.0, -17.0])  # beyond where the diagonal stops
-    if timed:
+    lambdas = {"lambda_d": 0.3, "lambda_t": 0.5}
+    if name == "6dgs":
+        del lambdas["lambda_t"]
+    else:
         raw["times"] = torch.rand(N, 1, generator=g)
-    model = (
-        Gaussians7DModel(lambda_d=0.3, lambda_t=0.5, **options) if timed else Gaussians6DModel(lambda_d=0.3, **options)
-    )
+    if name == "7dgs_nodir":
+        del lambdas["lambda_d"], raw["directions"], raw["coupling"]
+    model = build(name, **lambdas, **options)
+    assert isinstance(model, TriangularModel)
     model.log_modulation.requires_grad_(True)
     return model.to(dtype), {k: v.to(dtype).requires_grad_() for k, v in raw.items()}
+
+
+def lambda_of(model: TriangularModel, variable: str) -> Tensor | None:
+    return model.log_modulation[variable] if variable in model.observes else None
 
 
 def gradients(outputs: list[Tensor], inputs: list[Tensor]) -> list[Tensor]:
@@ -77,19 +85,19 @@ def assert_same(actual: list[Tensor], expected: list[Tensor]) -> None:
 
 
 @pytest.mark.usefixtures("instruction_set")
-@pytest.mark.parametrize(("timed", "options"), VARIANTS + SUBTRACTING)
-def test_slice(timed: bool, options: dict[str, Any]) -> None:
+@pytest.mark.parametrize(("name", "options"), VARIANTS + SUBTRACTING)
+def test_slice(name: str, options: dict[str, Any]) -> None:
     """Catches a wrong row order, reflection, gate or derivative of any parameter, in every instruction set."""
     center = torch.tensor([0.3, -0.2, -3.0])
-    exact, raw = model_and_raw(timed, options, torch.float64)
+    exact, raw = model_and_raw(name, options, torch.float64)
     seen = exact.condition(raw, Query(center.double(), torch.tensor(0.4, dtype=torch.float64)))
     expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
-    model, single = model_and_raw(timed, options, torch.float32)
+    model, single = model_and_raw(name, options, torch.float32)
     lambdas = list(model.log_modulation.parameters())
     actual = list(observe_triangular(
-        single["means"], single["directions"], single.get("times"), single["log_diagonal"], single["shape"],
-        single["motion"], single["coupling"], single["opacities"], center, torch.tensor(0.4),
-        model.log_modulation["direction"], model.log_modulation["time"] if timed else None,
+        single["means"], single.get("directions"), single.get("times"), single["log_diagonal"], single["shape"],
+        single["motion"], single.get("coupling", torch.empty(37, 0)), single["opacities"], center, torch.tensor(0.4),
+        lambda_of(model, "direction"), lambda_of(model, "time"),
         conditioned_first=options.get("factor_order") != "paper", form=OFF_DIAGONALS.index(model.triangle.form),
         directional_half=model.directional_half, subtracts=model.scheme == "cholesky",
     ))  # fmt: skip
@@ -312,6 +320,10 @@ def test_errors() -> None:
         show_colors(sh0, shN, means[:5], torch.ones(5), torch.zeros(3), 3)
     with pytest.raises(InputError, match="no gradient by center"):
         show_colors(sh0, shN, means, torch.ones(21), torch.zeros(3).requires_grad_(), 3)
+    with pytest.raises(InputError, match="expected directions, times or both, got neither"):
+        observe_triangular(torch.ones(2, 3), None, None, torch.ones(2, 3), torch.ones(2, 3), torch.ones(2, 0),
+                           torch.ones(2, 0), torch.ones(2), torch.zeros(3), None, None, None,
+                           conditioned_first=True)  # fmt: skip
     with pytest.raises(InputError, match="refine: expected"):
         refine([torch.ones(4, 3)], torch.ones(64, 3), torch.ones(64), [torch.ones(3, 64)], [torch.ones(3)], *TEN)
     values, out = [torch.ones(4, 3), torch.ones(4, 7)], [torch.ones(3, 64), torch.ones(7, 64)]

@@ -64,12 +64,10 @@ def assert_still_rows(exact: GaussianModel, raw: Raw, model: GaussianModel, sing
 
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("share", SHARES)
-@pytest.mark.parametrize(("timed", "options"), VARIANTS + SUBTRACTING)
-def test_still_rows_of_triangular_factors(timed: bool, options: dict[str, Any], share: float) -> None:
+@pytest.mark.parametrize(("name", "options"), VARIANTS + SUBTRACTING)
+def test_still_rows_of_triangular_factors(name: str, options: dict[str, Any], share: float) -> None:
     """Catches a still row that reads a column of time or direction, skews otherwise, or leaves a gradient unwritten."""
-    assert_still_rows(
-        *model_and_raw(timed, options, torch.float64), *model_and_raw(timed, options, torch.float32), share
-    )
+    assert_still_rows(*model_and_raw(name, options, torch.float64), *model_and_raw(name, options, torch.float32), share)
 
 
 @pytest.mark.usefixtures("instruction_set")
@@ -81,7 +79,7 @@ def test_still_rows_of_rotated_factors(share: float) -> None:
 
 def test_a_still_row_has_no_other_gradient() -> None:
     """Catches a gradient by what is a still row's no more, in kernel and reference alike."""
-    model, raw = model_and_raw(True, {}, torch.float32)
+    model, raw = model_and_raw("7dgs", {}, torch.float32)
     model.classes = Classes(0, 10, None)
     got = dict(zip(raw, gradients(list(model.observe(raw, Query(CENTER, TIME))), list(raw.values())), strict=True))
     for name in ("directions", "times", "motion", "coupling"):
@@ -188,7 +186,7 @@ def test_rows_that_agr_does_not_move(N: int, share: float, rests: bool, monkeypa
 
 def test_rows_that_there_are_not() -> None:
     """Catches a prefix longer than the arrays, which a kernel would read past their end, and levels of another kind."""
-    model, raw = model_and_raw(True, {}, torch.float32)
+    model, raw = model_and_raw("7dgs", {}, torch.float32)
     for count in (38, -1):
         model.classes = Classes(0, count, None)
         with pytest.raises(InputError, match="sliced: expected a number of rows from 0 to 37"):

@@ -16,15 +16,17 @@ MODELS: dict[str, dict[str, Any]] = {
     "4dgs": {},
     "6dgs": {"lambda_d": 0.35, "directional_half": False},
     "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
+    "7dgs_nodir": {"lambda_t": 0.5},
 }
+TRIANGULAR = ("6dgs", "7dgs", "7dgs_nodir")
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     **{name: (name, options) for name, options in MODELS.items()},
     **{f"{name}_agr": (name, options | {"agr": True}) for name, options in MODELS.items()},
     "4dgs_constant_colors": ("4dgs", {"time_degree": 0}),
-    **{f"{name}_paper": (name, MODELS[name] | {"factor_order": "paper"}) for name in ("6dgs", "7dgs")},
+    **{f"{name}_paper": (name, MODELS[name] | {"factor_order": "paper"}) for name in TRIANGULAR},
     **{
         f"{name}_{form}": (name, MODELS[name] | {"off_diagonal": form})
-        for name in ("6dgs", "7dgs")
+        for name in TRIANGULAR
         for form in ("raw", "row_scaled")
     },
 }

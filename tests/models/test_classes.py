@@ -82,8 +82,8 @@ def freeze(model: GaussianModel) -> None:
     splats = model.splats
     with torch.no_grad():
         if isinstance(model, TriangularModel):
-            splats["motion"].zero_()
-            splats["coupling"].zero_()
+            for kind in model.triangle.kinds[1:]:
+                splats[kind].zero_()
             splats["log_diagonal"][:, model.rows["t"] + model.rows["d"]] = LOG_SIZE_MAX
         else:
             splats["right_quats"].copy_(splats["left_quats"] * torch.tensor([1, -1, -1, 1]))

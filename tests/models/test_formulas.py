@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from small import CAMERA, MODELS, N, fresh, joint, lively, raw, seeded
+from small import CAMERA, MODELS, TRIANGULAR, N, fresh, joint, lively, raw, seeded
 
 from gsbench.models import GaussianModel, Gaussians3D, Query
-from gsbench.models.factors import KINDS
 from gsbench.models.gaussians4d import TIME_GATE_MIN
 
 TIME = 0.45
@@ -28,9 +27,10 @@ def triangular_factor(log_diagonal: np.ndarray, off_diagonal: np.ndarray) -> np.
 
 
 def by_hand(model: GaussianModel, order: str, half: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means [N, 3], covariances [N, 3, 3] and opacities [N] of a 6DGS or 7DGS at CAMERA and TIME."""
+    """Means [N, 3], covariances [N, 3, 3] and opacities [N] of a model of TRIANGULAR at CAMERA and TIME."""
     values = {name: value.numpy() for name, value in raw(model).items()}
-    letters = "".join(x * (1 if x == "t" else 3) for x in order if x != "t" or "times" in values)
+    there = "p" + "t" * ("times" in values) + "d" * ("directions" in values)
+    letters = "".join(x * (1 if x == "t" else 3) for x in order if x in there)
     p, t, d = ([i for i, x in enumerate(letters) if x == which] for which in "ptd")
     below, form = model.triangle.join(raw(model)).numpy(), model.triangle.form
     means, covariances, opacities = [], [], []
@@ -40,13 +40,17 @@ def by_hand(model: GaussianModel, order: str, half: float) -> tuple[np.ndarray, 
             L[np.ix_(p, p)] = np.diag(L.diagonal()[p]) @ (np.tril(L[np.ix_(p, p)], -1) + np.eye(3))
         S = L @ L.T
         away = mean - CAMERA.numpy()
-        offset_d = away / np.linalg.norm(away) - values["directions"][i]
+        offset_d = away / np.linalg.norm(away) - values["directions"][i] if d else np.zeros(0)
         offset_t = TIME - values["times"][i] if t else np.zeros(0)
         q, offset = t + d, np.concatenate([offset_t, offset_d])
         K = S[np.ix_(p, q)] @ np.linalg.inv(S[np.ix_(q, q)])
         means.append(mean + K @ offset)
         covariances.append(S[np.ix_(p, p)] - K @ S[np.ix_(q, p)])
-        exponent = half * model.modulation("direction").item() * offset_d @ np.linalg.inv(S[np.ix_(d, d)]) @ offset_d
+        exponent = 0.0
+        if d:
+            exponent = (
+                half * model.modulation("direction").item() * offset_d @ np.linalg.inv(S[np.ix_(d, d)]) @ offset_d
+            )
         if t:
             exponent += 0.5 * model.modulation("time").item() * offset_t[0] ** 2 / S[t[0], t[0]]
         opacities.append(math.exp(-exponent) / (1 + math.exp(-values["opacities"][i])))
@@ -62,7 +66,7 @@ def agree(sliced: Gaussians3D, means: np.ndarray, covariances: np.ndarray, opaci
 @pytest.mark.parametrize("form", ["relative", "raw"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize("name", ["6dgs", "7dgs"])
+@pytest.mark.parametrize("name", TRIANGULAR)
 def test_triangular_models(name: str, order: str, scheme: str, form: str) -> None:
     """Catches a wrong row order, a conditional block where f_temp or f_dir takes the marginal one, a wrong lambda."""
     model = lively(name, factor_order=order, scheme=scheme, off_diagonal=form)
@@ -78,7 +82,7 @@ def test_directional_half(name: str, half: bool) -> None:
     assert MODELS["6dgs"]["directional_half"] is False
 
 
-@pytest.mark.parametrize("name", ["6dgs", "7dgs"])
+@pytest.mark.parametrize("name", TRIANGULAR)
 def test_factor_orders_are_coordinates_of_one_family(name: str) -> None:
     """Catches an order that is another model: the same covariance, written in either, gives the same slice."""
     paper, first = lively(name, factor_order="paper"), lively(name, seed=3, factor_order="conditioned_first")
@@ -95,12 +99,12 @@ def test_factor_orders_are_coordinates_of_one_family(name: str) -> None:
     agree(b, a.means.detach().numpy(), covariance, a.opacities.detach().numpy())
 
 
-@pytest.mark.parametrize("name", ["6dgs", "7dgs"])
+@pytest.mark.parametrize("name", TRIANGULAR)
 @pytest.mark.parametrize("order", ORDERS)
 def test_far_from_the_query(name: str, order: str) -> None:
     """Catches 0 x inf in the gradient of a Gaussian so thin in t or d that nothing of it is seen (float32)."""
     model = fresh(name, factor_order=order)
-    for kind in KINDS:
+    for kind in model.triangle.kinds:
         model.splats[kind].data.normal_(generator=seeded(1))
     model.splats["log_diagonal"].data.fill_(-30.0)
     sliced = model.slice(Query.at(CAMERA.float(), TIME))

@@ -140,6 +140,27 @@ def test_a_second_model_with_the_same_effects_is_left_out_and_named():
     assert found.prices[0].models == "4dgs − 3dgs"
 
 
+def test_effects_are_priced_within_one_parametrisation_too():
+    """Catches a nested price computed across parametrisations, or one that replaces the published price."""
+    less = [
+        dataclasses.replace(
+            r, model="7dgs_nodir", per_view=[dataclasses.replace(v, psnr=v.psnr + 2) for v in r.per_view]
+        )
+        for r in cells("4dgs")
+    ]
+    published = cells("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
+    found = compare.cube(group(*published, *less))
+    assert found.prices == compare.cube(group(*published)).prices
+    assert {p.models: p.costs["psnr"].mean for p in found.nested} == {
+        "7dgs_nodir − 3dgs": pytest.approx(6.0),
+        "7dgs_noagr − 7dgs_nodir": pytest.approx(1.0),
+    }
+    assert found.left_out == []
+    alone = compare.cube(group(*[r for r in published if r.model != "4dgs"], *less))
+    assert alone.nested == []
+    assert "7dgs_noagr − 7dgs_nodir" in {p.models for p in alone.prices}
+
+
 def test_seconds_of_another_machine_do_not_count():
     """Catches seconds of two machines in one difference."""
     runs = cells("3dgs", "4dgs")

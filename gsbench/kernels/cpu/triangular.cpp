@@ -14,19 +14,20 @@ namespace {
 constexpr int64_t CHUNK = 512;  // Gaussians a task; the gradients of lambda are summed by chunks
 
 TriangularModel model_of(const TriangularArgs& a) {
-    return {a.conditioned_first, a.form, a.half, expf(*a.log_lambda_d), a.times ? expf(*a.log_lambda_t) : 0.0f,
-            {a.center[0], a.center[1], a.center[2]}, a.times ? *a.time : 0.0f};
+    return {a.conditioned_first, a.form, a.half, a.directions ? expf(*a.log_lambda_d) : 0.0f,
+            a.times ? expf(*a.log_lambda_t) : 0.0f, {a.center[0], a.center[1], a.center[2]}, a.times ? *a.time : 0.0f};
 }
 
-template <bool TIME>
-GSB_HD inline void load(const TriangularArgs& a, int64_t i, int n, TriangularParameters<Vec, TIME>& p) {
+template <Query Q>
+GSB_HD inline void load(const TriangularArgs& a, int64_t i, int n, TriangularParameters<Vec, Q>& p) {
+    using P = TriangularParameters<Vec, Q>;
     gather_row(a.means, i, n, p.mean);
-    gather_row(a.directions, i, n, p.direction);
-    if constexpr (TIME) p.time = load_first(a.times + i, n);
+    if constexpr (P::DIRECTION) gather_row(a.directions, i, n, p.direction);
+    if constexpr (P::TIME) p.time = load_first(a.times + i, n);
     gather_row(a.log_diagonal, i, n, p.log_diagonal);
     gather_row(a.shape, i, n, p.shape);
     gather_row(a.motion, i, n, p.motion);
-    gather_row(a.coupling, i, n, p.coupling);
+    if constexpr (P::COUPLED) gather_row(a.coupling, i, n, p.coupling);
     p.opacity = load_first(a.opacities + i, n);
 }
 
@@ -36,15 +37,15 @@ GSB_HD inline void load(const ObservationGrads& o, int64_t i, int n, Observed<Ve
     out.opacity = load_first(o.opacities + i, n);
 }
 
-template <bool TIME, template <class, int> class Reduction>
+template <Query Q, template <class, int> class Reduction>
 void observe(const TriangularArgs& a, const Observation& out) {
     const TriangularModel model = model_of(a);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.sliced > CHUNK)
     for (int64_t i = 0; i < a.sliced; i += LANES) {
         const int n = lanes_from(i, a.sliced);
-        TriangularParameters<Vec, TIME> raw;
-        load<TIME>(a, i, n, raw);
-        TriangularGaussian<Vec, TIME, Reduction> gaussian(model, raw);
+        TriangularParameters<Vec, Q> raw;
+        load<Q>(a, i, n, raw);
+        TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
         const Observed<Vec> seen = gaussian.observe();
         scatter_row(seen.mean, out.means, i, n);
         scatter_matrix(seen.factor, out.factors, i, n);
@@ -52,7 +53,7 @@ void observe(const TriangularArgs& a, const Observation& out) {
     }
 }
 
-template <bool TIME, template <class, int> class Reduction>
+template <Query Q, template <class, int> class Reduction>
 void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     const TriangularModel model = model_of(a);
     const int64_t chunks = (a.sliced + CHUNK - 1) / CHUNK;
@@ -63,20 +64,20 @@ void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, co
         Vec lambda_d(0.0f), lambda_t(0.0f);
         for (int64_t i = chunk * CHUNK; i < end; i += LANES) {
             const int n = lanes_from(i, end);
-            TriangularParameters<Vec, TIME> raw, g;
+            TriangularParameters<Vec, Q> raw, g;
             Observed<Vec> given;
-            load<TIME>(a, i, n, raw);
+            load<Q>(a, i, n, raw);
             load(grads, i, n, given);
-            TriangularGaussian<Vec, TIME, Reduction> gaussian(model, raw);
+            TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
             gaussian.observe();
             gaussian.vjp(given, g);
             scatter_row(g.mean, out.means, i, n);
-            scatter_row(g.direction, out.directions, i, n);
-            if constexpr (TIME) store_first(g.time, out.times + i, n);
+            if constexpr (g.DIRECTION) scatter_row(g.direction, out.directions, i, n);
+            if constexpr (g.TIME) store_first(g.time, out.times + i, n);
             scatter_row(g.log_diagonal, out.log_diagonal, i, n);
             scatter_row(g.shape, out.shape, i, n);
             scatter_row(g.motion, out.motion, i, n);
-            scatter_row(g.coupling, out.coupling, i, n);
+            if constexpr (g.COUPLED) scatter_row(g.coupling, out.coupling, i, n);
             store_first(g.opacity, out.opacities + i, n);
             lambda_d += g.lambda_d;  // lanes past the end were given zero
             lambda_t += g.lambda_t;
@@ -86,8 +87,8 @@ void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, co
     }
     double totals[2] = {};
     for (size_t k = 0; k < static_cast<size_t>(chunks) * 2; ++k) totals[k % 2] += lambdas[k];
-    *out.log_lambda_d = static_cast<float>(totals[0]) * model.lambda_d;
-    if constexpr (TIME) *out.log_lambda_t = static_cast<float>(totals[1]) * model.lambda_t;
+    if (a.directions) *out.log_lambda_d = static_cast<float>(totals[0]) * model.lambda_d;
+    if (a.times) *out.log_lambda_t = static_cast<float>(totals[1]) * model.lambda_t;
 }
 
 // What a still row is made of: of its log_diagonal, the columns of p only.
@@ -96,7 +97,7 @@ struct StillRows {
     int width, space;  // of log_diagonal; where the columns of p begin
 
     GSB_HD explicit StillRows(const TriangularArgs& a)
-        : a(a), width(a.times ? 7 : 6), space(a.conditioned_first ? width - 3 : 0) {}
+        : a(a), width(3 + (a.directions ? 3 : 0) + (a.times ? 1 : 0)), space(a.conditioned_first ? width - 3 : 0) {}
 
     GSB_HD void load(int64_t i, int n, StillTriangularParameters<Vec>& p) const {
         gather_columns(a.log_diagonal, width, space, i, n, p.log_diagonal);
@@ -134,7 +135,7 @@ void observe_still_rows_backward(const TriangularArgs& a, const ObservationGrads
     const int k = rows.width - 3;
     rows.each_chunk([&](int64_t first, int64_t end) {
         copy_rows(grads.means, out.means, 3, first, end);
-        fill_zero(out.directions, 3, first, end);
+        if (a.directions) fill_zero(out.directions, 3, first, end);
         if (a.times) fill_zero(out.times, 1, first, end);
         fill_zero(out.log_diagonal, rows.width, first, end);
         fill_zero(out.motion, 3 * k, first, end);
@@ -153,24 +154,26 @@ void observe_still_rows_backward(const TriangularArgs& a, const ObservationGrads
     });
 }
 
+// Calls run<Query, Reduction>() as the arguments say.
+template <class Run>
+void dispatch(const TriangularArgs& a, Run run) {
+    const auto reduced_by = [&]<template <class, int> class Reduction>() {
+        if (a.directions && a.times) return run.template operator()<Query::both, Reduction>();
+        a.times ? run.template operator()<Query::time, Reduction>() : run.template operator()<Query::direction, Reduction>();
+    };
+    a.subtracts ? reduced_by.template operator()<Subtraction>() : reduced_by.template operator()<Reflections>();
+}
+
 }  // namespace
 
 void observe_triangular(const TriangularArgs& a, const Observation& out) {
     observe_still_rows(a, out);
-    if (a.subtracts) {
-        a.times ? observe<true, Subtraction>(a, out) : observe<false, Subtraction>(a, out);
-    } else {
-        a.times ? observe<true, Reflections>(a, out) : observe<false, Reflections>(a, out);
-    }
+    dispatch(a, [&]<Query Q, template <class, int> class Reduction>() { observe<Q, Reduction>(a, out); });
 }
 
 void observe_triangular_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     observe_still_rows_backward(a, grads, out);
-    if (a.subtracts) {
-        a.times ? observe_backward<true, Subtraction>(a, grads, out) : observe_backward<false, Subtraction>(a, grads, out);
-    } else {
-        a.times ? observe_backward<true, Reflections>(a, grads, out) : observe_backward<false, Reflections>(a, grads, out);
-    }
+    dispatch(a, [&]<Query Q, template <class, int> class Reduction>() { observe_backward<Q, Reduction>(a, grads, out); });
 }
 
 }  // namespace GSB_ISA

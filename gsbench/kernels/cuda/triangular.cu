@@ -11,96 +11,97 @@ namespace gsb::cuda {
 namespace {
 
 // CONDITIONED is known to the compiler: where the factor is triangular in the right order, no reflection is compiled in.
-template <bool TIME, bool CONDITIONED>
+template <Query Q, bool CONDITIONED>
 __device__ TriangularModel model_of(const TriangularArgs& a) {
-    return {CONDITIONED, a.form, a.half, expf(*a.log_lambda_d), TIME ? expf(*a.log_lambda_t) : 0.0f,
-            {a.center[0], a.center[1], a.center[2]}, TIME ? *a.time : 0.0f};
+    using P = TriangularParameters<float, Q>;
+    return {CONDITIONED, a.form, a.half, P::DIRECTION ? expf(*a.log_lambda_d) : 0.0f,
+            P::TIME ? expf(*a.log_lambda_t) : 0.0f, {a.center[0], a.center[1], a.center[2]}, P::TIME ? *a.time : 0.0f};
 }
 
-template <bool TIME>
-__device__ TriangularParameters<float, TIME> parameters(const TriangularArgs& a, int64_t i) {
-    TriangularParameters<float, TIME> p{};
+template <Query Q>
+__device__ TriangularParameters<float, Q> parameters(const TriangularArgs& a, int64_t i) {
+    TriangularParameters<float, Q> p{};
     load_row(a.means, i, p.mean);
-    load_row(a.directions, i, p.direction);
-    if constexpr (TIME) p.time = a.times[i];
+    if constexpr (p.DIRECTION) load_row(a.directions, i, p.direction);
+    if constexpr (p.TIME) p.time = a.times[i];
     load_row(a.log_diagonal, i, p.log_diagonal);
     load_row(a.shape, i, p.shape);
     load_row(a.motion, i, p.motion);
-    load_row(a.coupling, i, p.coupling);
+    if constexpr (p.COUPLED) load_row(a.coupling, i, p.coupling);
     p.opacity = a.opacities[i];
     return p;
 }
 
 // The rows of p in log_diagonal.
-template <bool TIME, bool CONDITIONED>
-constexpr int SPACE = CONDITIONED ? TriangularParameters<float, TIME>::K : 0;
+template <Query Q, bool CONDITIONED>
+constexpr int SPACE = CONDITIONED ? TriangularParameters<float, Q>::K : 0;
 
-template <bool TIME, bool CONDITIONED>
+template <Query Q, bool CONDITIONED>
 __device__ StillTriangularParameters<float> still_parameters(const TriangularArgs& a, int64_t i) {
     StillTriangularParameters<float> p{};
-    const float* log_diagonal = a.log_diagonal + i * TriangularParameters<float, TIME>::N + SPACE<TIME, CONDITIONED>;
+    const float* log_diagonal = a.log_diagonal + i * TriangularParameters<float, Q>::N + SPACE<Q, CONDITIONED>;
     GSB_UNROLL for (int k = 0; k < 3; ++k) p.log_diagonal[k] = log_diagonal[k];
     load_row(a.shape, i, p.shape);
     p.opacity = a.opacities[i];
     return p;
 }
 
-template <bool TIME, bool CONDITIONED>
+template <Query Q, bool CONDITIONED>
 __global__ void observe_kernel(TriangularArgs a, Observation out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
     if (i >= a.sliced) {
-        const auto raw = still_parameters<TIME, CONDITIONED>(a, i);
+        const auto raw = still_parameters<Q, CONDITIONED>(a, i);
         const StillTriangularGaussian<float> gaussian(raw, a.form);
         store_still(gaussian, a.means, out, i);
         return;
     }
-    const TriangularModel model = model_of<TIME, CONDITIONED>(a);
-    const auto raw = parameters<TIME>(a, i);
-    const Observed<float> seen = TriangularGaussian<float, TIME>(model, raw).observe();
+    const TriangularModel model = model_of<Q, CONDITIONED>(a);
+    const auto raw = parameters<Q>(a, i);
+    const Observed<float> seen = TriangularGaussian<float, Q>(model, raw).observe();
     store_observed(seen, out, i);
 }
 
-template <bool TIME, bool CONDITIONED>
+template <Query Q, bool CONDITIONED>
 __global__ void observe_backward_kernel(TriangularArgs a, ObservationGrads grads, TriangularGrads out) {
     const int64_t i = global_thread();
-    TriangularParameters<float, TIME> g{};  // of a still row mostly zero
+    TriangularParameters<float, Q> g{};  // of a still row mostly zero
     if (i >= a.sliced && i < a.N) {
-        const auto raw = still_parameters<TIME, CONDITIONED>(a, i);
+        const auto raw = still_parameters<Q, CONDITIONED>(a, i);
         StillTriangularParameters<float> g_still{};
         const Observed<float> given = load_observed(grads, i);
         StillTriangularGaussian<float>(raw, a.form).vjp(given.factor, given.opacity, g_still);
         GSB_UNROLL for (int k = 0; k < 3; ++k) {
             g.mean[k] = given.mean[k];
-            g.log_diagonal[SPACE<TIME, CONDITIONED> + k] = g_still.log_diagonal[k];
+            g.log_diagonal[SPACE<Q, CONDITIONED> + k] = g_still.log_diagonal[k];
             g.shape[k] = g_still.shape[k];
         }
         g.opacity = g_still.opacity;
     } else if (i < a.N) {
-        const TriangularModel model = model_of<TIME, CONDITIONED>(a);
-        const auto raw = parameters<TIME>(a, i);
-        TriangularGaussian<float, TIME> gaussian(model, raw);
+        const TriangularModel model = model_of<Q, CONDITIONED>(a);
+        const auto raw = parameters<Q>(a, i);
+        TriangularGaussian<float, Q> gaussian(model, raw);
         gaussian.observe();
         gaussian.vjp(load_observed(grads, i), g);
     }
     if (i < a.N) {
         store_row(g.mean, out.means, i);
-        store_row(g.direction, out.directions, i);
-        if constexpr (TIME) out.times[i] = g.time;
+        if constexpr (g.DIRECTION) store_row(g.direction, out.directions, i);
+        if constexpr (g.TIME) out.times[i] = g.time;
         store_row(g.log_diagonal, out.log_diagonal, i);
         store_row(g.shape, out.shape, i);
         store_row(g.motion, out.motion, i);
-        store_row(g.coupling, out.coupling, i);
+        if constexpr (g.COUPLED) store_row(g.coupling, out.coupling, i);
         out.opacities[i] = g.opacity;
     }
     const float lambda_d = warp_sum(g.lambda_d), lambda_t = warp_sum(g.lambda_t);
     if (threadIdx.x % WARP == 0) {
-        atomicAdd(out.log_lambda_d, lambda_d * expf(*a.log_lambda_d));
-        if constexpr (TIME) atomicAdd(out.log_lambda_t, lambda_t * expf(*a.log_lambda_t));
+        if constexpr (g.DIRECTION) atomicAdd(out.log_lambda_d, lambda_d * expf(*a.log_lambda_d));
+        if constexpr (g.TIME) atomicAdd(out.log_lambda_t, lambda_t * expf(*a.log_lambda_t));
     }
 }
 
-// Calls run<TIME, CONDITIONED>() as the arguments say.
+// Calls run<Query, CONDITIONED>() as the arguments say.
 template <class Run>
 void dispatch(const TriangularArgs& a, Run run) {
     if (a.subtracts) {
@@ -108,25 +109,25 @@ void dispatch(const TriangularArgs& a, Run run) {
             "observe_triangular: expected the square-root scheme on a GPU, got one that subtracts");
     }
     if (a.N == 0) return;
-    if (a.times) {
-        a.conditioned_first ? run.template operator()<true, true>() : run.template operator()<true, false>();
-    } else {
-        a.conditioned_first ? run.template operator()<false, true>() : run.template operator()<false, false>();
-    }
+    const auto conditioned_on = [&]<Query Q>() {
+        a.conditioned_first ? run.template operator()<Q, true>() : run.template operator()<Q, false>();
+    };
+    if (a.directions && a.times) return conditioned_on.template operator()<Query::both>();
+    a.times ? conditioned_on.template operator()<Query::time>() : conditioned_on.template operator()<Query::direction>();
 }
 
 }  // namespace
 
 void observe_triangular(const TriangularArgs& a, const Observation& out, Stream stream) {
-    dispatch(a, [&]<bool TIME, bool CONDITIONED>() {
-        launch(observe_kernel<TIME, CONDITIONED>, small_blocks(a.N), SMALL_BLOCK, stream, a, out);
+    dispatch(a, [&]<Query Q, bool CONDITIONED>() {
+        launch(observe_kernel<Q, CONDITIONED>, small_blocks(a.N), SMALL_BLOCK, stream, a, out);
     });
 }
 
 void observe_triangular_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out,
                                  Stream stream) {
-    dispatch(a, [&]<bool TIME, bool CONDITIONED>() {
-        launch(observe_backward_kernel<TIME, CONDITIONED>, small_blocks(a.N), SMALL_BLOCK, stream, a, grads, out);
+    dispatch(a, [&]<Query Q, bool CONDITIONED>() {
+        launch(observe_backward_kernel<Q, CONDITIONED>, small_blocks(a.N), SMALL_BLOCK, stream, a, grads, out);
     });
 }
 

@@ -1,4 +1,5 @@
-// One Gaussian over position, direction and maybe time with a triangular factor (6DGS, 7DGS): its slice, and backwards.
+// One Gaussian over position and direction, time or both with a triangular factor (6DGS, 7DGS, 7DGS without direction):
+// its slice, and backwards.
 #pragma once
 
 #include "harmonics.h"
@@ -7,6 +8,9 @@
 
 namespace gsb {
 inline namespace GSB_ISA {
+
+// What a Gaussian is conditioned on. Rows of a factor are ordered d before t.
+enum class Query { direction, time, both };
 
 // What is the same for all Gaussians of a model.
 struct TriangularModel {
@@ -23,19 +27,22 @@ struct Observed {
     T mean[3], factor[3][3], opacity;
 };
 
-template <class T, bool TIME>
+template <class T, Query Q>
 struct TriangularParameters {
-    static constexpr int K = TIME ? 4 : 3, N = K + 3;
+    static constexpr bool DIRECTION = Q != Query::time, TIME = Q != Query::direction;
+    static constexpr int TIME_ROW = DIRECTION ? 3 : 0, K = TIME_ROW + TIME, N = K + 3;
+    static constexpr bool COUPLED = K > 1;  // else there is no entry within q, and `coupling` is not used
     T mean[3], direction[3], time, log_diagonal[N];
-    T shape[3], motion[3 * K], coupling[K * (K - 1) / 2];  // below the diagonal, row by row: `entry` says which is which
-    T opacity;                                             // a logit
-    T lambda_d, lambda_t;                                  // in gradients only
+    T shape[3], motion[3 * K], coupling[COUPLED ? K * (K - 1) / 2 : 1];  // row by row: `entry` says which is which
+    T opacity;                                                           // a logit
+    T lambda_d, lambda_t;                                                // in gradients only
 };
 
-template <class T, bool TIME, template <class, int> class Reduction = Reflections>
+template <class T, Query Q, template <class, int> class Reduction = Reflections>
 struct TriangularGaussian {
-    using Parameters = TriangularParameters<T, TIME>;
-    static constexpr int K = Parameters::K, N = Parameters::N;
+    using Parameters = TriangularParameters<T, Q>;
+    static constexpr bool DIRECTION = Parameters::DIRECTION, TIME = Parameters::TIME;
+    static constexpr int TIME_ROW = Parameters::TIME_ROW, K = Parameters::K, N = Parameters::N;
 
     const TriangularModel& model;
     const Parameters& raw;
@@ -48,7 +55,7 @@ struct TriangularGaussian {
     GSB_HD TriangularGaussian(const TriangularModel& model, const Parameters& raw) : model(model), raw(raw) {}
 
     // The factor's row of each row of (d, t, p).
-    GSB_HD int row(int i) const { return model.conditioned_first ? i : i < 3 ? N - 3 + i : i < K ? 3 : i - K; }
+    GSB_HD int row(int i) const { return model.conditioned_first ? i : i < TIME_ROW ? N - 3 + i : i < K ? 3 : i - K; }
 
     GSB_HD Observed<T> observe() {
         const T zero(0.0f);
@@ -69,19 +76,22 @@ struct TriangularGaussian {
             reduction.reduce(rows, t);
         }
         T delta[K];
-        offset = {raw.mean[0] - model.center[0], raw.mean[1] - model.center[1], raw.mean[2] - model.center[2]};
-        const Vec3<T> d = Unit<T>(offset).direction;
-        delta[0] = d.x - raw.direction[0];
-        delta[1] = d.y - raw.direction[1];
-        delta[2] = d.z - raw.direction[2];
-        if constexpr (TIME) delta[3] = T(model.time) - raw.time;
+        if constexpr (DIRECTION) {
+            offset = {raw.mean[0] - model.center[0], raw.mean[1] - model.center[1], raw.mean[2] - model.center[2]};
+            const Vec3<T> d = Unit<T>(offset).direction;
+            delta[0] = d.x - raw.direction[0];
+            delta[1] = d.y - raw.direction[1];
+            delta[2] = d.z - raw.direction[2];
+        }
+        if constexpr (TIME) delta[TIME_ROW] = T(model.time) - raw.time;
         whiten(t, delta, white);
-        T exponent = (white[0] * white[0] + white[1] * white[1] + white[2] * white[2]) * (model.half * model.lambda_d);
+        T exponent = zero;
+        if constexpr (DIRECTION) exponent = squares_d() * (model.half * model.lambda_d);
         if constexpr (TIME) {
             spread_t = zero;
-            GSB_UNROLL for (int j = 0; j < K; ++j) spread_t = spread_t + t.qq[3][j] * t.qq[3][j];
+            GSB_UNROLL for (int j = 0; j < K; ++j) spread_t = spread_t + t.qq[TIME_ROW][j] * t.qq[TIME_ROW][j];
             spread_t = sqrt(spread_t);
-            delta_t = delta[3] / spread_t;
+            delta_t = delta[TIME_ROW] / spread_t;
             exponent = exponent + delta_t * delta_t * (0.5f * model.lambda_t);
         }
         // What is too far from the query to be seen stays where it is, lest its huge numbers reach a gradient.
@@ -113,11 +123,11 @@ struct TriangularGaussian {
         }
         out.opacity = g.opacity * gate * opacity * (T(1.0f) - opacity);
         const T g_exponent = zero - g.opacity * opacity * gate;
-        const T squares = white[0] * white[0] + white[1] * white[1] + white[2] * white[2];
-        out.lambda_d = g_exponent * squares * model.half;
+        out.lambda_d = zero;
+        if constexpr (DIRECTION) out.lambda_d = g_exponent * squares_d() * model.half;
         T g_white[K];
         GSB_UNROLL for (int i = 0; i < K; ++i) {
-            g_white[i] = i < 3 ? g_exponent * white[i] * (2.0f * model.half * model.lambda_d) : zero;
+            g_white[i] = i < TIME_ROW ? g_exponent * white[i] * (2.0f * model.half * model.lambda_d) : zero;
         }
         moved_mean_vjp(t, white, {g.mean[0], g.mean[1], g.mean[2]}, g_white, g_t);
         const auto seen = gate > zero;
@@ -127,19 +137,27 @@ struct TriangularGaussian {
         if constexpr (TIME) {
             out.lambda_t = g_exponent * delta_t * delta_t * 0.5f;
             const T g_distance = g_exponent * delta_t * model.lambda_t / spread_t;
-            out.time = zero - g_white[3] - g_distance;
+            out.time = zero - g_white[TIME_ROW] - g_distance;
             const T g_spread = g_distance * delta_t / spread_t;
-            GSB_UNROLL for (int j = 0; j < K; ++j) g_t.qq[3][j] = g_t.qq[3][j] - g_spread * t.qq[3][j];
+            GSB_UNROLL for (int j = 0; j < K; ++j) {
+                g_t.qq[TIME_ROW][j] = g_t.qq[TIME_ROW][j] - g_spread * t.qq[TIME_ROW][j];
+            }
         }
-        const Vec3<T> g_offset = Unit<T>(offset).vjp({g_white[0], g_white[1], g_white[2]});
-        out.mean[0] = g.mean[0] + g_offset.x;
-        out.mean[1] = g.mean[1] + g_offset.y;
-        out.mean[2] = g.mean[2] + g_offset.z;
-        GSB_UNROLL for (int i = 0; i < 3; ++i) out.direction[i] = zero - g_white[i];
+        GSB_UNROLL for (int i = 0; i < 3; ++i) out.mean[i] = g.mean[i];
+        if constexpr (DIRECTION) {
+            const Vec3<T> g_offset = Unit<T>(offset).vjp({g_white[0], g_white[1], g_white[2]});
+            out.mean[0] = out.mean[0] + g_offset.x;
+            out.mean[1] = out.mean[1] + g_offset.y;
+            out.mean[2] = out.mean[2] + g_offset.z;
+            GSB_UNROLL for (int i = 0; i < 3; ++i) out.direction[i] = zero - g_white[i];
+        }
         factor_vjp(g_t, out);
     }
 
 private:
+    // |white_d|^2
+    GSB_HD T squares_d() const { return white[0] * white[0] + white[1] * white[1] + white[2] * white[2]; }
+
     // Nothing is left to do for a square root of that order; a scheme that subtracts never knows.
     GSB_HD bool is_reduced() const { return model.conditioned_first && Reduction<T, K>::KEEPS_REDUCED; }
 
@@ -147,12 +165,12 @@ private:
     // coupling in neither.
     template <bool FIRST, class P>
     GSB_HD static auto& entry(P& p, int i, int j) {
-        constexpr int Q = FIRST ? 0 : 3, SPACE = FIRST ? K : 0;  // the first row of q, and of p
+        constexpr int QUERY = FIRST ? 0 : 3, SPACE = FIRST ? K : 0;  // the first row of q, and of p
         const bool row_in_space = FIRST ? i >= K : i < 3, column_in_space = FIRST ? j >= K : j < 3;
         if (row_in_space && column_in_space) return p.shape[(i - SPACE) * (i - SPACE - 1) / 2 + j - SPACE];
         if (row_in_space) return p.motion[(i - SPACE) * K + j];
-        if (column_in_space) return p.motion[(i - Q) * 3 + j];
-        return p.coupling[(i - Q) * (i - Q - 1) / 2 + j - Q];
+        if (column_in_space) return p.motion[(i - QUERY) * 3 + j];
+        return p.coupling[(i - QUERY) * (i - QUERY - 1) / 2 + j - QUERY];
     }
 
     // Whether the entry (i, j) is stated in units of its row's diagonal.

@@ -1,6 +1,7 @@
 """Write the sections on worth: the price of each effect, where the seconds go, whether differences are real."""
 
 import math
+from dataclasses import replace
 from statistics import fmean
 
 from gsbench.report import compare
@@ -16,8 +17,10 @@ REST = "other"
 MOST_PAIRS = 28  # that are drawn: those of eight models
 PARAMETRISATION = (
     "4dgs is another parametrisation of a Gaussian than 7dgs without direction, so direction given time is priced "
-    "across the two. The nested comparison, 7dgs with d frozen, needs runs that are not among these records."
+    "across the two."
 )
+NOT_NESTED = "The nested comparison, with model=7dgs_nodir, needs runs that are not among these records."
+NESTED = "Nested: 7dgs_nodir, which is 7dgs less direction and nothing else, in the place of 4dgs."
 
 
 def effects_section(group: Group, canvas: Canvas) -> Section:
@@ -31,13 +34,14 @@ def effects_section(group: Group, canvas: Canvas) -> Section:
     if cube.on_demand:
         notes.append(f"Left out, as their Gaussians keep only the effects that pay: {words.listing(cube.on_demand)}.")
     if {"4dgs", "7dgs_noagr"} <= {arm.model for arm in cube.cells.values()}:
-        notes.append(PARAMETRISATION)
+        notes.append(f"{PARAMETRISATION} {NESTED if cube.nested else NOT_NESTED}")
     if not cube.prices:
         text = "No two finished models differ in one effect alone, so no effect can be priced."
         return Section("effects", "The price of each effect", [text], notes=notes)
+    shown = cube.prices + [replace(price, name=f"{price.name}, nested") for price in cube.nested]
     drawings = []
     for unit, title, digits in UNITS:
-        rows = [_row(price, price.costs[unit], digits) for price in cube.prices if price.costs[unit].scenes]
+        rows = [_row(price, price.costs[unit], digits) for price in shown if price.costs[unit].scenes]
         if rows:
             alt = f"Change in {title} of {words.listing([row.label for row in rows])}"
             drawings.append(Drawing(f"in {title}", charts.differences(rows, title).svg(f"{canvas.name}e{unit}", alt)))
@@ -50,7 +54,7 @@ def effects_section(group: Group, canvas: Canvas) -> Section:
             p.models,
             *(v for unit, _, _ in UNITS for v in (p.costs[unit].mean, p.costs[unit].low, p.costs[unit].high)),
         ]
-        for p in cube.prices
+        for p in shown
     ]
     table = Table("effects.csv", columns, priced)
     return Section("effects", "The price of each effect", _effect_words(cube), [Tab("", drawings)], table, notes=notes)
@@ -67,7 +71,7 @@ def _is_real(of: Estimate) -> bool:
 
 def _effect_words(cube: Cube) -> list[str]:
     """Say which effect is worth most, what it costs, which are not told from nothing, and how they interact."""
-    single = [p for p in cube.prices if p.order == 1 and "mean over" not in p.name]
+    single = [p for p in cube.prices if p.order == 1 and compare.MEAN not in p.name]
     best = max(single, key=lambda p: p.costs["psnr"].mean)
     gain, seconds = best.costs["psnr"], best.costs["seconds"]
     text = f"Worth most: {best.name}, {words.signed(gain.mean)} dB ({words.interval(gain, sign=True)})"
@@ -76,12 +80,17 @@ def _effect_words(cube: Cube) -> list[str]:
         text = f"No effect raises PSNR here; the least harm does {best.name}, {words.signed(gain.mean)} dB."
     unclear = [p.name for p in single if p.costs["psnr"].over and not _is_real(p.costs["psnr"])]
     said = [text, f"Not told from nothing in dB: {words.listing(unclear)}." if unclear else ""]
+    for price in cube.nested:
+        if price.name.startswith("direction"):
+            of = price.costs["psnr"]
+            said.append(f"{price.name.capitalize()}, within one parametrisation: {words.signed(of.mean)} dB "
+                        f"({words.interval(of, sign=True)}).")  # fmt: skip
     for price in cube.prices:
         of = price.costs["psnr"]
         if price.order == 2 and _is_real(of):
             side = f"{words.plain(abs(of.mean))} dB {'less' if of.mean < 0 else 'more'} than apart"
             said.append(f"{price.name.capitalize()}: together they bring {side} ({words.interval(of, sign=True)}).")
-    return [s for s in said[:4] if s]
+    return [s for s in said[:5] if s]
 
 
 def stages_section(group: Group, canvas: Canvas) -> Section:
