@@ -18,7 +18,7 @@ from gsbench.measure.record import ViewScore
 from gsbench.report import live
 from gsbench.report.__main__ import main
 from gsbench.report.arms import groups
-from gsbench.report.page import build, cost, evidence, gallery, time_to_quality, words, worth
+from gsbench.report.page import build, cost, evidence, gallery, palette, time_to_quality, words, worth
 from gsbench.report.page.content import Canvas, Column, Runs, Table
 from gsbench.report.page.events import of as events_of
 from gsbench.report.page.palette import DARK, LIGHT, MARKERS, styles
@@ -242,6 +242,8 @@ def test_a_model_keeps_its_colour():
     assert styles(["3dgs", "7dgs"])["7dgs"] == styles(["7dgs"])["7dgs"]
     many = styles(["3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "mine", "other"])
     assert len({s.marker for s in many.values()}) == 7
+    known = styles([*palette.MODELS, "mine"])
+    assert len({s.colour for s in known.values()}) == len({s.marker for s in known.values()}) == len(known)
     assert len(styles([f"m{i}" for i in range(40)])) == 40
 
 

@@ -1,12 +1,13 @@
 """Give every model its colour and its marker, the same in all figures, for eyes of every kind and for both themes.
 
-The hues are those of Okabe and Ito, which people with the common colour deficiencies tell apart, darkened for a white
-page and lightened for a black one to a contrast of at least 4.5:1. Markers tell the models apart without colour.
+The first hues are those of Okabe and Ito, which people with the common colour deficiencies tell apart, darkened for a
+white page and lightened for a black one to a contrast of at least 4.5:1. Markers tell the models apart without colour.
 """
 
 from dataclasses import dataclass
 
-MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "3dgs_agr", "4dgs_agr", "6dgs_agr", "auto")
+MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "3dgs_agr", "4dgs_agr", "6dgs_agr", "auto",
+          "7dgs_nodir", "7dgs_nodir_agr")  # fmt: skip
 CLASS_LIKE = {  # a Gaussian has the colour of the model whose effects it still has
     "refined": "7dgs",
     "sliced": "7dgs_noagr",
@@ -14,9 +15,11 @@ CLASS_LIKE = {  # a Gaussian has the colour of the model whose effects it still 
     "direction": "4dgs",
     "still": "3dgs",
 }
-LIGHT = ("#5c6066", "#0069a8", "#00734f", "#b34700", "#9c3d82", "#7d6608", "#1f6f78", "#4b4fa3", "#8c2d2d", "#3d6b1f")
-DARK = ("#b9bec6", "#5cbcf2", "#3ccb9f", "#ff9454", "#eb9fd0", "#e3cc4a", "#6fd0da", "#a9adff", "#ff9c9c", "#a8d672")
-MARKERS = ("^", "s", "h", "o", "D", "v", "P", "X", "<", ">")
+LIGHT = ("#5c6066", "#0069a8", "#00734f", "#b34700", "#9c3d82", "#7d6608", "#1f6f78", "#4b4fa3", "#8c2d2d", "#3d6b1f",
+         "#b0185a", "#6a4a2f")  # fmt: skip
+DARK = ("#b9bec6", "#5cbcf2", "#3ccb9f", "#ff9454", "#eb9fd0", "#e3cc4a", "#6fd0da", "#a9adff", "#ff9c9c", "#a8d672",
+        "#ff8fbf", "#d9b38c")  # fmt: skip
+MARKERS = ("^", "s", "h", "o", "D", "v", "P", "X", "<", ">", "p", "d")
 STAGES_LIGHT = ("#22476b", "#3b6b96", "#6390b8", "#8fb2d1", "#b7cfe3", "#d7e4ef", "#e8eef4")
 STAGES_DARK = ("#c9e0f5", "#a3c6e6", "#7ba8cf", "#588ab3", "#3f6e95", "#2c5373", "#223d54")
 

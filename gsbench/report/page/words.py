@@ -22,6 +22,11 @@ def listing(words: list[str], last: str = "and") -> str:
     return f"{', '.join(words[:-1])} {last} {words[-1]}" if len(words) > 1 else "".join(words)
 
 
+def sentence(text: str) -> str:
+    """Begin a text with a capital letter, and leave the others as they are."""
+    return text[:1].upper() + text[1:]
+
+
 def count(number: int, what: str) -> str:
     """Count things: "1 run", "2 runs"."""
     return f"{number:,} {what}{'' if number == 1 else 's'}"

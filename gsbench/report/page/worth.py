@@ -83,13 +83,13 @@ def _effect_words(cube: Cube) -> list[str]:
     for price in cube.nested:
         if price.name.startswith("direction"):
             of = price.costs["psnr"]
-            said.append(f"{price.name.capitalize()}, within one parametrisation: {words.signed(of.mean)} dB "
+            said.append(f"{words.sentence(price.name)}, within one parametrisation: {words.signed(of.mean)} dB "
                         f"({words.interval(of, sign=True)}).")  # fmt: skip
     for price in cube.prices:
         of = price.costs["psnr"]
         if price.order == 2 and _is_real(of):
             side = f"{words.plain(abs(of.mean))} dB {'less' if of.mean < 0 else 'more'} than apart"
-            said.append(f"{price.name.capitalize()}: together they bring {side} ({words.interval(of, sign=True)}).")
+            said.append(f"{words.sentence(price.name)}: together they bring {side} ({words.interval(of, sign=True)}).")
     return [s for s in said[:5] if s]
 
 
