@@ -41,7 +41,7 @@ table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR, and mode
 	$(BIN)/python -m gsbench.report results/mini || status=$$?; \
 	exit $$status
 
-frontier: setup  ## train the six models at five lengths and three capacities, three seeds each, two runs at a time; about 70 minutes
+frontier: setup  ## train seven models at five lengths and three capacities, and AGR on all, three seeds, two at a time; about 85 minutes
 	@status=0; for axis in train.iterations=250,500,1000,2000,4000 train.densify.grad_threshold=1e-4,4e-4; do \
 		$(BIN)/python -m gsbench --multirun +exp=frontier +launch=parallel launch.at_once=2 \
 			model=$(MODELS),7dgs_nodir seed=0,1,2 $$axis $(ARGS) || status=$$?; \

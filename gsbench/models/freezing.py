@@ -101,7 +101,7 @@ def _without(model: TriangularModel, blocks: Reduced, gain: Tensor, variables: l
         T_qq[:, column, column] = math.exp(LOG_SIZE_MAX)
         kept[..., column] = 0
     p_rows = torch.cat([kept @ T_qq, blocks.T_pp], -1)
-    q_rows = torch.cat([T_qq, torch.zeros_like(T_qq[..., :3])], -1)
+    q_rows = torch.cat([T_qq, T_qq.new_zeros(*T_qq.shape[:2], 3)], -1)
     return torch.cat([p_rows, q_rows], 1)[:, model.own_order()]
 
 

@@ -14,7 +14,13 @@ from gsbench.scenes.scene import Points, View
 
 N, SIZE, VIEWS = 60, 24, 30
 BLACK = torch.zeros(3)
-OPTIONS = {"7dgs": {"lambda_t": 0.5, "lambda_d": 0.3, "agr": True}, "6dgs": {"lambda_d": 0.3}, "4dgs": {}, "3dgs": {}}
+OPTIONS = {
+    "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3, "agr": True},
+    "7dgs_nodir": {"lambda_t": 0.5, "agr": True},
+    "6dgs": {"lambda_d": 0.3},
+    "4dgs": {},
+    "3dgs": {},
+}
 
 
 def trained_a_little(name: str, seed: int) -> GaussianModel:
