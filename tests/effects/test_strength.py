@@ -65,13 +65,13 @@ def slice_of(model: GaussianModel, cut: Cut, live: Gaussians3D, query: Query) ->
 
 def brute_force(model: GaussianModel, views: list[View], cut: Cut) -> Tensor:
     """The error that each Gaussian adds when it alone becomes the cut, what improves a view not counted, [N]."""
-    errors = torch.zeros(N)
+    errors = torch.zeros(len(model))
     for view in views:
         query = Query.of(view.camera, view.time)
         live = model.slice(query)
         changed = slice_of(model, cut, live, query)
         before = rasterize_slice(live, view.camera, BLACK, model.backend).image[0]
-        for i in range(N):
+        for i in range(len(model)):
             one = Gaussians3D(*(x.clone() for x in live))
             for x, y in zip(one, changed, strict=True):
                 x[i] = y[i]
@@ -98,12 +98,33 @@ def test_prediction_against_brute_force(name: str) -> None:
         true, guess = brute_force(model, views, cut), predicted.errors[cut.name]
         # The image is linear in opacities and colours, and not in what moves: docs/effects.md has the figures.
         linear = cut.raw is None or cut.level is not None
-        least_rank, least_share = (0.98, 0.5) if linear else (0.92, 0.25)
+        # One that changes places in depth with another is predicted at 0.38 of its error.
+        least_rank, least_share = (0.98, 0.5) if linear else (0.92 if name == "4dgs" else 0.95, 0.35)
         assert float(torch.corrcoef(torch.stack([ranks(true), ranks(guess)]))[0, 1]) > least_rank, cut.name
         worst = true.argsort(descending=True)[: N // 3]
         assert (guess[worst] > least_share * true[worst]).all(), cut.name
         if linear:
             assert float(guess.sum() / true.sum()) == pytest.approx(1, abs=0.15), cut.name
+
+
+def test_an_opaque_gaussian_is_no_harder_to_predict() -> None:
+    """Catches a cut drawn behind or within the opaque Gaussian that it stands for, and so predicted too cheap."""
+    random = torch.Generator().manual_seed(0)
+    points = Points(torch.cartesian_prod(torch.tensor([-0.9, 0, 0.9]), torch.tensor([-0.5, 0.5]), torch.zeros(1)),
+                    torch.rand(6, 3, generator=random))  # fmt: skip
+    ratios = {}
+    for name, logit in (("transparent", -2.0), ("opaque", 4.0)):
+        model = build("7dgs_nodir", lambda_t=0.001)
+        model.initialise(points, 4, random)
+        model.requires_grad_(False)
+        model.splats["log_diagonal"][:, model.rows["p"]] = -2.1  # apart from one another
+        model.splats["motion"][:] = 0.01 * torch.randn(6, 3, generator=torch.Generator().manual_seed(2))
+        model.splats["opacities"][:] = logit
+        views = views_of(model, 1)
+        queries = [Query.of(view.camera, view.time) for view in views]
+        still = next(cut for cut in cuts_of(model, queries, [model.slice(q) for q in queries]) if cut.name == "still")
+        ratios[name] = probe(model, views, BLACK, draws=8).errors["still"] / brute_force(model, views, still)
+    assert ratios["opaque"].mean() / ratios["transparent"].mean() == pytest.approx(1, abs=0.15)
 
 
 def test_what_is_hidden_is_not_taken() -> None:
