@@ -65,7 +65,7 @@ class TriangularModel(GaussianModel):
         self.factor_order = factor_order
         self.scheme = scheme
         self.split_in_time = split_in_time
-        # Row numbers of p, d and t in the triangular factor; sorted to (p, d, t), those of d and t among q's.
+        # Row numbers of p, d and t in the triangular factor; and of t and d in q, which is ordered (d, t).
         there = "p" + "".join(LETTERS[x] for x in self.observes)
         letters = "".join(x * WIDTH[x] for x in FACTOR_ORDERS[factor_order] if x in there)
         self.rows = {x: [i for i, letter in enumerate(letters) if letter == x] for x in "pdt"}
