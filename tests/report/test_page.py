@@ -230,6 +230,19 @@ def contrast(a, b):
     return (max(light) + 0.05) / (min(light) + 0.05)
 
 
+def test_prices_within_one_parametrisation_are_said_beside_the_others():
+    """Catches a nested price without its name, its sentence or its note, and a name whose capitals are lost."""
+    records = frontier(models=("3dgs", "4dgs", "7dgs_noagr"), scenes=("suzanne",), seeds=3, lengths=(1000,))
+    without = worth.effects_section(group(records), canvas())
+    assert worth.NOT_NESTED in " ".join(without.notes)
+    less = [dataclasses.replace(r, model="7dgs_nodir") for r in records if r.model == "4dgs"]
+    section = worth.effects_section(group([*records, *less]), canvas())
+    assert worth.NESTED in " ".join(section.notes)
+    assert any(said.startswith("Direction, with time, within one parametrisation: ") for said in section.sentences)
+    assert {"direction, with time", "direction, with time, nested"} <= {row[0] for row in section.table.rows}
+    assert words.sentence("with AGR") == "With AGR"
+
+
 def test_colours_are_readable_in_both_themes():
     """Catches a colour of a model that disappears on its page."""
     assert min(contrast(c, "#ffffff") for c in LIGHT) >= 4.5
