@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsbench.kernels.headers import LOG_SIZE_MAX, TIME_GATE_MIN
 from gsbench.models.factors import partner, quaternion, turn_of_space
-from gsbench.models.query import Query, unit
+from gsbench.models.query import Query
 from gsbench.models.slicing import Reduced, gain_of, reduce, whiten
 
 if TYPE_CHECKING:
@@ -47,9 +47,9 @@ def freeze_triangular(
     by_name["still"] = list(model.columns)
     shift, gates = torch.zeros_like(gain[:, 0]), {name: torch.zeros_like(gain[:, 0, 0]) for name in by_name}
     for query, weight in zip(queries, weights.double(), strict=True):
-        delta = _delta(model, raw, query)
+        delta = model.offset(raw, query).double()
         shift += weight[:, None] * delta
-        exponents = _exponents(model, blocks, delta)
+        exponents = model.exponents(blocks.T_qq, delta, whiten(blocks.T_qq, delta))
         for name, variables in by_name.items():
             gates[name] += weight * torch.exp(-torch.stack([exponents[x] for x in variables]).sum(0))
     changed = {}
@@ -62,30 +62,6 @@ def freeze_triangular(
         new |= {center: torch.zeros_like(raw[center]) for x in variables for center in [CENTERS[x]]}
         changed[name] = {key: value.to(raw["means"].dtype) for key, value in new.items()}
     return changed
-
-
-def _delta(model: TriangularModel, raw: Raw, query: Query) -> Tensor:
-    """Compute q - mu_q, [N, k], ordered (d, t)."""
-    delta = []
-    if "direction" in model.observes:
-        delta.append(unit(raw["means"] - query.center) - raw["directions"])
-    if "time" in model.observes:
-        assert query.time is not None
-        delta.append(query.time - raw["times"])
-    return torch.cat(delta, -1).double()
-
-
-def _exponents(model: TriangularModel, blocks: Reduced, delta: Tensor) -> dict[str, Tensor]:
-    """Compute -ln f_dir and -ln f_temp [N] (7DGS eq. 11 and 12)."""
-    found = {}
-    if "direction" in model.observes:
-        half = 0.5 if model.directional_half else 1.0
-        white = whiten(blocks.T_qq[:, :3, :3], delta[:, :3])
-        found["direction"] = half * model.modulation("direction").double() * white.square().sum(-1)
-    if "time" in model.observes:
-        distance = delta[:, -1] / blocks.T_qq[:, -1].norm(dim=-1)
-        found["time"] = 0.5 * model.modulation("time").double() * distance.square()
-    return found
 
 
 def _without(model: TriangularModel, blocks: Reduced, gain: Tensor, variables: list[str]) -> Tensor:

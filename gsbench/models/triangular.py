@@ -90,29 +90,21 @@ class TriangularModel(GaussianModel):
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Slice at d = the unit vector from the camera to mu_p, and t (7DGS, algorithm 1)."""
-        factor = self.factors(raw)
-        centers, places = [raw["means"]], []
-        if "direction" in self.observes:
-            centers.append(raw["directions"])
-            places.append(unit(raw["means"] - query.center))
-        if query.time is not None and "time" in self.observes:
-            centers.append(raw["times"])
-            places.append(query.time.expand(len(factor), 1))
-        mean, at = torch.cat(centers, -1), torch.cat(places, -1)
+        factor, offset = self.factors(raw), self.offset(raw, query)
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
-        delta = at - mean[:, 3:]
         # A Gaussian so far from the query that its opacity is zero is replaced by a unit Gaussian at the query, and its
         # gate is zero. Otherwise its huge numbers would reach a gradient as 0 x inf.
         with torch.no_grad():
-            seen = self._exponent(reduced.T_qq, delta, whiten(reduced.T_qq, delta)) < EXPONENT_MAX
-        delta = torch.where(seen[:, None], delta, 0.0)
+            seen = self._exponent(reduced.T_qq, offset, whiten(reduced.T_qq, offset)) < EXPONENT_MAX
+        delta = torch.where(seen[:, None], offset, 0.0)
         T_qq = torch.where(seen[:, None, None], reduced.T_qq, torch.eye(delta.shape[1]).to(delta))
         white = whiten(T_qq, delta)
         gate = torch.where(seen, torch.exp(-self._exponent(T_qq, delta, white)), 0.0)
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
-            means, factors, _ = slice_gaussians(mean, factor, at, scheme=self.scheme)
+            mean = F.pad(raw["means"], (0, offset.shape[1]))  # q is measured from mu_q
+            means, factors, _ = slice_gaussians(mean, factor, offset, scheme=self.scheme)
         return Conditioned(means, factors, gate)
 
     def still(self, raw: Raw) -> Conditioned:
@@ -214,16 +206,32 @@ class TriangularModel(GaussianModel):
         L = self.triangle.factor(raw["log_diagonal"], raw)
         return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
 
-    def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
-        """Compute (lambda_d |white_d|^2 + lambda_t (t - mu_t)^2 / S_t) / 2 = -ln(f_dir f_temp), [N] (eq. 11 and 12)."""
-        exponent = torch.zeros_like(delta[:, 0])
+    def offset(self, raw: Raw, query: Query) -> Tensor:
+        """Compute q - mu_q, [N, k], ordered (d, t)."""
+        parts = []
+        if "direction" in self.observes:
+            parts.append(unit(raw["means"] - query.center) - raw["directions"])
+        if query.time is not None and "time" in self.observes:
+            parts.append(query.time - raw["times"])
+        return torch.cat(parts, -1)
+
+    def exponents(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> dict[str, Tensor]:
+        """Compute lambda_d |white_d|^2 / 2 = -ln f_dir and lambda_t (t - mu_t)^2 / (2 S_t) = -ln f_temp, [N] each.
+
+        By the name of the variable (7DGS eq. 11 and 12), of delta = q - mu_q and white = T_qq^-1 delta.
+        """
+        found = {}
         if "direction" in self.observes:
             half = 0.5 if self.directional_half else 1.0
-            exponent = half * self.modulation("direction") * white[:, :3].square().sum(-1)
+            found["direction"] = half * self.modulation("direction") * white[:, :3].square().sum(-1)
         if "time" in self.observes:
             distance = delta[:, -1] / T_qq[:, -1].norm(dim=-1)  # in standard deviations, sqrt(S_t)
-            exponent = exponent + 0.5 * self.modulation("time") * distance.square()
-        return exponent
+            found["time"] = 0.5 * self.modulation("time") * distance.square()
+        return found
+
+    def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
+        """Compute -ln(f_dir f_temp), [N]."""
+        return torch.stack(list(self.exponents(T_qq, delta, white).values())).sum(0)
 
     def _blocks(self, factor: Tensor) -> Reduced:
         """Cut a factor of `conditioned_first` into its blocks; it is already reduced, with the columns of q first."""
@@ -246,6 +254,23 @@ class TriangularModel(GaussianModel):
     def long_in_time(self) -> Tensor:
         """Test |S_pt| > 0.05 extent and sqrt(S_t) > 0.25 T (7DGS, section 4.4)."""
         return self.moves_long(self.factors(dict(self.splats.items())))
+
+
+class TimedModel(TriangularModel):
+    """Gaussians conditioned on t, and maybe on d."""
+
+    def __init__(self, *, lambda_t: float, **options: Any) -> None:
+        """Make an empty model.
+
+        Args:
+            lambda_t: initial sensitivity of f_temp.
+            options: as `TriangularModel`.
+
+        Raises:
+            InputError: an option is out of its range.
+        """
+        super().__init__(**options)
+        self.modulate("time", lambda_t)
 
 
 class DirectionalModel(TriangularModel):
