@@ -157,11 +157,9 @@ void observe_still_rows_backward(const TriangularArgs& a, const ObservationGrads
 // Calls run<Query, Reduction>() as the arguments say.
 template <class Run>
 void dispatch(const TriangularArgs& a, Run run) {
-    const auto reduced_by = [&]<template <class, int> class Reduction>() {
-        if (a.directions && a.times) return run.template operator()<Query::both, Reduction>();
-        a.times ? run.template operator()<Query::time, Reduction>() : run.template operator()<Query::direction, Reduction>();
-    };
-    a.subtracts ? reduced_by.template operator()<Subtraction>() : reduced_by.template operator()<Reflections>();
+    observing(a.directions, a.times, [&]<Query Q>() {
+        a.subtracts ? run.template operator()<Q, Subtraction>() : run.template operator()<Q, Reflections>();
+    });
 }
 
 }  // namespace

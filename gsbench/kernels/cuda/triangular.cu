@@ -109,11 +109,9 @@ void dispatch(const TriangularArgs& a, Run run) {
             "observe_triangular: expected the square-root scheme on a GPU, got one that subtracts");
     }
     if (a.N == 0) return;
-    const auto conditioned_on = [&]<Query Q>() {
+    observing(a.directions, a.times, [&]<Query Q>() {
         a.conditioned_first ? run.template operator()<Q, true>() : run.template operator()<Q, false>();
-    };
-    if (a.directions && a.times) return conditioned_on.template operator()<Query::both>();
-    a.times ? conditioned_on.template operator()<Query::time>() : conditioned_on.template operator()<Query::direction>();
+    });
 }
 
 }  // namespace

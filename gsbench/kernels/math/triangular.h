@@ -12,6 +12,13 @@ inline namespace GSB_ISA {
 // What a Gaussian is conditioned on. Rows of a factor are ordered d before t.
 enum class Query { direction, time, both };
 
+// Calls run<Query>() for what is observed: one of the two at least.
+template <class Run>
+void observing(bool direction, bool time, Run run) {
+    if (direction && time) return run.template operator()<Query::both>();
+    time ? run.template operator()<Query::time>() : run.template operator()<Query::direction>();
+}
+
 // What is the same for all Gaussians of a model.
 struct TriangularModel {
     bool conditioned_first;  // rows of the factor are (d, t, p); else (p, t, d), as in the paper
