@@ -117,12 +117,16 @@ def cube(group: Group) -> Cube:
     nested = [
         price
         for name, weights in _contrasts()
-        if any(own.get(cell) is not cells.get(cell) for cell in weights)
+        if is_single(name)
+        and any(own.get(cell) is not cells.get(cell) for cell in weights)
         and (price := _price(group, own, name, weights))
-        and price.order == 1
-        and MEAN not in price.name
     ]
     return Cube(cells, prices, nested, missing, left_out, [arm.model for arm in group.main_arms if arm.on_demand])
+
+
+def is_single(name: str) -> bool:
+    """Tell whether a price is that of one effect, given which others are on."""
+    return " × " not in name and MEAN not in name
 
 
 def _cell(arm: Arm) -> Cell:

@@ -71,7 +71,7 @@ def _is_real(of: Estimate) -> bool:
 
 def _effect_words(cube: Cube) -> list[str]:
     """Say which effect is worth most, what it costs, which are not told from nothing, and how they interact."""
-    single = [p for p in cube.prices if p.order == 1 and compare.MEAN not in p.name]
+    single = [p for p in cube.prices if compare.is_single(p.name)]
     best = max(single, key=lambda p: p.costs["psnr"].mean)
     gain, seconds = best.costs["psnr"], best.costs["seconds"]
     text = f"Worth most: {best.name}, {words.signed(gain.mean)} dB ({words.interval(gain, sign=True)})"
