@@ -93,7 +93,10 @@ def probe(
         residual = here.image - view.image
         own = torch.Generator().manual_seed(seeds[v])
         signs = [torch.randint(0, 2, residual.shape, generator=own).to(residual) * 2 - 1 for _ in range(draws)]
-        place = Place(model, queries[v], seen[v], here, here.products([residual, *signs]), [residual, *signs])
+        vectors = [residual, *signs]
+        products = here.products(vectors)
+        removed = [-product.opacities * seen[v].opacities for product in products]
+        place = Place(model, queries[v], seen[v], here, products, vectors, removed)
         return float(residual.square().sum()), [_error(cut, place, drawing) for cut in cuts]
 
     errors, total = {cut.name: torch.zeros_like(seen[0].opacities) for cut in cuts}, 0.0
@@ -163,14 +166,14 @@ class Place(NamedTuple):
     drawn: Drawn
     products: list[Gaussians3D]  # of `vectors` with the derivative of the image
     vectors: list[Tensor]  # [H, W, 3]: the residual, then random signs
+    removed: list[Tensor]  # [N] what each Gaussian's removal changes, times each of the vectors
 
 
 def _error(cut: Cut, here: Place, draw: Drawing) -> Tensor:
     """Compute E [N] of a cut in one view."""
     model, live = here.model, here.live
-    removed = [-product.opacities * live.opacities for product in here.products]
     if cut.raw is None:
-        return _grown(removed)
+        return _grown(here.removed)
     raw = dict(model.splats.items()) | cut.raw
     if cut.level is not None:
         colors = model.paint(raw, live.means, live.opacities, here.query)
@@ -190,7 +193,7 @@ def _error(cut: Cut, here: Place, draw: Drawing) -> Tensor:
     delta = [to - at for at, to in zip(live, changed, strict=True)]
     along = [(_dot(a, delta) + _dot(b, delta)) / 2 for a, b in zip(here.products, there, strict=True)]
     added = [product.opacities * changed.opacities for product in there]
-    return overlap * _grown(along) + (1 - overlap) * _grown(removed, added)
+    return overlap * _grown(along) + (1 - overlap) * _grown(here.removed, added)
 
 
 def _grown(*changes: list[Tensor]) -> Tensor:
