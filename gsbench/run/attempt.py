@@ -180,9 +180,9 @@ class Attempt:
         metrics["psnr_train"] = trainer.psnr(evenly(trainer.scene.train, len(views)))
         record, on_demand = self.describe("ok", None), self._on_demand(trainer)
         if on_demand and self._shown:
-            first = views[0]
+            first, renderer = views[0], trainer.renderer
             self._classes = picture.draw(
-                trainer.model, first.camera, first.time, trainer.background, config.raster.antialias
+                trainer.model, first.camera, first.time, renderer.background, renderer.antialias
             )
         return replace(
             record, protocol=record.protocol | made,
@@ -268,10 +268,9 @@ def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dic
 
     Frames are `replayed` from a CUDA graph where CUDA can record the model, and otherwise `launched` anew each time.
     """
-    config = trainer.config
     if trainer.model.backend.name != "cuda":
         return trainer.render, {}
-    replay = Replay(trainer.model, trainer.background, config.raster.antialias)
+    replay = Replay(trainer.model, trainer.renderer.background, trainer.renderer.antialias)
     try:
         replay(first.camera, first.time)
     except RuntimeError as error:  # an operation that waits for the device, in a model or a scheme written in torch

@@ -3,7 +3,6 @@
 import copy
 import time
 from dataclasses import asdict, replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -20,12 +19,11 @@ from gsbench.measure.schema import parse
 from gsbench.measure.speed import synchroniser, time_in_turns
 from gsbench.models import GaussianModel
 from gsbench.models.classes import Classes
-from gsbench.models.render import render
 from gsbench.scenes import Scene, View
 from gsbench.train.density import DensityControl
 from gsbench.train.floor import Floor
 from gsbench.train.optim import Optimizer
-from gsbench.train.psnr import mean_psnr
+from gsbench.train.renderer import Renderer
 
 GATES = ("off", "end", "both")
 LOSS_IN_TRAINING = 0.5  # dB on val at once: the rest of the training makes up for it (docs/effects.md)
@@ -57,7 +55,7 @@ class Gating:
 
     def __init__(
         self, model: GaussianModel, optimizer: Optimizer, density: DensityControl, floor: Floor, scene: Scene,
-        background: Tensor, config: Config,
+        renderer: Renderer, config: Config,
     ) -> None:  # fmt: skip
         """Gate `model`; the moments, the counts and the floor of its Gaussians follow.
 
@@ -67,14 +65,14 @@ class Gating:
             density: of the model.
             floor: of the model.
             scene: gives the views that are probed and those that the loss is measured on.
-            background: colour [3].
+            renderer: of the training.
             config: says by which gates, and what they may cost.
         """
         self.model = model
         self.optimizer = optimizer
         self.density = density
         self.floor = floor
-        self.background = background
+        self.renderer = renderer
         self.config = config
         self.gates: list[Gate] = []
         self.notes: list[str] = []
@@ -125,14 +123,10 @@ class Gating:
     def _beside(self, one: GaussianModel, other: GaussianModel, views: list[View]) -> tuple[float, list[float]]:
         """Return the PSNR that the other model has less on views, and the median milliseconds of frames of both."""
         count = max(self.config.protocol.renders, len(views))
-        frames = [partial(self._frame, model, views) for model in (one, other)]
+        frames = [lambda i, model=model: self.renderer.image(model, views[i % len(views)]) for model in (one, other)]
         times = time_in_turns(frames, count, synchroniser(self.config.device))
-        return self._psnr(one, views) - self._psnr(other, views), [one.p50 for one in times]
-
-    @torch.no_grad()
-    def _frame(self, model: GaussianModel, views: list[View], i: int) -> Tensor:
-        view = views[i % len(views)]
-        return render(model, view.camera, view.time, self.background, self.config.raster.antialias)
+        psnr = self.renderer.psnr
+        return psnr(one, views) - psnr(other, views), [one.p50 for one in times]
 
     @torch.no_grad()
     def _gate(self, step: int | None, budget_db: float, most: int) -> None:
@@ -143,9 +137,11 @@ class Gating:
         # Nor does AGR rest: when a Gaussian can be seen still changes.
         spans = seen_times(self.model, self.probed) if at_end else None
         hidden = None if spans is None else spans[:, 0].isinf()
-        strength = probe(self.model, self.probed, self.background, seed=self.config.seed, most=most,
-                         antialias=self.config.raster.antialias, by_halves=at_end, hidden=hidden)  # fmt: skip
-        found = gate_within(self.model, strength, budget_db, lambda model: self._psnr(model, self.checked), spans)
+        strength = probe(self.model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
+                         antialias=self.renderer.antialias, by_halves=at_end, hidden=hidden)  # fmt: skip
+        found = gate_within(
+            self.model, strength, budget_db, lambda model: self.renderer.psnr(model, self.checked), spans
+        )
         if found is None:
             self.notes.append(f"{'at the end' if at_end else f'at step {step}'} no simplification cost at most "
                               f"{budget_db} dB on {self.checked_on}")  # fmt: skip
@@ -160,9 +156,6 @@ class Gating:
         self.optimizer.follow(self.model, found.rows, found.changed)
         self.density.follow(found.rows)
         self.floor.update()
-
-    def _psnr(self, model: GaussianModel, views: list[View]) -> float:
-        return mean_psnr(model, views, self.background, self.config.raster.antialias)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what was decided, for the checkpoint; the classes are the model's."""

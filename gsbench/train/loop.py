@@ -17,14 +17,13 @@ from gsbench.measure.curve import Curve
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel
 from gsbench.models.classes import pack
-from gsbench.models.render import render
 from gsbench.scenes import Scene, View
 from gsbench.train.checkpoint import whole_number
 from gsbench.train.density import DensityControl
 from gsbench.train.floor import Floor
 from gsbench.train.gating import NO_GATES, Gating
 from gsbench.train.optim import Optimizer
-from gsbench.train.psnr import mean_psnr
+from gsbench.train.renderer import Renderer
 from gsbench.train.schedule import Schedule, batch, generator
 from gsbench.train.step import Step, fitting_threads
 from gsbench.train.watch import DivergedError, Watch
@@ -62,14 +61,14 @@ class Trainer:
         self.scene = scene
         self.views = views
         self.config = config
-        self.background = scene.train[0].image.new_tensor(scene.background)
+        self.renderer = Renderer(scene.train[0].image.new_tensor(scene.background), config.raster.antialias)
         self.schedule = Schedule(train, config.model.sh_degree, config.agr)
         self.optimizer = Optimizer(model, config.model, train, scene.extent, config.optim)
         self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity, len(scene.train))
         self.floor = Floor(model, [view.camera for view in scene.train])
         self.stages = StageClock(config.device)
-        self.gradients = Step(model, self.background, train.ssim_weight, config.raster.antialias, self.stages)
-        self.gating = Gating(model, self.optimizer, self.density, self.floor, scene, self.background, config)
+        self.gradients = Step(model, self.renderer.background, train.ssim_weight, self.renderer.antialias, self.stages)
+        self.gating = Gating(model, self.optimizer, self.density, self.floor, scene, self.renderer, config)
         self.watch = Watch(config.device)
         if config.device.startswith("cuda"):  # a bad step is found some steps later, and must not be applied until then
             self.optimizer.adam.found_inf = self.watch.skip  # type: ignore[attr-defined]
@@ -171,12 +170,11 @@ class Trainer:
 
     def psnr(self, views: list[View]) -> float:
         """Measure the mean PSNR over views, dB."""
-        return mean_psnr(self.model, views, self.background, self.config.raster.antialias)
+        return self.renderer.psnr(self.model, views)
 
-    @torch.no_grad()
     def render(self, view: View) -> Tensor:
         """Render the image of a view, [H, W, 3]."""
-        return render(self.model, view.camera, view.time, self.background, self.config.raster.antialias)
+        return self.renderer.image(self.model, view)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next step depends on, and everything measured so far, for the checkpoint.

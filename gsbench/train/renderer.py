@@ -1,0 +1,35 @@
+"""Render views of a model as its run is configured to, and measure their PSNR."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsbench.lanes import side_by_side
+from gsbench.measure.quality import psnr
+from gsbench.models import GaussianModel
+from gsbench.models.render import render
+from gsbench.scenes import View
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """What the images of a run have in common."""
+
+    background: Tensor  # [3]
+    antialias: bool  # see `gsbench.raster.rasterize`
+
+    @torch.no_grad()
+    def image(self, model: GaussianModel, view: View) -> Tensor:
+        """Render the image [H, W, 3] of a view."""
+        return render(model, view.camera, view.time, self.background, self.antialias)
+
+    @torch.no_grad()
+    def psnr(self, model: GaussianModel, views: Sequence[View]) -> float:
+        """Measure the mean PSNR of a model over views, which are rendered side by side, dB."""
+
+        def of_view(view: View) -> float:
+            return psnr(self.image(model, view), view.image)
+
+        return sum(side_by_side(of_view, views, model.backend.lanes(model.splats["means"]))) / len(views)
