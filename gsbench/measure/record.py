@@ -160,6 +160,11 @@ class Record:
     overrides: list[str] = field(default_factory=list)  # `python -m gsbench` and these words repeat the run
     on_demand: OnDemand | None = None  # None: every Gaussian paid for every effect of the model
 
+    @property
+    def path(self) -> Path:
+        """The folder of the run, from that of all results; raises InputError as `run_path`."""
+        return run_path(Path(), self.experiment, self.scene, self.model, self.seed, variant=self.variant)
+
 
 def write(record: Record, path: Path) -> None:
     """Write `record` to `path` atomically as strict JSON.
@@ -217,7 +222,12 @@ def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, 
     """
     _check_names(experiment, scene, model, variant, "")
     _check_seed(seed, "")
-    return root / experiment / scene / (f"{model},{variant}" if variant else model) / f"seed{seed}"
+    return root / experiment / scene / model_folder(model, variant) / f"seed{seed}"
+
+
+def model_folder(model: str, variant: str) -> str:
+    """Name the folder of all seeds of a model and a variant of it, which may be ""."""
+    return f"{model},{variant}" if variant else model
 
 
 def _check_names(experiment: str, scene: str, model: str, variant: str, where: str) -> None:

@@ -98,9 +98,7 @@ def _differ(what: str, records: list[Record], get: Get) -> str:
     """Warn that the compared runs differ, and list the runs of each value."""
     runs: dict[str, list[str]] = {}
     for record in records:
-        runs.setdefault(get(record), []).append(
-            f"{record.scene}/{record.model}{',' * bool(record.variant)}{record.variant}/seed{record.seed}"
-        )
+        runs.setdefault(get(record), []).append("/".join(record.path.parts[1:]))
     listed = []
     for value, names in sorted(runs.items()):
         more = f" and {len(names) - MOST_RUNS_NAMED} more" if len(names) > MOST_RUNS_NAMED else ""

@@ -16,6 +16,7 @@ from gsbench.config import Config
 from gsbench.measure import record as records
 from gsbench.measure.provenance import config_hash
 from gsbench.reading import read_file
+from gsbench.run.overrides import UNNAMED, deciding
 from gsbench.scenes.files import digest
 from gsbench.scenes.ply import MAX_FILE
 
@@ -30,7 +31,6 @@ MEASURING = (
 )  # fmt: skip
 OWN_NAMES = ("exp", "model", "scene")  # the groups that have a place in a run's path
 DEFAULTS = {"train": "default", "raster": "default", "protocol": "gsbench"}  # groups of conf/config.yaml
-UNNAMED = ("results", "resume", "launch")  # where results lie, whether they are kept and who runs identify nothing
 LONGEST_VARIANT = 80  # characters: several such folders must fit into a path of 255
 
 
@@ -77,8 +77,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
     for key in UNNAMED if config.init.ply is not None else (*UNNAMED, "init"):  # older runs have no such key
         del plain[key]
     plain = _storable(plain)
-    repeating = sorted(word for word in overrides if re.split("[=.]", word.lstrip("+"))[0] not in UNNAMED)
-    return Run(config, plain, folder, label, variant, repeating)
+    return Run(config, plain, folder, label, variant, deciding(overrides))
 
 
 def hash_of(ply: str) -> str:

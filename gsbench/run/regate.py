@@ -41,7 +41,7 @@ def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tu
     old = records.read(folder / records.FILE_NAME)
     words = ["gate=end"] + ([] if budget_db == 0.05 else [f"budget_db={budget_db}"])
     variant = ",".join(([old.variant] if old.variant else []) + words)
-    new = folder.parent.parent / f"{old.model},{variant}" / folder.name
+    new = folder.parent.parent / records.model_folder(old.model, variant) / folder.name
     overrides = sorted([*old.overrides, "effects.gate=end", f"effects.budget_db={budget_db}"])
     check_folder(new)
     attempt = Attempt(Run(config, plain, new, old.model, variant, overrides))

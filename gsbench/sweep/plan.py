@@ -13,10 +13,9 @@ from pathlib import Path
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.schema import parse
 from gsbench.reading import MAX_JSON, parse_json, read_file
+from gsbench.run.overrides import deciding
 
 FOLDER, FILE_NAME, ENDED, JOBS = ".sweep", "plan.json", "ended", ".submitit"
-NO_NUMBER = re.compile(r"[+~]*(results|resume|launch)\b")  # overrides of them change no number of a run
-
 Identity = tuple[str, ...]
 
 
@@ -43,8 +42,8 @@ class Ended:
 
 
 def identity(overrides: Sequence[str]) -> Identity:
-    """Reduce the overrides of a run to those that decide its numbers, sorted."""
-    return tuple(sorted(one for one in overrides if not NO_NUMBER.match(one)))
+    """Reduce the overrides of a run to those that decide its numbers."""
+    return tuple(deciding(overrides))
 
 
 def write(plan: Plan, folder: Path) -> Path:

@@ -16,11 +16,12 @@ from omegaconf import DictConfig, open_dict
 
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
+from gsbench.run.overrides import launches
 from gsbench.sweep import plan
 from gsbench.sweep.axes import SCENES_DEPEND_ON, scenes_of
 from gsbench.sweep.finish import see_through
 from gsbench.sweep.hooks import plan_of
-from gsbench.sweep.plan import NO_NUMBER, identity
+from gsbench.sweep.plan import identity
 from gsbench.sweep.status import BROKEN, Asked, Experiment, status
 
 CONFIG_NAME = "config"
@@ -44,7 +45,7 @@ def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfi
         InputError: `more` would change what is run.
     """
     for one in more:
-        if not NO_NUMBER.match(one) or "launch" not in one:
+        if not launches(one):
             raise InputError(f"retry: expected overrides of launch, such as launch.memory=16G, got '{one}'")
     groups: dict[tuple[str, ...], list[Asked]] = defaultdict(list)
     for asked in broken(experiment):
@@ -56,7 +57,7 @@ def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfi
 
 def _launch(asked: Asked) -> list[str]:
     """The overrides of a run that say how it is launched."""
-    return [one for one in asked.overrides if NO_NUMBER.match(one) and "launch" in one.partition("=")[0]]
+    return [one for one in asked.overrides if launches(one)]
 
 
 def _relaunch(

@@ -55,22 +55,16 @@ def _strips(records: list[Record], folder: Path) -> dict[str, dict[str, tuple[Re
     at = places(folder, FILE_NAME)
     found: dict[str, dict[str, tuple[Record, list[Cut]]]] = {}
     for r in sorted(records, key=lambda r: r.seed):
-        path = at.get(place(r))
+        path = at.get(r.path)
         models = found.setdefault(r.scene, {})
         if path and r.model not in models and (rows := cut_strip(path)):
             models[r.model] = r, rows
     return {scene: dict(sorted(models.items())) for scene, models in sorted(found.items()) if models}
 
 
-def places(folder: Path, name: str) -> dict[tuple[str, ...], Path]:
-    """Find the files of a name below a folder of results, by `place`."""
-    return {path.parts[-5:-1]: path for path in sorted(folder.resolve().rglob(name))}
-
-
-def place(record: Record) -> tuple[str, ...]:
-    """Return the last parts of the folder of a run: experiment, scene, model with its variant, seed."""
-    label = f"{record.model},{record.variant}" if record.variant else record.model
-    return record.experiment, record.scene, label, f"seed{record.seed}"
+def places(folder: Path, name: str) -> dict[Path, Path]:
+    """Find the files of a name below a folder of results, by `Record.path`."""
+    return {Path(*path.parts[-5:-1]): path for path in sorted(folder.resolve().rglob(name))}
 
 
 def images(of: list[tuple[str, Path]]) -> list[Image]:

@@ -173,7 +173,7 @@ def _swatches() -> list[Swatch]:
 def _images(found: list[Decided], folder: Path) -> list[Image]:
     """Show the picture by class of the first seed of each scene and model, as many as there is room for."""
     places = gallery.places(folder, PICTURE)
-    paths = [next((p for r in one.runs if (p := places.get(gallery.place(r)))), None) for one in found]
+    paths = [next((p for r in one.runs if (p := places.get(r.path))), None) for one in found]
     captions = [f"{one.scene}, {one.name}" for one in found]
     return gallery.images([(c, path) for c, path in zip(captions, paths, strict=True) if path])
 

@@ -79,8 +79,7 @@ def over(of: Estimate) -> str:
 
 def run_name(record: Record) -> str:
     """Name a run as its folder does."""
-    label = f"{record.model},{record.variant}" if record.variant else record.model
-    return f"{record.experiment}/{record.scene}/{label}/seed{record.seed}"
+    return record.path.as_posix()
 
 
 def command(records: list[Record]) -> str:

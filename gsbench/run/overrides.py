@@ -1,0 +1,18 @@
+"""Tell the overrides that decide a run's numbers from those that say where its results lie and who runs it."""
+
+import re
+from collections.abc import Sequence
+
+UNNAMED = ("results", "resume", "launch")  # groups and keys that change no number of a run
+_UNNAMED = re.compile(rf"[+~]*({'|'.join(UNNAMED)})\b")
+_LAUNCH = re.compile(r"[+~]*launch\b")
+
+
+def deciding(overrides: Sequence[str]) -> list[str]:
+    """Return the overrides that decide a run's numbers, sorted: equal for two commands of the same run."""
+    return sorted(one for one in overrides if not _UNNAMED.match(one))
+
+
+def launches(override: str) -> bool:
+    """Tell whether an override says how a run is launched."""
+    return _LAUNCH.match(override) is not None
