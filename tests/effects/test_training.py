@@ -13,7 +13,7 @@ from gsbench.run.load import load_run
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene
 from gsbench.stability.training_cases import compose, moving_square
-from gsbench.train.gating import LAST_RATE, Gating
+from gsbench.train.gating import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating
 from gsbench.train.loop import Trainer
 from gsbench.train.schedule import Schedule, generator
 
@@ -59,7 +59,7 @@ def few_steps_recover(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a checkpoint that lacks what a gate decided: broken off after the gate, and gone on from there."""
-    monkeypatch.setattr("gsbench.train.gating.LOSS_IN_TRAINING", 3.0)
+    monkeypatch.setattr("gsbench.train.gating.LOSS_WITH_AGR", 3.0)
     whole = trainer("effects.gate=both")
     expected = end(whole)
     assert whole.gating.gates[0].step == 60
@@ -84,7 +84,7 @@ def test_off_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches momentum that moves on what a gate froze, and kept entries that no longer learn."""
-    monkeypatch.setattr("gsbench.train.gating.LOSS_IN_TRAINING", 20.0)
+    monkeypatch.setattr("gsbench.train.gating.LOSS_WITH_AGR", 20.0)
     monkeypatch.setattr("gsbench.effects.budget.SHARES", (0.5,))
     one = trainer("effects.gate=both")
     one.run(lambda _: None, "test", lambda: one.step < 61)
@@ -110,6 +110,15 @@ def test_when_a_model_is_gated() -> None:
     assert due() == [59]
     assert due("train.densify.stop=21000") == [69]
     assert due("train.densify.stop=29000") == []
+
+
+@pytest.mark.parametrize(("model", "loss"), [("7dgs", LOSS_WITH_AGR), ("7dgs_noagr", LOSS_IN_TRAINING)])
+def test_what_a_gate_in_training_may_cost(model: str, loss: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches models without AGR, which do not make up for it, gated as freely as those with it."""
+    asked: list[tuple[int | None, float]] = []
+    monkeypatch.setattr(Gating, "_gate", lambda _, *given: asked.append(given[:2]))
+    end(trainer("effects.gate=both", model=model))
+    assert asked == [(60, loss), (None, 0.05)]
 
 
 @pytest.mark.parametrize("words", [(), ("effects.gate=both",)])
