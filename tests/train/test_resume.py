@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import time
@@ -31,6 +32,15 @@ def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
+@pytest.fixture(scope="module")
+def whole(square: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of an unbroken run, which tests only read."""
+    results = tmp_path_factory.mktemp("whole")
+    done = gsbench(*overrides(square, results, *RUN))
+    assert done.returncode == 0, done.stderr
+    return results
+
+
 def final_state(results: Path) -> dict[str, object]:
     (path,) = results.rglob(checkpoint.FILE_NAME)
     return checkpoint.read(path).state
@@ -55,16 +65,15 @@ def assert_same_bits(a: object, b: object, where: str = "state") -> None:
         assert a == b, where
 
 
-def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, tmp_path: Path) -> None:
+def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, whole: Path, tmp_path: Path) -> None:
     """Catches anything that the next step depends on and the checkpoint lacks: SIGKILL twice, at no chosen moment.
 
     The model has everything there is to lose: AGR, moments of cloned and split Gaussians, statistics of density
-    control, the order of views, trained lambdas. Two unbroken runs first: the same seed gives the same bits.
+    control, the order of views, trained lambdas. A second unbroken run first: the same seed gives the same bits.
     """
-    for name in ("whole", "again"):
-        done = gsbench(*overrides(square, tmp_path / name, *RUN))
-        assert done.returncode == 0, done.stderr
-    assert_same_bits(final_state(tmp_path / "whole"), final_state(tmp_path / "again"))
+    done = gsbench(*overrides(square, tmp_path / "again", *RUN))
+    assert done.returncode == 0, done.stderr
+    assert_same_bits(final_state(whole), final_state(tmp_path / "again"))
 
     killed_at = []
     for _ in range(2):
@@ -87,38 +96,33 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, tmp_pa
     done = gsbench(*overrides(square, tmp_path / "broken", *RUN))
     assert done.returncode == 0, done.stderr
     assert "goes on from step" in done.stderr
-    assert_same_bits(final_state(tmp_path / "whole"), final_state(tmp_path / "broken"))
+    assert_same_bits(final_state(whole), final_state(tmp_path / "broken"))
 
     scores = []
-    for name in ("whole", "broken"):
-        (path,) = record.find(tmp_path / name)
+    for results in (whole, tmp_path / "broken"):
+        (path,) = record.find(results)
         scores.append(record.read(path))
     assert scores[0].metrics == scores[1].metrics
     assert [p.psnr_val for p in scores[0].curve] == [p.psnr_val for p in scores[1].curve]
 
 
-def test_a_reloaded_checkpoint_measures_the_same(square: Path, tmp_path: Path) -> None:
+def test_a_reloaded_checkpoint_measures_the_same(square: Path, whole: Path, tmp_path: Path) -> None:
     """Catches a score that differs between the model in training and on disk (elsewhere 32.63 and 33.02 dB)."""
-    arguments = overrides(square, tmp_path, *RUN)
-    assert gsbench(*arguments).returncode == 0
-    (path,) = record.find(tmp_path)
+    results = shutil.copytree(whole, tmp_path / "copy")
+    (path,) = record.find(results)
     first = record.read(path)
     path.unlink()
-    done = gsbench(*arguments)
+    done = gsbench(*overrides(square, results, *RUN))
     assert "goes on from step 60" in done.stderr
     assert record.read(path).metrics == first.metrics
 
 
-def test_another_seed_gives_other_bits(square: Path, tmp_path: Path) -> None:
+def test_another_seed_gives_other_bits(square: Path, whole: Path, tmp_path: Path) -> None:
     """Catches a seed that is overwritten by 0, as the official 4DGS does."""
-    scores = set()
-    for seed in (0, 1):
-        assert gsbench(*overrides(square, tmp_path, *RUN, f"seed={seed}")).returncode == 0
-    for path in record.find(tmp_path):
-        metrics = record.read(path).metrics
-        assert metrics is not None
-        scores.add(metrics["psnr"])
-    assert len(scores) == 2
+    assert gsbench(*overrides(square, tmp_path, *RUN, "seed=1")).returncode == 0
+    metrics = [record.read(path).metrics for results in (whole, tmp_path) for path in record.find(results)]
+    assert None not in metrics
+    assert metrics[0] != metrics[1]
 
 
 class Exploit:
