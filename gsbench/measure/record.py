@@ -68,6 +68,8 @@ class Cost:
     num_gaussians: int
     bytes: int  # of the model's parameters
     peak_memory: int  # bytes: gsbench.measure.speed.peak_memory
+    train_cpu_s: float | None = None  # CPU-seconds of all threads in those of `train_s`; None in older records
+    load: float | None = None  # of the machine, this run included, mean over `train_s`: gsbench.measure.speed.load
 
 
 @dataclass(frozen=True)

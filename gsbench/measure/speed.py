@@ -1,9 +1,11 @@
-"""Measure speed and memory: FPS, seconds by stage of training, peak bytes.
+"""Measure speed and memory: FPS, seconds by stage of training, CPU-seconds, the load of the machine, peak bytes.
 
 torch is imported only for a GPU, so that records and tables of records do not need it.
 """
 
 import ctypes
+import math
+import os
 import statistics
 import sys
 import time
@@ -195,6 +197,61 @@ class Laps:
         for name, start, end in self._ended:
             sums[name] = sums.get(name, 0.0) + self._clock.seconds(start, end)
         return sums
+
+
+class Effort:
+    """Sums the CPU-seconds of this process over blocks, ``with effort: ...``, and averages the load of the machine.
+
+    Beside the seconds of a training they say what else the machine did: the load counts all processes that ran or
+    waited, and CPU-seconds do not grow while another process runs. What is not known is None.
+    """
+
+    def __init__(self) -> None:
+        """Begin without seconds."""
+        self._seconds = self._cpu_s = self._load_s = 0.0
+        self._began = 0.0, 0.0
+
+    def __enter__(self) -> None:
+        self._began = time.perf_counter(), time.process_time()
+
+    def __exit__(self, *_: object) -> None:
+        seconds, cpu_s = time.perf_counter() - self._began[0], time.process_time() - self._began[1]
+        self._seconds += seconds
+        self._cpu_s += cpu_s
+        self._load_s += load() * seconds
+
+    def add(self, other: "Effort") -> None:
+        """Add the seconds of another one."""
+        self._seconds += other._seconds
+        self._cpu_s += other._cpu_s
+        self._load_s += other._load_s
+
+    @property
+    def cpu_s(self) -> float | None:
+        """The CPU-seconds of all threads of this process."""
+        return None if math.isnan(self._cpu_s) else self._cpu_s
+
+    @property
+    def load(self) -> float | None:
+        """The mean of `load()` over the seconds."""
+        return None if math.isnan(self._load_s) or not self._seconds else self._load_s / self._seconds
+
+    def state_dict(self) -> dict[str, float]:
+        """Return the sums so far, for the checkpoint."""
+        return {"seconds": self._seconds, "cpu_s": self._cpu_s, "load_s": self._load_s}
+
+    def load_state_dict(self, state: dict[str, float] | None) -> None:
+        """Continue from the sums of a checkpoint; without any, as in older ones, nothing is known from here on."""
+        state = state or dict.fromkeys(("seconds", "cpu_s", "load_s"), math.nan)
+        self._seconds, self._cpu_s, self._load_s = (float(state[name]) for name in ("seconds", "cpu_s", "load_s"))
+
+
+def load() -> float:
+    """Return the mean number of processes that ran or waited to in the last minute; NaN where no one counts them."""
+    try:
+        return os.getloadavg()[0]
+    except (AttributeError, OSError):  # Windows; a container without /proc
+        return math.nan
 
 
 class _Clock(Protocol):

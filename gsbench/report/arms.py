@@ -28,11 +28,13 @@ QUANTITIES: dict[str, Callable[[Record], float]] = {
     "psnr": lambda r: _number((r.metrics or {}).get("psnr")),  # dB, the evaluated split
     "psnr_val": psnr_val,  # dB
     "seconds": lambda r: r.cost.train_s if r.cost else math.nan,  # of training
+    "cpu_s": lambda r: _number(r.cost.train_cpu_s if r.cost else None),  # of all threads in those seconds
+    "load": lambda r: _number(r.cost.load if r.cost else None),  # of the machine
     "ms": lambda r: r.cost.render_ms.p50 if r.cost else math.nan,  # a frame, median
     "mb": lambda r: r.cost.bytes / 1e6 if r.cost else math.nan,  # of the model's parameters
 }
 GATES = ("off", "end", "both")  # of effects.gate
-OF_THE_MACHINE = ("seconds", "ms")  # quantities that compare only between runs of one machine
+OF_THE_MACHINE = ("seconds", "cpu_s", "ms")  # quantities that compare only between runs of one machine
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,7 @@ def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:
     for title, get in (("machine", _machine), ("commit", _commit), ("versions", _versions)):
         same = len({get(r) for r in records}) == 1
         notes.append(f"{title}: {get(records[0])}" if same else _differ(title, records, get))
+    notes += _load(records)
     if any(_commit(r).endswith("-dirty") for r in records):
         notes.append(f"{WARNING}: files differed from their commit (-dirty): it does not reproduce these numbers.")
     notes += [_seeds(records, spread), *DEFINITIONS]
@@ -60,6 +61,17 @@ def _iterations(record: Record) -> str:
 
 def _machine(record: Record) -> str:
     return f"{printable(record.provenance.device)}, {record.provenance.threads} threads"
+
+
+def _load(records: list[Record]) -> list[str]:
+    """Say how busy the machine was, as far as the records do."""
+    costs = [r.cost for r in records if r.cost]
+    loads = [cost.load for cost in costs if cost.load is not None]
+    if not loads:
+        return []
+    ends = dict.fromkeys(f"{load:.1f}" for load in (min(loads), max(loads)))
+    silent = f"; {len(costs) - len(loads)} of {len(costs)} runs do not say" if len(loads) < len(costs) else ""
+    return [f"load of the machine during a training, these runs included: {' to '.join(ends)}{silent}"]
 
 
 def _commit(record: Record) -> str:

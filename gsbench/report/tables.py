@@ -25,6 +25,7 @@ COLUMNS = (  # their keys are columns of `tidy`
     Column("fps", "FPS", None, "fps"),
     Column("num_gaussians", "#Gaussians", 0, "num_gaussians"),
 )
+COSTS = ("fps", "num_gaussians", "bytes", "peak_memory", "train_cpu_s", "load")  # of a record, as it has them
 TRAIN = Column("psnr_train", "PSNR train", 2)  # shown on request
 EXTRA_COLUMNS = (Column("lpips_vgg", "LPIPS-VGG", 3), Column(LEAKS, LEAKS, 2))  # where a run has them
 
@@ -84,7 +85,7 @@ def quantities(r: Record) -> dict[str, Any]:
     flat["missing"] = "; ".join(f"{name}: {why}" for name, why in sorted(r.missing.items()))
     cost = r.cost
     flat["train_min"] = cost and cost.train_s / 60
-    flat |= {name: cost and getattr(cost, name) for name in ("fps", "num_gaussians", "bytes", "peak_memory")}
+    flat |= {name: cost and getattr(cost, name) for name in COSTS}
     flat |= {f"render_ms_{name}": cost and getattr(cost.render_ms, name) for name in ("p10", "p50", "p90")}
     flat |= {f"effect_{name}": value for name, value in vars(r.effects).items()}
     flat |= {f"protocol_{name}": value for name, value in sorted(r.protocol.items())}

@@ -18,7 +18,7 @@ from gsbench.measure import record as records
 from gsbench.measure.provenance import provenance
 from gsbench.measure.quality import Quality, evaluate, evenly
 from gsbench.measure.record import Cost, Effects, OnDemand, Record, TimeScreen
-from gsbench.measure.speed import peak_memory, reset_peak_memory, synchroniser, time_renders
+from gsbench.measure.speed import Effort, peak_memory, reset_peak_memory, synchroniser, time_renders
 from gsbench.models import GaussianModel
 from gsbench.models.classes import packed_bytes
 from gsbench.models.replay import Replay
@@ -49,6 +49,7 @@ class Attempt:
         # What can be refused of model=auto is, by the candidate that asks for more; `fit` chooses.
         self.config = with_candidate(this.config, "moving") if is_auto(this.config) else this.config
         self.screen: TimeScreen | None = None
+        self._screening = Effort()
         self.model: GaussianModel | None = None
         self.scene: Scene | None = None
         self.start: TrainedGaussians | None = None  # trained Gaussians to start from; None: points
@@ -93,6 +94,7 @@ class Attempt:
             print(f"{this.name}: goes on from step {trainer.step} of {path}", file=sys.stderr)
         elif self.screen is not None:
             trainer.stages.add("screen", self.screen.seconds)
+            trainer.effort.add(self._screening)
         about = self.plain(), plain_description(scene)
         with stop.requested() as request:
             report = progress.Reporter(this.folder, this.overrides, self.config.train.iterations)
@@ -136,7 +138,8 @@ class Attempt:
 
     def _choose(self, scene: Scene) -> GaussianModel:
         """Choose the model of model=auto, and say why."""
-        self.config, self.screen = resolve(self.this.config, scene)
+        with self._screening:
+            self.config, self.screen = resolve(self.this.config, scene)
         self.model = model = build(self.config)
         print(f"{self.this.name}: time is {self.screen.decision}: {self.screen.reason}; {self.config.model.name}"
               f"{' with AGR' if self.config.agr else ''}", file=sys.stderr)  # fmt: skip
@@ -175,6 +178,8 @@ class Attempt:
             num_gaussians=len(trainer.model),
             bytes=packed_bytes(trainer.model),
             peak_memory=peak_memory(config.device),
+            train_cpu_s=trainer.effort.cpu_s,
+            load=trainer.effort.load,
         )
         metrics, missing = with_best(quality, trainer, config)
         metrics["psnr_train"] = trainer.psnr(evenly(trainer.scene.train, len(views)))

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.measure.curve import Curve
-from gsbench.measure.speed import StageClock
+from gsbench.measure.speed import Effort, StageClock
 from gsbench.models import GaussianModel
 from gsbench.models.classes import pack
 from gsbench.scenes import Scene, View
@@ -67,6 +67,7 @@ class Trainer:
         self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity, len(scene.train))
         self.floor = Floor(model, [view.camera for view in scene.train])
         self.stages = StageClock(config.device)
+        self.effort = Effort()
         self.gradients = Step(model, self.renderer.background, train.ssim_weight, self.renderer.antialias, self.stages)
         self.gating = Gating(model, self.optimizer, self.density, self.floor, scene, self.renderer, config)
         self.watch = Watch(config.device)
@@ -99,7 +100,7 @@ class Trainer:
         ) as bar:
             while self.step < train.iterations:
                 camera = self.scene.train[0].camera
-                with fitting_threads(len(self.model), camera.width * camera.height):
+                with self.effort, fitting_threads(len(self.model), camera.width * camera.height):
                     self._descend()
                 if self.schedule.measures(self.step):
                     self._measure()
@@ -122,7 +123,7 @@ class Trainer:
         """Gate the finished model, and measure what that changed; the measuring counts as no time of the training."""
         self.model.set_phase(self.schedule.phase(self.step - 1))
         ungated = self.gating.now()
-        with self.stages("gate"):
+        with self.effort, self.stages("gate"):
             self.gating.at_end()
         self.gating.compare(ungated, self.views)
 
@@ -191,6 +192,7 @@ class Trainer:
             "floor": self.floor.state_dict(),
             "gating": self.gating.state_dict(),
             "stages": self.stages.state_dict(),
+            "effort": self.effort.state_dict(),
             "curve": self.curve.state_dict(),
             "best": vars(self.best).copy(),
         }
@@ -209,6 +211,7 @@ class Trainer:
             self.floor.load_state_dict(state["floor"])
             self.gating.load_state_dict(state.get("gating", NO_GATES))
             self.stages.load_state_dict(state["stages"])
+            self.effort.load_state_dict(state.get("effort"))
             self.curve.load_state_dict(state["curve"])
             self.best = Best(**state["best"])
         except InputError:

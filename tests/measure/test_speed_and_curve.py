@@ -1,5 +1,6 @@
 """Timing and the curve: what is timed, what is waited for, what a resumed run continues."""
 
+import os
 import time
 
 import numpy as np
@@ -55,6 +56,47 @@ def test_stages_add_up_and_survive_a_resume(monkeypatch):
         pass
     assert resumed.seconds["slice"] == 3.0
     assert stages.seconds["slice"] == 2.0
+
+
+def test_effort_adds_up_and_survives_a_resume(monkeypatch):
+    """Would catch a load that each block sets anew, blocks that count alike however long, and CPU-seconds that a resume
+    or the screen before a training loses."""
+    wall, cpu = iter([0.0, 1.0, 10.0, 13.0, 20.0, 21.0]), iter([5.0, 7.0, 50.0, 51.0, 60.0, 60.5])
+    loads = iter([2.0, 4.0, 1.0])
+    monkeypatch.setattr(time, "perf_counter", lambda: next(wall))
+    monkeypatch.setattr(time, "process_time", lambda: next(cpu))
+    monkeypatch.setattr(os, "getloadavg", lambda: (next(loads), 0.0, 0.0))
+    effort, screen = speed.Effort(), speed.Effort()
+    assert effort.load is None
+    for _ in range(2):  # 1 s of 2 CPUs under a load of 2, 3 s under one of 4
+        with effort:
+            pass
+    assert (effort.cpu_s, effort.load) == (3.0, 3.5)
+    with screen:
+        pass
+    effort.add(screen)
+    resumed = speed.Effort()
+    resumed.load_state_dict(effort.state_dict())
+    assert (resumed.cpu_s, resumed.load) == (3.5, pytest.approx(15 / 5))
+
+
+@pytest.mark.parametrize("fault", [AttributeError, OSError])
+def test_an_effort_that_is_not_known_is_none(fault, monkeypatch):
+    """Would catch a system without loads that ends the training, and half of a training's seconds given as all."""
+
+    def silent():
+        raise fault
+
+    monkeypatch.setattr(os, "getloadavg", silent)
+    effort = speed.Effort()
+    with effort:
+        pass
+    assert effort.load is None
+    assert effort.cpu_s is not None
+    effort.load_state_dict(None)  # a checkpoint of an older gsbench
+    with effort:
+        pass
+    assert (effort.cpu_s, effort.load) == (None, None)
 
 
 def test_laps_are_all_of_the_time(monkeypatch):

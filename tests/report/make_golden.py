@@ -53,7 +53,17 @@ def make(model: str = "7dgs", scene: str = "suzanne", seed: int = 0, psnr: float
         },
         missing={"lpips_vgg": "no trunk weights"},
         per_view=[ViewScore("test/r_000", psnr, psnr + 0.1, 0.9, 0.1)],
-        cost=Cost(90.0 + seed, {"raster": 60.0, "loss": 30.0}, RenderTimes(40.0, 50.0, 60.0), 20.0, 5000, 10**6, 10**9),
+        cost=Cost(
+            90.0 + seed,
+            {"raster": 60.0, "loss": 30.0},
+            RenderTimes(40.0, 50.0, 60.0),
+            20.0,
+            5000,
+            10**6,
+            10**9,
+            train_cpu_s=150.0,
+            load=2.0 + seed,
+        ),
         curve=[Point(500, 45.0, psnr - 1), Point(1000, 90.0, psnr)],
         provenance=Provenance(
             git_commit="0123456789abcdef0123456789abcdef01234567",

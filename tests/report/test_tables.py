@@ -156,6 +156,16 @@ def test_a_protocol_may_go_with_the_scene_but_not_within_it():
     )
 
 
+def test_the_load_is_told_as_far_as_it_is_known():
+    """Would catch a load of some runs that passes for that of all, and records that are silent about it taken for 0."""
+    busy, silent = make(seed=1), make("4dgs")
+    silent = dataclasses.replace(silent, cost=dataclasses.replace(silent.cost, load=None, train_cpu_s=None))
+    assert "these runs included: 3.0\n" in page(busy)
+    assert "these runs included: 3.0; 1 of 2 runs do not say" in page(busy, silent, failed(seed=2))
+    assert "load" not in page(silent)
+    assert list(tables.tidy([busy, silent]).load.isna()) == [False, True]
+
+
 def test_columns_that_leak_or_are_rare_say_so():
     """Would catch the best-on-test column without its warning, or an LPIPS-VGG that was measured and is not shown."""
     metrics = {**make().metrics, "lpips_vgg": 0.25, "psnr_best_on_test": 26.5}

@@ -55,7 +55,7 @@ def assert_same_bits(a: object, b: object, where: str = "state") -> None:
         assert isinstance(b, dict)
         assert a.keys() == b.keys(), where
         for key in a:
-            if key not in ("stages", "curve"):  # seconds, which no two runs share
+            if key not in ("stages", "effort", "curve"):  # seconds, which no two runs share
                 assert_same_bits(a[key], b[key], f"{where}.{key}")
     elif isinstance(a, list):
         assert isinstance(b, list)
@@ -103,6 +103,8 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, whole:
         (path,) = record.find(results)
         scores.append(record.read(path))
     assert scores[0].metrics == scores[1].metrics
+    costs = [score.cost for score in scores]
+    assert all(cost and cost.train_cpu_s and cost.train_cpu_s > 0.5 * cost.train_s for cost in costs)  # of all attempts
     assert [p.psnr_val for p in scores[0].curve] == [p.psnr_val for p in scores[1].curve]
 
 

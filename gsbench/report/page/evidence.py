@@ -22,13 +22,14 @@ def _compared(group: Group) -> list[Record]:
 
 def protocol_section(group: Group) -> Section:
     """List protocol, data, machine, commit, versions and seeds, warnings first, and every run."""
-    columns = [Column("run"), Column("status"), Column("PSNR dB", 2), Column("training s", 1), Column("ms a frame", 2)]
-    columns += [Column("MB", 2), Column("iterations"), Column("machine"), Column("commit"), Column("command")]
+    columns = [Column("run"), Column("status"), Column("PSNR dB", 2), Column("training s", 1), Column("CPU s", 1)]
+    columns += [Column("load", 1), Column("ms a frame", 2), Column("MB", 2), Column("iterations"), Column("machine")]
+    columns += [Column("commit"), Column("command")]
     rows: list[list[Value]] = [
         [
             words.run_name(r),
             r.status,
-            *(group.value(r, q) for q in ("psnr", "seconds", "ms", "mb")),
+            *(group.value(r, q) for q in ("psnr", "seconds", "cpu_s", "load", "ms", "mb")),
             iterations(r),
             machine(r),
             r.provenance.git_commit,
