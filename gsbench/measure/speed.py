@@ -229,12 +229,13 @@ class Effort:
     @property
     def cpu_s(self) -> float | None:
         """The CPU-seconds of all threads of this process."""
-        return None if math.isnan(self._cpu_s) else self._cpu_s
+        return self._cpu_s if math.isfinite(self._cpu_s) else None
 
     @property
     def load(self) -> float | None:
         """The mean of `load()` over the seconds."""
-        return None if math.isnan(self._load_s) or not self._seconds else self._load_s / self._seconds
+        mean = self._load_s / self._seconds if self._seconds else math.nan
+        return mean if math.isfinite(mean) else None
 
     def state_dict(self) -> dict[str, float]:
         """Return the sums so far, for the checkpoint."""

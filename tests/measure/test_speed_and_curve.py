@@ -93,10 +93,14 @@ def test_an_effort_that_is_not_known_is_none(fault, monkeypatch):
         pass
     assert effort.load is None
     assert effort.cpu_s is not None
-    effort.load_state_dict(None)  # a checkpoint of an older gsbench
-    with effort:
-        pass
-    assert (effort.cpu_s, effort.load) == (None, None)
+    for state in (
+        None,
+        {"seconds": 1.0, "cpu_s": float("inf"), "load_s": float("inf")},
+    ):  # an older checkpoint, a bad one
+        effort.load_state_dict(state)
+        with effort:
+            pass
+        assert (effort.cpu_s, effort.load) == (None, None)
 
 
 def test_laps_are_all_of_the_time(monkeypatch):
