@@ -3,9 +3,11 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from gsbench.allocator import keep_freed_memory
 from gsbench.openmp import sleep_when_idle
 
-sleep_when_idle()  # before anything of gsbench imports torch or the kernels
+keep_freed_memory()  # both before anything of gsbench imports torch or the kernels
+sleep_when_idle()
 
 __version__ = "0.2.0"  # the only place: pyproject.toml reads it here, and a test holds CITATION.cff to it
 

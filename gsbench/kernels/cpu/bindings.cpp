@@ -4,10 +4,6 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
-#if defined(__GLIBC__)
-#include <malloc.h>
-#endif
-
 #include "dispatch.h"
 
 namespace nb = nanobind;
@@ -16,19 +12,9 @@ namespace {
 
 const gsb::Kernels* active = nullptr;
 
-// A step frees 100 MB of gradients and asks for them again. By default the system takes large blocks back each time and
-// maps them anew page by page, a quarter of a step of 4DGS at 150,000 Gaussians.
-void keep_memory() {
-#if defined(__GLIBC__)
-    mallopt(M_MMAP_THRESHOLD, 1 << 30);
-    mallopt(M_TRIM_THRESHOLD, 1 << 30);
-#endif
-}
-
 }  // namespace
 
 NB_MODULE(_native, m) {
-    keep_memory();
     active = &gsb::kernels_of(gsb::instruction_sets().back());
     m.def("instruction_sets", &gsb::instruction_sets, "Those built in that run on this machine, the best last.");
     m.def("use", [](const std::string& isa) { active = &gsb::kernels_of(isa); }, "Switch to an instruction set.");
