@@ -64,6 +64,9 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
     Raises:
         InputError: the scene has no training view.
     """
+    # The first optimizer of a process imports torch's compiler, a second that is not the screen's: a training makes its
+    # optimizer before its clock starts, too.
+    torch.optim.Adam([torch.zeros(1)])
     started = time.perf_counter()
     if not scene.train:
         raise InputError(f"{scene.name}: expected training views to look at, there are none")

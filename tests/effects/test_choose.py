@@ -1,6 +1,9 @@
 """Whether a scene changes with time, asked of scenes whose answer is known."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +30,23 @@ def test_known_worlds(world: World, decision: str) -> None:
     assert found.decision == decision, found
     assert found.free is not None
     assert found.free > 0.7
+
+
+def test_imports_are_no_seconds_of_the_screen() -> None:
+    """Catches a screen that is charged for what torch imports with a process's first optimizer, once 1.1 s of 1.5."""
+    code = """
+import sys, time
+from worlds import filmed, still
+from gsbench.effects import choose
+clock, loaded = time.perf_counter, []
+time.perf_counter = lambda: (loaded.append(set(sys.modules)), clock())[1]
+choose.screen(filmed(still))
+print(len([name for name in loaded[-1] - loaded[0] if name.startswith("torch._dynamo")]))
+"""
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    environment = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert done.stdout == "0\n", done.stderr
 
 
 def test_shuffled_times_are_no_time() -> None:
