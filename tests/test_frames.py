@@ -7,17 +7,16 @@ import pytest
 import torch
 
 from gsbench.backends import CPU, CUDA, Backend
-from gsbench.config import RasterConfig
 from gsbench.run import attempt
 from gsbench.scenes.scene import Camera, View
+from gsbench.train.renderer import Renderer
 
 VIEW = View("test/r_0", Camera(torch.eye(4), torch.eye(3), 5, 4), 0.4, torch.zeros(4, 5, 3))
 
 
 def trainer(backend: Backend) -> Any:
-    config = SimpleNamespace(device="cpu", raster=RasterConfig())
-    model = SimpleNamespace(backend=backend)
-    return SimpleNamespace(model=model, background=None, config=config, render=lambda _: "launched")
+    model, renderer = SimpleNamespace(backend=backend), Renderer(torch.zeros(3), antialias=False)
+    return SimpleNamespace(model=model, renderer=renderer, render=lambda _: "launched")
 
 
 class Recorded:
