@@ -21,9 +21,9 @@ def keep_freed_memory() -> None:
     thresholds are, so the lanes of gsbench.lanes share the first one's: docs/cpu.md has what that is worth. Where there
     is no glibc, nothing is done.
     """
-    if sys.platform != "linux":
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None  # musl has none
+    if mallopt is None:
         return
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # musl has none
     for variable, (option, value) in OPTIONS.items():
-        if mallopt is not None and variable not in os.environ:
+        if variable not in os.environ:
             mallopt(option, value)

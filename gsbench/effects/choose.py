@@ -64,9 +64,7 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
     Raises:
         InputError: the scene has no training view.
     """
-    # The first optimizer of a process imports torch's compiler, a second that is not the screen's: a training makes its
-    # optimizer before its clock starts, too.
-    torch.optim.Adam([torch.zeros(1)])
+    import_compiler()
     started = time.perf_counter()
     if not scene.train:
         raise InputError(f"{scene.name}: expected training views to look at, there are none")
@@ -91,6 +89,14 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
     if found.p <= LEVEL:
         return conclude("on", f"what a static fit leaves over changes with time ({said})", found)
     return conclude("off", f"what a static fit leaves over does not change with time ({said})", found)
+
+
+def import_compiler() -> None:
+    """Let torch import its compiler, as the first optimizer of a process does, before a clock starts.
+
+    It takes a second that is not the screen's: a training makes its optimizer before its clock starts, too.
+    """
+    torch.optim.Adam([torch.zeros(1)])
 
 
 # ---- the test

@@ -13,6 +13,7 @@ from torch import Tensor
 from gsbench import models
 from gsbench.config import Config, DataConfig
 from gsbench.effects import picture
+from gsbench.effects.choose import import_compiler
 from gsbench.errors import InputError, one_line
 from gsbench.measure import record as records
 from gsbench.measure.provenance import provenance
@@ -138,6 +139,7 @@ class Attempt:
 
     def _choose(self, scene: Scene) -> GaussianModel:
         """Choose the model of model=auto, and say why."""
+        import_compiler()
         with self._screening:
             self.config, self.screen = resolve(self.this.config, scene)
         self.model = model = build(self.config)
