@@ -93,10 +93,8 @@ def test_an_effort_that_is_not_known_is_none(fault, monkeypatch):
         pass
     assert effort.load is None
     assert effort.cpu_s is not None
-    for state in (
-        None,
-        {"seconds": 1.0, "cpu_s": float("inf"), "load_s": float("inf")},
-    ):  # an older checkpoint, a bad one
+    endless = {"seconds": 1.0, "cpu_s": float("inf"), "load_s": float("inf")}
+    for state in (None, endless):  # of an older gsbench; of none, for a record holds no infinity
         effort.load_state_dict(state)
         with effort:
             pass
