@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gsbench.kernels.tape import Tape
@@ -179,21 +180,29 @@ def _error(cut: Cut, here: Place, draw: Drawing) -> Tensor:
         colors = model.paint(raw, live.means, live.opacities, here.query)
         return _grown([(product.colors * (colors - live.colors)).sum(-1) for product in here.products])
     means, factors, opacities = model.observe(raw, here.query)
-    changed = Gaussians3D(means, factors, opacities, model.paint(raw, means, opacities, here.query))
+    whole = Gaussians3D(means, factors, opacities, model.paint(raw, means, opacities, here.query))
+    live, changed = _first(cut.rows, live), _first(cut.rows, whole)
+    before, removed = [_first(cut.rows, product) for product in here.products], [x[: cut.rows] for x in here.removed]
     thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))
-    both = draw(Gaussians3D(*(torch.cat(pair) for pair in zip(live, thin, strict=True))))
-    N = len(live.means)
-    size = torch.maximum(here.drawn.radii, both.radii[N:]).clamp(min=1) / 3
-    distance = (both.means2d[N:] - here.drawn.means2d) / (2 * size[:, None])
+    both = draw(Gaussians3D(*(torch.cat(pair) for pair in zip(here.live, thin, strict=True))))
+    N = len(here.live.means)
+    size = torch.maximum(here.drawn.radii[: cut.rows], both.radii[N:]).clamp(min=1) / 3
+    distance = (both.means2d[N:] - here.drawn.means2d[: cut.rows]) / (2 * size[:, None])
     overlap = torch.exp(-distance.square().sum(-1))
     shown = 1 - HIDDEN * live.opacities * overlap
     scale = changed.opacities / (thin.opacities.clamp(min=1e-12) * shown)  # an image is linear in an opacity
     there = [Gaussians3D(p.means[N:] * scale[:, None], p.factors[N:] * scale[:, None, None], p.opacities[N:] / shown,
                          p.colors[N:] * scale[:, None]) for p in both.products(here.vectors)]  # fmt: skip
     delta = [to - at for at, to in zip(live, changed, strict=True)]
-    along = [(_dot(a, delta) + _dot(b, delta)) / 2 for a, b in zip(here.products, there, strict=True)]
+    along = [(_dot(a, delta) + _dot(b, delta)) / 2 for a, b in zip(before, there, strict=True)]
     added = [product.opacities * changed.opacities for product in there]
-    return overlap * _grown(along) + (1 - overlap) * _grown(here.removed, added)
+    error = overlap * _grown(along) + (1 - overlap) * _grown(removed, added)
+    return F.pad(error, (0, N - cut.rows))
+
+
+def _first(rows: int, gaussians: Gaussians3D) -> Gaussians3D:
+    """Return the first rows of a slice."""
+    return Gaussians3D(*(x[:rows] for x in gaussians))
 
 
 def _grown(*changes: list[Tensor]) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsbench.lanes import side_by_side
 from gsbench.models.base import GaussianModel, Gaussians3D, Raw
-from gsbench.models.classes import Classes
+from gsbench.models.classes import Classes, count
 from gsbench.models.query import Query
 from gsbench.scenes.points import SH_C0
 
@@ -27,6 +27,7 @@ class Cut:
 
     name: str
     raw: Raw | None  # the raw parameters that change; None: the Gaussian is removed
+    rows: int  # only this many first rows change: classes that are behind them have nothing of this to lose
     level: int | None = None  # of the harmonics that are left (see Classes.levels), where only the colour changes
 
 
@@ -47,19 +48,21 @@ def cuts_of(
     raw: Raw = {name: value.detach() for name, value in model.splats.items()}
     fewer = {level: raw | {"shN": raw["shN"] * model.kept(Classes(0, 0, _all(model, level)))["shN"]}
              for level in model.lower_levels()}  # fmt: skip
+    rows = count(model)
+    sliced = len(model) - rows["still"]
     refined, lost = _averages(model, queries, slices, weights, names if model.refines else (), list(fewer.values()))
     raw = raw | refined
     if model.refines:
-        found.append(Cut(SLICED, refined))
+        found.append(Cut(SLICED, refined, rows["refined"]))
     for name, frozen in model.frozen(raw, queries, weights).items():
         if name != STILL and not by_halves:
             continue
-        found.append(Cut(name, {key: raw[key] for key in names} | frozen))
-    found.append(Cut(REMOVED, None))
+        found.append(Cut(name, {key: raw[key] for key in names} | frozen, sliced))
+    found.append(Cut(REMOVED, None, len(model)))
     for (level, cut), missing in zip(fewer.items(), lost, strict=True):
         constant = cut["sh0"].clone()
         constant.flatten(1, -2)[:, 0] += missing / SH_C0
-        found.append(Cut(f"level{level}", {"sh0": constant, "shN": cut["shN"]}, level))
+        found.append(Cut(f"level{level}", {"sh0": constant, "shN": cut["shN"]}, len(model), level))
     return found
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_strength import BLACK, OPTIONS, SIZE, N, trained_a_little, views_of
+from test_strength import BLACK, OPTIONS, SIZE, N, slice_of, trained_a_little, views_of
 from torch import Tensor
 from worlds import camera
 
@@ -17,7 +17,9 @@ from gsbench.errors import InputError
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.measure.quality import psnr
 from gsbench.models import GaussianModel, Query
+from gsbench.models.base import Gaussians3D
 from gsbench.models.classes import count, pack, packed_bytes
+from gsbench.models.cuts import cuts_of
 from gsbench.models.render import render
 
 VIEWS = 10
@@ -112,6 +114,28 @@ def test_a_second_gate_takes_no_more_for_nothing(name: str) -> None:
     assert len(rows) <= len(after)
     for a, b in zip(images(after), images(again), strict=True):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
+
+
+def _up_to_turns(gaussians: Gaussians3D) -> Gaussians3D:
+    """A slice with covariances for factors: freezing 4DGS turns a factor."""
+    return gaussians._replace(factors=gaussians.factors @ gaussians.factors.mT)
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_a_cut_leaves_the_rows_behind_it(name: str) -> None:
+    """Catches a cut of a gated model that changes Gaussians whose errors the probe does not look at."""
+    _, after = gated(name, 3.0)
+    views = views_of(after, 1)[:VIEWS]
+    queries = [Query.of(view.camera, view.time) for view in views]
+    live = [after.slice(query) for query in queries]
+    errors = probe(after, views, BLACK).errors
+    for cut in cuts_of(after, queries, live):
+        for query, before in zip(queries, live, strict=True):
+            changed = slice_of(after, cut, before, query)
+            for a, b in zip(_up_to_turns(before), _up_to_turns(changed), strict=True):
+                torch.testing.assert_close(a[cut.rows :], b[cut.rows :], atol=1e-5, rtol=1e-5)
+        assert (errors[cut.name][cut.rows :] == 0).all()
+        assert cut.rows == 0 or (errors[cut.name][: cut.rows] > 0).any()
 
 
 @pytest.mark.parametrize("name", OPTIONS)
