@@ -80,7 +80,8 @@ class DensifyConfig:
 
     start: int = 500  # after this step Gaussians are cloned, split and pruned ..
     stop: int = 15_000  # .. until this one
-    every: int = 100  # steps of a run of any length: clones need them to move apart before the next decision
+    every: int = 100  # steps of a run of any length: clones need them to move apart before the next decision ..
+    rounds: int | None = None  # .. and more where a long run would have more than so many of them; None: 36
     reset_every: int = 3_000  # opacity reset
     grad_threshold: float = 2e-4  # mean gradient of a 2D mean, in units of half the image
     clone_below: float = 0.01  # clone if the largest scale is below this part of the extent, else split

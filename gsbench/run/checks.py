@@ -37,6 +37,7 @@ RANGES = {  # of numbers that the schema types but does not bound, both ends inc
     "train.densify.start": (0, ENDLESS),
     "train.densify.stop": (0, ENDLESS),
     "train.densify.every": (1, ENDLESS),
+    "train.densify.rounds": (1, ENDLESS),
     "train.densify.reset_every": (1, ENDLESS),
     "train.densify.grad_threshold": (0, math.inf),
     "train.densify.clone_below": (0, math.inf),

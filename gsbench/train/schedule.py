@@ -1,13 +1,19 @@
 """Schedule a training: scale the steps of the recipe to a run of any length, and order the views."""
 
+import math
+
 import torch
 
 from gsbench.config import TrainConfig
 from gsbench.models import Phase
 
 # Some intervals are a number of steps in a run of any length: clones need `densify.every` steps to move apart, so it is
-# not scaled, and Adam needs this many between two resets to raise opacities again at its rate of 0.05.
+# no part of a run, and Adam needs this many between two resets to raise opacities again at its rate of 0.05.
 STEPS_BETWEEN_RESETS = 300
+
+# Gaussians multiply by each round of densification, so a long run has no more rounds than this: on trex, 72 rounds left
+# three times as many Gaussians as 18, and val no better (docs/tuning.md).
+MOST_ROUNDS = 36
 
 GATE = 18_000  # the step of the recipe after which the model is gated in training, if densification is over ..
 STEPS_TO_RECOVER = 300  # .. and so many are left: with 120 left of 300, a gated training ended 0.4 dB lower
@@ -24,7 +30,8 @@ class Schedule:
         densify = config.densify
         self.densify_start = self.scaled(densify.start)
         self.densify_stop = self.scaled(densify.stop)
-        self.densify_every = densify.every
+        window, rounds = self.densify_stop - self.densify_start, densify.rounds or MOST_ROUNDS
+        self.densify_every = max(densify.every, math.ceil(window / rounds))
         self.reset_every = max(self.scaled(densify.reset_every), STEPS_BETWEEN_RESETS)
 
     def scaled(self, step: int) -> int:
@@ -40,7 +47,7 @@ class Schedule:
         )
 
     def densifies(self, step: int) -> bool:
-        """Tell whether Gaussians are cloned, split and pruned after a step (3DGS: from 500 to 15,000, every 100)."""
+        """Tell whether Gaussians are cloned, split and pruned after a step from 500 to 15,000, as in 3DGS."""
         done = step + 1
         return self.densify_start < done <= self.densify_stop and done % self.densify_every == 0
 

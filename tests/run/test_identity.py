@@ -98,7 +98,7 @@ def test_every_key_is_of_training_or_of_measuring() -> None:
         "model.agr_octaves", "model.sh_degree", "model.min_opacity", *(f"train.{name}" for name in (
             "iterations", "recipe_iterations", "batch_size", "ssim_weight", "sh_every", "refine_from",
             "modulation_from", "curve_points", *(f"densify.{name}" for name in (
-                "start", "stop", "every", "reset_every", "grad_threshold", "clone_below", "prune_above")))),
+                "start", "stop", "every", "rounds", "reset_every", "grad_threshold", "clone_below", "prune_above")))),
     }  # fmt: skip
 
 

@@ -12,7 +12,8 @@ def schedule(iterations: int, batch_size: int = 4) -> Schedule:
 
 def test_full_run_is_the_recipe_as_published() -> None:
     """Catches an off-by-one in any step of the 30,000-iteration run: 3DGS' and 7DGS' own numbers."""
-    s = schedule(30_000)
+    published = DensifyConfig(rounds=145)  # as in conf/recipe/paper.yaml
+    s = Schedule(TrainConfig(densify=published), sh_degree=3, agr=True)
     densified = [step + 1 for step in range(30_000) if s.densifies(step)]
     assert densified == list(range(600, 15_001, 100))
     assert [step + 1 for step in range(30_000) if s.resets(step)] == [3_000, 6_000, 9_000, 12_000]
@@ -32,6 +33,15 @@ def test_short_run_keeps_the_proportions(iterations: int) -> None:
     assert short.phase(iterations - 1).sh_degree == 3
     assert short.phase(iterations - 1).refine
     assert short.densify_stop == iterations // 2 or iterations % 2
+
+
+@pytest.mark.parametrize(("iterations", "rounds"), [(1_000, 5), (7_000, 34), (7_400, 36), (15_000, 36), (300_000, 36)])
+def test_rounds_of_densification_do_not_grow_with_the_run(iterations: int, rounds: int) -> None:
+    """Catches a long run that densifies as often as its length allows, and a short one that densifies less for it."""
+    s = schedule(iterations)
+    done = [step + 1 for step in range(iterations) if s.densifies(step)]
+    assert abs(len(done) - rounds) <= 1
+    assert s.densify_every == 100 or iterations > 7_400
 
 
 def test_intervals_never_fall_below_what_they_wait_for() -> None:
