@@ -12,7 +12,7 @@ FLOORS: tuple[set[str], ...] = (
     {"allocator", "openmp"},
     {""},  # the package itself, which Python imports before any room
     {"errors", "config"},
-    {"lanes", "memory", "tensors"},
+    {"lanes", "memory", "schedule", "tensors"},
     {"reading"},
     {"scenes", "kernels"},
     {"backends"},

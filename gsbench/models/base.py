@@ -3,7 +3,6 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -18,6 +17,7 @@ from gsbench.models.query import Query, unit
 from gsbench.models.refinement import OCTAVES, Refinement
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
 from gsbench.scenes.scene import Points
+from gsbench.schedule import Phase
 
 Raw = dict[str, Tensor]  # raw parameters by name, N rows each
 CHILDREN = 2  # a split leaves two Gaussians ..
@@ -41,15 +41,6 @@ class Conditioned(NamedTuple):
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
     gate: Tensor  # [N] f_temp f_dir in [0, 1], a factor of the opacity
-
-
-@dataclass(frozen=True)
-class Phase:
-    """The parts of a model that are switched on at some step of the training."""
-
-    sh_degree: int
-    refine: bool  # AGR moves the parameters and learns
-    tune_modulation: bool  # lambda_t and lambda_d learn
 
 
 class GaussianModel(nn.Module, ABC):

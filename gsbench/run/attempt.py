@@ -36,8 +36,8 @@ from gsbench.scenes.points import frustum_points, random_points
 from gsbench.scenes.trained import TrainedGaussians
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
+from gsbench.train.draws import generator
 from gsbench.train.loop import Trainer
-from gsbench.train.schedule import generator
 from gsbench.train.watch import DivergedError
 
 

@@ -15,8 +15,9 @@ from gsbench.models import GaussianModel
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Scene
 from gsbench.scenes.scene import Points
+from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
-from gsbench.train.schedule import Schedule, generator
+from gsbench.train.draws import generator
 
 
 @dataclass(frozen=True)

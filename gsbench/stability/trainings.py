@@ -16,8 +16,8 @@ from gsbench.scenes.scene import Camera, Points, Scene, View
 from gsbench.stability.cases import Case, Cell, device_of
 from gsbench.stability.training_cases import Training
 from gsbench.train.diagnosis import explain
+from gsbench.train.draws import generator
 from gsbench.train.loop import Trainer
-from gsbench.train.schedule import generator
 from gsbench.train.watch import DivergedError
 
 

@@ -18,13 +18,14 @@ from gsbench.measure.speed import Effort, StageClock
 from gsbench.models import GaussianModel
 from gsbench.models.classes import pack
 from gsbench.scenes import Scene, View
+from gsbench.schedule import Schedule
 from gsbench.train.checkpoint import whole_number
 from gsbench.train.density import DensityControl
+from gsbench.train.draws import batch, generator
 from gsbench.train.floor import Floor
 from gsbench.train.gating import NO_GATES, Gating
 from gsbench.train.optim import Optimizer
 from gsbench.train.renderer import Renderer
-from gsbench.train.schedule import Schedule, batch, generator
 from gsbench.train.step import Step, fitting_threads
 from gsbench.train.watch import DivergedError, Watch
 

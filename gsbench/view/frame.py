@@ -9,13 +9,13 @@ import numpy.typing as npt
 import torch
 
 from gsbench.effects.picture import class_colors, cost_colors
-from gsbench.models.base import Phase
 from gsbench.models.classes import count
 from gsbench.models.query import Query
 from gsbench.models.render import rasterize_slice
 from gsbench.report.pictures import inferno
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
+from gsbench.schedule import Phase
 from gsbench.view.film import pixels
 from gsbench.view.stages import RASTER, SLICE, StageWatch, part_of
 

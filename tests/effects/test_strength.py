@@ -6,11 +6,12 @@ from torch import Tensor
 from worlds import camera
 
 from gsbench.effects.strength import probe
-from gsbench.models import GaussianModel, Phase, Query, build
+from gsbench.models import GaussianModel, Query, build
 from gsbench.models.base import Gaussians3D
 from gsbench.models.cuts import Cut, cuts_of
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes.scene import Points, View
+from gsbench.schedule import Phase
 
 N, SIZE, VIEWS = 60, 24, 30
 BLACK = torch.zeros(3)

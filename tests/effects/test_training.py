@@ -12,10 +12,11 @@ from gsbench.measure import record
 from gsbench.run.load import load_run
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene
+from gsbench.schedule import Schedule
 from gsbench.stability.training_cases import compose, moving_square
+from gsbench.train.draws import generator
 from gsbench.train.gating import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating
 from gsbench.train.loop import Trainer
-from gsbench.train.schedule import Schedule, generator
 
 STEPS = 100
 

@@ -6,10 +6,11 @@ from small import CAMERA, VARIANTS, N, lively, seeded
 from torch import Tensor
 
 from gsbench.kernels.headers import LOG_SIZE_MAX
-from gsbench.models import GaussianModel, Phase, Query
+from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Classes
 from gsbench.models.factors import rotation, rotation4d, turn_of_space
 from gsbench.models.triangular import TriangularModel
+from gsbench.schedule import Phase
 
 OBSERVING = [name for name in VARIANTS if not name.startswith("3dgs")]
 QUERY = Query.at(CAMERA, 0.45)

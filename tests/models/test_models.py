@@ -11,12 +11,13 @@ from small import CAMERA, EXTENT, MODELS, VARIANTS, N, fresh, lively, raw, seede
 from torch import Tensor, nn
 
 from gsbench.errors import InputError
-from gsbench.models import Phase, Query, build
+from gsbench.models import Query, build
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.factors import KINDS
 from gsbench.models.query import unit
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
+from gsbench.schedule import Phase
 
 # ---- the start
 

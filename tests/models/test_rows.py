@@ -9,8 +9,9 @@ from small import CAMERA, EXTENT, MODELS, VARIANTS, N, fresh, joint, lively, raw
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models import GaussianModel, Phase, Query
+from gsbench.models import GaussianModel, Query
 from gsbench.models.base import CHILDREN
+from gsbench.schedule import Phase
 
 TRIANGULAR = [v for v in VARIANTS if v.startswith(("6dgs", "7dgs")) and "row_scaled" not in v]
 IN_TIME = [v for v in TRIANGULAR if v.startswith("7dgs")]

@@ -7,12 +7,13 @@ import torch
 from models.small import CAMERA, MODELS, VARIANTS, seeded
 from torch import Tensor
 
-from gsbench.models import GaussianModel, Phase, Query, build
+from gsbench.models import GaussianModel, Query, build
 from gsbench.models.base import Conditioned, Raw
 from gsbench.models.factors import rotation, rotation4d
 from gsbench.models.start import quaternions_in_space, start_from
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
+from gsbench.schedule import Phase
 
 N = 12
 

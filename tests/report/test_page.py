@@ -13,6 +13,7 @@ import pytest
 from make_golden import make
 from many_records import EFFECTS, HOSTILE, frontier, hostile, write_all
 
+from gsbench.config import TrainConfig
 from gsbench.measure.curve import Point
 from gsbench.measure.record import ViewScore
 from gsbench.report import live
@@ -23,6 +24,7 @@ from gsbench.report.page.content import Canvas, Column, Runs, Table
 from gsbench.report.page.events import of as events_of
 from gsbench.report.page.palette import DARK, LIGHT, MARKERS, styles
 from gsbench.report.pictures import strip, write_png
+from gsbench.schedule import Schedule
 
 
 class Page(HTMLParser):
@@ -309,13 +311,10 @@ def test_the_gallery_fits(tmp_path, monkeypatch):
 
 
 def test_events_are_those_of_the_schedule():
-    """Catches marks at other steps than those at which training changes: the rule stands twice, for want of torch."""
-    train = pytest.importorskip("gsbench.train.schedule")
-    from gsbench.config import TrainConfig
-
+    """Catches marks at other steps than those at which training changes."""
     for length in (250, 2000, 7000):
         config = TrainConfig(iterations=length)
-        schedule = train.Schedule(config, 3, True)
+        schedule = Schedule(config, 3, True)
         plain = {**dataclasses.asdict(config)}
         one = make()
         model = {"lr": {"modulation": {}}}

@@ -27,8 +27,8 @@ from gsbench.stability import (
 from gsbench.stability.cases import CASES
 from gsbench.train import checkpoint, diagnosis
 from gsbench.train.checkpoint import Checkpoint
+from gsbench.train.draws import generator
 from gsbench.train.loop import Trainer
-from gsbench.train.schedule import generator
 from gsbench.train.step import Seen
 from gsbench.train.watch import DivergedError
 

@@ -14,9 +14,9 @@ from gsbench.models import Query
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene
 from gsbench.stability.training_cases import compose, moving_square
+from gsbench.train.draws import generator
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import rate_at
-from gsbench.train.schedule import generator
 from gsbench.train.step import Seen
 
 

@@ -1,11 +1,11 @@
-"""Say at which steps of a run its schedule changed something, from the config in its record.
+"""Say at which steps of a run its schedule changed something, from the config in its record."""
 
-The rule is that of gsbench.train.schedule, which needs torch; a test holds the two together.
-"""
-
+from dataclasses import fields
 from typing import Any
 
+from gsbench.config import DensifyConfig, TrainConfig
 from gsbench.measure.record import Record
+from gsbench.schedule import Schedule
 
 MEANING = {
     "A": "AGR starts",
@@ -13,7 +13,6 @@ MEANING = {
     "D": "densification ends",
     "L": "λ starts to be learned",
 }
-STEPS_BETWEEN_RESETS = 300  # as in gsbench.train.schedule
 MOST_RESETS = 4  # that are marked
 
 
@@ -22,7 +21,7 @@ def of(record: Record) -> list[tuple[int, str]]:
     config = record.provenance.config.get("train")
     try:
         steps = _steps(record, config) if isinstance(config, dict) else []
-    except (KeyError, TypeError, ZeroDivisionError, OverflowError):
+    except (KeyError, TypeError, ValueError, ArithmeticError):
         return []  # a record of another gsbench, whose config has other keys
     letters: dict[int, str] = {}
     for step, letter in sorted(steps):
@@ -31,14 +30,18 @@ def of(record: Record) -> list[tuple[int, str]]:
 
 
 def _steps(record: Record, config: dict[str, Any]) -> list[tuple[int, str]]:
-    total, densify = config["iterations"], config["densify"]
-    scaled = lambda step: max(1, round(step * total / config["recipe_iterations"]))  # noqa: E731
-    stop = scaled(densify["stop"])
-    every = max(scaled(densify["reset_every"]), STEPS_BETWEEN_RESETS)
-    resets = [done for done in range(every, stop + 1, every) if done + every // 2 <= stop]
-    found = [(step, "R") for step in resets[:MOST_RESETS]] + [(stop, "D")]
+    densify = DensifyConfig(**_known(DensifyConfig, config["densify"]))
+    train = TrainConfig(**_known(TrainConfig, config) | {"densify": densify})
+    schedule = Schedule(train, sh_degree=0, agr=record.effects.refinement)
+    found = [(step, "R") for step in schedule.resets_after[:MOST_RESETS]] + [(schedule.densify_stop, "D")]
     if record.effects.refinement:
-        found.append((scaled(config["refine_from"]), "A"))
+        found.append((schedule.scaled(train.refine_from), "A"))
     if "modulation" in record.provenance.config["model"]["lr"]:
-        found.append((scaled(config["modulation_from"]), "L"))
-    return [(step, letter) for step, letter in found if step <= total]
+        found.append((schedule.scaled(train.modulation_from), "L"))
+    return [(step, letter) for step, letter in found if step <= train.iterations]
+
+
+def _known(kind: type[TrainConfig | DensifyConfig], config: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys of a recorded config that this version of gsbench has; those that it lacks have their default."""
+    names = {one.name for one in fields(kind)}
+    return {key: value for key, value in config.items() if key in names}

@@ -1,9 +1,9 @@
-"""The recipe's steps at any length of run, and the order of views."""
+"""The recipe's steps at any length of run."""
 
 import pytest
 
 from gsbench.config import DensifyConfig, TrainConfig
-from gsbench.train.schedule import STEPS_BETWEEN_RESETS, Schedule, batch, generator
+from gsbench.schedule import STEPS_BETWEEN_RESETS, Schedule
 
 
 def schedule(iterations: int, batch_size: int = 4) -> Schedule:
@@ -66,26 +66,6 @@ def test_curve_has_its_points_and_ends_at_the_last_step(iterations: int, points:
     steps = [step for step in range(iterations) if s.measures(step)]
     assert steps[-1] == iterations - 1
     assert len(steps) == min(points, iterations)
-
-
-def test_every_view_is_seen_once_an_epoch() -> None:
-    """Catches sampling with replacement, and batches that lose views where an epoch ends within them."""
-    seen = [view for step in range(35) for view in batch(step, 7, 3, seed=1)]
-    for epoch in range(15):
-        assert sorted(seen[7 * epoch : 7 * epoch + 7]) == list(range(7))
-    assert seen[:7] != seen[7:14]
-
-
-def test_batches_depend_on_seed_and_step_alone() -> None:
-    """Catches hidden state in the order of views, which a resumed run would not have."""
-    assert batch(12, 60, 4, seed=3) == batch(12, 60, 4, seed=3)
-    assert any(batch(k, 60, 4, seed=3) != batch(k, 60, 4, seed=4) for k in range(3))
-
-
-def test_streams_of_different_purposes_differ() -> None:
-    """Catches seeds that collide: (0, 1) and (1, 0), or a stream reused for another purpose."""
-    first = {generator(*key).initial_seed() for key in [(0,), (1,), (0, 0), (0, 1), (1, 0), (0, 1, 0)]}
-    assert len(first) == 6
 
 
 def test_densify_config_is_the_published_one() -> None:

@@ -1,11 +1,12 @@
-"""Schedule a training: scale the steps of the recipe to a run of any length, and order the views."""
+"""Schedule a training: scale the steps of the recipe to a run of any length.
+
+This module needs no torch, so that the page of a report can mark what a schedule did.
+"""
 
 import math
-
-import torch
+from dataclasses import dataclass
 
 from gsbench.config import TrainConfig
-from gsbench.models import Phase
 
 # Some intervals are a number of steps in a run of any length: clones need `densify.every` steps to move apart, so it is
 # no part of a run, and Adam needs this many between two resets to raise opacities again at its rate of 0.05.
@@ -17,6 +18,15 @@ MOST_ROUNDS = 36
 
 GATE = 18_000  # the step of the recipe after which the model is gated in training, if densification is over ..
 STEPS_TO_RECOVER = 300  # .. and so many are left: with 120 left of 300, a gated training ended 0.4 dB lower
+
+
+@dataclass(frozen=True)
+class Phase:
+    """The parts of a model that are switched on at some step of the training."""
+
+    sh_degree: int
+    refine: bool  # AGR moves the parameters and learns
+    tune_modulation: bool  # lambda_t and lambda_d learn
 
 
 class Schedule:
@@ -32,7 +42,9 @@ class Schedule:
         self.densify_stop = self.scaled(densify.stop)
         window, rounds = self.densify_stop - self.densify_start, densify.rounds or MOST_ROUNDS
         self.densify_every = max(densify.every, math.ceil(window / rounds))
-        self.reset_every = max(self.scaled(densify.reset_every), STEPS_BETWEEN_RESETS)
+        every = self.reset_every = max(self.scaled(densify.reset_every), STEPS_BETWEEN_RESETS)
+        # Opacities are reset once so many steps are done: while densifying, and only with steps left to recover.
+        self.resets_after = range(every, self.densify_stop - every // 2 + 1, every)
 
     def scaled(self, step: int) -> int:
         """Scale a step of the recipe to this run; at least 1."""
@@ -52,9 +64,8 @@ class Schedule:
         return self.densify_start < done <= self.densify_stop and done % self.densify_every == 0
 
     def resets(self, step: int) -> bool:
-        """Tell whether opacities are reset after a step: while densifying, and only with steps left to recover."""
-        done = step + 1
-        return done % self.reset_every == 0 and done + self.reset_every // 2 <= max(self.densify_stop, 1)
+        """Tell whether opacities are reset after a step, counted from 0."""
+        return step + 1 in self.resets_after
 
     def has_reset(self, step: int) -> bool:
         """Tell whether there was an opacity reset; from then on Gaussians that are too large are pruned."""
@@ -70,29 +81,3 @@ class Schedule:
         points = max(1, self.config.curve_points)
         done, total = step + 1, self.config.iterations
         return done == total or done * points // total != step * points // total
-
-
-def batch(step: int, views: int, batch_size: int, seed: int) -> list[int]:
-    """List the views of a step: every view appears once an epoch, in an order drawn from (seed, epoch).
-
-    The result depends on the arguments alone, so that a resumed run sees the same views as an uninterrupted one.
-
-    Args:
-        step: counted from 0.
-        views: the number of training views.
-        batch_size: views in a step.
-        seed: of the run.
-    """
-    chosen = []
-    for position in range(step * batch_size, (step + 1) * batch_size):
-        epoch, place = divmod(position, views)
-        chosen.append(int(torch.randperm(views, generator=generator(seed, epoch))[place]))
-    return chosen
-
-
-def generator(seed: int, *purpose: int) -> torch.Generator:
-    """Make a random generator for a seed and a purpose, such as the number of a step."""
-    mixed = 0
-    for number in (seed, *purpose):
-        mixed = (mixed * 6364136223846793005 + number + 1442695040888963407) % (1 << 63)
-    return torch.Generator().manual_seed(mixed)
