@@ -55,8 +55,9 @@ frontier: setup  ## train seven models at five lengths and three capacities, and
 tables: setup  ## write Tables 1 and 2 of the paper from whatever is in results/, and say what is missing
 	$(BIN)/python -m gsbench.report --tables results
 
+# Two processes, for CI has two cores; a file's tests stay together, since they share trainings.
 test: lint  ## lint, types and all tests but the slow ones
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-all: lint $(VENV)/installed-docs  ## the slow tests too
 	$(BIN)/python -m pytest -m 'slow or not slow'

@@ -11,7 +11,7 @@ from tiny_run import ROOT
 FLOORS: tuple[set[str], ...] = (
     {"allocator", "openmp"},
     {""},  # the package itself, which Python imports before any room
-    {"errors", "config"},
+    {"errors", "config", "phase"},
     {"lanes", "memory", "schedule", "tensors"},
     {"reading"},
     {"scenes", "kernels"},

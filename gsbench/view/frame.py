@@ -12,10 +12,10 @@ from gsbench.effects.picture import class_colors, cost_colors
 from gsbench.models.classes import count
 from gsbench.models.query import Query
 from gsbench.models.render import rasterize_slice
+from gsbench.phase import Phase
 from gsbench.report.pictures import inferno
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
-from gsbench.schedule import Phase
 from gsbench.view.film import pixels
 from gsbench.view.stages import RASTER, SLICE, StageWatch, part_of
 

@@ -17,9 +17,9 @@ from gsbench.models import GaussianModel, build
 from gsbench.models.base import Gaussians3D
 from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes, count
 from gsbench.models.cuts import STILL
+from gsbench.phase import Phase
 from gsbench.report.page.palette import CLASS_LIKE, LIGHT, MODELS
 from gsbench.scenes import Camera, Points
-from gsbench.schedule import Phase
 
 CAMERA = Camera(torch.eye(4), torch.tensor([[50.0, 0, 50], [0, 50, 10], [0, 0, 1]]), 100, 20)
 CENTRES = (10, 30, 50, 70, 90)  # pixels of five Gaussians, four standard deviations of which are between two

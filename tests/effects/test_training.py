@@ -55,7 +55,7 @@ def assert_same(a: object, b: object) -> None:
 @pytest.fixture(autouse=True)
 def few_steps_recover(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trainings of a test are short."""
-    monkeypatch.setattr("gsbench.train.schedule.STEPS_TO_RECOVER", 20)
+    monkeypatch.setattr("gsbench.schedule.STEPS_TO_RECOVER", 20)
 
 
 def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,9 +17,9 @@ from gsbench.kernels.library import Library
 from gsbench.models import Query
 from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes, count
 from gsbench.models.render import rasterize_slice, render
+from gsbench.phase import Phase
 from gsbench.run.load import LoadedRun, SceneDescription
 from gsbench.scenes import Camera
-from gsbench.schedule import Phase
 from gsbench.view import paths
 from gsbench.view.__main__ import main
 from gsbench.view.client import camera_at
