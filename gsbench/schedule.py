@@ -9,7 +9,7 @@ from gsbench.config import TrainConfig
 from gsbench.phase import Phase
 
 # Some intervals are a number of steps in a run of any length: clones need `densify.every` steps to move apart, so it is
-# no part of a run, and Adam needs this many between two resets to raise opacities again at its rate of 0.05.
+# not scaled, and Adam needs this many between two resets to raise opacities again at its rate of 0.05.
 STEPS_BETWEEN_RESETS = 300
 
 # Gaussians multiply by each round of densification, so a long run has no more rounds than 7,400 iterations have: 145 of
@@ -50,7 +50,7 @@ class Schedule:
         )
 
     def densifies(self, step: int) -> bool:
-        """Tell whether Gaussians are cloned, split and pruned after a step from 500 to 15,000, as in 3DGS."""
+        """Tell whether Gaussians are cloned, split and pruned after a step (3DGS: from 500 to 15,000)."""
         done = step + 1
         return self.densify_start < done <= self.densify_stop and done % self.densify_every == 0
 

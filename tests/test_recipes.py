@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from gsbench.config import CONF, Config, register_schema
 from gsbench.run.setup import build
 from gsbench.scenes.points import random_points
+from gsbench.schedule import Schedule
 from gsbench.train.optim import Optimizer, rate_at
 
 
@@ -40,6 +41,7 @@ def test_rates_of_the_paper() -> None:
             assert found["log_diagonal"] == 5e-2
             assert found["shape"] == found["motion"] == found["coupling"] == 1e-2
         assert (config.agr, config.model.agr_octaves) == (True, 10)
+        assert Schedule(config.train, 3, config.agr).densify_every == 100
         assert config.model.options["factor_order"] == "paper"
         assert config.model.options["off_diagonal"] == "raw"
 
@@ -50,6 +52,7 @@ def test_rates_of_the_authors_code() -> None:
     found = rates(config, 0.5)
     assert (found["log_diagonal"], found["shape"], found["motion"], found["modulation"]) == (5e-3, 1e-3, 1e-3, 0)
     assert not config.agr
+    assert Schedule(composed("+recipe=authors", "train.iterations=30000").train, 3, agr=False).densify_every == 100
     assert config.model.options["lambda_t"] == config.model.options["lambda_d"] == 0.01
     assert config.model.options["off_diagonal"] == "row_scaled"
 

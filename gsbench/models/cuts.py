@@ -50,9 +50,9 @@ def cuts_of(
              for level in model.lower_levels()}  # fmt: skip
     rows = count(model)
     sliced = len(model) - rows["still"]
-    refined, lost = _averages(model, queries, slices, weights, names if model.refines else (), list(fewer.values()))
+    refined, lost = _averages(model, queries, slices, weights, names if rows["refined"] else (), list(fewer.values()))
     raw = raw | refined
-    if model.refines:
+    if rows["refined"]:
         found.append(Cut(SLICED, refined, rows["refined"]))
     for name, frozen in model.frozen(raw, queries, weights).items():
         if name != STILL and not by_halves:
