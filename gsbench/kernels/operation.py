@@ -44,6 +44,7 @@ class Operation:
         zeroed: Sequence[str] = (),
         on_request: Sequence[str] = (),
         integers: Sequence[str] = (),
+        lists: Sequence[str] = (),
         derive: Callable[[dict[str, Tensor], Slots], Sizes] | None = None,
         scratch: str | None = None,
         memory: str = "results",
@@ -63,6 +64,7 @@ class Operation:
             zeroed: inputs whose gradient is a sum over Gaussians, of which a GPU's blocks each add a part.
             on_request: inputs whose gradient costs something, and is computed where it is wanted only.
             integers: inputs of int32; all others are float32.
+            lists: inputs [n] whose length differs from call to call, and is the size of nothing else.
             derive: sizes that are no input's own, from the tensors given and the numbers.
             scratch: the shape of memory that backward needs on a GPU, zero on entry.
             memory: what the outputs are, for a message that there is not enough of it.
@@ -80,6 +82,7 @@ class Operation:
         self._optional = {i for group in self._left_out_together for i in group}
         self._on_request = {f"grad.{key}" for key in on_request}
         self._zeroed = {f"grad.{key}" for key in (*adds, *zeroed, *on_request)}
+        self._lists = {places[key]: inputs[key] for key in lists}  # the names of their lengths
         self._dtypes = [torch.int32 if key in integers else torch.float32 for key in self.inputs]
         self._derive = derive
         self._scratch = _shape(scratch) if scratch is not None else None
@@ -219,10 +222,13 @@ class Operation:
 
     def match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
         """The sizes and numbers of a call; raises InputError unless everything is as declared."""
-        call = [*numbers, *[(x.shape, x.dtype, x.device, x.layout) for x in tensors]]
+        call = [*numbers, *[(x.dim() if i in self._lists else x.shape, x.dtype, x.device, x.layout)
+                            for i, x in enumerate(tensors)]]  # fmt: skip
         last, slots = self._last
         if call != last:  # a training step asks the same a thousand times
             slots = self._match(tensors, numbers)
+            for length in self._lists.values():
+                del slots[length]
             self._last = call, slots
         return slots
 

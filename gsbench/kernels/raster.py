@@ -89,6 +89,7 @@ _blend = Operation(
     passive=["half_sizes", "offsets", "ids", "transmittance", "stop"],
     on_request=["background"],
     integers=["offsets", "ids"],
+    lists=["ids"],
     derive=_of_images,
     scratch="C N sums",
     memory="images",

@@ -33,9 +33,14 @@ class _Inputs(NamedTuple):
         *values, weight_in, bias_in = tensors[: -4 - 2 * networks]
         weights_out, biases_out = tensors[-4 - 2 * networks : -4 - networks], tensors[-4 - networks : -4]
         units, gamma, spans, time = tensors[-4:]
-        left_out = spans.dim() < 2
+        left_out = spans.shape == (0,)
         return cls(values, weight_in, bias_in, weights_out, biases_out, units, gamma,
                    None if left_out else spans, None if left_out else time)  # fmt: skip
+
+    def named(self) -> list[tuple[str, Tensor]]:
+        """Every tensor that is there, in order, with the name that messages have for it."""
+        each = [(name, x if isinstance(x, list) else [x]) for name, x in self._asdict().items() if x is not None]
+        return [(name, x) for name, listed in each for x in listed]
 
     def layers(self) -> dict[str, Tensor]:
         """The weights as the kernels take them: gamma(t) is in the biases, and the units are in the weights."""
@@ -71,7 +76,10 @@ class _Refine(Operation):
 
     def split(self, arguments: Sequence[Any]) -> tuple[Tensors, tuple[Any, ...]]:
         *tensors, networks, refined = arguments
-        return list(tensors), (networks, refined)
+        if not all(isinstance(x, Tensor) for x in tensors):
+            kinds = ", ".join(sorted({type(x).__name__ for x in tensors if not isinstance(x, Tensor)}))
+            raise InputError(f"refine: expected tensors, got {kinds}")
+        return tensors, (networks, refined)
 
     def differentiable(self, tensors: Tensors) -> list[bool]:
         return [True] * (len(tensors) - 4) + [False] * 4
@@ -111,18 +119,44 @@ class _Refine(Operation):
 
     def _slots(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
         """What the kernels take, and what must live as long: the arrays, the layers and the spans."""
+        slots = self.match(tensors, numbers).copy()
+        given = _Inputs.of(tensors, numbers[0])
+        values, weights = in_rows(given.values), given.layers()
+        spans = None if given.spans is None else given.spans.contiguous()
+        slots |= {"values": _addresses(values), "spans": address(spans), "time": address(given.time),
+                  "rows": values, "layers": weights, "kept": (spans, given.time)}  # fmt: skip
+        return slots | {key: x.data_ptr() for key, x in weights.items()}
+
+    def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
         networks, refined = numbers
         given = _Inputs.of(tensors, networks)
-        values, weights = in_rows(given.values), given.layers()
-        widths = tuple(x.shape[1] for x in values)
-        own, moved = widths[: networks - 1], first_rows("refine: rows", refined, values[0])
-        spans = None if given.spans is None else given.spans.contiguous()
-        slots: Slots = {"N": values[0].shape[0], "refined": moved, "features": weights["weight_in"].shape[1],
-                        "networks": networks, "arrays": len(values), "outputs": sum(widths),
-                        "widths": (*own, sum(widths) - sum(own)), "value_widths": widths,
-                        "values": _addresses(values), "spans": address(spans), "time": address(given.time),
-                        "rows": values, "layers": weights, "kept": (spans, given.time)}  # fmt: skip
-        return slots | {key: x.data_ptr() for key, x in weights.items()}
+        listed = given.named()
+        for name, x in listed:
+            check_tensor(x, f"refine: {name}", (torch.float32,))
+            if x.dim() == 0 and name != "time":
+                raise InputError(f"refine: {name}: expected at least one dimension, got none")
+        widths, moved = [w.shape[0] for w in given.weights_out], [x.shape[-1] for x in given.values]
+        last, hidden = networks - 1, HIDDEN * networks
+        if last < 1 or [*moved[:last], sum(moved[last:])] != widths:
+            raise InputError(f"refine: expected a perceptron for each feature and one for all other values, got "
+                             f"outputs of {widths} numbers for values of {moved}")  # fmt: skip
+        if networks > MAX_NETWORKS or len(moved) > MAX_VALUES:
+            raise InputError(f"refine: expected at most {MAX_NETWORKS} perceptrons and {MAX_VALUES} arrays of values, "
+                             f"got {networks} and {len(moved)}")  # fmt: skip
+        like, features = given.values[0], sum(widths[:last])
+        rows = first_rows("refine: rows", refined, like)
+        shapes: list[tuple[int, ...]] = [(len(like), c) for c in moved]
+        shapes += [(hidden, features + len(given.gamma)), (hidden,)]
+        shapes += [(c, HIDDEN) for c in widths] + [(c,) for c in widths]
+        shapes += [(sum(widths),), (len(given.gamma),)]
+        if given.spans is not None:
+            shapes += [(rows, 2), ()]
+        for (name, x), shape in zip(listed, shapes, strict=True):
+            if tuple(x.shape) != shape or x.device != like.device:
+                raise InputError(f"refine: expected {name} of shape {list(shape)} on {like.device}, got "
+                                 f"{list(x.shape)} on {x.device}")  # fmt: skip
+        return {"N": len(like), "refined": rows, "features": features, "networks": networks, "arrays": len(moved),
+                "outputs": sum(widths), "widths": tuple(widths), "value_widths": tuple(moved)}  # fmt: skip
 
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
         return [x.new_empty(x.shape) for x in tensors[: -6 - 2 * numbers[0]]]
@@ -167,38 +201,12 @@ def refine(
     Raises:
         InputError: not float32 on one device, shapes that do not fit, or there are not so many rows.
     """
-    refined = EVERY_ROW if rows is None else rows
-    given = {"values": values, "weight_in": [weight_in], "bias_in": [bias_in], "weights_out": weights_out,
-             "biases_out": biases_out, "units": [units], "gamma": [gamma],
-             "spans": [] if spans is None else [spans], "time": [] if time is None else [time]}  # fmt: skip
-    for name, listed in given.items():
-        for x in listed:
-            check_tensor(x, f"refine: {name}", (torch.float32,))
-            if x.dim() == 0 and name != "time":
-                raise InputError(f"refine: {name}: expected at least one dimension, got none")
-    widths, moved = [w.shape[0] for w in weights_out], [x.shape[-1] for x in values]
-    last, hidden = len(widths) - 1, HIDDEN * len(widths)
-    if last < 1 or [*moved[:last], sum(moved[last:])] != widths:
-        raise InputError(f"refine: expected a perceptron for each feature and one for all other values, got outputs "
-                         f"of {widths} numbers for values of {moved}")  # fmt: skip
-    if len(widths) > MAX_NETWORKS or len(values) > MAX_VALUES:
-        raise InputError(f"refine: expected at most {MAX_NETWORKS} perceptrons and {MAX_VALUES} arrays of values, got "
-                         f"{len(widths)} and {len(values)}")  # fmt: skip
-    N, G = values[0].shape[0], gamma.shape[0]
-    shapes: list[tuple[str, Tensor, tuple[int, ...]]] = []
-    shapes += [("values", x, (N, c)) for x, c in zip(values, moved, strict=True)]
-    shapes += [("weight_in", weight_in, (hidden, sum(widths[:last]) + G)), ("bias_in", bias_in, (hidden,))]
-    shapes += [("weights_out", w, (c, HIDDEN)) for w, c in zip(weights_out, widths, strict=True)]
-    shapes += [("biases_out", b, (c,)) for b, c in zip(biases_out, widths, strict=True)]
-    shapes += [("units", units, (sum(widths),)), ("gamma", gamma, (G,))]
+    if len(weights_out) != len(biases_out):
+        raise InputError(f"refine: expected weights_out and biases_out of as many perceptrons, got {len(weights_out)} "
+                         f"and {len(biases_out)}")  # fmt: skip
     if (spans is None) != (time is None):
         raise InputError("refine: expected spans and time together, got one of them")
-    if spans is not None and time is not None:
-        shapes += [("spans", spans, (first_rows("refine: rows", refined, values[0]), 2)), ("time", time, ())]
-    for name, x, shape in shapes:
-        if tuple(x.shape) != shape or x.device != values[0].device:
-            raise InputError(f"refine: expected {name} of shape {list(shape)} on {values[0].device}, got "
-                             f"{list(x.shape)} on {x.device}")  # fmt: skip
     nothing = gamma.new_empty(0)
     when = (nothing, nothing) if spans is None else (spans, time)
-    return _refine(*values, weight_in, bias_in, *weights_out, *biases_out, units, gamma, *when, len(widths), refined)
+    return _refine(*values, weight_in, bias_in, *weights_out, *biases_out, units, gamma, *when, len(weights_out),
+                   EVERY_ROW if rows is None else rows)  # fmt: skip

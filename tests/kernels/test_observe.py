@@ -331,3 +331,8 @@ def test_errors() -> None:
         refine(values, torch.ones(128, 2), torch.ones(128), out, [torch.ones(3), torch.ones(7)], *TEN)
     with pytest.raises(InputError, match="values of"):
         refine(values[::-1], torch.ones(128, 3), torch.ones(128), out, [torch.ones(3), torch.ones(7)], *TEN)
+    with pytest.raises(InputError, match="weights_out and biases_out"):
+        refine(values, torch.ones(128, 3), torch.ones(128), out, [torch.ones(3)], *TEN)
+    with pytest.raises(InputError, match="refine: expected tensors, got ndarray"):
+        refine([*values[:1], values[1].numpy()], torch.ones(128, 3), torch.ones(128), out, [torch.ones(3),
+               torch.ones(7)], *TEN)  # fmt: skip

@@ -130,6 +130,18 @@ def test_shared_colors_collect_the_gradient_of_every_camera() -> None:
     torch.testing.assert_close(shared["colors"], separate["colors"].sum(0))
 
 
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("place", [0, 15, (1 << 17) - 1, 1 << 17, -1])
+def test_one_bad_value_of_many_is_flagged(bad: float, place: int) -> None:
+    """Catches vectors or parts of a large array that are not looked at: its first, where parts meet, its last."""
+    N = 100_003
+    arrays = [torch.full((N, 3), 0.5), torch.full((N, 3, 3), 0.5), torch.full((N,), 0.5), torch.full((N, 3), 0.5)]
+    rest = torch.eye(4)[None], torch.eye(3)[None], torch.zeros(3)
+    assert int(raster.flag_values(*arrays, *rest)) == 0
+    arrays[1].view(-1)[place] = bad
+    assert int(raster.flag_values(*arrays, *rest)) == 1 << 1
+
+
 def test_what_it_cannot_do_is_said() -> None:
     """Catches a crash or a silent wrong result where the backend has limits the reference has not."""
     arguments = single("random")

@@ -15,7 +15,7 @@ from many_records import EFFECTS, HOSTILE, frontier, hostile, write_all
 
 from gsbench.config import TrainConfig
 from gsbench.measure.curve import Point
-from gsbench.measure.record import ViewScore
+from gsbench.measure.record import Effects, ViewScore
 from gsbench.report import live
 from gsbench.report.__main__ import main
 from gsbench.report.arms import groups
@@ -310,24 +310,40 @@ def test_the_gallery_fits(tmp_path, monkeypatch):
     assert gallery.gallery(records, folder) == []
 
 
+def events_by_letter(train: TrainConfig, model: dict, effects: Effects) -> dict[str, list[int]]:
+    """The marks of a run with this recipe, model and effects."""
+    one = make()
+    provenance = dataclasses.replace(one.provenance, config={"train": dataclasses.asdict(train), "model": model})
+    marks = events_of(dataclasses.replace(one, provenance=provenance, effects=effects))
+    return {letter: [step for step, letters in marks if letter in letters] for letter in "RDAL"}
+
+
+LEARNT = {"lr": {"modulation": {"start": 1e-3}}}
+FIXED = {"lr": {"modulation": {"start": 0}}}
+
+
 def test_events_are_those_of_the_schedule():
     """Catches marks at other steps than those at which training changes."""
     for length in (250, 2000, 7000):
         config = TrainConfig(iterations=length)
         schedule = Schedule(config, 3, True)
-        plain = {**dataclasses.asdict(config)}
-        one = make()
-        model = {"lr": {"modulation": {}}}
-        one = dataclasses.replace(
-            one, provenance=dataclasses.replace(one.provenance, config={"train": plain, "model": model})
-        )
-        found = {letter: [s for s, letters in events_of(one) if letter in letters] for letter in "RDAL"}
+        found = events_by_letter(config, LEARNT, Effects(time=True, direction=True, refinement=True))
         resets = [step + 1 for step in range(length) if schedule.resets(step)]
         assert found["R"] == resets[:4]
         assert found["D"] == [schedule.densify_stop]
         assert found["A"] == [next(s for s in range(length) if schedule.phase(s).refine)]
         assert found["L"] == [next(s for s in range(length) if schedule.phase(s).tune_modulation)]
     assert events_of(make()) == []
+
+
+def test_a_lambda_that_is_fixed_is_not_said_to_be_learned():
+    """Catches a mark for 4DGS and 6DGS, whose rate is 0, and none for model=auto, whose rates are its candidate's."""
+    config, both = TrainConfig(iterations=2000), {"candidates": {"moving": LEARNT, "static": FIXED}, "lr": {}}
+    moving = Effects(time=True, direction=True, refinement=True)
+    static = Effects(time=False, direction=True, refinement=False)
+    assert events_by_letter(config, FIXED, moving)["L"] == []
+    assert events_by_letter(config, both, moving)["L"] == events_by_letter(config, LEARNT, moving)["L"] != []
+    assert events_by_letter(config, both, static)["L"] == []
 
 
 def test_a_table_shows_its_first_rows_and_links_all():

@@ -1,5 +1,7 @@
 """Say at which steps of a run its schedule changed something, from the config in its record."""
 
+from typing import Any
+
 from gsbench.config import TrainConfig
 from gsbench.errors import InputError
 from gsbench.measure.record import Record
@@ -19,7 +21,7 @@ def of(record: Record) -> list[tuple[int, str]]:
     """Return steps and the letters of what happens there, by rising step; nothing where the config does not tell."""
     try:
         steps = _steps(record)
-    except (InputError, KeyError, TypeError, ArithmeticError):
+    except (InputError, KeyError, TypeError, AttributeError, ArithmeticError):
         return []  # a record of another gsbench, whose config has other keys
     letters: dict[int, str] = {}
     for step, letter in sorted(steps):
@@ -34,6 +36,15 @@ def _steps(record: Record) -> list[tuple[int, str]]:
     found = [(step, "R") for step in schedule.resets_after[:MOST_RESETS]] + [(schedule.densify_stop, "D")]
     if record.effects.refinement:
         found.append((schedule.scaled(train.refine_from), "A"))
-    if "modulation" in config["model"]["lr"]:
+    if _rates(record).get("modulation", {}).get("start", 0) > 0:
         found.append((schedule.scaled(train.modulation_from), "L"))
     return [(step, letter) for step, letter in found if step <= train.iterations]
+
+
+def _rates(record: Record) -> dict[str, Any]:
+    """Return the learning rates of the run's model; of model=auto those of the candidate that it chose."""
+    model = record.provenance.config["model"]
+    if model.get("candidates"):
+        model = model["candidates"]["moving" if record.effects.time else "static"]
+    rates: dict[str, Any] = model["lr"]
+    return rates
