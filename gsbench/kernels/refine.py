@@ -33,7 +33,7 @@ class _Inputs(NamedTuple):
         *values, weight_in, bias_in = tensors[: -4 - 2 * networks]
         weights_out, biases_out = tensors[-4 - 2 * networks : -4 - networks], tensors[-4 - networks : -4]
         units, gamma, spans, time = tensors[-4:]
-        left_out = spans.shape == (0,)
+        left_out = spans.shape == time.shape == (0,)
         return cls(values, weight_in, bias_in, weights_out, biases_out, units, gamma,
                    None if left_out else spans, None if left_out else time)  # fmt: skip
 

@@ -196,7 +196,7 @@ def test_rows_that_there_are_not() -> None:
         observe_rotated(*single.values(), rotating.clock, TIME, rotating.log_modulation["time"], sliced=46)
     with pytest.raises(InputError, match="refine: rows"):
         Refinement([3, 4], torch.Generator())([torch.ones(2, 3), torch.ones(2, 4)], TIME, by_kernel=True, rows=3)
-    for spans in (torch.ones(3, 2), torch.ones(2, 3), torch.ones(2, 2).double()):
+    for spans in (torch.ones(3, 2), torch.ones(2, 3), torch.ones(2, 2).double(), torch.empty(0)):
         with pytest.raises(InputError, match="spans"):
             Refinement([3, 4], torch.Generator())([torch.ones(2, 3), torch.ones(2, 4)], TIME, by_kernel=True, rows=2,
                                                   spans=spans)  # fmt: skip

@@ -9,7 +9,8 @@ namespace {
 
 constexpr int64_t PART = 1 << 17;  // numbers that are worth a second thread
 
-// Not zero where one of `count` numbers is not in [low, high]. GCC vectorises no such loop inside a parallel region.
+// Not zero where one of `count` numbers is not in [low, high]. Inside a parallel region GCC 12 does not
+// vectorise this loop.
 int any_outside(const float* x, int64_t count, float low, float high) {
     int bad = 0;
 #pragma omp simd reduction(| : bad)
