@@ -105,6 +105,9 @@ class Trainer:
                     self._descend()
                 if self.schedule.measures(self.step):
                     self._measure()
+                if self.schedule.resets(self.step):  # after the measuring: opacities take hundreds of steps to recover
+                    with self.effort, self.stages("density"):
+                        self.density.reset_opacities()
                 self.step += 1
                 bar.update()
                 # Seconds are those of the last point: reading the clock's own would wait for a GPU at every step.
@@ -148,8 +151,6 @@ class Trainer:
         with stages("density"):
             if self.schedule.densifies(step):
                 self.density.densify(generator(self.config.seed, step), self.schedule.has_reset(step))
-            if self.schedule.resets(step):
-                self.density.reset_opacities()
             if (step + 1) % self.schedule.densify_every == 0:
                 self.floor.update()
         if self.config.effects.gate == "both" and self.schedule.gates(step):

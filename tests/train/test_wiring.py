@@ -84,12 +84,24 @@ def test_opacities_are_reset_when_the_schedule_says() -> None:
         opacities.fill_(2.0)
     ceiling = 2 * fitted.config.model.min_opacity
     for step in (0, 1):
-        fitted.step = step
-        fitted._descend()
+        fitted.run(lambda _: None, "two steps", goes_on=lambda: False)
         assert (torch.sigmoid(opacities).max().item() <= ceiling * 1.001) == (step == 1)
     state = fitted.optimizer.adam.state[opacities]
     assert not state["exp_avg"].any()
     assert not state["exp_avg_sq"].any()
+
+
+def test_a_point_of_the_curve_is_measured_before_a_reset() -> None:
+    """Catches a curve, and a best on val, of models whose opacities were lowered a moment ago."""
+    fitted = trainer()
+    fitted.schedule.resets = fitted.schedule.measures = lambda _: True  # type: ignore[method-assign]
+    opacities = fitted.model.splats["opacities"]
+    with torch.no_grad():
+        opacities.fill_(2.0)
+    fitted.psnr = lambda _: opacities.max().sigmoid().item()  # type: ignore[method-assign]
+    fitted.run(lambda _: None, "a step", goes_on=lambda: False)
+    assert fitted.curve.last.psnr_val > 0.5  # type: ignore[union-attr, operator]
+    assert opacities.max().sigmoid() <= 2.001 * fitted.config.model.min_opacity
 
 
 def test_what_any_view_of_the_batch_saw_is_moved() -> None:
