@@ -45,9 +45,8 @@ PERMUTATIONS = 999
 LEVEL = 0.01  # time is on where p is at most this
 LEAST_FREE = 0.5  # share of the waves' variance that the camera must leave free
 LEAST_VIEWS = 12
-NEAR_AXES = (
-    0.5  # a point nearest to all optical axes is the scene's centre if they pass it within this part of its depth
-)
+# A point nearest to all optical axes is the scene's centre if they pass it within this part of its depth.
+NEAR_AXES = 0.5
 RADIUS = 0.4  # of the points around the centre, in distances of the cameras
 
 Array = NDArray[np.float64]
