@@ -84,7 +84,7 @@ def test_opacities_are_reset_when_the_schedule_says() -> None:
         opacities.fill_(2.0)
     ceiling = 2 * fitted.config.model.min_opacity
     for step in (0, 1):
-        fitted.run(lambda _: None, "two steps", goes_on=lambda: False)
+        fitted.run(lambda _: None, "a step", goes_on=lambda: False)
         assert (torch.sigmoid(opacities).max().item() <= ceiling * 1.001) == (step == 1)
     state = fitted.optimizer.adam.state[opacities]
     assert not state["exp_avg"].any()
