@@ -137,6 +137,11 @@ class Provenance:
     data_hash: str  # Scene.fingerprint
     time: str  # UTC, ISO 8601
 
+    @property
+    def machine(self) -> str:
+        """The device and the threads: seconds compare only between runs of one machine."""
+        return f"{self.device}, {self.threads} thread{'' if self.threads == 1 else 's'}"
+
 
 @dataclass(frozen=True)
 class Record:

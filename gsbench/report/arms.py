@@ -147,16 +147,16 @@ class Group:
     @cached_property
     def machine(self) -> str:
         """The machine of most runs; seconds of other machines are left out."""
-        return Counter(map(machine, self.finished or self.records)).most_common(1)[0][0]
+        return Counter(r.provenance.machine for r in self.finished or self.records).most_common(1)[0][0]
 
     @cached_property
     def elsewhere(self) -> int:
         """The number of finished runs on other machines."""
-        return sum(machine(r) != self.machine for r in self.finished)
+        return sum(r.provenance.machine != self.machine for r in self.finished)
 
     def value(self, record: Record, quantity: str) -> float:
         """Read one of QUANTITIES from a record; NaN where it is missing or measured on another machine."""
-        if quantity in OF_THE_MACHINE and machine(record) != self.machine:
+        if quantity in OF_THE_MACHINE and record.provenance.machine != self.machine:
             return math.nan
         return QUANTITIES[quantity](record)
 
@@ -212,11 +212,6 @@ def gating(record: Record) -> str:
 def _ungated(variant: str) -> str:
     """Return a variant without its words on gates."""
     return ",".join(word for word in variant.split(",") if word.partition("=")[0] not in ("gate", "budget_db"))
-
-
-def machine(record: Record) -> str:
-    """Name the machine of a run: its device and its threads."""
-    return f"{record.provenance.device}, {record.provenance.threads} threads"
 
 
 def iterations(record: Record) -> int | None:

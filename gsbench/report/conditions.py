@@ -60,7 +60,7 @@ def _iterations(record: Record) -> str:
 
 
 def _machine(record: Record) -> str:
-    return f"{printable(record.provenance.device)}, {record.provenance.threads} threads"
+    return printable(record.provenance.machine)
 
 
 def _load(records: list[Record]) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsbench.effects.words import CLASSES
 from gsbench.measure.record import Gate, Record
-from gsbench.report.arms import Arm, Group, machine
+from gsbench.report.arms import Arm, Group
 from gsbench.report.intervals import Estimate, estimate
 
 REMOVED = "removed"
@@ -67,7 +67,7 @@ def _average(group: Group, scene: str, arm: Arm, name: str, runs: list[Record]) 
     at_end = [(r, r.on_demand.gates[-1]) for r in runs if r.on_demand and _ends(r.on_demand.gates)]
     evaluated = all(gate.eval_loss_db is not None for _, gate in at_end)
     loss: Callable[[Gate], float | None] = lambda g: g.eval_loss_db if evaluated else g.measured_db  # noqa: E731
-    here = [gate for r, gate in at_end if machine(r) == group.machine]
+    here = [gate for r, gate in at_end if r.provenance.machine == group.machine]
     splits = [str(r.protocol.get("eval_split", "evaluated")) if evaluated else gate.checked_on for r, gate in at_end]
     kinds = [*CLASSES, REMOVED] if gates else []
     return Decided(

@@ -339,3 +339,10 @@ def test_results_make_no_commit_dirty(tmp_path: Path, monkeypatch: pytest.Monkey
     assert git_commit() == clean
     place.write_text("2")
     assert git_commit() == f"{clean}-dirty"
+
+
+def test_a_machine_is_named_by_its_threads() -> None:
+    """Catches "1 threads" on every page, and seconds of different numbers of threads taken for one machine's."""
+    of = make().provenance
+    assert of.machine == "a CPU, 2 threads"
+    assert dataclasses.replace(of, threads=1).machine == "a CPU, 1 thread"

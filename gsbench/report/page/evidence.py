@@ -2,7 +2,7 @@
 
 from gsbench.measure.record import Record
 from gsbench.report import layout, tables
-from gsbench.report.arms import Group, iterations, machine
+from gsbench.report.arms import Group, iterations
 from gsbench.report.conditions import conditions
 from gsbench.report.page import words
 from gsbench.report.page.content import Column, Section, Table, Value
@@ -31,7 +31,7 @@ def protocol_section(group: Group) -> Section:
             r.status,
             *(group.value(r, q) for q in ("psnr", "seconds", "cpu_s", "load", "ms", "mb")),
             iterations(r),
-            machine(r),
+            r.provenance.machine,
             r.provenance.git_commit,
             words.command([r]) or "not in its record",
         ]
