@@ -121,9 +121,9 @@ class Group:
 
     @cached_property
     def variant(self) -> str:
-        """The variant at which models are compared: the one that most of them share, first none."""
+        """The variant at which models are compared: the one that most of them share, first what is not ablated."""
         shared = Counter(arm.variant for arm in self.arms)
-        return min(shared, key=lambda variant: (-shared[variant], variant), default="")
+        return min(shared, key=lambda variant: (-shared[variant], is_ablated(variant), variant), default="")
 
     @cached_property
     def main_arms(self) -> list[Arm]:
@@ -132,8 +132,8 @@ class Group:
 
     @cached_property
     def compared(self) -> list[Arm]:
-        """The arms that are told apart in pairs: those at the common variant, and the same but for their gates."""
-        return [arm for arm in self.arms if arm.variant == self.variant or _ungated(arm.variant) == self.variant]
+        """The arms that are told apart in pairs: those at the common variant but for their gates and ablations."""
+        return [arm for arm in self.arms if _common(arm.variant) == _common(self.variant)]
 
     def label(self, arm: Arm) -> str:
         """Name an arm among the compared ones: its model, and its variant where that is not the common one."""
@@ -209,9 +209,15 @@ def gating(record: Record) -> str:
     return f"gate={gate}" if gate in GATES and gate != model.get("gate", "off") else ""
 
 
-def _ungated(variant: str) -> str:
-    """Return a variant without its words on gates."""
-    return ",".join(word for word in variant.split(",") if word.partition("=")[0] not in ("gate", "budget_db"))
+def is_ablated(variant: str) -> bool:
+    """Tell whether a variant changes one part of a model, by a file of conf/ablation."""
+    return any(word.startswith("ablation=") and word != "ablation=none" for word in variant.split(","))
+
+
+def _common(variant: str) -> str:
+    """Return a variant without its words on gates and ablations."""
+    own = ("gate", "budget_db", "ablation")
+    return ",".join(word for word in variant.split(",") if word.partition("=")[0] not in own)
 
 
 def iterations(record: Record) -> int | None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsbench.report.arms import Arm, Group, Values
+from gsbench.report.arms import Arm, Group, Values, is_ablated
 from gsbench.report.intervals import LEVEL, Estimate, estimate, holm
 
 Cell = tuple[bool, bool, bool]  # simulates time, direction, AGR
@@ -36,10 +36,12 @@ class Pair:
 def pairs(group: Group) -> list[Pair]:
     """Compare every two models at the common variant, gated ones too, on what both have finished.
 
-    The largest difference comes first.
+    Ablations are compared with what they change a part of, not with one another. The largest difference comes first.
     """
     found = []
     for a, b in itertools.combinations(group.compared, 2):
+        if is_ablated(a.variant) and is_ablated(b.variant):
+            continue
         difference = estimate(group.contrast([(1.0, a), (-1.0, b)], "psnr"))
         if difference.scenes == 0:
             continue

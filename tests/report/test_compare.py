@@ -51,6 +51,28 @@ def test_only_the_common_variant_is_compared():
     assert found[0].differs
 
 
+def test_ablations_are_compared_with_the_whole_model_alone():
+    """Catches a page of ablations that compares none of them, or all with one another, and Holm over those pairs."""
+    values = {"none": 25.0, "no_agr": 24.0, "schur": 23.0, "cholesky": 22.0}
+    one = group(
+        *(
+            run("7dgs_noagr" if name == "no_agr" else "7dgs", s, (v, v + s / 10), variant=f"ablation={name}")
+            for name, v in values.items()
+            for s in range(3)
+        ),
+        run("7dgs", 0, (99.0, 99.0), variant="ablation=schur,iterations=9000"),
+    )
+    assert one.variant == "ablation=none"
+    found = compare.pairs(one)
+    assert [one.label(p.better) for p in found] == ["7dgs"] * 3
+    assert [one.label(p.other) for p in found] == [
+        "7dgs, ablation=cholesky",
+        "7dgs, ablation=schur",
+        "7dgs_noagr, ablation=no_agr",
+    ]
+    assert [p.difference.mean for p in found] == pytest.approx([3.0, 2.0, 1.0])
+
+
 def test_models_that_share_no_scene_are_no_pair():
     """Catches a comparison of different scenes, and a crash where a model finished nothing."""
     failed = run("c", status="failed", reason="out of memory", metrics=None, missing={}, cost=None, per_view=[])
