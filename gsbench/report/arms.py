@@ -136,8 +136,8 @@ class Group:
         return [arm for arm in self.arms if _common(arm.variant) == _common(self.variant)]
 
     def label(self, arm: Arm) -> str:
-        """Name an arm among the compared ones: its model, and its variant where that is not the common one."""
-        return arm.model if arm.variant == self.variant else arm.name
+        """Name an arm among the compared ones: its model, and in brackets a variant that is not the common one."""
+        return arm.model if arm.variant == self.variant else f"{arm.model} ({arm.variant or 'default'})"
 
     @cached_property
     def covered(self) -> list[str]:

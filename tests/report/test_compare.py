@@ -66,9 +66,9 @@ def test_ablations_are_compared_with_the_whole_model_alone():
     found = compare.pairs(one)
     assert [one.label(p.better) for p in found] == ["7dgs"] * 3
     assert [one.label(p.other) for p in found] == [
-        "7dgs, ablation=cholesky",
-        "7dgs, ablation=schur",
-        "7dgs_noagr, ablation=no_agr",
+        "7dgs (ablation=cholesky)",
+        "7dgs (ablation=schur)",
+        "7dgs_noagr (ablation=no_agr)",
     ]
     assert [p.difference.mean for p in found] == pytest.approx([3.0, 2.0, 1.0])
 

@@ -252,4 +252,4 @@ def test_the_command_line_for_a_gated_run_names_it(tmp_path):
 def test_a_gated_model_is_told_apart_from_the_ungated_one(tmp_path):
     """Catches pairs that leave out the one a reader of gates asks for."""
     text = Page(build.render([*WHOLE, *on_demand(WHOLE, label="7dgs")], tmp_path)).text
-    assert re.search(r"7dgs, gate=both\S* − 7dgs\b|7dgs − 7dgs, gate=both", text)
+    assert re.search(r"7dgs \(gate=both\S*\) − 7dgs\b|7dgs − 7dgs \(gate=both", text)
