@@ -25,6 +25,7 @@ _KINDS: dict[type, tuple[type, ...]] = {int: (int,), float: (float, int), bool: 
 
 
 EVERY_ROW = 2**62  # for a number of rows: as many as there are
+MOST_KNOWN = 64  # calls whose shapes an operation remembers; density control makes new ones all the time
 
 
 class Operation:
@@ -96,7 +97,7 @@ class Operation:
             (Tensor, NoneType) if i in self._optional else (Tensor,) for i in range(len(inputs))
         ]
         self._kinds += [_KINDS[kind] for kind in self.numbers.values()]
-        self._last: tuple[list[Any] | None, Slots] = None, {}
+        self._known: dict[tuple[Any, ...], Slots] = {}  # by numbers, shapes and types: what `match` found
         self.backward_kernel = f"{name}_backward"  # of the same arguments as any other that is put here
         self._traced = _register(self)
 
@@ -222,14 +223,16 @@ class Operation:
 
     def match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
         """The sizes and numbers of a call; raises InputError unless everything is as declared."""
-        call = [*numbers, *[(x.dim() if i in self._lists else x.shape, x.dtype, x.device, x.layout)
-                            for i, x in enumerate(tensors)]]  # fmt: skip
-        last, slots = self._last
-        if call != last:  # a training step asks the same a thousand times
+        call = (*numbers, *[(x.dim() if i in self._lists else x.shape, x.dtype, x.device, x.layout)
+                            for i, x in enumerate(tensors)])  # fmt: skip
+        slots = self._known.get(call)  # a training asks the same a thousand times, models in turns the same few
+        if slots is None:
             slots = self._match(tensors, numbers)
             for length in self._lists.values():
                 del slots[length]
-            self._last = call, slots
+            if len(self._known) >= MOST_KNOWN:
+                self._known.clear()
+            self._known[call] = slots
         return slots
 
     def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:

@@ -20,21 +20,19 @@ class _Inputs(NamedTuple):
     values: Tensors
     weight_in: Tensor
     bias_in: Tensor
-    weights_out: Tensors
-    biases_out: Tensors
+    weight_out: Tensor
+    bias_out: Tensor
     units: Tensor
     gamma: Tensor
     spans: Tensor | None
     time: Tensor | None
 
     @classmethod
-    def of(cls, tensors: Tensors, networks: int) -> "_Inputs":
+    def of(cls, tensors: Tensors) -> "_Inputs":
         """Take the list apart; spans and time are empty where they are left out."""
-        *values, weight_in, bias_in = tensors[: -4 - 2 * networks]
-        weights_out, biases_out = tensors[-4 - 2 * networks : -4 - networks], tensors[-4 - networks : -4]
-        units, gamma, spans, time = tensors[-4:]
+        *values, weight_in, bias_in, weight_out, bias_out, units, gamma, spans, time = tensors
         left_out = spans.shape == time.shape == (0,)
-        return cls(values, weight_in, bias_in, weights_out, biases_out, units, gamma,
+        return cls(values, weight_in, bias_in, weight_out, bias_out, units, gamma,
                    None if left_out else spans, None if left_out else time)  # fmt: skip
 
     def named(self) -> list[tuple[str, Tensor]]:
@@ -49,18 +47,16 @@ class _Inputs(NamedTuple):
         weights = {
             "weight_in": weight_in[:, :read] / self.units[:read],
             "bias_in": F.linear(self.gamma, weight_in[:, read:], self.bias_in.detach()),
-            "weight_out": torch.cat(self.weights_out).detach() * self.units[:, None],
-            "bias_out": torch.cat(self.biases_out).detach() * self.units,
+            "weight_out": self.weight_out.detach() * self.units[:, None],
+            "bias_out": self.bias_out.detach() * self.units,
         }
         return dict(zip(weights, in_rows(list(weights.values())), strict=True))
 
     def of_layers(self, g: dict[str, Tensor]) -> Tensors:
         """The gradients of the layers' own weights, from those of `layers`."""
-        widths = [x.shape[0] for x in self.biases_out]
         read = g["weight_in"].shape[1]
         g_in = torch.cat([g["weight_in"] / self.units[:read], torch.outer(g["bias_in"], self.gamma)], 1)
-        g_out, g_bias = g["weight_out"] * self.units[:, None], g["bias_out"] * self.units
-        return [g_in, g["bias_in"], *g_out.split(widths), *g_bias.split(widths)]
+        return [g_in, g["bias_in"], g["weight_out"] * self.units[:, None], g["bias_out"] * self.units]
 
 
 class _Refine(Operation):
@@ -71,15 +67,14 @@ class _Refine(Operation):
     """
 
     def __init__(self) -> None:
-        super().__init__("refine", inputs={}, outputs={}, numbers={"networks": int, "refined": int},
-                         memory="refinements")  # fmt: skip
+        super().__init__("refine", inputs={}, outputs={}, numbers={"refined": int}, memory="refinements")
 
     def split(self, arguments: Sequence[Any]) -> tuple[Tensors, tuple[Any, ...]]:
-        *tensors, networks, refined = arguments
+        *tensors, refined = arguments
         if not all(isinstance(x, Tensor) for x in tensors):
             kinds = ", ".join(sorted({type(x).__name__ for x in tensors if not isinstance(x, Tensor)}))
             raise InputError(f"refine: expected tensors, got {kinds}")
-        return tensors, (networks, refined)
+        return tensors, (refined,)
 
     def differentiable(self, tensors: Tensors) -> list[bool]:
         return [True] * (len(tensors) - 4) + [False] * 4
@@ -114,13 +109,13 @@ class _Refine(Operation):
         slots |= {"given.values": _addresses(dense), "grad.values": _addresses(moved), "grad.scratch": address(scratch)}
         slots |= {f"grad.{key}": g.data_ptr() for key, g in g_weights.items()}
         library.call("refine_backward", slots, like)
-        own = _Inputs.of(tensors, networks).of_layers(g_weights)
+        own = _Inputs.of(tensors).of_layers(g_weights)
         return [*moved, *dense[features:], *own, None, None, None, None]
 
     def _slots(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
         """What the kernels take, and what must live as long: the arrays, the layers and the spans."""
         slots = self.match(tensors, numbers).copy()
-        given = _Inputs.of(tensors, numbers[0])
+        given = _Inputs.of(tensors)
         values, weights = in_rows(given.values), given.layers()
         spans = None if given.spans is None else given.spans.contiguous()
         slots |= {"values": _addresses(values), "spans": address(spans), "time": address(given.time),
@@ -128,27 +123,27 @@ class _Refine(Operation):
         return slots | {key: x.data_ptr() for key, x in weights.items()}
 
     def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        networks, refined = numbers
-        given = _Inputs.of(tensors, networks)
+        given = _Inputs.of(tensors)
         listed = given.named()
         for name, x in listed:
             check_tensor(x, f"refine: {name}", (torch.float32,))
             if x.dim() == 0 and name != "time":
                 raise InputError(f"refine: {name}: expected at least one dimension, got none")
-        widths, moved = [w.shape[0] for w in given.weights_out], [x.shape[-1] for x in given.values]
-        last, hidden = networks - 1, HIDDEN * networks
-        if last < 1 or [*moved[:last], sum(moved[last:])] != widths:
-            raise InputError(f"refine: expected a perceptron for each feature and one for all other values, got "
-                             f"outputs of {widths} numbers for values of {moved}")  # fmt: skip
+        moved = [x.shape[-1] for x in given.values]
+        networks, rest = divmod(len(given.weight_in), HIDDEN)
+        last = networks - 1
+        if rest or not 1 <= last < len(moved):
+            raise InputError(f"refine: expected {HIDDEN} rows of weight_in for each feature and {HIDDEN} for all other "
+                             f"values, got {len(given.weight_in)} for {len(moved)} values")  # fmt: skip
         if networks > MAX_NETWORKS or len(moved) > MAX_VALUES:
             raise InputError(f"refine: expected at most {MAX_NETWORKS} perceptrons and {MAX_VALUES} arrays of values, "
                              f"got {networks} and {len(moved)}")  # fmt: skip
-        like, features = given.values[0], sum(widths[:last])
-        rows = first_rows("refine: rows", refined, like)
+        widths = [*moved[:last], sum(moved[last:])]
+        like, features, outputs, hidden = given.values[0], sum(widths[:last]), sum(widths), HIDDEN * networks
+        rows = first_rows("refine: rows", numbers[0], like)
         shapes: list[tuple[int, ...]] = [(len(like), c) for c in moved]
-        shapes += [(hidden, features + len(given.gamma)), (hidden,)]
-        shapes += [(c, HIDDEN) for c in widths] + [(c,) for c in widths]
-        shapes += [(sum(widths),), (len(given.gamma),)]
+        shapes += [(hidden, features + len(given.gamma)), (hidden,), (outputs, HIDDEN), (outputs,)]
+        shapes += [(outputs,), (len(given.gamma),)]
         if given.spans is not None:
             shapes += [(rows, 2), ()]
         for (name, x), shape in zip(listed, shapes, strict=True):
@@ -156,10 +151,10 @@ class _Refine(Operation):
                 raise InputError(f"refine: expected {name} of shape {list(shape)} on {like.device}, got "
                                  f"{list(x.shape)} on {x.device}")  # fmt: skip
         return {"N": len(like), "refined": rows, "features": features, "networks": networks, "arrays": len(moved),
-                "outputs": sum(widths), "widths": tuple(widths), "value_widths": tuple(moved)}  # fmt: skip
+                "outputs": outputs, "widths": tuple(widths), "value_widths": tuple(moved)}  # fmt: skip
 
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
-        return [x.new_empty(x.shape) for x in tensors[: -6 - 2 * numbers[0]]]
+        return [x.new_empty(x.shape) for x in _Inputs.of(tensors).values]
 
 
 def _addresses(tensors: Tensors) -> tuple[int, ...]:
@@ -173,8 +168,8 @@ def refine(
     values: Tensors,  # of [N, c]; those of the first P - 1 are the features, F numbers in all
     weight_in: Tensor,  # [P * 64, F + G]
     bias_in: Tensor,  # [P * 64]
-    weights_out: Tensors,  # P of [c, 64]
-    biases_out: Tensors,  # P of [c]
+    weight_out: Tensor,  # [sum of c, 64]
+    bias_out: Tensor,  # [sum of c]
     units: Tensor,  # [sum of c]
     gamma: Tensor,  # [G]
     *,
@@ -190,8 +185,8 @@ def refine(
         values: raw parameters, those that are read first.
         weight_in: the first layers of all perceptrons, 64 rows each.
         bias_in: theirs.
-        weights_out: the second layers.
-        biases_out: theirs.
+        weight_out: the second layers, a row for each number that is moved.
+        bias_out: theirs.
         units: what the perceptrons measure each number in.
         gamma: what is the same for all Gaussians, the encoded time.
         rows: how many of the first are moved, all by default; the others are copied.
@@ -201,12 +196,9 @@ def refine(
     Raises:
         InputError: not float32 on one device, shapes that do not fit, or there are not so many rows.
     """
-    if len(weights_out) != len(biases_out):
-        raise InputError(f"refine: expected weights_out and biases_out of as many perceptrons, got {len(weights_out)} "
-                         f"and {len(biases_out)}")  # fmt: skip
     if (spans is None) != (time is None):
         raise InputError("refine: expected spans and time together, got one of them")
     nothing = gamma.new_empty(0)
     when = (nothing, nothing) if spans is None else (spans, time)
-    return _refine(*values, weight_in, bias_in, *weights_out, *biases_out, units, gamma, *when, len(weights_out),
+    return _refine(*values, weight_in, bias_in, weight_out, bias_out, units, gamma, *when,
                    EVERY_ROW if rows is None else rows)  # fmt: skip

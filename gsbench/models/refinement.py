@@ -51,14 +51,16 @@ class Refinement(nn.Module):
         self.octaves = octaves
         self.register_buffer("units", torch.ones(sum(outputs)) if units is None else units)
         width = self.features + 2 * octaves
-        # The first layers of all networks read the same f: they are one matrix, 64 rows for each.
+        self.widths = outputs
+        # The first layers of all networks read the same f: they are one matrix, 64 rows for each. So are the second
+        # layers, a row for each number that is moved.
         self.weight_in = nn.Parameter(torch.empty(HIDDEN * len(outputs), width))
         self.bias_in = nn.Parameter(torch.empty(HIDDEN * len(outputs)))
         bound = 1 / math.sqrt(width)  # torch.nn.Linear's own initialisation, drawn from the run's seed
         nn.init.uniform_(self.weight_in, -bound, bound, generator=generator)
         nn.init.uniform_(self.bias_in, -bound, bound, generator=generator)
-        self.weights_out = nn.ParameterList([nn.Parameter(torch.zeros(width, HIDDEN)) for width in outputs])
-        self.biases_out = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in outputs])
+        self.weight_out = nn.Parameter(torch.zeros(sum(outputs), HIDDEN))
+        self.bias_out = nn.Parameter(torch.zeros(sum(outputs)))
 
     def forward(
         self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False, rows: int | None = None,
@@ -71,9 +73,8 @@ class Refinement(nn.Module):
         """
         if by_kernel:
             gamma = encode_time(time, self.octaves)
-            return refine(values, self.weight_in, self.bias_in, list(self.weights_out), list(self.biases_out),
-                          self.units, gamma, rows=rows, spans=spans,
-                          time=None if spans is None else time)  # fmt: skip
+            return refine(values, self.weight_in, self.bias_in, self.weight_out, self.bias_out, self.units, gamma,
+                          rows=rows, spans=spans, time=None if spans is None else time)  # fmt: skip
         if rows is not None:
             still = [x[:rows] for x in values]
             moved = self(still, time)
@@ -83,10 +84,9 @@ class Refinement(nn.Module):
             return [torch.cat([x, rest[rows:]]) for x, rest in zip(moved, values, strict=True)]
         # The units scale rows and columns of the layers instead of the parameters of every Gaussian.
         weight_in, bias_in = self.weight_in[:, : self.features] / self.units[: self.features], self.at_time(time)
-        units = self.units.split([len(w) for w in self.weights_out])
-        weights_out = [w * unit[:, None] for w, unit in zip(self.weights_out, units, strict=True)]
-        biases_out = [b * unit for b, unit in zip(self.biases_out, units, strict=True)]
-        features = torch.cat(values[: len(self.weights_out) - 1], -1)
+        weights_out = (self.weight_out * self.units[:, None]).split(self.widths)
+        biases_out = (self.bias_out * self.units).split(self.widths)
+        features = torch.cat(values[: len(self.widths) - 1], -1)
         parts = torch.relu(F.linear(features, weight_in, bias_in)).split(HIDDEN, -1)
         layers = zip(parts, weights_out, biases_out, strict=True)
         residuals = torch.cat([F.linear(h, w, b) for h, w, b in layers], -1).split([x.shape[-1] for x in values], -1)

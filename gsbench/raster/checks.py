@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.operation import MOST_KNOWN
 from gsbench.kernels.raster import LOWER
 from gsbench.memory import require
 from gsbench.tensors import check_tensor
 
-_last: list[object] = []  # what was found good last: a training asks the same a thousand times
+_known: set[tuple[object, ...]] = set()  # what was found good: a training asks the same a thousand times
 
 
 def check_arguments(
@@ -18,13 +19,11 @@ def check_arguments(
     width: int, height: int, background: Tensor | None, near: float, far: float, eps2d: float,
 ) -> None:  # fmt: skip
     """Raise InputError unless everything is as `rasterize` says."""
-    global _last
-    sizes = width, type(width), height, type(height), near, far, eps2d
-    given = means, factors, opacities, colors, viewmats, Ks, background
-    call: list[object] = [*sizes, *[isinstance(x, Tensor) and (x.shape, x.dtype, x.device, x.layout) for x in given]]
-    if call == _last:
-        return
     _check_viewport(width, height, near, far, eps2d)
+    given = means, factors, opacities, colors, viewmats, Ks, background
+    call = width, height, *[(x.shape, x.dtype, x.device, x.layout) if isinstance(x, Tensor) else type(x) for x in given]
+    if call in _known:
+        return
     tensors = {"means": means, "factors": factors, "opacities": opacities, "colors": colors,
                "viewmats": viewmats, "Ks": Ks}  # fmt: skip
     if background is not None:
@@ -48,7 +47,9 @@ def check_arguments(
     if means.device.type == "cpu":
         size = f"{C} images of {width}x{height} with {D} channels and {N} Gaussians"
         require(means.element_size() * (C * width * height * (D + 1) + C * N * 30), size, LOWER)
-    _last = call
+    if len(_known) >= MOST_KNOWN:
+        _known.clear()
+    _known.add(call)
 
 
 def _check_viewport(width: int, height: int, near: float, far: float, eps2d: float) -> None:

@@ -50,8 +50,7 @@ def draw(
     if flagged:  # looked at by the kernel, so that only a bad value waits for the words
         check_values(means, factors, opacities, colors, viewmats, Ks, background)
     image, alpha = blend(splats, colors, background, bins, viewport)
-    radii = splats.half_sizes.amax(-1).ceil_().int()
-    return RasterOutput(image, alpha, RasterInfo(radii, splats.means2d, splats.depths, len(bins.ids)))
+    return RasterOutput(image, alpha, RasterInfo(splats.half_sizes, splats.means2d, splats.depths, len(bins.ids)))
 
 
 def draw_within(

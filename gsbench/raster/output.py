@@ -9,10 +9,15 @@ from torch import Tensor
 class RasterInfo:
     """What the rasterizer knows beside the image."""
 
-    radii: Tensor  # [C, N] int32, pixels: half the side of the square that holds every pixel drawn; 0: not drawn
+    half_sizes: Tensor  # [C, N, 2] pixels: half the sides of the rectangle that holds every pixel drawn; 0: not drawn
     means2d: Tensor  # [C, N, 2] pixels, in the autograd graph: its gradient drives densification
     depths: Tensor  # [C, N] camera-space z of the means
     pairs: int  # (tile, Gaussian) pairs blended
+
+    @property
+    def radii(self) -> Tensor:
+        """Half the side of the square that holds every pixel drawn, [C, N] int32, pixels; 0: not drawn."""
+        return self.half_sizes.detach().amax(-1).ceil_().int()
 
 
 @dataclass(frozen=True)

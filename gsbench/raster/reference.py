@@ -46,7 +46,7 @@ def draw(
         alphas.append(alpha)
         pairs += len(tiles)
     info = RasterInfo(
-        radii=torch.stack([s.half_sizes.amax(-1).ceil().int() for s in splats]),
+        half_sizes=torch.stack([s.half_sizes for s in splats]),
         means2d=means2d,
         depths=torch.stack([s.depths for s in splats]),
         pairs=pairs,

@@ -35,8 +35,8 @@ def trained_a_little(name: str, seed: int) -> GaussianModel:
             size = {"means": 0.02, "motion": 0.15, "opacities": 1.5, "shN": 0.08}.get(key, 0.2)
             parameter += size * torch.randn(parameter.shape, generator=random)
         if model.refinement is not None:
-            for layer in model.refinement.weights_out:
-                layer += 0.02 * torch.randn(layer.shape, generator=random)
+            weight = model.refinement.weight_out
+            weight += 0.02 * torch.randn(weight.shape, generator=random)
     return model.requires_grad_(False)
 
 

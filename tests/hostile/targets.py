@@ -50,8 +50,7 @@ def targets() -> dict[str, Target]:
                   "conditioned_first": True}  # fmt: skip
     colors = {**common, "sh0": rand(N, 1, 3), "shN": rand(N, 15, 3), "center": rand(3), "degree": 3}
     moved = {"a": rand(N, 3), "b": rand(N, 7), "weight_in": rand(2 * HIDDEN, 5), "bias_in": rand(2 * HIDDEN),
-             "out_a": rand(3, HIDDEN), "out_b": rand(7, HIDDEN), "bias_a": rand(3), "bias_b": rand(7),
-             "units": rand(10) + 1, "gamma": rand(2)}  # fmt: skip
+             "weight_out": rand(10, HIDDEN), "bias_out": rand(10), "units": rand(10) + 1, "gamma": rand(2)}  # fmt: skip
     step = {"parameter": rand(N, 3), "gradient": rand(N, 3), "mean": rand(N, 3), "square": rand(N, 3),
             "drawn": torch.ones(N, dtype=torch.bool), "rate": 0.1, "betas": [0.9, 0.999], "eps": 1e-8,
             "step": torch.tensor(1.0)}  # fmt: skip
@@ -81,9 +80,8 @@ def targets() -> dict[str, Target]:
     }  # fmt: skip
 
 
-def _refine(a: Any, b: Any, weight_in: Any, bias_in: Any, out_a: Any, out_b: Any, bias_a: Any, bias_b: Any, units: Any,
-            gamma: Any) -> list[Tensor]:  # fmt: skip
-    return refine([a, b], weight_in, bias_in, [out_a, out_b], [bias_a, bias_b], units, gamma)
+def _refine(a: Any, b: Any, **layers: Any) -> list[Tensor]:
+    return refine([a, b], **layers)
 
 
 def _evaluate(a: Any, b: Any, background: Any) -> float | None:

@@ -175,8 +175,7 @@ def test_networks_too_large_are_refused(move: Move) -> None:
     one, units = move(torch.ones(1)), move(torch.ones(32))
     with pytest.raises(InputError, match="at most 28 outputs"):
         refine.refine([move(torch.ones(4, 3)), move(torch.ones(4, 29))], move(torch.ones(128, 3)), one.expand(128),
-                      [move(torch.ones(3, 64)), move(torch.ones(29, 64))], [one.expand(3), one.expand(29)], units,
-                      move(torch.empty(0)))  # fmt: skip
+                      move(torch.ones(32, 64)), one.expand(32), units, move(torch.empty(0)))  # fmt: skip
 
 
 @pytest.mark.usefixtures("threads")

@@ -260,12 +260,11 @@ def nan_memory(what: str, like: Tensor, shape: tuple[int, ...]) -> Tensor:  # no
 
 def backward_of_refinement(values: list[Tensor], weights: list[Tensor], g_out: list[Tensor]) -> list[Tensor]:
     """By the kernel: gradients of the two features, then of the weights."""
-    weight_in, bias_in, weight_out, bias_out = weights
-    tensors = [*values, weight_in, bias_in, *weight_out.split([3, 1, 12]), *bias_out.split([3, 1, 12]), *COMMON]
-    outputs, slots = refining._refine.run(tensors, (3, EVERY_ROW))
+    tensors = [*values, *weights, *COMMON]
+    outputs, slots = refining._refine.run(tensors, (EVERY_ROW,))
     found = refining._refine.backward(tensors, slots, outputs, g_out, [True] * len(tensors))
     gradients = [g for g in found if g is not None]
-    return [*gradients[:2], *gradients[4:6], torch.cat(gradients[6:9]), torch.cat(gradients[9:12])]
+    return [*gradients[:2], *gradients[4:]]
 
 
 @pytest.mark.usefixtures("instruction_set", "threads")
@@ -304,8 +303,8 @@ TEN = torch.ones(10), torch.empty(0)
 
 def test_no_gaussians() -> None:
     """Catches a loop that runs once over nothing."""
-    out = refine([torch.empty(0, 3), torch.empty(0, 7)], torch.ones(128, 3), torch.ones(128),
-                 [torch.ones(3, 64), torch.ones(7, 64)], [torch.ones(3), torch.ones(7)], *TEN)  # fmt: skip
+    out = refine([torch.empty(0, 3), torch.empty(0, 7)], torch.ones(128, 3), torch.ones(128), torch.ones(10, 64),
+                 torch.ones(10), *TEN)  # fmt: skip
     assert [x.shape for x in out] == [(0, 3), (0, 7)]
     assert show_colors(torch.empty(0, 1, 3), torch.empty(0, 15, 3), torch.empty(0, 3), torch.empty(0),
                        torch.zeros(3), 3).shape == (0, 3)  # fmt: skip
@@ -325,14 +324,16 @@ def test_errors() -> None:
                            torch.ones(2, 0), torch.ones(2), torch.zeros(3), None, None, None,
                            conditioned_first=True)  # fmt: skip
     with pytest.raises(InputError, match="refine: expected"):
-        refine([torch.ones(4, 3)], torch.ones(64, 3), torch.ones(64), [torch.ones(3, 64)], [torch.ones(3)], *TEN)
-    values, out = [torch.ones(4, 3), torch.ones(4, 7)], [torch.ones(3, 64), torch.ones(7, 64)]
-    with pytest.raises(InputError, match="refine: expected"):
-        refine(values, torch.ones(128, 2), torch.ones(128), out, [torch.ones(3), torch.ones(7)], *TEN)
-    with pytest.raises(InputError, match="values of"):
-        refine(values[::-1], torch.ones(128, 3), torch.ones(128), out, [torch.ones(3), torch.ones(7)], *TEN)
-    with pytest.raises(InputError, match="weights_out and biases_out"):
-        refine(values, torch.ones(128, 3), torch.ones(128), out, [torch.ones(3)], *TEN)
+        refine([torch.ones(4, 3)], torch.ones(64, 3), torch.ones(64), torch.ones(3, 64), torch.ones(3), *TEN)
+    values, out = [torch.ones(4, 3), torch.ones(4, 7)], torch.ones(10, 64)
+    with pytest.raises(InputError, match="refine: expected weight_in of shape"):
+        refine(values, torch.ones(128, 2), torch.ones(128), out, torch.ones(10), *TEN)
+    with pytest.raises(InputError, match="refine: expected weight_in of shape"):
+        refine(values[::-1], torch.ones(128, 3), torch.ones(128), out, torch.ones(10), *TEN)
+    for rows in (0, 64, 127, 192):
+        with pytest.raises(InputError, match="64 rows of weight_in for each feature"):
+            refine(values, torch.ones(rows, 3), torch.ones(rows), out, torch.ones(10), *TEN)
+    with pytest.raises(InputError, match="refine: expected bias_out of shape"):
+        refine(values, torch.ones(128, 3), torch.ones(128), out, torch.ones(3), *TEN)
     with pytest.raises(InputError, match="refine: expected tensors, got ndarray"):
-        refine([*values[:1], values[1].numpy()], torch.ones(128, 3), torch.ones(128), out, [torch.ones(3),
-               torch.ones(7)], *TEN)  # fmt: skip
+        refine([*values[:1], values[1].numpy()], torch.ones(128, 3), torch.ones(128), out, torch.ones(10), *TEN)

@@ -9,8 +9,8 @@ import torch
 from gsbench import kernels
 from gsbench.errors import InputError
 from gsbench.kernels.library import library_of
-from gsbench.kernels.operation import Operation
-from gsbench.kernels.slices import observe_rotated, observe_still
+from gsbench.kernels.operation import MOST_KNOWN, Operation
+from gsbench.kernels.slices import _still, observe_rotated, observe_still
 
 
 def declared() -> list[Operation]:
@@ -25,7 +25,7 @@ def test_declaration_and_kernel_name_the_same(operation: Operation) -> None:
     """Catches a field that a declaration has and the kernel's structure has not: it would be dropped in silence."""
     library = library_of("cpu")
     names = {*operation.inputs, *operation.numbers} - {"with_gradient"}  # which is said by a null
-    for name in names - {"networks"} if operation.inputs else ():
+    for name in names if operation.inputs else ():
         assert library.takes(operation.name, name) or library.takes(operation.name, f"out.{name}"), name
     for name in operation.outputs:
         assert library.takes(operation.name, f"out.{name}"), name
@@ -55,6 +55,23 @@ def test_what_does_not_fit_is_refused(given: tuple[torch.Tensor, ...], said: str
     """Catches arrays that a kernel would read past their end."""
     with pytest.raises(InputError, match=said):
         observe_still(*given)
+
+
+def test_known_calls_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches models that are rendered in turns and pay for each other's checks (0.1 ms a frame), and sizes of
+    Gaussians that are kept for ever."""
+    matched: list[int] = []
+    own = _still._match
+    monkeypatch.setattr(_still, "_match", lambda tensors, numbers: (matched.append(1), own(tensors, numbers))[1])
+    for _ in range(3):
+        for N in (1003, 1005):
+            factors, opacities = observe_still(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
+            assert factors.shape == (N, 3, 3)
+            assert opacities.shape == (N,)
+    assert len(matched) <= 2
+    for N in range(2 * MOST_KNOWN):
+        observe_still(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
+    assert len(_still._known) <= MOST_KNOWN
 
 
 def test_columns_are_put_in_rows() -> None:

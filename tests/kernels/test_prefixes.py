@@ -201,9 +201,8 @@ def test_rows_that_there_are_not() -> None:
             Refinement([3, 4], torch.Generator())([torch.ones(2, 3), torch.ones(2, 4)], TIME, by_kernel=True, rows=2,
                                                   spans=spans)  # fmt: skip
     with pytest.raises(InputError, match="spans and time together"):
-        refining.refine([torch.ones(2, 3), torch.ones(2, 4)], torch.ones(128, 3), torch.ones(128), [torch.ones(3, 64),
-                        torch.ones(4, 64)], [torch.ones(3), torch.ones(4)], torch.ones(7), torch.empty(0),
-                        spans=torch.ones(2, 2))  # fmt: skip
+        refining.refine([torch.ones(2, 3), torch.ones(2, 4)], torch.ones(128, 3), torch.ones(128), torch.ones(7, 64),
+                        torch.ones(7), torch.ones(7), torch.empty(0), spans=torch.ones(2, 2))  # fmt: skip
     sh0, shN, means, _ = color_inputs(1, torch.float32)
     for levels in (torch.zeros(21), torch.zeros(20, dtype=torch.int32), torch.zeros(21, dtype=torch.int64)):
         with pytest.raises(InputError, match="levels"):

@@ -53,7 +53,7 @@ def lively(variant: str, count: int = N, seed: int = 0, **options: Any) -> Gauss
         for parameter in model.splats.values():
             parameter += 0.3 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
         if model.refinement is not None:
-            for parameter in [*model.refinement.weights_out, *model.refinement.biases_out]:
+            for parameter in (model.refinement.weight_out, model.refinement.bias_out):
                 parameter += 0.05 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
     return model
 

@@ -214,23 +214,23 @@ def test_refinement_starts_at_zero_but_learns() -> None:
     moved = refinement(values, torch.tensor(0.3))
     assert all(torch.equal(x, y) for x, y in zip(moved, values, strict=True))
     sum(x.sum() for x in moved).backward()
-    assert all(w.grad.any() for w in refinement.weights_out)
+    assert refinement.weight_out.grad.any(1).all()
 
 
 def test_refinement_is_four_perceptrons_on_27_numbers() -> None:
     """Catches a shortcut of the shared first layer that is not 27 x 64 x c on the concatenated features."""
     refinement = Refinement([3, 1, 3, 28], torch.Generator().manual_seed(0)).double()
-    for i, p in enumerate([*refinement.weights_out, *refinement.biases_out]):
+    for i, p in enumerate([refinement.weight_out, refinement.bias_out]):
         p.data = normal(i, *p.shape)
     values, time = list(normal(9, 6, 35).split([3, 1, 3, 28], -1)), torch.tensor(0.3, dtype=torch.float64)
     f = torch.cat([*values[:3], encode_time(time).expand(6, -1)], -1)
     assert f.shape[-1] == 27
     for i, (value, moved) in enumerate(zip(values, refinement(values, time), strict=True)):
-        rows = slice(64 * i, 64 * (i + 1))
+        rows, own = slice(64 * i, 64 * (i + 1)), slice([0, 3, 4, 7][i], [3, 4, 7, 35][i])
         perceptron = nn.Sequential(nn.Linear(27, 64), nn.ReLU(), nn.Linear(64, value.shape[1])).double()
         first, last = perceptron[0], perceptron[2]
         first.weight.data, first.bias.data = refinement.weight_in.data[rows], refinement.bias_in.data[rows]
-        last.weight.data, last.bias.data = refinement.weights_out[i].data, refinement.biases_out[i].data
+        last.weight.data, last.bias.data = refinement.weight_out.data[own], refinement.bias_out.data[own]
         torch.testing.assert_close(moved, value + perceptron(f))
 
 

@@ -47,6 +47,12 @@ def test_shapes(name: str) -> None:
     refused({name: [[0.0]]}, name)
 
 
+def test_a_background_that_is_no_tensor_is_none() -> None:
+    """Catches a list that is let in where the same scene was drawn without a background before."""
+    rasterize(**case("tall"), background=None, backend="reference")
+    refused({"background": [0.0, 0.0, 0.0]}, "background: expected a tensor, got list")
+
+
 def test_rows_that_differ() -> None:
     """Catches numbers of Gaussians, cameras or channels that do not agree."""
     refused({"opacities": torch.zeros(39).double()}, "opacities: expected shape [40], got [39]")

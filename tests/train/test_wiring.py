@@ -191,8 +191,7 @@ def test_a_model_shows_the_same_by_kernels_and_in_torch(name: str, degree: int, 
         for splat in model.splats.values():
             splat.add_(0.3 * torch.randn(splat.shape, generator=random))
         assert model.refinement is not None
-        for weight in model.refinement.weights_out:
-            weight.normal_(0, 0.02, generator=random)
+        model.refinement.weight_out.normal_(0, 0.02, generator=random)
     model.set_phase(replace(model.phase, sh_degree=degree, refine=True))
     shown = []
     for backend in (AUTO, REFERENCE):
@@ -213,7 +212,8 @@ def test_agr_starts_as_linear_layers_do() -> None:
         assert 0.9 * bound < values.abs().max() <= bound
         assert values.mean().abs() < 0.1 * bound
     assert refinement.weight_in.std().item() == pytest.approx(bound / math.sqrt(3), rel=0.05)
-    assert not any(weight.any() for weight in [*refinement.weights_out, *refinement.biases_out])
+    assert not refinement.weight_out.any()
+    assert not refinement.bias_out.any()
 
 
 def test_the_size_of_4dgs_is_its_largest_in_space() -> None:
