@@ -140,12 +140,13 @@ class Trainer:
             seen = self.gradients(views)
         except DivergedError as error:
             raise DivergedError(f"step {step}: {error}") from None
-        with stages("density"):
-            for view, one in zip(views, seen, strict=True):
-                self.density.observe(one.radii, one.g_means2d, view.camera.width, view.camera.height, len(views))
+        if step < self.schedule.densify_stop:
+            with stages("density"):
+                for view, one in zip(views, seen, strict=True):
+                    self.density.observe(one.radii, one.g_means2d, view.camera.width, view.camera.height, len(views))
         self.watch.see(step, torch.stack([one.loss for one in seen]).sum(), self.model.groups())
         with stages("optimizer"):
-            drawn = self.density.unseen < len(views)
+            drawn = torch.cat([one.radii for one in seen]).any(0)
             self.optimizer.step(step, drawn, slowed=self.gating.slows_agr(step))
             self.floor.hold()
         with stages("density"):
