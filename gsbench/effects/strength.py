@@ -41,6 +41,7 @@ THIN = 0.02  # the opacity of Gaussians that are tried out beside the others
 # The share of a thin Gaussian's motion that an opaque one in its place hides or outshines: the root of the integral of
 # r^2 g^2 (1 - g)^2 over that of r^2 g^2 is 0.6 for g = exp(-r^2 / 2).
 HIDDEN = 0.4
+OPACITY, COLOR = 12, slice(13, 16)  # columns of `_rows_of`
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,8 @@ def probe(
         signs = [torch.randint(0, 2, residual.shape, generator=own).to(residual) * 2 - 1 for _ in range(draws)]
         vectors = [residual, *signs]
         products = here.products(vectors)
-        removed = [-product.opacities * seen[v].opacities for product in products]
-        place = Place(model, queries[v], seen[v], here, products, vectors, removed)
+        removed = -products[..., OPACITY] * seen[v].opacities
+        place = Place(model, queries[v], seen[v], _rows_of(seen[v]), here, products, vectors, removed)
         return float(residual.square().sum()), [_error(cut, place, drawing) for cut in cuts]
 
     errors, total = {cut.name: torch.zeros_like(seen[0].opacities) for cut in cuts}, 0.0
@@ -131,14 +132,14 @@ class Drawn(NamedTuple):
         """The image [H, W, 3]."""
         return self.images[0].detach()
 
-    def products(self, vectors: list[Tensor]) -> list[Gaussians3D]:
-        """Multiply vectors [H, W, 3] by the derivative of the image by the slice, from the left."""
+    def products(self, vectors: list[Tensor]) -> Tensor:
+        """Multiply K vectors [H, W, 3] by the derivative of the image by the slice, from the left: [K, N, 16]."""
         found = []
         for vector in vectors:
             sums: dict[int, Tensor] = {}
             self.tape.backward(self.images, vector[None], self.at, sums)
-            found.append(Gaussians3D(*(sums[id(x)] for x in self.at)))
-        return found
+            found.append(_rows_of(Gaussians3D(*(sums[id(x)] for x in self.at))))
+        return torch.stack(found)
 
 
 class Drawing(NamedTuple):
@@ -164,10 +165,11 @@ class Place(NamedTuple):
     model: GaussianModel
     query: Query
     live: Gaussians3D
+    rows: Tensor  # [N, 16], of `live`
     drawn: Drawn
-    products: list[Gaussians3D]  # of `vectors` with the derivative of the image
-    vectors: list[Tensor]  # [H, W, 3]: the residual, then random signs
-    removed: list[Tensor]  # [N] what each Gaussian's removal changes, times each of the vectors
+    products: Tensor  # [K, N, 16] of `vectors` with the derivative of the image
+    vectors: list[Tensor]  # K of [H, W, 3]: the residual, then random signs
+    removed: Tensor  # [K, N] what each Gaussian's removal changes, times each of the vectors
 
 
 def _error(cut: Cut, here: Place, draw: Drawing) -> Tensor:
@@ -178,41 +180,34 @@ def _error(cut: Cut, here: Place, draw: Drawing) -> Tensor:
     raw = dict(model.splats.items()) | cut.raw
     if cut.level is not None:
         colors = model.paint(raw, live.means, live.opacities, here.query)
-        return _grown([(product.colors * (colors - live.colors)).sum(-1) for product in here.products])
+        return _grown((here.products[..., COLOR] * (colors - live.colors)).sum(-1))
     means, factors, opacities = model.observe(raw, here.query)
     whole = Gaussians3D(means, factors, opacities, model.paint(raw, means, opacities, here.query))
-    live, changed = _first(cut.rows, live), _first(cut.rows, whole)
-    before, removed = [_first(cut.rows, product) for product in here.products], [x[: cut.rows] for x in here.removed]
+    N, n = len(live.means), cut.rows
+    changed = Gaussians3D(*(x[:n] for x in whole))
     thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))
-    both = draw(Gaussians3D(*(torch.cat(pair) for pair in zip(here.live, thin, strict=True))))
-    N = len(here.live.means)
-    size = torch.maximum(here.drawn.radii[: cut.rows], both.radii[N:]).clamp(min=1) / 3
-    distance = (both.means2d[N:] - here.drawn.means2d[: cut.rows]) / (2 * size[:, None])
+    both = draw(Gaussians3D(*(torch.cat(pair) for pair in zip(live, thin, strict=True))))
+    size = torch.maximum(here.drawn.radii[:n], both.radii[N:]).clamp(min=1) / 3
+    distance = (both.means2d[N:] - here.drawn.means2d[:n]) / (2 * size[:, None])
     overlap = torch.exp(-distance.square().sum(-1))
-    shown = 1 - HIDDEN * live.opacities * overlap
+    shown = 1 - HIDDEN * live.opacities[:n] * overlap
     scale = changed.opacities / (thin.opacities.clamp(min=1e-12) * shown)  # an image is linear in an opacity
-    there = [Gaussians3D(p.means[N:] * scale[:, None], p.factors[N:] * scale[:, None, None], p.opacities[N:] / shown,
-                         p.colors[N:] * scale[:, None]) for p in both.products(here.vectors)]  # fmt: skip
-    delta = [to - at for at, to in zip(live, changed, strict=True)]
-    along = [(_dot(a, delta) + _dot(b, delta)) / 2 for a, b in zip(before, there, strict=True)]
-    added = [product.opacities * changed.opacities for product in there]
-    error = overlap * _grown(along) + (1 - overlap) * _grown(removed, added)
-    return F.pad(error, (0, N - cut.rows))
+    thin_products = both.products(here.vectors)[:, N:]
+    there = thin_products * scale[:, None]
+    there[..., OPACITY] = thin_products[..., OPACITY] / shown
+    along = ((here.products[:, :n] + there) * (_rows_of(changed) - here.rows[:n])).sum(-1) / 2
+    added = there[..., OPACITY] * changed.opacities
+    error = overlap * _grown(along) + (1 - overlap) * _grown(here.removed[:, :n], added)
+    return F.pad(error, (0, N - n))
 
 
-def _first(rows: int, gaussians: Gaussians3D) -> Gaussians3D:
-    """Return the first rows of a slice."""
-    return Gaussians3D(*(x[:rows] for x in gaussians))
+def _rows_of(gaussians: Gaussians3D) -> Tensor:
+    """Put the mean, the factor, the opacity and the colour of each Gaussian in a row, [N, 16]."""
+    means, factors, opacities, colors = gaussians
+    return torch.cat([means, factors.flatten(1), opacities[:, None], colors], 1)
 
 
-def _grown(*changes: list[Tensor]) -> Tensor:
-    """Compute max(0, 2 <r, x>) + |x|^2 [N] of changes x that do not overlap, of each <r, x> and then some <g, x>."""
-    first = torch.stack([change[0] for change in changes]).sum(0)
-    second = torch.stack([torch.stack(change[1:]).square().mean(0) for change in changes]).sum(0)
-    return (2 * first).clamp(min=0) + second
-
-
-def _dot(product: Gaussians3D, delta: list[Tensor]) -> Tensor:
-    """Compute <product, delta> of each Gaussian, [N]."""
-    parts = [(p * d).flatten(1).sum(1) if p.dim() > 1 else p * d for p, d in zip(product, delta, strict=True)]
-    return torch.stack(parts).sum(0)
+def _grown(*changes: Tensor) -> Tensor:
+    """Compute max(0, 2 <r, x>) + |x|^2 [N] of changes x that do not overlap, [K, N] each: <r, x>, then some <g, x>."""
+    products = torch.stack(changes)
+    return (2 * products[:, 0].sum(0)).clamp(min=0) + products[:, 1:].square().mean(1).sum(0)

@@ -16,7 +16,7 @@ from gsbench.train.checkpoint import Checkpoint
 
 
 def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
-    """Gate a finished run as `effects.gate=end` would have; return the record of the new run and its folder.
+    """Gate a finished run as `effects.gate=end` would have, but by halves too; return the new run's record and folder.
 
     Args:
         folder: of the run; it is not changed.
@@ -45,7 +45,10 @@ def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tu
     overrides = sorted([*old.overrides, "effects.gate=end", f"effects.budget_db={budget_db}"])
     check_folder(new)
     attempt = Attempt(Run(config, plain, new, old.model, variant, overrides))
-    model, scene = attempt.prepare()
+    try:
+        model, scene = attempt.prepare()
+    except InputError as error:
+        raise InputError(f"{error}; if the data set is elsewhere now, name its folder by --data-root") from None
     if scene.fingerprint != found.data:
         raise InputError(f"{folder}: expected the data that it was trained on, {scene.name} has changed since")
     trainer = attempt.trainer(model, scene)
@@ -53,7 +56,7 @@ def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tu
     if trainer.step < config.train.iterations:
         raise InputError(f"{folder}: expected a finished run, this one is at step {trainer.step} of "
                          f"{config.train.iterations}: run it again, it goes on from there")  # fmt: skip
-    trainer.gate_at_end()
+    trainer.gate_at_end(by_halves=True)
     content = Checkpoint(training_hash(plain), found.data, trainer.state_dict(), plain, found.scene)
     checkpoint.save(new / checkpoint.FILE_NAME, content)
     record = attempt.measure(trainer)

@@ -94,7 +94,9 @@ class Gating:
 
     def in_training(self, step: int) -> None:
         """Gate before a step; what that costs on val at once is bounded by LOSS_WITH_AGR or LOSS_IN_TRAINING."""
-        self._gate(step, LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING, VIEWS_IN_TRAINING)
+        most = LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING
+        # Kernels keep the entries of still Gaussians; those of one that is frozen by halves would learn on.
+        self._gate(step, most, VIEWS_IN_TRAINING, by_halves=False)
 
     def slows_agr(self, step: int) -> float:
         """Return the factor of AGR's rate at a step: after a gate in training it falls log-linearly to LAST_RATE."""
@@ -103,9 +105,9 @@ class Gating:
         begun, iterations = self.gates[0].step, self.config.train.iterations
         return float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))
 
-    def at_end(self) -> None:
+    def at_end(self, by_halves: bool) -> None:
         """Gate the finished model within `effects.budget_db`."""
-        self._gate(None, self.config.effects.budget_db, MOST_VIEWS)
+        self._gate(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
 
     def now(self) -> Shape:
         """Return the model's Gaussians as they are, for `compare`."""
@@ -132,16 +134,15 @@ class Gating:
         return psnr(one, views) - psnr(other, views), [one.p50 for one in times]
 
     @torch.no_grad()
-    def _gate(self, step: int | None, budget_db: float, most: int) -> None:
+    def _gate(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> None:
         """Probe, choose and apply; where nothing is within the budget, note that."""
         started = time.perf_counter()
         at_end = step is None
-        # In training nothing is frozen by halves: kernels keep the entries of still rows, but these would learn on.
-        # Nor does AGR rest: when a Gaussian can be seen still changes.
+        # In training AGR does not rest: when a Gaussian can be seen still changes.
         spans = seen_times(self.model, self.probed) if at_end else None
         hidden = None if spans is None else spans[:, 0].isinf()
         strength = probe(self.model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
-                         antialias=self.renderer.antialias, by_halves=at_end, hidden=hidden)  # fmt: skip
+                         antialias=self.renderer.antialias, by_halves=by_halves, hidden=hidden)  # fmt: skip
         found = gate_within(
             self.model, strength, budget_db, lambda model: self.renderer.psnr(model, self.checked), spans
         )

@@ -8,12 +8,14 @@ import torch
 from tiny_run import gsbench, overrides, write_moving_square
 
 from gsbench.effects import __main__ as command
+from gsbench.effects.strength import probe
 from gsbench.measure import record
 from gsbench.run.load import load_run
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene
 from gsbench.schedule import Schedule
 from gsbench.stability.training_cases import compose, moving_square
+from gsbench.train import gating
 from gsbench.train.draws import generator
 from gsbench.train.gating import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating
 from gsbench.train.loop import Trainer
@@ -77,7 +79,7 @@ def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyP
 
 def test_off_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a gate that acts, or draws a random number, where none was asked for."""
-    monkeypatch.setattr(Gating, "_gate", lambda *_: pytest.fail("a gate was asked"))
+    monkeypatch.setattr(Gating, "_gate", lambda *_, **__: pytest.fail("a gate was asked"))
     plain = trainer("effects.gate=off")
     end(plain)
     assert plain.model.classes is None
@@ -115,11 +117,12 @@ def test_when_a_model_is_gated() -> None:
 
 @pytest.mark.parametrize(("model", "loss"), [("7dgs", LOSS_WITH_AGR), ("7dgs_noagr", LOSS_IN_TRAINING)])
 def test_what_a_gate_in_training_may_cost(model: str, loss: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches models without AGR, which do not make up for it, gated as freely as those with it."""
-    asked: list[tuple[int | None, float]] = []
-    monkeypatch.setattr(Gating, "_gate", lambda _, *given: asked.append(given[:2]))
+    """Catches models without AGR, which do not make up for it, gated as freely as those with it, and a training that
+    looks at half freezes, which saves no time of a frame."""
+    asked: list[tuple[int | None, float, bool]] = []
+    monkeypatch.setattr(Gating, "_gate", lambda _, step, db, __, by_halves: asked.append((step, db, by_halves)))
     end(trainer("effects.gate=both", model=model))
-    assert asked == [(60, loss), (None, 0.05)]
+    assert asked == [(60, loss, False), (None, 0.05, False)]
 
 
 @pytest.mark.parametrize("words", [(), ("effects.gate=both",)])
@@ -147,7 +150,9 @@ def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
-def test_auto_and_a_gate_after_the_fact(square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_auto_and_a_gate_after_the_fact(
+    square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches model=auto that says nothing of what it chose, a loaded run of another model, a gate that spoils the old.
 
     The scene has six views, which are too few to tell: it is simulated, and that is said.
@@ -172,7 +177,10 @@ def test_auto_and_a_gate_after_the_fact(square: Path, tmp_path: Path, capsys: py
     assert plain.returncode == 0, plain.stderr
     (old,) = tmp_path.glob("dnerf/square/7dgs,*/seed0")
     kept = {path.name: path.read_bytes() for path in old.iterdir()}
+    halves: list[bool] = []
+    monkeypatch.setattr(gating, "probe", lambda *x, **y: (halves.append(y["by_halves"]), probe(*x, **y))[1])
     assert command.main(["--checkpoint", str(old), "--budget-db", "1"]) == 0
+    assert halves == [True]  # a finished model has the time
     assert {path.name: path.read_bytes() for path in old.iterdir()} == kept
     (new,) = tmp_path.glob("dnerf/square/7dgs,*,gate=end,budget_db=1.0/seed0")
     gated = record.read(new / record.FILE_NAME)
@@ -182,3 +190,5 @@ def test_auto_and_a_gate_after_the_fact(square: Path, tmp_path: Path, capsys: py
     capsys.readouterr()
     assert command.main(["--checkpoint", str(new)]) == 2
     assert "not gated at its end" in capsys.readouterr().err
+    assert command.main(["--checkpoint", str(old), "--data-root", str(tmp_path / "nowhere")]) == 2
+    assert "name its folder by --data-root" in capsys.readouterr().err
