@@ -101,8 +101,9 @@ def _arranged(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixe
     names = ("image", f"{sum(counts.values()):,} Gaussians by class", f"cost of what a pixel shows, 0 to {most:.0f} ns")
     for i, title in enumerate(names):
         _write(titles, title, i * step + 6, 0)
-    legend = _paper(-(-len(counts) // COLUMNS), row.shape[1])
-    for i, (name, number) in enumerate(counts.items()):
+    there = {name: number for name, number in counts.items() if number}
+    legend = _paper(-(-len(there) // COLUMNS), row.shape[1])
+    for i, (name, number) in enumerate(there.items()):
         line, left = i // COLUMNS, i % COLUMNS * step + 6
         legend[line * LINE + 5 : line * LINE + 17, left : left + 12] = COLOURS[name]
         _write(legend, f"{CLASSES[name]}: {number:,}", left + 18, line)

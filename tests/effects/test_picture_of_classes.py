@@ -65,17 +65,17 @@ def test_each_class_has_its_colour() -> None:
 
 
 def test_the_legend_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a count beside the wrong name, and a swatch of another colour than its Gaussians."""
+    """Catches a count beside the wrong name, a swatch of another colour than its Gaussians, and one of none."""
     written = []
     monkeypatch.setattr(cv2, "putText", lambda *given: written.append(given[1]))
     frozen = torch.tensor([0, 0, 0, TIME, 0], dtype=torch.uint8)
     model = five(classes=Classes(2, 4, torch.zeros(5, dtype=torch.int32), frozen))
     image = picture.draw(model, CAMERA, 0.5, torch.ones(3))
-    counts = dict(zip(NAMES, (2, 1, 1, 0, 1), strict=True))
+    counts = {"refined": 2, "sliced": 1, "time": 1, "still": 1}
     assert written[3:] == [f"{CLASSES[name]}: {number}" for name, number in counts.items()]
     assert written[1] == "5 Gaussians by class"
     legend = image[picture.LINE + ENLARGED * 20 :]
-    for i, name in enumerate(NAMES):
+    for i, name in enumerate(counts):
         left = i % 3 * (ENLARGED * 100 + picture.GAP)
         assert legend[i // 3 * picture.LINE + 10, left + 10].tolist() == list(picture.COLOURS[name])
 
