@@ -59,7 +59,7 @@ def choose(strength: Strength, model: GaussianModel, budget: float) -> Choice:
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
         """Choose for a price of error; return both choices, and the error of each Gaussian."""
         paint, hue = (painting + price * hues).min(0)
-        form = (costs + price * forms + torch.where(removes, 0.0, paint)).argmin(0)
+        _, form = (costs + price * forms + torch.where(removes, 0.0, paint)).min(0)  # argmin takes 8 to 30 times longer
         error = forms.gather(0, form[None])[0] + hues.gather(0, hue[None])[0] * ~removes[form, 0]
         return form, hue, error
 
