@@ -6,6 +6,8 @@ BIN := $(VENV)/bin
 MODELS := 3dgs,4dgs,6dgs,7dgs,7dgs_noagr,auto
 # More overrides: make table1 ARGS="train.iterations=3000 seed=1"
 ARGS ?=
+# A clone has our records in results/, and what is finished there is kept. RESULTS=FOLDER times this machine alone.
+RESULTS ?= results
 
 # The CUDA kernels, compiled for five architectures, take minutes: made where a GPU is to run them. CUDA=on|auto|off.
 CUDA := $(if $(shell nvidia-smi -L 2> /dev/null),auto,off)
@@ -37,23 +39,23 @@ $(VENV)/installed-docs: $(VENV)/installed
 
 table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR, and model=auto, on the embedded scenes; print and write the table
 	@status=0; \
-	$(BIN)/python -m gsbench --multirun +exp=mini model=$(MODELS) $(ARGS) || status=$$?; \
-	$(BIN)/python -m gsbench.report results/mini || status=$$?; \
+	$(BIN)/python -m gsbench --multirun +exp=mini results=$(RESULTS) model=$(MODELS) $(ARGS) || status=$$?; \
+	$(BIN)/python -m gsbench.report $(RESULTS)/mini || status=$$?; \
 	exit $$status
 
 # Models come last, so that they take turns: minutes in which the machine is slow are every model's.
 frontier: setup  ## train seven models at five lengths and three capacities, and AGR on all, three seeds, two at a time; about an hour
 	@status=0; for axis in train.iterations=250,500,1000,2000,4000 train.densify.grad_threshold=1e-4,4e-4; do \
 		$(BIN)/python -m gsbench --multirun +exp=frontier +launch=parallel launch.at_once=2 \
-			seed=0,1,2 $$axis model=$(MODELS),7dgs_nodir $(ARGS) || status=$$?; \
+			results=$(RESULTS) seed=0,1,2 $$axis model=$(MODELS),7dgs_nodir $(ARGS) || status=$$?; \
 	done; \
 	$(BIN)/python -m gsbench --multirun +exp=frontier +launch=parallel launch.at_once=2 \
-		seed=0,1,2 model=3dgs,4dgs,6dgs,7dgs_nodir agr=true $(ARGS) || status=$$?; \
-	$(BIN)/python -m gsbench.report results/frontier || status=$$?; \
+		results=$(RESULTS) seed=0,1,2 model=3dgs,4dgs,6dgs,7dgs_nodir agr=true $(ARGS) || status=$$?; \
+	$(BIN)/python -m gsbench.report $(RESULTS)/frontier || status=$$?; \
 	exit $$status
 
 tables: setup  ## write Tables 1 and 2 of the paper from whatever is in results/, and say what is missing
-	$(BIN)/python -m gsbench.report --tables results
+	$(BIN)/python -m gsbench.report --tables $(RESULTS)
 
 # Two processes, for CI has two cores; a file's tests stay together, since they share trainings.
 test: lint  ## lint, types and all tests but the slow ones
