@@ -35,9 +35,11 @@ def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:
     data: dict[str, Get] = {printable(records[0].dataset): lambda r: r.provenance.data_hash[:8]}
     notes = []
     for title, facts in (("protocol", protocol), ("data", data)):
-        # both may differ between scenes (lego is measured on val), but not within a scene
+        # both may differ between scenes (lego is measured on val), but not within a scene, unless a variant says so
         notes.append(f"{title}: " + "; ".join(f"{name} {_by_scene(records, get)}" for name, get in facts.items()))
-        notes += [_differ(name, records, get) for name, get in facts.items() if not _goes_with_scene(records, get)]
+        for name, get in facts.items():
+            silent = [r for r in records if not any(word.startswith(f"{name}=") for word in r.variant.split(","))]
+            notes += [] if _goes_with_scene(silent, get) else [_differ(name, silent, get)]
     if any(r.scene == "lego" and r.protocol.get("eval_split") == "val" for r in records):
         notes.append("lego is measured on val: the test split of D-NeRF's lego contradicts its motion.")
     for title, get in (("machine", _machine), ("commit", _commit), ("versions", _versions)):
@@ -97,13 +99,14 @@ def _goes_with_scene(records: list[Record], get: Get) -> bool:
 
 
 def _by_scene(records: list[Record], get: Get) -> str:
-    """Show the value that all runs share, or each value with its scenes."""
+    """Show the values of all runs, each with its scenes unless all have it."""
+    every = {record.scene for record in records}
     scenes: dict[str, set[str]] = {}
     for record in records:
         scenes.setdefault(get(record), set()).add(record.scene)
-    if len(scenes) == 1:
-        return next(iter(scenes))
-    return ", ".join(f"{value} ({', '.join(sorted(scenes[value]))})" for value in sorted(scenes))
+    ordered = sorted(scenes, key=lambda value: (int(value) if value.isdigit() else 0, value))
+    return ", ".join(value if scenes[value] == every else f"{value} ({', '.join(sorted(scenes[value]))})"
+                     for value in ordered)  # fmt: skip
 
 
 def _differ(what: str, records: list[Record], get: Get) -> str:

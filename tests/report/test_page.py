@@ -87,6 +87,22 @@ def test_the_first_screen_answers(tmp_path):
     assert text.index("10 s of training") < text.index("What accuracy costs")
 
 
+def test_the_first_screen_names_the_run():
+    """Catches an answer that another capacity or gate won, told as if it were the model's default."""
+    plain = dataclasses.replace(frontier(("7dgs",), lengths=(2000,))[0], variant="")
+    config = {**plain.provenance.config, "effects": {"gate": "both"}}
+    gated = dataclasses.replace(
+        plain,
+        variant="gate=both,iterations=2000,threshold=1e-4",
+        metrics={**plain.metrics, "psnr": 40.0},
+        per_view=[],
+        provenance=dataclasses.replace(plain.provenance, config=config),
+    )
+    (_, answer, *_) = cost.answers(group([plain, gated]))
+    assert answer.model == "7dgs, gate=both"
+    assert answer.detail.startswith("2,000 iterations, threshold=1e-4, ")
+
+
 def test_sentences_where_models_tie():
     """Catches a winner among equal models, and a pair that is called a difference."""
     records = [dataclasses.replace(r, model=m) for m in ("a", "b") for r in frontier(("7dgs",), lengths=(1000,))]

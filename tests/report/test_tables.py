@@ -156,6 +156,23 @@ def test_a_protocol_may_go_with_the_scene_but_not_within_it():
     )
 
 
+def test_what_a_variant_names_may_differ():
+    """Would catch a warning on every frontier, whose rows name their lengths, or none where no row names it."""
+    lengths = {"": 1000, "iterations=250": 250, "iterations=4000": 4000}
+    runs = [of_length("4dgs", length, variant) for variant, length in lengths.items()]
+    assert "iterations 250, 1000, 4000\n" in page(*runs)
+    assert "WARNING" not in page(*runs)
+    text = page(*runs, of_length("7dgs", 500, "sh_degree=0"))
+    assert "WARNING: the rows differ in iterations: 1000 (suzanne/4dgs/seed0); 500 (suzanne/7dgs" in text
+
+
+def of_length(model, iterations, variant=""):
+    """A run of a length that its variant names or does not."""
+    run = make(model, variant=variant)
+    config = {**run.provenance.config, "train": {"iterations": iterations}}
+    return dataclasses.replace(run, provenance=dataclasses.replace(run.provenance, config=config))
+
+
 def test_the_load_is_told_as_far_as_it_is_known():
     """Would catch a load of some runs that passes for that of all, and records that are silent about it taken for 0."""
     busy, silent = make(seed=1), make("4dgs")
