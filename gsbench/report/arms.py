@@ -214,10 +214,14 @@ def is_ablated(variant: str) -> bool:
     return any(word.startswith("ablation=") and word != "ablation=none" for word in variant.split(","))
 
 
+def without(variant: str, *names: str) -> str:
+    """Return a variant without its words on some settings, each named by the last part of its key."""
+    return ",".join(word for word in variant.split(",") if word.partition("=")[0].rpartition(".")[2] not in names)
+
+
 def _common(variant: str) -> str:
     """Return a variant without its words on gates and ablations."""
-    own = ("gate", "budget_db", "ablation")
-    return ",".join(word for word in variant.split(",") if word.partition("=")[0] not in own)
+    return without(variant, "gate", "budget_db", "ablation")
 
 
 def iterations(record: Record) -> int | None:

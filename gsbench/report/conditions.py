@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 
 from gsbench.measure.record import Record
+from gsbench.report.arms import without
 
 WARNING = "WARNING"
 MOST_RUNS_NAMED = 3
@@ -38,8 +39,9 @@ def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:
         # both may differ between scenes (lego is measured on val), but not within a scene, unless a variant says so
         notes.append(f"{title}: " + "; ".join(f"{name} {_by_scene(records, get)}" for name, get in facts.items()))
         for name, get in facts.items():
-            silent = [r for r in records if not any(word.startswith(f"{name}=") for word in r.variant.split(","))]
-            notes += [] if _goes_with_scene(silent, get) else [_differ(name, silent, get)]
+            silent = [r for r in records if without(r.variant, name) == r.variant]
+            if not _goes_with_scene(silent, get):
+                notes.append(_differ(name, silent, get))
     if any(r.scene == "lego" and r.protocol.get("eval_split") == "val" for r in records):
         notes.append("lego is measured on val: the test split of D-NeRF's lego contradicts its motion.")
     for title, get in (("machine", _machine), ("commit", _commit), ("versions", _versions)):
@@ -104,7 +106,7 @@ def _by_scene(records: list[Record], get: Get) -> str:
     scenes: dict[str, set[str]] = {}
     for record in records:
         scenes.setdefault(get(record), set()).add(record.scene)
-    ordered = sorted(scenes, key=lambda value: (int(value) if value.isdigit() else 0, value))
+    ordered = sorted(scenes, key=lambda value: (len(value) if value.isdecimal() else 0, value))  # 250 before 1000
     return ", ".join(value if scenes[value] == every else f"{value} ({', '.join(sorted(scenes[value]))})"
                      for value in ordered)  # fmt: skip
 

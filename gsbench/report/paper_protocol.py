@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from gsbench.measure.record import Record
-from gsbench.report.arms import iterations
+from gsbench.report.arms import iterations, without
 from gsbench.report.conditions import printable
 from gsbench.report.paper import PROTOCOLS
 
@@ -109,9 +109,7 @@ def departure(record: Record) -> str:
 
 def arm(record: Record) -> Arm:
     """Return the arm that a run is of."""
-    words = record.variant.split(",") if record.variant else []
-    kept = [word for word in words if word.partition("=")[0].rpartition(".")[2] not in _NOT_OF_THE_RECIPE]
-    return Arm(record.model, record.experiment, ",".join(kept))
+    return Arm(record.model, record.experiment, without(record.variant, *_NOT_OF_THE_RECIPE))
 
 
 def arms(records: list[Record]) -> list[Arm]:

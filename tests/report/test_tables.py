@@ -164,6 +164,8 @@ def test_what_a_variant_names_may_differ():
     assert "WARNING" not in page(*runs)
     text = page(*runs, of_length("7dgs", 500, "sh_degree=0"))
     assert "WARNING: the rows differ in iterations: 1000 (suzanne/4dgs/seed0); 500 (suzanne/7dgs" in text
+    foreign = of_length("4dgs", "²", "iterations=x")  # a digit that is no number
+    assert "iterations ², 1000" in page(runs[0], foreign)
 
 
 def of_length(model, iterations, variant=""):

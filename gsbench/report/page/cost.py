@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from gsbench.measure.record import Record
 from gsbench.report import frontier as f
 from gsbench.report import paper
-from gsbench.report.arms import Arm, Group
+from gsbench.report.arms import Arm, Group, without
 from gsbench.report.frontier import Point
 from gsbench.report.page import charts, words
 from gsbench.report.page.content import Canvas, Column, Drawing, Runs, Section, Tab, Table, Value
@@ -64,7 +64,7 @@ def _answer(group: Group, points: list[Point], cost: str, budget: float, title: 
     if choice is None:
         return Answer(title, "", "none fits", "", f"The quickest took {write(min(known))}.")
     point = choice.point
-    detail = f"{', '.join([*_told(point.arm), write(point.cost[cost])])}. "
+    detail = f"{_told(point.arm)}{write(point.cost[cost])}. "
     others = {p.series for p in points if p.cost[cost] <= budget} - {point.series}
     if choice.level:
         detail += f"Not told apart from {words.listing([p.series for p in choice.level])}."
@@ -80,12 +80,12 @@ def _answer(group: Group, points: list[Point], cost: str, budget: float, title: 
     return Answer(title, point.series, value, words.interval(point.psnr), detail)
 
 
-def _told(arm: Arm) -> list[str]:
-    """Return what sets an arm apart from the others of its series: its length, and the rest of its variant."""
-    length = [f"{arm.iterations:,} iterations"] if arm.iterations else []
-    words_of_variant = arm.variant.split(",") if arm.name != arm.model else []
-    gates = arm.series.partition(", ")[2]
-    return length + [w for w in words_of_variant if w != gates and not (length and w.startswith("iterations="))]
+def _told(arm: Arm) -> str:
+    """Say what sets an arm apart from the others of its series: its length, and the rest of its variant."""
+    length = f"{arm.iterations:,} iterations, " if arm.iterations else ""
+    told = [name for name, known in (("iterations", length), ("gate", arm.series != arm.model)) if known]
+    rest = without(arm.variant, *told) if arm.name != arm.model else ""
+    return length + (f"{rest.replace(',', ', ')}, " if rest else "")
 
 
 def frontier_section(group: Group, canvas: Canvas) -> Section:
