@@ -5,9 +5,11 @@ What cannot be drawn (an opacity below 1/255 after f_temp and f_dir) is left out
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.headers import MAX_WAVES
 from gsbench.kernels.operation import Operation
 
@@ -26,18 +28,21 @@ def _bases(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
 
 _show = Operation(
     "show_colors",
-    inputs={"sh0": "N 1 3", "shN": "N rest 3", "means": "N 3", "opacities": "N", "times": "N 1", "center": "3",
-            "time": "", "levels": "N"},
-    outputs={"colors": "N 3"},
+    inputs={
+        "sh0": Input("N 1 3", Gradient.ADDED),
+        "shN": Input("N rest 3", Gradient.ADDED),
+        "means": Input("N 3"),
+        "opacities": Input("N", Gradient.NONE),
+        "times": Input("N 1", left_out_with="time"),
+        "center": Input("3", Gradient.REFUSED),
+        "time": Input("", Gradient.REFUSED, left_out_with="time"),
+        "levels": Input("N", Gradient.REFUSED, torch.int32, left_out_with="levels"),
+    },
+    outputs={"colors": Output("N 3")},
     numbers={"degree": int, "waves": int},
-    constant=["center", "time", "levels"],
-    passive=["opacities"],
-    optional=["times time", "levels"],
-    integers=["levels"],
-    adds=["sh0", "shN"],
     derive=_bases,
     memory="colours",
-)  # fmt: skip
+)
 
 
 def show_colors(

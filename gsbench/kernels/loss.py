@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.library import Slots, allocate, library_of
 from gsbench.kernels.operation import Operation, Tensors, address, in_rows
 from gsbench.tensors import check_number, check_tensor
@@ -17,11 +18,12 @@ class _Similarity(Operation):
 
     def __init__(self) -> None:
         super().__init__(
-            "l1_ssim", inputs={"image": "?one height width 3", "target": "?one height width 3"},
-            outputs={"loss": "", "gradient": "numbers"}, numbers={"ssim_weight": float, "with_gradient": bool},
-            constant=["target"], passive=["gradient"],
+            "l1_ssim",
+            inputs={"image": Input("?one height width 3"), "target": Input("?one height width 3", Gradient.REFUSED)},
+            outputs={"loss": Output(""), "gradient": Output("numbers", gradient=False)},
+            numbers={"ssim_weight": float, "with_gradient": bool},
             derive=lambda given, numbers: {"numbers": given["image"].numel() if numbers["with_gradient"] else 0},
-        )  # fmt: skip
+        )
 
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
         slots = self.match(tensors, numbers).copy()

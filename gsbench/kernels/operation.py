@@ -13,14 +13,15 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels import tape
+from gsbench.kernels.fields import Gradient, Input, Output, sizes_of
 from gsbench.kernels.library import Slots, allocate, library_of
 from gsbench.tensors import check_tensor
 
 Tensors = list[Tensor]  # an input that is left out is an empty tensor of one dimension
-Shape = tuple[int | str, ...]
 Sizes = dict[str, int]
 
 _SCHEMA = {int: "int", float: "float", bool: "bool"}
+_STARTS_AT_ZERO = (Gradient.ADDED, Gradient.SUMMED, Gradient.ON_REQUEST)
 _KINDS: dict[type, tuple[type, ...]] = {int: (int,), float: (float, int), bool: (bool,)}  # what is accepted for each
 
 
@@ -35,17 +36,9 @@ class Operation:
         self,
         name: str,
         *,
-        inputs: dict[str, str],
-        outputs: dict[str, str],
+        inputs: dict[str, Input],
+        outputs: dict[str, Output],
         numbers: dict[str, type] | None = None,
-        constant: Sequence[str] = (),
-        passive: Sequence[str] = (),
-        optional: Sequence[str] = (),
-        adds: Sequence[str] = (),
-        zeroed: Sequence[str] = (),
-        on_request: Sequence[str] = (),
-        integers: Sequence[str] = (),
-        lists: Sequence[str] = (),
         derive: Callable[[dict[str, Tensor], Slots], Sizes] | None = None,
         scratch: str | None = None,
         memory: str = "results",
@@ -54,45 +47,33 @@ class Operation:
 
         Args:
             name: of the operation and its kernel.
-            inputs: their shapes, as "N 3" or "C height width D": sizes are numbers, or names that mean the same size
-                wherever they stand. A first size that may be left out has a question mark.
-            outputs: the same.
+            inputs: the tensors it takes, by the names of the kernel's fields.
+            outputs: the tensors it returns.
             numbers: what is no tensor, by type; an int is a size too.
-            constant: inputs by which there is no gradient, and asking for one is an error.
-            passive: inputs and outputs that no gradient goes through, in silence.
-            optional: inputs that may be left out; of those named together, as in "times time", all or none.
-            adds: inputs to whose gradient the kernel adds, so that those of several views need one memory.
-            zeroed: inputs whose gradient is a sum over Gaussians, of which a GPU's blocks each add a part.
-            on_request: inputs whose gradient costs something, and is computed where it is wanted only.
-            integers: inputs of int32; all others are float32.
-            lists: inputs [n] whose length differs from call to call, and is the size of nothing else.
             derive: sizes that are no input's own, from the tensors given and the numbers.
             scratch: the shape of memory that backward needs on a GPU, zero on entry.
             memory: what the outputs are, for a message that there is not enough of it.
         """
         self.name = name
-        self.inputs = {key: _shape(text) for key, text in inputs.items()}
-        self.outputs = tuple(outputs)
+        self.inputs, self.outputs = inputs, outputs
         self.numbers = numbers or {}
-        self.constant = frozenset(constant)
-        self.adds = {i for i, key in enumerate(inputs) if key in adds}
-        self._differentiable = [key not in {*constant, *passive} for key in inputs]
-        self._carries = [key not in passive for key in outputs]
-        places = {key: i for i, key in enumerate(inputs)}
-        self._left_out_together = [[places[key] for key in names.split()] for names in optional]
-        self._optional = {i for group in self._left_out_together for i in group}
-        self._on_request = {f"grad.{key}" for key in on_request}
-        self._zeroed = {f"grad.{key}" for key in (*adds, *zeroed, *on_request)}
-        self._lists = {places[key]: inputs[key] for key in lists}  # the names of their lengths
-        self._dtypes = [torch.int32 if key in integers else torch.float32 for key in self.inputs]
+        given = list(inputs.values())
+        self.adds = {i for i, x in enumerate(given) if x.gradient is Gradient.ADDED}
+        self._differentiable = [x.gradient not in (Gradient.NONE, Gradient.REFUSED) for x in given]
+        self._carries = [x.gradient for x in outputs.values()]
+        self._optional = {i for i, x in enumerate(given) if x.left_out_with}
+        self._shapes = [sizes_of(x.shape) for x in given]
+        self._lists = {i: x.shape for i, x in enumerate(given) if x.is_list}  # the names of their lengths
         self._derive = derive
-        self._scratch = _shape(scratch) if scratch is not None else None
+        self._scratch = sizes_of(scratch) if scratch is not None else None
         self._memory = memory
         # The names of the kernels' fields; None where there is no gradient.
-        self._out = [(f"out.{key}", _shape(text)) for key, text in outputs.items()]
+        self._out = [(f"out.{key}", sizes_of(x.shape)) for key, x in outputs.items()]
         self._given = [f"given.{key}" for key in outputs]
-        self._needed = {f"given.{key}" for key in outputs if key not in passive} - _MAY_BE_NULL
+        self._needed = {f"given.{key}" for key, x in outputs.items() if x.gradient} - _MAY_BE_NULL
         self._grad = [f"grad.{key}" if own else None for key, own in zip(inputs, self._differentiable, strict=True)]
+        self._on_request = {i for i, x in enumerate(given) if x.gradient is Gradient.ON_REQUEST}
+        self._zeroed = {i for i, x in enumerate(given) if x.gradient in _STARTS_AT_ZERO}
         self._kinds: list[tuple[type, ...]] = [
             (Tensor, NoneType) if i in self._optional else (Tensor,) for i in range(len(inputs))
         ]
@@ -109,8 +90,8 @@ class Operation:
                 that there is not.
         """
         tensors, numbers = self.split(arguments)
-        for key, x in zip(self.inputs, tensors, strict=False):
-            if key in self.constant and x.requires_grad:
+        for (key, declared), x in zip(self.inputs.items(), tensors, strict=False):
+            if declared.gradient is Gradient.REFUSED and x.requires_grad:
                 raise InputError(f"{self.name} has no gradient by {key}: detach it")
         recording = tape.current()
         if recording is not None:
@@ -181,8 +162,8 @@ class Operation:
             slots: what it returned beside the outputs.
             outputs: which it returned.
             given: one for each output.
-            wanted: one for each input; only inputs that are `on_request` heed it.
-            sums: by an input's number: memory to which its gradient is added, for inputs of `adds`.
+            wanted: one for each input; only inputs with a gradient ON_REQUEST heed it.
+            sums: by an input's number: memory to which its gradient is added, for inputs whose gradient is ADDED.
         """
         like = tensors[0]
         library = library_of(like.device.type)
@@ -197,7 +178,7 @@ class Operation:
             if key is None:
                 gradients.append(None)
                 continue
-            if (key in self._on_request and not wanted[i]) or self._is_left_out(i, x):
+            if (i in self._on_request and not wanted[i]) or self._is_left_out(i, x):
                 gradients.append(None)
                 slots[key] = 0
                 continue
@@ -205,7 +186,7 @@ class Operation:
                 gradient = sums[i]
             else:
                 gradient = allocate("gradients", like, x.shape)
-                if key in self._zeroed:
+                if i in self._zeroed:
                     gradient.zero_()
             gradients.append(gradient)
             slots[key] = gradient.data_ptr()
@@ -238,18 +219,19 @@ class Operation:
     def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
         slots: Slots = dict(zip(self.numbers, numbers, strict=True))
         there = [not self._is_left_out(i, x) for i, x in enumerate(tensors)]
-        for group in self._left_out_together:
-            if len({there[i] for i in group}) > 1:  # a kernel takes the address of each for that of a number
-                names = ", ".join(key for i, key in enumerate(self.inputs) if i in group)
-                raise InputError(f"{self.name}: expected all of {names}, or none of them")
-        for key, x, dtype, own in zip(self.inputs, tensors, self._dtypes, there, strict=True):
+        for group in {x.left_out_with for x in self.inputs.values()} - {None}:
+            together = {key: own for (key, x), own in zip(self.inputs.items(), there, strict=True)
+                        if x.left_out_with == group}  # fmt: skip
+            if len(set(together.values())) > 1:  # a kernel takes the address of each for that of a number
+                raise InputError(f"{self.name}: expected all of {', '.join(together)}, or none of them")
+        for (key, declared), x, own in zip(self.inputs.items(), tensors, there, strict=True):
             if own:
-                check_tensor(x, f"{self.name}: {key}", (dtype,))
+                check_tensor(x, f"{self.name}: {key}", (declared.dtype,))
         if self._derive is not None:
             given = {key: x for key, x, own in zip(self.inputs, tensors, there, strict=True) if own}
             slots.update(self._derive(given, slots))
         device = tensors[0].device
-        for (key, shape), x, own in zip(self.inputs.items(), tensors, there, strict=True):
+        for key, shape, x, own in zip(self.inputs, self._shapes, tensors, there, strict=True):
             if not own:
                 continue
             actual, expected = list(x.shape), list(shape)
@@ -313,10 +295,6 @@ def first_rows(name: str, count: int, x: Tensor) -> int:
 def in_rows(tensors: Tensors) -> Tensors:
     """The same values row by row in memory; a view that torch negates when it reads it is written out."""
     return [x if x.is_contiguous() and not x.is_neg() else x.resolve_neg().contiguous() for x in tensors]
-
-
-def _shape(text: str) -> Shape:
-    return tuple(int(size) if size.isdigit() else size for size in text.split())
 
 
 def _apart(results: Tensors, inputs: Sequence[Tensor | None]) -> Tensors:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.headers import TILE
 from gsbench.kernels.library import Library, allocate, library_of
 from gsbench.kernels.operation import Operation, address, in_rows
@@ -53,12 +54,20 @@ def count_tiles(width: int, height: int) -> int:
 
 _project = Operation(
     "project",
-    inputs={"means": "N 3", "factors": "N 3 3", "opacities": "N", "viewmats": "C 4 4", "Ks": "C 3 3"},
-    outputs={"means2d": "C N 2", "roots": "C N 4", "depths": "C N", "half_sizes": "C N 2"},
+    inputs={
+        "means": Input("N 3"),
+        "factors": Input("N 3 3"),
+        "opacities": Input("N"),
+        "viewmats": Input("C 4 4", Gradient.ON_REQUEST),
+        "Ks": Input("C 3 3", Gradient.REFUSED),
+    },
+    outputs={
+        "means2d": Output("C N 2"),
+        "roots": Output("C N 4"),
+        "depths": Output("C N"),
+        "half_sizes": Output("C N 2", gradient=False),
+    },
     numbers={"width": int, "height": int, "near": float, "far": float, "eps2d": float, "antialias": bool},
-    constant=["Ks"],
-    passive=["half_sizes"],
-    on_request=["viewmats"],
     memory="projected Gaussians",
 )
 
@@ -82,18 +91,26 @@ def _of_images(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, i
 
 _blend = Operation(
     "blend",
-    inputs={"means2d": "C N 2", "roots": "C N 4", "half_sizes": "C N 2", "colors": "?sets N D", "background": "D",
-            "offsets": "lists", "ids": "pairs"},
-    outputs={"image": "C height width D", "alpha": "C height width 1", "transmittance": "C state", "stop": "C state"},
+    inputs={
+        "means2d": Input("C N 2"),
+        "roots": Input("C N 4"),
+        "half_sizes": Input("C N 2", Gradient.NONE),
+        "colors": Input("?sets N D"),
+        "background": Input("D", Gradient.ON_REQUEST),
+        "offsets": Input("lists", Gradient.NONE, torch.int32),
+        "ids": Input("pairs", Gradient.NONE, torch.int32, is_list=True),
+    },
+    outputs={
+        "image": Output("C height width D"),
+        "alpha": Output("C height width 1"),
+        "transmittance": Output("C state", gradient=False),
+        "stop": Output("C state", gradient=False),
+    },
     numbers={"width": int, "height": int},
-    passive=["half_sizes", "offsets", "ids", "transmittance", "stop"],
-    on_request=["background"],
-    integers=["offsets", "ids"],
-    lists=["ids"],
     derive=_of_images,
     scratch="C N sums",
     memory="images",
-)  # fmt: skip
+)
 
 
 def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewport: Viewport) -> tuple[Tensor, Tensor]:

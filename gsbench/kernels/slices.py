@@ -5,23 +5,32 @@ from typing import Any
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.operation import EVERY_ROW, Operation, first_rows
 
-_SLICE = {"means": "N 3", "factors": "N 3 3", "opacities": "N"}
+_SLICE = {"means": Output("N 3"), "factors": Output("N 3 3"), "opacities": Output("N")}
 
 _triangular = Operation(
     "observe_triangular",
-    inputs={"means": "N 3", "directions": "N 3", "times": "N 1", "log_diagonal": "N rows", "shape": "N 3",
-            "motion": "N moves", "coupling": "N couplings", "opacities": "N", "center": "3", "time": "",
-            "log_lambda_d": "", "log_lambda_t": ""},
+    inputs={
+        "means": Input("N 3"),
+        "directions": Input("N 3", left_out_with="direction"),
+        "times": Input("N 1", left_out_with="time"),
+        "log_diagonal": Input("N rows"),
+        "shape": Input("N 3"),
+        "motion": Input("N moves"),
+        "coupling": Input("N couplings"),
+        "opacities": Input("N"),
+        "center": Input("3", Gradient.REFUSED),
+        "time": Input("", Gradient.REFUSED, left_out_with="time"),
+        "log_lambda_d": Input("", Gradient.SUMMED, left_out_with="direction"),
+        "log_lambda_t": Input("", Gradient.SUMMED, left_out_with="time"),
+    },
     outputs=_SLICE,
     numbers={"half": float, "conditioned_first": bool, "form": int, "subtracts": bool, "sliced": int},
-    constant=["center", "time"],
-    optional=["directions log_lambda_d", "times time log_lambda_t"],
-    zeroed=["log_lambda_d", "log_lambda_t"],
     derive=lambda given, numbers: _entries(given) | _sliced(given, numbers),
     memory="a slice's Gaussians",
-)  # fmt: skip
+)
 
 
 def _sliced(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
@@ -99,15 +108,22 @@ def observe_triangular(
 
 _rotated = Operation(
     "observe_rotated",
-    inputs={"means": "N 3", "times": "N 1", "scales": "N 4", "left_quats": "N 4", "right_quats": "N 4",
-            "opacities": "N", "clock": "", "time": "", "log_lambda_t": ""},
+    inputs={
+        "means": Input("N 3"),
+        "times": Input("N 1"),
+        "scales": Input("N 4"),
+        "left_quats": Input("N 4"),
+        "right_quats": Input("N 4"),
+        "opacities": Input("N"),
+        "clock": Input("", Gradient.REFUSED),
+        "time": Input("", Gradient.REFUSED),
+        "log_lambda_t": Input("", Gradient.SUMMED),
+    },
     outputs=_SLICE,
     numbers={"sliced": int},
-    constant=["clock", "time"],
-    zeroed=["log_lambda_t"],
     derive=lambda given, numbers: _sliced(given, numbers),
     memory="a slice's Gaussians",
-)  # fmt: skip
+)
 
 
 def observe_rotated(
@@ -153,8 +169,8 @@ def observe_rotated(
 
 _still = Operation(
     "observe_still",
-    inputs={"scales": "N 3", "quats": "N 4", "opacities": "N"},
-    outputs={"factors": "N 3 3", "opacities": "N"},
+    inputs={"scales": Input("N 3"), "quats": Input("N 4"), "opacities": Input("N")},
+    outputs={"factors": Output("N 3 3"), "opacities": Output("N")},
     memory="a slice's Gaussians",
 )
 

@@ -11,13 +11,10 @@ import threading
 from collections import Counter
 from collections.abc import Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from gsbench.kernels.operation import Operation
 
 _in_charge = threading.local()  # each thread has its own
 
@@ -35,8 +32,35 @@ def add_to(sums: dict[int, Tensor], key: int, gradient: Tensor) -> None:
         sums[key] = gradient
 
 
+class Differentiable(Protocol):
+    """What a tape asks of an operation: to run, and to run backwards; `gsbench.kernels.operation.Operation` does."""
+
+    name: str
+    adds: set[int]  # inputs to whose gradient the backward kernel adds
+
+    def run(self, tensors: list[Tensor], numbers: Sequence[Any]) -> tuple[list[Tensor], dict[str, Any]]:
+        """Return the outputs, and what backward can use again."""
+
+    def differentiable(self, tensors: list[Tensor]) -> list[bool]:
+        """Tell by which inputs there is a gradient."""
+
+    def carries_gradient(self, outputs: list[Tensor]) -> list[bool]:
+        """Tell through which outputs there is one."""
+
+    def backward(
+        self,
+        tensors: list[Tensor],
+        slots: dict[str, Any],
+        outputs: list[Tensor],
+        given: Sequence[Tensor | None],
+        wanted: Sequence[bool],
+        sums: dict[int, Tensor] | None = None,
+    ) -> list[Tensor | None]:
+        """Return the gradients by the inputs, of those by the outputs."""
+
+
 class _Note(NamedTuple):
-    operation: Operation
+    operation: Differentiable
     tensors: list[Tensor]
     wanted: list[bool]
     slots: dict[str, Any]
@@ -58,7 +82,7 @@ class Tape:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         _in_charge.tape = self._outer
 
-    def record(self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
+    def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
         """Run an operation, and note it where a gradient goes through it."""
         outputs, slots = operation.run(tensors, numbers)
         if not torch.is_grad_enabled():
@@ -96,7 +120,7 @@ class _Gradients:
         self.uses = Counter([id(x) for note in notes for x in note.tensors])
 
     def give(self, x: Tensor, gradient: Tensor) -> None:
-        """Take in a gradient by x; through the graph, where x is autograd's."""
+        """Accumulate dL/dx; if x has a `grad_fn`, backpropagate through autograd."""
         self._add(x, gradient)
         if x.grad_fn is None:
             return

@@ -5,8 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
-from gsbench.kernels.operation import Operation
-from gsbench.kernels.tape import Tape
+from gsbench.kernels.tape import Differentiable, Tape
 from gsbench.measure.speed import Laps
 
 SLICE, RASTER = "slice", "raster"
@@ -29,11 +28,11 @@ class StageWatch(Tape):
         super().__init__()
         self._laps = Laps(device)
 
-    def record(self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
+    def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
         """Run an operation, and end the stages that end with it."""
         if operation.name in _FOLLOWS:
             self._laps.end(_FOLLOWS[operation.name])
-        outputs = operation.forward(tensors, numbers)
+        outputs, _ = operation.run(tensors, numbers)
         if operation.name in _ENDS:
             self._laps.end(_ENDS[operation.name])
         return outputs
