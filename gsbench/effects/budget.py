@@ -13,6 +13,7 @@ from gsbench.effects.strength import Strength
 from gsbench.measure.record import Gate
 from gsbench.models import GaussianModel
 from gsbench.models.classes import count, packed_bytes
+from gsbench.models.color_order import order_of
 
 SHARES = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)  # of the squared error, tried from the largest
 MOST_PREDICTED = 2.0  # times the budget: on few views a loss may be measured that is smaller than it is
@@ -73,5 +74,6 @@ def levels_of(model: GaussianModel) -> dict[str, int]:
     if model.classes is None or model.classes.levels is None:
         return {}
     values, counts = torch.unique(model.classes.levels, return_counts=True)
-    names = [f"degree {level % 4}" + (f", {level // 4 + 1} waves" if level > 3 else "") for level in values.tolist()]
+    orders = [order_of(packed) for packed in values.tolist()]
+    names = [f"degree {one.degree}" + (f", {one.waves} waves" if one.waves > 1 else "") for one in orders]
     return dict(zip(names, counts.tolist(), strict=True))

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from gsbench.effects.strength import Strength
 from gsbench.models import GaussianModel
-from gsbench.models.classes import DIRECTION, MOST_LEVEL, TIME, Classes, count
+from gsbench.models.classes import DIRECTION, TIME, Classes, count
+from gsbench.models.color_order import MOST_PACKED, at_most, order_of
 from gsbench.models.cuts import LIVE, REMOVED, SLICED, STILL
 
 # Nanoseconds that a Gaussian adds to a frame, as measured on an EPYC Zen 4 (AVX-512, one thread, 5,300 Gaussians at
@@ -52,7 +53,7 @@ def choose(strength: Strength, model: GaussianModel, budget: float) -> Choice:
     forms = torch.stack(list(geometry.values()))
     removes = torch.tensor([name == REMOVED for name in geometry], device=live.device)[:, None]
     assert now.levels is not None
-    levels = torch.stack([now.levels] + [_lower(now.levels, v.level) for v in strength.cuts if v.level is not None])
+    levels = torch.stack([now.levels] + [at_most(now.levels, v.level) for v in strength.cuts if v.level is not None])
     hues = torch.stack([none] + [strength.errors[v.name] for v in strength.cuts if v.level is not None])
     painting = _painting(levels)
 
@@ -97,13 +98,9 @@ def most_cost(model: GaussianModel) -> float:
 
 
 def _painting(levels: Tensor) -> Tensor:
-    """Return the nanoseconds that colours of some levels take."""
-    return torch.tensor(COLORING, device=levels.device)[levels % 4] * (levels // 4 + 1)
-
-
-def _lower(levels: Tensor, most: int) -> Tensor:
-    """Return levels [N] with at most the degree and the waves of another level."""
-    return (levels % 4).clamp(max=most % 4) + 4 * (levels // 4).clamp(max=most // 4)
+    """Return the cost, ns, of evaluating colours of some orders, packed."""
+    order = order_of(levels)
+    return torch.tensor(COLORING, device=levels.device)[order.degree] * order.waves
 
 
 def classes_of(model: GaussianModel) -> Classes:
@@ -142,7 +139,7 @@ def apply(
         if cut.raw is None:
             continue
         rows = choice.geometry[cut.name] if cut.level is None else (
-            (choice.levels != now.levels) & (choice.levels == _lower(now.levels, cut.level)))  # fmt: skip
+            (choice.levels != now.levels) & (choice.levels == at_most(now.levels, cut.level)))  # fmt: skip
         for key, value in cut.raw.items():
             model.splats[key].data[rows] = value[rows]
     place = torch.arange(len(model), device=now.levels.device)
@@ -158,7 +155,7 @@ def apply(
     frozen[still] = 0
     kind = torch.where(refined, 0, torch.where(still, 2, 1))
     # Rows of a class are sorted by what is frozen and by level, and otherwise stay in order: equal work lies together.
-    rank = (kind * 4 + frozen) * (MOST_LEVEL + 1) + MOST_LEVEL - choice.levels
+    rank = (kind * 4 + frozen) * (MOST_PACKED + 1) + MOST_PACKED - choice.levels
     if spans is None:
         order = rank.argsort(stable=True)
     else:  # those that AGR moves at the same times lie together too: a GPU's warps rest as a whole

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from gsbench.models.color_order import coefficients_within, order_of
 from gsbench.scenes.points import SH_C0  # Y_00
 
 # Constants of the real spherical harmonics of degree 1 to 3, in 3DGS' order and signs.
@@ -52,12 +53,12 @@ def sh_time_colors(
         directions: [N, 3] unit vectors.
         degree: of the spherical harmonics in use.
         time_offset: [N] t - mu_t.
-        levels: [N] int32, each row's degree + 4 (M - 1) at most, as `gsbench.models.base.Classes` has it.
+        levels: [N] int32, the most that each row has, packed as by `ColorOrder`.
     """
     frequencies = torch.arange(coefficients.shape[1], device=time_offset.device, dtype=time_offset.dtype)
     waves = torch.cos(2 * math.pi * frequencies * time_offset[:, None])  # [N, M]
     if levels is not None:
-        waves = torch.where(frequencies <= (levels // 4)[:, None], waves, 0.0)
+        waves = torch.where(frequencies < order_of(levels).waves[:, None], waves, 0.0)
     basis = _basis_within(directions, degree, levels)
     used = (coefficients[:, :, : basis.shape[-1]] * waves[..., None, None]).sum(1)
     return ((basis[..., None] * used).sum(1) + 0.5).clamp(min=0)
@@ -68,5 +69,4 @@ def _basis_within(directions: Tensor, degree: int, levels: Tensor | None) -> Ten
     basis = sh_basis(directions, degree)
     if levels is None:
         return basis
-    degrees = [own for own in range(degree + 1) for _ in range(2 * own + 1)]
-    return torch.where(torch.tensor(degrees, device=levels.device) <= (levels % 4)[:, None], basis, 0.0)
+    return torch.where(coefficients_within(levels, degree)[:, 0], basis, 0.0)

@@ -13,6 +13,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.models.appearance import sh_colors
 from gsbench.models.classes import Classes, unpack
+from gsbench.models.color_order import ColorOrder, coefficients_within
 from gsbench.models.query import Query, unit
 from gsbench.models.refinement import OCTAVES, Refinement
 from gsbench.phase import Phase
@@ -131,12 +132,12 @@ class GaussianModel(nn.Module, ABC):
         return {}
 
     def full_level(self) -> int:
-        """Return the level of colour (see `Classes.levels`) in use."""
-        return self.phase.sh_degree
+        """Return the order of colour in use, packed as by `ColorOrder`."""
+        return ColorOrder(self.phase.sh_degree, 1).packed
 
     def lower_levels(self) -> list[int]:
-        """List the levels of colour below the one in use."""
-        return list(range(self.phase.sh_degree))
+        """List the orders of colour below the one in use, packed."""
+        return [ColorOrder(degree, 1).packed for degree in range(self.phase.sh_degree)]
 
     def kept(self, classes: Classes) -> dict[str, Tensor]:
         """Tell which entries of the parameters matter to rows of these classes; those not named matter all.
@@ -145,8 +146,7 @@ class GaussianModel(nn.Module, ABC):
         """
         if classes.levels is None:
             return {}
-        degrees = [math.isqrt(k) for k in range(1, (self.sh_degree + 1) ** 2)]
-        return {"shN": (torch.tensor(degrees, device=classes.levels.device) <= classes.levels[:, None] % 4)[..., None]}
+        return {"shN": coefficients_within(classes.levels, self.sh_degree).flatten(1)[:, 1:, None]}
 
     @torch.no_grad()
     def fill(self, classes: Classes) -> None:

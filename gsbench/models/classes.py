@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.models.color_order import MOST_PACKED
 
 if TYPE_CHECKING:
     from gsbench.models.base import GaussianModel
 
 TIME, DIRECTION = 1, 2  # in Classes.frozen
 NAMES = ("refined", "sliced", "time", "direction", "still")  # of classes, by what AGR, slicing or freezing does to them
-MOST_LEVEL = 31  # degree 3 and 8 waves
 _STATE = "classes."
 
 
@@ -27,7 +27,7 @@ class Classes(NamedTuple):
 
     refined: int  # this many first rows are moved by AGR
     sliced: int  # this many first rows (refined <= sliced) change with the query; the others are still
-    levels: Tensor | None  # [N] int32: the harmonics of a row's colours, degree + 4 (waves - 1); None: all of them
+    levels: Tensor | None  # [N] int32: the order of a row's colours, packed as by `ColorOrder`; None: the whole
     frozen: Tensor | None = None  # [N] uint8: TIME + DIRECTION, what a sliced row does not change with; None: nothing
     spans: Tensor | None = None  # [refined, 2] clips: AGR moves a row only from a first to a last time; None: always
 
@@ -83,7 +83,7 @@ def unpack(model: GaussianModel, state: dict[str, Any]) -> tuple[dict[str, Any],
     refined, sliced = part("counts", (2,), torch.int64).tolist()
     levels, frozen = part("levels", (N,), torch.uint8).to(torch.int32), part("frozen", (N,), torch.uint8)
     spans = part("spans", (refined, 2), torch.float32) if f"{_STATE}spans" in own else None
-    known = bool((levels <= MOST_LEVEL).all()) and bool((frozen <= TIME + DIRECTION).all())
+    known = bool((levels <= MOST_PACKED).all()) and bool((frozen <= TIME + DIRECTION).all())
     if own or not known or not 0 <= refined <= sliced <= N:
         raise InputError(f"checkpoint: expected classes of {N} rows, got {refined}, {sliced} and levels or frozen "
                          f"effects that there are not")  # fmt: skip

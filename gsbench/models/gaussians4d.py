@@ -14,6 +14,7 @@ from gsbench.kernels.slices import observe_rotated
 from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
 from gsbench.models.classes import Classes
+from gsbench.models.color_order import ColorOrder, coefficients_within, order_of
 from gsbench.models.factors import partner, rotation, rotation4d, sizes, turn_of_space
 from gsbench.models.freezing import freeze_rotated
 from gsbench.models.query import Query, unit
@@ -101,28 +102,25 @@ class Gaussians4DModel(GaussianModel):
 
     def full_level(self) -> int:
         """The degree in use with all waves."""
-        return self.phase.sh_degree + 4 * self.time_degree
+        return ColorOrder(self.phase.sh_degree, self.time_degree + 1).packed
 
     def lower_levels(self) -> list[int]:
         """List every degree up to the one in use, with all waves and with the constant one alone."""
-        levels = [degree + 4 * waves for waves in (0, self.time_degree) for degree in range(self.phase.sh_degree + 1)]
-        return sorted(set(levels) - {self.full_level()})
+        degrees = range(self.phase.sh_degree + 1)
+        orders = {ColorOrder(degree, waves).packed for waves in (1, self.time_degree + 1) for degree in degrees}
+        return sorted(orders - {self.full_level()})
 
     def kept(self, classes: Classes) -> dict[str, Tensor]:
         """Tell which entries matter: a still row has no right quaternion, and a time where its colour has waves."""
         masks = {}
         if classes.levels is not None:
-            K = (self.sh_degree + 1) ** 2
-            places = range(1, (self.time_degree + 1) * K)
-            degrees = classes.levels.new_tensor([math.isqrt(place % K) for place in places])
-            waves = classes.levels.new_tensor([place // K for place in places])
-            levels = classes.levels[:, None]
-            masks["shN"] = ((degrees <= levels % 4) & (waves <= levels // 4))[..., None]
+            stored = coefficients_within(classes.levels, self.sh_degree, self.time_degree + 1)
+            masks["shN"] = stored.flatten(1)[:, 1:, None]  # the constant coefficient is sh0's
         if classes.frozen is not None:
             changes = torch.arange(len(classes.frozen), device=classes.frozen.device)[:, None] < classes.sliced
             space = torch.tensor([[True, True, True, False]], device=changes.device)
             assert classes.levels is not None
-            timed = changes | (classes.levels[:, None] >= 4)
+            timed = changes | (order_of(classes.levels).waves > 1)[:, None]
             masks |= {"times": timed, "right_quats": changes.expand(-1, 4), "scales": changes | space}
         return masks
 
