@@ -14,7 +14,6 @@ import torch
 
 from gsbench.errors import InputError
 from gsbench.measure.speed import time_in_turns
-from gsbench.models.classes import packed_bytes
 from gsbench.models.render import render
 from gsbench.run.load import LoadedRun, load_run, scene_of
 from gsbench.scenes import View
@@ -47,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"benchmarks.frames: {error}", file=sys.stderr)
         return 2
     times = time_in_turns([frames_of(run, views) for run in runs], asked.count)
-    sizes = [packed_bytes(run.model) for run in runs]
+    sizes = [run.model.stored_bytes() for run in runs]
     for run, time, size in zip(runs, times, sizes, strict=True):
         print(f"{run.folder}: {len(run.model)} Gaussians, {time.p50:.3f} ms ({time.p50 / times[0].p50:.2f}), "
               f"{size / 1e6:.3f} MB ({size / sizes[0]:.2f})")  # fmt: skip

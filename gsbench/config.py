@@ -62,7 +62,8 @@ class LearningRate:
 class ModelConfig:
     """A model: the keys that every model has, and the options of this model's constructor."""
 
-    name: str = MISSING  # of the class in gsbench/models/
+    name: str = MISSING  # of the class in gsbench/models/ ..
+    module: str | None = None  # .. or in this Python module: docs/adding_a_model.md
     published_with_agr: bool = False  # whether AGR is part of the method as its authors describe it
     agr: bool = "${.published_with_agr}"  # type: ignore[assignment]  # an interpolation, typed when resolved
     agr_octaves: int = 4  # K of AGR's time encoding; the paper's 10 memorise every frame: docs/tuning.md

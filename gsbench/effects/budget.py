@@ -12,8 +12,8 @@ from gsbench.effects.gate import apply, choose
 from gsbench.effects.strength import Strength
 from gsbench.measure.record import Gate
 from gsbench.models import GaussianModel
-from gsbench.models.classes import count, packed_bytes
 from gsbench.models.color_order import order_of
+from gsbench.models.gated import GatedModel
 
 SHARES = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)  # of the squared error, tried from the largest
 MOST_PREDICTED = 2.0  # times the budget: on few views a loss may be measured that is smaller than it is
@@ -23,14 +23,14 @@ MOST_PREDICTED = 2.0  # times the budget: on few views a loss may be measured th
 class Gated:
     """A model after a gate."""
 
-    model: GaussianModel
+    model: GatedModel
     gate: Gate  # what was decided, for the record
     rows: Tensor  # [M] the place that each Gaussian had before
     changed: Tensor  # [M] bool: whether it became another cut
 
 
 def gate_within(
-    model: GaussianModel,
+    model: GatedModel,
     strength: Strength,
     budget_db: float,
     measure: Callable[[GaussianModel], float],
@@ -60,10 +60,10 @@ def gate_within(
                 share=share,
                 predicted_db=10 * math.log10(1 + choice.predicted),
                 measured_db=loss,
-                rows=count(gated) | {"removed": len(model) - len(gated)},
+                rows=gated.count_classes() | {"removed": len(model) - len(gated)},
                 levels=levels_of(gated),
-                bytes_before=packed_bytes(model),
-                bytes=packed_bytes(gated),
+                bytes_before=model.stored_bytes(),
+                bytes=gated.stored_bytes(),
             )
             return Gated(gated, gate, rows, changed)
     return None

@@ -10,20 +10,22 @@ from gsbench.effects.strength import MOST_VIEWS, evenly_spaced
 from gsbench.models import GaussianModel, Query
 from gsbench.models.classes import DIRECTION
 from gsbench.models.cuts import STILL, shares_of
+from gsbench.models.gated import GatedModel
 from gsbench.scenes import View
 
 
 @torch.no_grad()
 def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianModel | None:
-    """Return a copy whose slices do not change with the direction of view; None where the model's never do.
+    """Return a copy whose slices do not change with the direction of view.
 
-    AGR goes on, as do time and the harmonics of the colours.
+    It is None where the model's slices never do, and where the model cannot freeze what it observes. AGR goes on, as do
+    time and the harmonics of the colours.
 
     Args:
         model: trained.
         views: training views, over which the frozen direction is averaged.
     """
-    if "direction" not in model.observes:
+    if not isinstance(model, GatedModel) or "direction" not in model.observes:
         return None
     queries = [Query.of(view.camera, view.time) for view in evenly_spaced(views, MOST_VIEWS)]
     weights = shares_of([model.slice(query).opacities for query in queries])

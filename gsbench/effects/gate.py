@@ -12,9 +12,10 @@ from torch import Tensor
 
 from gsbench.effects.strength import Strength
 from gsbench.models import GaussianModel
-from gsbench.models.classes import DIRECTION, TIME, Classes, count
+from gsbench.models.classes import DIRECTION, TIME, Classes
 from gsbench.models.color_order import MOST_PACKED, at_most, order_of
 from gsbench.models.cuts import LIVE, REMOVED, SLICED, STILL
+from gsbench.models.gated import GatedModel
 
 # Nanoseconds that a Gaussian adds to a frame, as measured on an EPYC Zen 4 (AVX-512, one thread, 5,300 Gaussians at
 # 80 x 80). They are constants, so that the same seed chooses the same Gaussians on every machine.
@@ -107,7 +108,7 @@ def classes_of(model: GaussianModel) -> Classes:
     """Return the classes of a model, or those that say what each row of one without classes pays for."""
     if model.classes is not None:
         return model.classes
-    rows = count(model)
+    rows = model.count_classes()
     sliced = rows["refined"] + rows["sliced"]
     device = model.splats["opacities"].device
     levels = torch.full((len(model),), model.full_level(), dtype=torch.int32, device=device)
@@ -116,7 +117,7 @@ def classes_of(model: GaussianModel) -> Classes:
 
 @torch.no_grad()
 def apply(
-    model: GaussianModel,
+    model: GatedModel,
     strength: Strength,
     choice: Choice,
     spans: Tensor | None = None,  # [N, 2]

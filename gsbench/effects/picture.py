@@ -13,7 +13,7 @@ from torch import Tensor
 from gsbench.effects.gate import classes_of, cost_of, most_cost
 from gsbench.effects.words import CLASSES
 from gsbench.models import GaussianModel, Query
-from gsbench.models.classes import NAMES, count
+from gsbench.models.classes import NAMES
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes import Camera
 
@@ -62,7 +62,7 @@ def draw(
     ]
     panels = [_bytes(image) for image in images]
     panels[2] = _heat(panels[2][..., 0])
-    return _arranged(panels, count(model), most_cost(model))
+    return _arranged(panels, model.count_classes(), most_cost(model))
 
 
 def class_colors(model: GaussianModel) -> Tensor:

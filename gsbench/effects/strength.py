@@ -33,6 +33,7 @@ from gsbench.lanes import side_by_side
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Gaussians3D
 from gsbench.models.cuts import REMOVED, Cut, cuts_of
+from gsbench.models.gated import GatedModel
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes import Camera, View
 
@@ -55,7 +56,7 @@ class Strength:
 
 @torch.no_grad()
 def probe(
-    model: GaussianModel,
+    model: GatedModel,
     views: Sequence[View],
     background: Tensor,
     *,

@@ -1,8 +1,10 @@
-"""Define the base of all models: N Gaussians with raw parameters, their slice, and edits of their rows."""
+"""Define what every model must have: N Gaussians with raw parameters, their slice, and edits of their rows.
+
+What a model may have beside that, so that gates can simplify its Gaussians, is `gsbench.models.gated`.
+"""
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -12,19 +14,19 @@ from gsbench.backends import AUTO, Backend
 from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.models.appearance import sh_colors
-from gsbench.models.classes import Classes, unpack
-from gsbench.models.color_order import ColorOrder, coefficients_within
+from gsbench.models.classes import NAMES, Classes
+from gsbench.models.color_order import ColorOrder
 from gsbench.models.query import Query, unit
 from gsbench.models.refinement import OCTAVES, Refinement
 from gsbench.phase import Phase
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
 from gsbench.scenes.scene import Points
+from gsbench.scenes.trained import TrainedGaussians
 
 Raw = dict[str, Tensor]  # raw parameters by name, N rows each
 CHILDREN = 2  # a split leaves two Gaussians ..
 SHRINK = 0.8 * CHILDREN  # .. that are 1.6 times smaller (3DGS, gaussian_model.py)
 INITIAL_OPACITY = 0.1
-LENGTHS = ("means", "motion")  # raw parameters in world units; sizes are logarithms, which another unit only shifts
 
 
 class Gaussians3D(NamedTuple):
@@ -50,6 +52,7 @@ class GaussianModel(nn.Module, ABC):
     observes: ClassVar[tuple[str, ...]] = ()  # of "time", "direction"
     centers: ClassVar[tuple[str, ...]] = ("means",)  # the raw parameters that are means: AGR reads and moves them ..
     geometry: ClassVar[tuple[str, ...]]  # .. and moves these, which form the factor
+    lengths: ClassVar[tuple[str, ...]] = ("means",)  # those of both in world units; logarithms of sizes are not
 
     def __init__(
         self, *, agr: bool = False, agr_octaves: int = OCTAVES, sh_degree: int = 3, backend: Backend = AUTO
@@ -77,7 +80,7 @@ class GaussianModel(nn.Module, ABC):
         self.agr_octaves = agr_octaves
         self.sh_degree = sh_degree
         self.backend = backend
-        self.classes: Classes | None = None  # None: every row has every effect
+        self.classes: Classes | None = None  # None: every row has every effect; a GatedModel may have them
         self.extent = 1.0  # of the scene, world units
         self.phase = Phase(sh_degree, agr, False)
 
@@ -91,13 +94,6 @@ class GaussianModel(nn.Module, ABC):
     def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Slice Gaussians with raw parameters `raw` at a query."""
 
-    def still(self, raw: Raw) -> Conditioned:
-        """Return Gaussians that no query changes, with a gate of one; a model that observes something overrides it.
-
-        They are what `condition` tends to where Gaussians grow long in all that is observed, and move with none of it.
-        """
-        raise NotImplementedError(f"{type(self).__name__}.still")
-
     @abstractmethod
     def scales(self) -> Tensor:
         """Return the largest standard deviation of each Gaussian in space, [N], world units."""
@@ -110,6 +106,15 @@ class GaussianModel(nn.Module, ABC):
         """Raise raw sizes in space to at least `least` [N], world units; a model without such sizes does nothing."""
         return
 
+    def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
+        """Return the raw geometry that has the shape of trained 3D Gaussians in space, given its initial one.
+
+        A model that does not say how starts with spheres of the same volume.
+        """
+        points, radii = Points(trained.means, trained.means), trained.log_scales.mean(1).exp()
+        spheres = self.initial_geometry(points, radii, torch.Generator().manual_seed(0))
+        return {name: spheres[name] for name in self.geometry}
+
     def long_in_time(self) -> Tensor:
         """Tell which Gaussians are split because of their extent in time, [N] bool (7DGS, section 4.4)."""
         return torch.zeros(len(self), dtype=torch.bool, device=self.splats["means"].device)
@@ -119,44 +124,9 @@ class GaussianModel(nn.Module, ABC):
         rest = dc.new_zeros(len(dc), (self.sh_degree + 1) ** 2 - 1, 3)
         return {"sh0": dc[:, None], "shN": rest}
 
-    def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Freeze effects at their weighted mean over queries; return the raw parameters that each changes.
-
-        The last, `still`, changes with no query. A model whose slice never changes has nothing to freeze.
-
-        Args:
-            raw: parameters without AGR.
-            queries: V of them.
-            weights: [V, N], of which each Gaussian's sum to 1.
-        """
-        return {}
-
     def full_level(self) -> int:
         """Return the order of colour in use, packed as by `ColorOrder`."""
         return ColorOrder(self.phase.sh_degree, 1).packed
-
-    def lower_levels(self) -> list[int]:
-        """List the orders of colour below the one in use, packed."""
-        return [ColorOrder(degree, 1).packed for degree in range(self.phase.sh_degree)]
-
-    def kept(self, classes: Classes) -> dict[str, Tensor]:
-        """Tell which entries of the parameters matter to rows of these classes; those not named matter all.
-
-        The masks are bool, broadcastable to the parameters. Entries that do not matter have the constants of `fill`.
-        """
-        if classes.levels is None:
-            return {}
-        return {"shN": coefficients_within(classes.levels, self.sh_degree).flatten(1)[:, 1:, None]}
-
-    @torch.no_grad()
-    def fill(self, classes: Classes) -> None:
-        """Set the entries that do not matter to rows of these classes to constants."""
-        for name, mask in self.kept(classes).items():
-            self.splats[name].data.masked_fill_(~mask, self.constant(name))
-
-    def constant(self, name: str) -> float:
-        """Return what the entries of a parameter are that do not matter."""
-        return 0.0
 
     def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
         """Compute the colours [N, 3] of a slice; a model whose colours are not these harmonics overrides it.
@@ -192,7 +162,7 @@ class GaussianModel(nn.Module, ABC):
             widths = {name: raw[name].shape[-1] for name in (*self.centers, *self.geometry)}
             outputs = [*(widths[name] for name in self.centers), sum(widths[name] for name in self.geometry)]
             size = size_of(points)
-            units = torch.cat([torch.full((n,), size if name in LENGTHS else 1.0) for name, n in widths.items()])
+            units = torch.cat([torch.full((n,), size if name in self.lengths else 1.0) for name, n in widths.items()])
             self.refinement = Refinement(outputs, generator, self.agr_octaves, units)
         self.set_phase(self.phase)
 
@@ -210,27 +180,22 @@ class GaussianModel(nn.Module, ABC):
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """Compute the means, factors and opacities of a slice; models that have a kernel for it call the kernel."""
-        means, factors, gate = self._sliced_and_still(raw, query)
+        means, factors, gate = self.condition(raw, query)
         return means, factors, torch.sigmoid(raw["opacities"]) * gate
-
-    def _sliced_and_still(self, raw: Raw, query: Query) -> Conditioned:
-        """Slice the rows that change with the query, and leave the others as they are."""
-        if self.sliced is None:
-            return self.condition(raw, query)
-        changing = {name: x[: self.sliced] for name, x in raw.items()}
-        others = {name: x[self.sliced :] for name, x in raw.items()}
-        parts = zip(self.condition(changing, query), self.still(others), strict=True)
-        return Conditioned(*map(torch.cat, parts))
-
-    @property
-    def sliced(self) -> int | None:
-        """How many of the first rows change with the query; None: all that a slice is made of."""
-        return None if self.classes is None or not self.observes else self.classes.sliced
 
     @property
     def levels(self) -> Tensor | None:
         """The harmonics of each row's colours, [N] int32 as in `Classes`; None: all of them."""
         return None if self.classes is None else self.classes.levels
+
+    def count_classes(self) -> dict[str, int]:
+        """Count the Gaussians of each class, by the names of `gsbench.models.classes.NAMES`."""
+        N, classes = len(self), self.classes
+        if classes is not None:
+            return classes.by_name(N)
+        refined, sliced = N if self.refines else 0, N if self.observes else 0
+        counts = refined, sliced - refined if sliced else 0, 0, 0, N - max(refined, sliced)
+        return dict(zip(NAMES, counts, strict=True))
 
     @property
     def refines(self) -> bool:
@@ -302,13 +267,24 @@ class GaussianModel(nn.Module, ABC):
         """Lower every opacity to at most `ceiling` (3DGS, section 5.2)."""
         self.splats["opacities"].data.clamp_(max=math.log(ceiling / (1 - ceiling)))
 
+    # ---- what a checkpoint holds
+
+    def pack(self) -> dict[str, Tensor]:
+        """Return the state of the model for a checkpoint."""
+        state: dict[str, Tensor] = self.state_dict()
+        return state
+
+    def stored_bytes(self) -> int:
+        """Return the bytes of the parameters, as a checkpoint holds them."""
+        constants = {name for name, _ in self.named_buffers()}
+        return sum(x.numel() * x.element_size() for name, x in self.pack().items() if name not in constants)
+
     def load_state(self, state: dict[str, Any]) -> None:
-        """Load what `gsbench.models.classes.pack` returned, of any number of Gaussians.
+        """Load what `pack` returned, of any number of Gaussians.
 
         Raises:
             InputError: the state is that of another model.
         """
-        state, classes = unpack(self, state)
         means = state.get("splats.means")
         N = len(means) if isinstance(means, Tensor) and means.dim() else 0
         own = self.state_dict()
@@ -325,6 +301,3 @@ class GaussianModel(nn.Module, ABC):
         for name, parameter in self.splats.items():
             parameter.data = torch.empty(state[f"splats.{name}"].shape, dtype=parameter.dtype, device=parameter.device)
         self.load_state_dict(state)
-        self.classes = classes
-        if classes is not None:
-            self.fill(classes)

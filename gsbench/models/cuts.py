@@ -13,7 +13,8 @@ from torch import Tensor
 
 from gsbench.lanes import side_by_side
 from gsbench.models.base import GaussianModel, Gaussians3D, Raw
-from gsbench.models.classes import Classes, count
+from gsbench.models.classes import Classes
+from gsbench.models.gated import GatedModel
 from gsbench.models.query import Query
 from gsbench.scenes.points import SH_C0
 
@@ -32,7 +33,7 @@ class Cut:
 
 
 def cuts_of(
-    model: GaussianModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], by_halves: bool = True
+    model: GatedModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], by_halves: bool = True
 ) -> list[Cut]:
     """List the ways to simplify the Gaussians of a model.
 
@@ -48,7 +49,7 @@ def cuts_of(
     raw: Raw = {name: value.detach() for name, value in model.splats.items()}
     fewer = {level: raw | {"shN": raw["shN"] * model.kept(Classes(0, 0, _all(model, level)))["shN"]}
              for level in model.lower_levels()}  # fmt: skip
-    rows = count(model)
+    rows = model.count_classes()
     sliced = len(model) - rows["still"]
     refined, lost = _averages(model, queries, slices, weights, names if rows["refined"] else (), list(fewer.values()))
     raw = raw | refined

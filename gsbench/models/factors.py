@@ -142,3 +142,13 @@ def rotation4d(left: Tensor, right: Tensor) -> Tensor:
     M_left = torch.stack([a, -b, -c, -d, b, a, -d, c, c, d, a, -b, d, -c, b, a], -1).unflatten(-1, (4, 4))
     M_right = torch.stack([p, q, r, s, -q, p, -s, r, -r, s, p, -q, -s, -r, q, p], -1).unflatten(-1, (4, 4))
     return M_left @ M_right
+
+
+def quaternions_in_space(quats: Tensor) -> tuple[Tensor, Tensor]:  # [N, 4] wxyz
+    """Return the two quaternions of `rotation4d` that turn (x, y, z) by a quaternion wxyz and leave t as it is.
+
+    `rotation4d(l, r)` maps v = x + y i + z j + t k to l v r*. It leaves k as it is where r = k* l k, and then turns
+    v k* = t - z i + y j - x k by l: the axis (x, y, z) is (z, -y, x) there.
+    """
+    w, x, y, z = quats.unbind(-1)
+    return torch.stack([w, z, -y, x], -1), torch.stack([w, -z, y, x], -1)

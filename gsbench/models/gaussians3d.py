@@ -1,27 +1,30 @@
 """Model a static scene by 3DGS, whose slice is the Gaussian itself (Kerbl et al. 2023)."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsbench.kernels.slices import observe_still
-from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
+from gsbench.models.base import SHRINK, Conditioned, Raw
 from gsbench.models.factors import rotation, sizes
+from gsbench.models.gated import GatedModel
 from gsbench.models.query import Query
 from gsbench.models.registry import register
 from gsbench.scenes.scene import Points
+from gsbench.scenes.trained import TrainedGaussians
 
 
 @register("3dgs")
-class Gaussians3DModel(GaussianModel):
+class Gaussians3DModel(GatedModel):
     """Means, log scales and quaternions: F = R S, cov = R S S R^T (3DGS eq. 6)."""
 
     geometry = ("scales", "quats")
 
     def __init__(self, **options: Any) -> None:
-        """Make an empty model, with the options of `GaussianModel`."""
+        """Make an empty model, with the options of `GatedModel`."""
         super().__init__(**options)
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
@@ -32,7 +35,19 @@ class Gaussians3DModel(GaussianModel):
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Return the Gaussian itself."""
+        return self.still(raw)
+
+    def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
+        """Return the trained Gaussians' own scales and quaternions."""
+        return {"scales": trained.log_scales, "quats": trained.quats}
+
+    def still(self, raw: Raw) -> Conditioned:
+        """Return the Gaussian itself, which no query changes."""
         return Conditioned(raw["means"], self.factors(raw), torch.ones_like(raw["opacities"]))
+
+    def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
+        """Return nothing: there is no effect to freeze."""
+        return {}
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """Slice by the kernel where the backend has one."""

@@ -12,22 +12,23 @@ from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import LOG_SIZE_MAX, MAX_WAVES, TIME_GATE_MIN
 from gsbench.kernels.slices import observe_rotated
 from gsbench.models.appearance import sh_time_colors
-from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
+from gsbench.models.base import SHRINK, Conditioned, Raw
 from gsbench.models.classes import Classes
 from gsbench.models.color_order import ColorOrder, coefficients_within, order_of
-from gsbench.models.factors import partner, rotation, rotation4d, sizes, turn_of_space
-from gsbench.models.freezing import freeze_rotated
+from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
+from gsbench.models.gated import OPACITY_MARGIN, GatedModel
 from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
-from gsbench.models.slicing import check_scheme, mahalanobis, slice_gaussians
+from gsbench.models.slicing import check_scheme, gain_of, mahalanobis, reduce, slice_gaussians
 from gsbench.scenes.points import size_of
 from gsbench.scenes.scene import Points
+from gsbench.scenes.trained import TrainedGaussians
 
 MAX_DEGREE = 32  # of the Fourier series; above it are only frequencies that no clip resolves
 
 
 @register("4dgs")
-class Gaussians4DModel(GaussianModel):
+class Gaussians4DModel(GatedModel):
     """Means and times, four log scales and two quaternions: F = M_left(l) M_right(r) S over (x, y, z, t).
 
     A rotation of space and time needs one unit for both. With `clock` the clip is as long as the scene is large, so
@@ -50,7 +51,7 @@ class Gaussians4DModel(GaussianModel):
             time_degree: frequencies of the colour's Fourier series besides the constant one; 0: constant colours.
             scheme: of `slice_gaussians`.
             lambda_t: sensitivity of the temporal opacity.
-            options: as `GaussianModel`.
+            options: as `GatedModel`.
 
         Raises:
             InputError: an option is out of its range.
@@ -95,10 +96,35 @@ class Gaussians4DModel(GaussianModel):
         factors = rotation(turn_of_space(raw["left_quats"])) * sizes(raw["scales"][:, :3])[:, None, :]
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
+    def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
+        """Return a factor whose block of space is the trained one; its size in time is the initial one."""
+        left, right = quaternions_in_space(trained.quats)
+        scales = torch.cat([trained.log_scales, raw["scales"][:, 3:]], 1)
+        return {"scales": scales, "left_quats": left, "right_quats": right}
+
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Freeze t, by `gsbench.models.freezing.freeze_rotated`."""
-        return {"still": freeze_rotated(self, raw, queries, weights)}
+        """Freeze t: the mean stays where it is on average, the opacity keeps f_temp's mean, the factor the slice's."""
+        factor = self.factors(raw).double()
+        blocks = reduce(factor)
+        shift, opacity = torch.zeros_like(factor[:, 3:, 0]), torch.zeros_like(factor[:, 0, 0])
+        for query, weight in zip(queries, weights.double(), strict=True):
+            assert query.time is not None
+            delta = (query.time - raw["times"]).double()
+            gate = self.gate(factor, delta)
+            shift += weight[:, None] * delta
+            opacity += weight * torch.where(gate > TIME_GATE_MIN, gate, 0.0) * torch.sigmoid(raw["opacities"].double())
+        turn, lengths, _ = torch.linalg.svd(blocks.T_pp)
+        left = turn_of_space(quaternion(turn * torch.linalg.det(turn)[:, None, None]))
+        new = {
+            "means": raw["means"] + (gain_of(blocks.T_pq, blocks.T_qq) @ shift[..., None])[..., 0],
+            "scales": torch.cat([lengths.log(), torch.full_like(shift, LOG_SIZE_MAX)], -1),
+            "left_quats": left,
+            "right_quats": partner(left),
+            "opacities": torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)),
+        }
+        still = {name: value.to(raw[name].dtype) for name, value in new.items()}
+        return {"still": still}
 
     def full_level(self) -> int:
         """The degree in use with all waves."""

@@ -1,49 +1,94 @@
-"""Register models by name and build them."""
+"""Register models by name, those of other packages too, and build them."""
 
 import importlib
 import inspect
 import pkgutil
+import traceback
 from collections.abc import Callable
+from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, TypeVar
 
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import InputError, did_you_mean, one_line
 from gsbench.models.base import GaussianModel
 
 _REGISTRY: dict[str, type[GaussianModel]] = {}
+ENTRY_POINTS = "gsbench.models"  # the group in which an installed package lists its modules of models
 M = TypeVar("M", bound=type[GaussianModel])
 
 
 def register(name: str) -> Callable[[M], M]:
-    """Decorate a class so that `build` finds it by this name."""
+    """Decorate a class so that `build` finds it by this name; raises InputError where another class has the name."""
 
     def enter(model: M) -> M:
+        other = _REGISTRY.get(name, model)
+        if (other.__module__, other.__qualname__) != (model.__module__, model.__qualname__):
+            raise InputError(f"model '{name}': expected a name of its own, {other.__module__} has a model of that name")
         _REGISTRY[name] = model
         return model
 
     return enter
 
 
-def find(name: str) -> type[GaussianModel]:
+def find(name: str, module: str | None = None) -> type[GaussianModel]:
     """Return the class registered as `name`.
 
-    This imports every module of `gsbench.models`, so that a new model is one new file in that folder.
+    Every module of `gsbench.models` is imported, so that a new model is one new file in that folder, and every entry
+    point of the group `gsbench.models` of an installed package.
+
+    Args:
+        name: of the model.
+        module: a Python module that registers it, imported first: what the user names, never what a file says.
 
     Raises:
-        InputError: the model is unknown.
+        InputError: the model is unknown, or a module cannot be imported.
     """
-    package = importlib.import_module("gsbench.models")
-    for module in pkgutil.iter_modules(package.__path__):
-        importlib.import_module(f"gsbench.models.{module.name}")
+    _import_all()
+    if module is not None:
+        _import(module, f"model.module={module!a:.80}")
     if not isinstance(name, str) or name not in _REGISTRY:
         raise InputError(f"model '{name}' is not known. {did_you_mean(name, _REGISTRY)}")
     return _REGISTRY[name]
 
 
-def build(name: str, **options: Any) -> GaussianModel:
+def is_registered(name: str) -> bool:
+    """Tell whether gsbench, an installed package or a module that was imported before has a model of this name.
+
+    Raises:
+        InputError: the models of an installed package cannot be imported.
+    """
+    _import_all()
+    return name in _REGISTRY
+
+
+def _import_all() -> None:
+    """Import every module of `gsbench.models` and every entry point; what is imported already costs nothing."""
+    package = importlib.import_module("gsbench.models")
+    for own in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"gsbench.models.{own.name}")
+    for point in entry_points(group=ENTRY_POINTS):
+        _import(point.module, f"entry point {point.name} of {ENTRY_POINTS}")
+
+
+def _import(module: str, named_by: str) -> None:
+    """Import a module of models; raises InputError that says in one line where it fails."""
+    try:
+        importlib.import_module(module)
+    except InputError:
+        raise
+    except Exception as error:  # whatever the code of another package raises
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = "" if "importlib" in place.filename else f"{Path(place.filename).name}, line {place.lineno}: "
+        raise InputError(f"{named_by}: expected a Python module that can be imported: {where}"
+                         f"{type(error).__name__}: {one_line(error)}") from None  # fmt: skip
+
+
+def build(name: str, *, module: str | None = None, **options: Any) -> GaussianModel:
     """Build the model registered as `name`, without Gaussians yet.
 
     Args:
         name: such as `3dgs`, `4dgs`, `6dgs`, `7dgs`.
+        module: a Python module that registers it, as of `find`.
         options: of the model's class and of `GaussianModel`, such as `agr`, `sh_degree`, `lambda_t`.
 
     Returns:
@@ -63,7 +108,7 @@ def build(name: str, **options: Any) -> GaussianModel:
         ...
         gsbench.errors.InputError: model '7dsg' is not known. Did you mean '7dgs'? Valid: 3dgs, ...
     """
-    model = find(name)
+    model = find(name, module)
     # A constructor passes unknown options on to its base, so the options are those of all base classes.
     known: dict[str, inspect.Parameter] = {}
     for cls in (cls for cls in model.__mro__ if issubclass(cls, GaussianModel)):

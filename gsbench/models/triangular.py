@@ -11,23 +11,26 @@ from torch import Tensor
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.kernels.slices import observe_triangular
-from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
+from gsbench.models.base import SHRINK, Conditioned, Raw
 from gsbench.models.classes import DIRECTION, TIME, Classes
-from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle
-from gsbench.models.freezing import freeze_triangular
+from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle, rotation, sizes
+from gsbench.models.gated import OPACITY_MARGIN, GatedModel
 from gsbench.models.query import Query, unit
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.scene import Points
+from gsbench.scenes.trained import TrainedGaussians
 
 # The order of position, time and direction among the rows of the triangular factor.
 FACTOR_ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
 WIDTH = {"p": 3, "t": 1, "d": 3}
+CENTERS = {"time": "times", "direction": "directions"}  # the raw parameters that are means of variables
 LETTERS = {"time": "t", "direction": "d"}
+FLATTEST = 1e-9  # thinnest side of a trained Gaussian in units of its widest
 TIME_CORRELATION = 0.05  # split in time where |S_pt| is above this part of the scene's extent ..
 TIME_SCALE = 0.25  # .. and sqrt(S_t) above this part of the clip (7DGS, section 4.4)
 
 
-class TriangularModel(GaussianModel):
+class TriangularModel(GatedModel):
     """Gaussians with means of p and d, t or both, and one lower triangular factor of their covariance.
 
     For slicing, the rows of a factor are ordered (p, d, t): with d before t, the leading block of the reduced factor is
@@ -35,6 +38,7 @@ class TriangularModel(GaussianModel):
     """
 
     geometry: ClassVar[tuple[str, ...]] = ("log_diagonal", *KINDS)
+    lengths = ("means", "motion")
     directional_half = True  # whether f_dir has the 1/2 of 7DGS eq. 12
 
     def __init__(
@@ -53,7 +57,7 @@ class TriangularModel(GaussianModel):
             scheme: of `slice_gaussians`.
             off_diagonal: the `form` of `Triangle`, which says what the parameters below the diagonal mean.
             split_in_time: whether Gaussians that move are also split because of their extent in time.
-            options: as `GaussianModel`.
+            options: as `GatedModel`.
 
         Raises:
             InputError: an option is out of its range.
@@ -196,10 +200,62 @@ class TriangularModel(GaussianModel):
         """A frozen variable is as long as it can be, and moves nothing."""
         return LOG_SIZE_MAX if name == "log_diagonal" else 0.0
 
+    def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
+        """Return the initial factor with the block of position replaced by the trained one."""
+        space = torch.tensor(self.rows["p"])
+        double = {name: value.double() for name, value in raw.items()}
+        factor = self.triangle.factor(double["log_diagonal"], double)  # diagonal: the model starts without coupling
+        # The thinnest side of a flat Gaussian becomes a difference of numbers as large as its widest side.
+        log_scales = trained.log_scales.double()
+        log_scales = log_scales.clamp(min=log_scales.amax(1, keepdim=True) + math.log(FLATTEST))
+        factor[:, space[:, None], space] = rotation(trained.quats.double()) * sizes(log_scales)[:, None, :]
+        return self.triangle.parameters(factor)
+
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Freeze t, d and both, as far as they are observed, by `gsbench.models.freezing.freeze_triangular`."""
-        return freeze_triangular(self, raw, queries, weights)
+        """Freeze t, d and both, as far as they are observed, at their weighted means over queries.
+
+        The slice of (T_qq, K, T_pp) is mu_p + K (q - mu_q) with the factor T_pp. Freezing a variable zeroes its column
+        of K; the mean keeps what the column did to it on average, and the opacity what f_temp or f_dir did. Its
+        standard deviation becomes exp(LOG_SIZE_MAX), so that no query is far from its mean.
+        """
+        blocks = Reduced(*(block.double() for block in reduce(self.factors(raw))))
+        gain = gain_of(blocks.T_pq, blocks.T_qq)
+        by_name = {name: [name] for name in self.columns} if len(self.columns) > 1 else {}
+        by_name["still"] = list(self.columns)
+        shift, gates = torch.zeros_like(gain[:, 0]), {name: torch.zeros_like(gain[:, 0, 0]) for name in by_name}
+        for query, weight in zip(queries, weights.double(), strict=True):
+            delta = self.offset(raw, query).double()
+            shift += weight[:, None] * delta
+            exponents = self.exponents(blocks.T_qq, delta, whiten(blocks.T_qq, delta))
+            for name, variables in by_name.items():
+                gates[name] += weight * torch.exp(-torch.stack([exponents[x] for x in variables]).sum(0))
+        changed = {}
+        for name, variables in by_name.items():
+            columns = [column for x in variables for column in self.columns[x]]
+            moved = raw["means"] + (gain[..., columns] @ shift[:, columns, None])[..., 0]
+            opacity = (torch.sigmoid(raw["opacities"].double()) * gates[name]).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+            new = self.triangle.parameters(self._without(blocks, gain, variables)) | {"means": moved}
+            new["opacities"] = torch.logit(opacity)
+            new |= {center: torch.zeros_like(raw[center]) for x in variables for center in [CENTERS[x]]}
+            changed[name] = {key: value.to(raw["means"].dtype) for key, value in new.items()}
+        return changed
+
+    def _without(self, blocks: Reduced, gain: Tensor, variables: list[str]) -> Tensor:
+        """Compute the factor [N, n, n] in the model's own order whose slices depend on no frozen variable."""
+        T_qq, kept = blocks.T_qq.clone(), gain.clone()
+        if "direction" in variables and "time" in self.observes:
+            # t is no longer measured by d: its own deviation becomes its whole one
+            deviation = T_qq[:, -1].norm(dim=-1)
+            T_qq[:, -1] = 0
+            T_qq[:, -1, -1] = deviation
+        for column in [column for x in variables for column in self.columns[x]]:
+            T_qq[:, column] = 0
+            T_qq[:, column, column] = math.exp(LOG_SIZE_MAX)
+            kept[..., column] = 0
+        p_rows = torch.cat([kept @ T_qq, blocks.T_pp], -1)
+        q_rows = torch.cat([T_qq, T_qq.new_zeros(*T_qq.shape[:2], 3)], -1)
+        return torch.cat([p_rows, q_rows], 1)[:, self.own_order()]
 
     def factors(self, raw: Raw) -> Tensor:
         """Compute the triangular factor with its rows sorted to (p, d, t), [N, n, n]."""

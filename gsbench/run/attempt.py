@@ -21,7 +21,6 @@ from gsbench.measure.quality import Quality, evaluate, evenly
 from gsbench.measure.record import Cost, Effects, OnDemand, Record, TimeScreen
 from gsbench.measure.speed import Effort, peak_memory, reset_peak_memory, synchroniser, time_renders
 from gsbench.models import GaussianModel
-from gsbench.models.classes import packed_bytes
 from gsbench.models.replay import Replay
 from gsbench.models.start import start_from
 from gsbench.report.pictures import strip, write_png
@@ -178,7 +177,7 @@ class Attempt:
             render_ms=times,
             fps=times.fps,
             num_gaussians=len(trainer.model),
-            bytes=packed_bytes(trainer.model),
+            bytes=trainer.model.stored_bytes(),
             peak_memory=peak_memory(config.device),
             train_cpu_s=trainer.effort.cpu_s,
             load=trainer.effort.load,
@@ -229,7 +228,7 @@ class Attempt:
             reason: why it failed or diverged; None where it ended well.
         """
         config, scene, this = self.config, self.scene, self.this
-        observes = models.find(config.model.name).observes
+        observes = models.find(config.model.name, config.model.module).observes
         camera = scene.train[0].camera if scene else None
         on_gpu = config.device.startswith("cuda") and self.model is not None
         return Record(

@@ -12,6 +12,7 @@ from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.measure.schema import parse
 from gsbench.models import GaussianModel
+from gsbench.models.registry import is_registered
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Scene
 from gsbench.scenes.scene import Points
@@ -125,10 +126,18 @@ def plain_description(scene: Scene) -> dict[str, Any]:
 
 
 def typed_config(plain: dict[str, Any], path: Path) -> Config:
-    """Type the plain config of a checkpoint; raises InputError where it is not one."""
+    """Type the plain config of a checkpoint; raises InputError where it is not one.
+
+    A checkpoint is untrusted, so that the module it names for its model is never imported: the user does it.
+    """
     try:
         typed = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.create(plain))
         config: Config = OmegaConf.to_object(typed)  # type: ignore[assignment]
     except (OmegaConfBaseException, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: expected the config of a run: {str(error).splitlines()[0]}") from None
+    module, config.model.module = config.model.module, None
+    if module is not None and not is_registered(config.model.name):
+        raise InputError(f"{path}: expected a model that is known, got '{config.model.name}' of the module "
+                         f"{module!a:.80}, which a checkpoint cannot import: do it by --model-module, or `import` it "
+                         f"before load_run")  # fmt: skip
     return config

@@ -14,6 +14,7 @@ def build(config: Config) -> GaussianModel:
     """Build the model of a config, without Gaussians yet; raises InputError as `models.build` does."""
     return models.build(
         config.model.name,
+        module=config.model.module,
         agr=config.agr,
         agr_octaves=config.model.agr_octaves,
         sh_degree=config.model.sh_degree,

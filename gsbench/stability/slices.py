@@ -4,6 +4,7 @@ import functools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +18,7 @@ from gsbench.stability.cases import Case, Cell, backends_with, device_of
 from gsbench.stability.population import indefinite
 from gsbench.stability.slicing_cases import COUNT, Observed, variables
 
-OPTIONS = {
+OPTIONS: dict[str, dict[str, Any]] = {
     "4dgs": {},
     "6dgs": {"lambda_d": 0.35, "directional_half": False},
     "7dgs": {"lambda_d": 0.35, "lambda_t": 0.35},

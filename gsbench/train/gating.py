@@ -19,6 +19,7 @@ from gsbench.measure.schema import parse
 from gsbench.measure.speed import synchroniser, time_in_turns
 from gsbench.models import GaussianModel
 from gsbench.models.classes import Classes
+from gsbench.models.gated import as_gated
 from gsbench.scenes import Scene, View
 from gsbench.train.density import DensityControl
 from gsbench.train.floor import Floor
@@ -137,15 +138,13 @@ class Gating:
     def _gate(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> None:
         """Probe, choose and apply; where nothing is within the budget, note that."""
         started = time.perf_counter()
-        at_end = step is None
+        model, at_end = as_gated(self.model), step is None
         # In training AGR does not rest: when a Gaussian can be seen still changes.
-        spans = seen_times(self.model, self.probed) if at_end else None
+        spans = seen_times(model, self.probed) if at_end else None
         hidden = None if spans is None else spans[:, 0].isinf()
-        strength = probe(self.model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
+        strength = probe(model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
                          antialias=self.renderer.antialias, by_halves=by_halves, hidden=hidden)  # fmt: skip
-        found = gate_within(
-            self.model, strength, budget_db, lambda model: self.renderer.psnr(model, self.checked), spans
-        )
+        found = gate_within(model, strength, budget_db, lambda gated: self.renderer.psnr(gated, self.checked), spans)
         if found is None:
             self.notes.append(f"{'at the end' if at_end else f'at step {step}'} no simplification cost at most "
                               f"{budget_db} dB on {self.checked_on}")  # fmt: skip

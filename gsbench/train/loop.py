@@ -16,7 +16,6 @@ from gsbench.errors import InputError
 from gsbench.measure.curve import Curve
 from gsbench.measure.speed import Effort, StageClock
 from gsbench.models import GaussianModel
-from gsbench.models.classes import pack
 from gsbench.scenes import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.train.checkpoint import whole_number
@@ -194,7 +193,7 @@ class Trainer:
         self.watch.look()
         return {
             "step": self.step,
-            "model": pack(self.model),
+            "model": self.model.pack(),
             "optimizer": self.optimizer.state_dict(),
             "density": self.density.state_dict(),
             "floor": self.floor.state_dict(),

@@ -9,7 +9,6 @@ import numpy.typing as npt
 import torch
 
 from gsbench.effects.picture import class_colors, cost_colors
-from gsbench.models.classes import count
 from gsbench.models.query import Query
 from gsbench.models.render import rasterize_slice
 from gsbench.phase import Phase
@@ -71,7 +70,7 @@ class Painter:
         self.name = f"{run.folder.parent.name} {run.folder.name}"  # such as "7dgs seed0"
         self.trained_phase = run.model.phase
         self.has_agr = run.model.refinement is not None
-        self.counts = count(run.model)  # of Gaussians, by class
+        self.counts = run.model.count_classes()  # of Gaussians, by class
         background = torch.tensor(run.scene.background).to(run.config.device)
         self._backgrounds = {IMAGE: background, CLASS: torch.ones_like(background), COST: torch.zeros_like(background)}
         self._colors = {CLASS: class_colors(run.model), COST: cost_colors(run.model, most_cost)}

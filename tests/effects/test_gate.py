@@ -18,7 +18,6 @@ from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.measure.quality import psnr
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Gaussians3D
-from gsbench.models.classes import count, pack, packed_bytes
 from gsbench.models.cuts import cuts_of
 from gsbench.models.render import render
 
@@ -64,7 +63,7 @@ def test_more_budget_buys_more(name: str) -> None:
         choice = choose(strength, after, share)
         assert choice.predicted <= share
         apply(after, strength, choice)
-        sizes.append(packed_bytes(after))
+        sizes.append(after.stored_bytes())
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] < 0.8 * sizes[0]
 
@@ -73,7 +72,7 @@ def test_more_budget_buys_more(name: str) -> None:
 def test_classes_are_as_the_rows(name: str) -> None:
     """Catches rows sorted into the wrong class: with the classes forgotten the images stay the same."""
     _, after = gated(name, 3.0)
-    rows, classes = count(after), after.classes
+    rows, classes = after.count_classes(), after.classes
     assert classes is not None
     assert sum(rows.values()) == len(after) < N
     assert 0 <= classes.refined <= classes.sliced <= len(after)
@@ -93,7 +92,7 @@ def test_a_frozen_variable_changes_nothing() -> None:
         everything = choose(strength, after, 0.0)
         all_rows = {key: torch.full((N,), key == name) for key in everything.geometry}
         apply(after, strength, replace(everything, geometry=all_rows))
-        assert count(after)[name] == len(after) == N
+        assert after.count_classes()[name] == len(after) == N
         for a, b in zip(after.slice(here)[:3], after.slice(same)[:3], strict=True):
             torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
         frozen = after.splats["log_diagonal"][:, [i for x in {"time": "t", "direction": "d"}.get(name, "td")
@@ -110,7 +109,7 @@ def test_a_second_gate_takes_no_more_for_nothing(name: str) -> None:
     again = copy.deepcopy(after)
     strength = probe(after, views_of(after, 1)[:VIEWS], BLACK)
     rows, _ = apply(again, strength, choose(strength, again, 0.0))
-    assert count(again)["refined"] <= count(after)["refined"]
+    assert again.count_classes()["refined"] <= after.count_classes()["refined"]
     assert len(rows) <= len(after)
     for a, b in zip(images(after), images(again), strict=True):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
@@ -142,7 +141,7 @@ def test_a_cut_leaves_the_rows_behind_it(name: str) -> None:
 def test_only_what_matters_is_stored(name: str) -> None:
     """Catches a checkpoint that loses an entry, or keeps those that change no image."""
     _, after = gated(name, 3.0)
-    state = pack(after)
+    state = after.pack()
     stored = sum(x.numel() for key, x in state.items() if key.startswith("splats."))
     whole = sum(x.numel() for x in after.splats.values())
     assert stored < 0.9 * whole
@@ -160,7 +159,7 @@ def test_only_what_matters_is_stored(name: str) -> None:
 def test_classes_of_a_checkpoint_are_checked(fault: str) -> None:
     """Catches a damaged checkpoint that reaches the kernels with rows that there are not."""
     _, after = gated("7dgs", 3.0)
-    state = pack(after)
+    state = after.pack()
     if fault == "counts":
         state["classes.counts"] = torch.tensor([5, len(after) + 1])
     elif fault == "levels":
@@ -195,7 +194,7 @@ def test_the_loss_is_measured_and_not_only_predicted() -> None:
     assert found.gate.measured_db <= 0.3
     assert found.gate.measured_db == pytest.approx(measure(model) - measure(found.model), abs=1e-9)
     assert sum(found.gate.rows.values()) == N
-    assert found.gate.bytes < found.gate.bytes_before == packed_bytes(model)
+    assert found.gate.bytes < found.gate.bytes_before == model.stored_bytes()
     assert model.classes is None
     worse = iter([30.0] + [20.0] * 20)
     assert gate_within(model, strength, 0.3, lambda _: next(worse)) is None

@@ -15,7 +15,7 @@ from gsbench.effects.words import CLASSES
 from gsbench.measure import record
 from gsbench.models import GaussianModel, build
 from gsbench.models.base import Gaussians3D
-from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes, count
+from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes
 from gsbench.models.cuts import STILL
 from gsbench.phase import Phase
 from gsbench.report.page.palette import CLASS_LIKE, LIGHT, MODELS
@@ -57,7 +57,7 @@ def test_each_class_has_its_colour() -> None:
     model = one_of_each()
     image = picture.draw(model, CAMERA, 0.5, torch.zeros(3))
     assert picture.kinds_of(model).tolist() == list(range(5))
-    assert dict(zip(NAMES, torch.bincount(picture.kinds_of(model)).tolist(), strict=True)) == count(model)
+    assert dict(zip(NAMES, torch.bincount(picture.kinds_of(model)).tolist(), strict=True)) == model.count_classes()
     assert np.abs(np.array(panel(image, 0)) - 127.5).max() < 3
     assert np.abs(np.array(panel(image, 1)) - [picture.COLOURS[name] for name in NAMES]).max() < 6
     corner = image[picture.LINE, ENLARGED * 100 + picture.GAP]

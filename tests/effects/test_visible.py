@@ -14,7 +14,6 @@ from gsbench.effects.strength import probe
 from gsbench.effects.visible import seen_times, share_asleep
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import GaussianModel, Query
-from gsbench.models.classes import pack, packed_bytes
 from gsbench.models.render import render
 
 
@@ -83,10 +82,10 @@ def test_agr_rests_unseen() -> None:
     assert 0.2 < asleep < 1
     assert share_asleep(gated, views) is None
     other = trained_a_little("7dgs", 1)
-    other.load_state(pack(resting))
+    other.load_state(resting.pack())
     assert other.classes is not None
     assert torch.equal(other.classes.spans, resting.classes.spans)
-    assert packed_bytes(resting) == packed_bytes(gated) + 8 * resting.classes.refined
+    assert resting.stored_bytes() == gated.stored_bytes() + 8 * resting.classes.refined
     assert len(classes_of(resting).spans) == resting.classes.refined
 
 

@@ -15,7 +15,7 @@ from gsbench.effects import picture
 from gsbench.effects.gate import most_cost
 from gsbench.kernels.library import Library
 from gsbench.models import Query
-from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes, count
+from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes
 from gsbench.models.render import rasterize_slice, render
 from gsbench.phase import Phase
 from gsbench.run.load import LoadedRun, SceneDescription
@@ -112,7 +112,7 @@ def test_colours_are_those_of_the_picture_of_classes(classes: Classes | None) ->
     for i, colours in enumerate(("image", CLASS, COST)):
         panel = panels[: factor * SIZE : factor, i * step :][:, : factor * SIZE : factor]
         assert (made.paint(camera, Asked(0.4, colours=colours)).image == panel).all()
-    assert made.counts == count(made.run.model)
+    assert made.counts == made.run.model.count_classes()
     assert all(made.counts[name] == 16 for name in NAMES) == (classes is not None)
 
 
