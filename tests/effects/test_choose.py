@@ -101,6 +101,15 @@ def test_the_level_of_the_test(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.mean(np.array(deals) <= 0.01) <= 0.027
 
 
+@pytest.mark.parametrize(("wave", "found"), [(1, True), (2, True), (3, True), (4, True), (5, False)])
+def test_the_waves_that_are_looked_for(wave: int, found: bool) -> None:
+    """Catches a constant among the slow waves in place of the fastest, and faster ones: cos(pi k t), k = 1 to 4."""
+    times = (np.arange(40) + 0.5) / 40
+    gradients = np.cos(np.pi * wave * times)[:, None] + 0.1 * np.random.default_rng(0).standard_normal((40, 20))
+    p = evidence(gradients @ gradients.T, times, np.ones((40, 1)), 0).p
+    assert p == 0.001 if found else p > 0.05
+
+
 def test_the_answer_is_that_of_its_seed() -> None:
     """Catches a draw that is not the seed's."""
     scene = filmed(moving, views=16)

@@ -128,6 +128,31 @@ def test_an_opaque_gaussian_is_no_harder_to_predict() -> None:
     assert ratios["opaque"].mean() / ratios["transparent"].mean() == pytest.approx(1, abs=0.15)
 
 
+def test_a_removal_is_priced_by_what_it_does_to_the_residual() -> None:
+    """Catches the sign of <r, x>: half of what a removal changes is missing in the image, or is too much in it.
+
+    The image is linear in an opacity: with r = x / 2 the removal adds <x, x> to what it adds without a residual, and
+    with r = -x / 2, where it would be an improvement, nothing.
+    """
+    model, N = trained_a_little("3dgs", 0), 4
+    query = Query.at(camera(0.3, 0.2, SIZE).center, None)
+    seen = camera(0.3, 0.2, SIZE)
+    live = model.slice(query)
+    image = rasterize_slice(live, seen, BLACK, model.backend).image[0]
+
+    def removed(truth: Tensor) -> Tensor:
+        return probe(model, [View("0", seen, None, truth)], BLACK).errors["removed"]
+
+    plain = removed(image)
+    for i in live.opacities.argsort(descending=True)[:N].tolist():
+        without = live.opacities.clone()
+        without[i] = 0
+        x = rasterize_slice(live._replace(opacities=without), seen, BLACK, model.backend).image[0] - image
+        assert x.square().sum() > 1e-3
+        assert float(removed(image - x / 2)[i] - plain[i]) == pytest.approx(float(x.square().sum()), rel=1e-3)
+        assert float(removed(image + x / 2)[i]) == pytest.approx(float(plain[i]), rel=1e-3)
+
+
 def test_what_is_hidden_is_not_taken() -> None:
     """Catches a Gaussian that is removed because none of the views that were looked at shows it."""
     model = trained_a_little("3dgs", 0)

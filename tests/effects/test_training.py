@@ -1,6 +1,7 @@
 """Gates in a training, model=auto, and the gate of a finished run, as a user meets them."""
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,26 +9,30 @@ import torch
 from tiny_run import gsbench, overrides, write_moving_square
 
 from gsbench.effects import __main__ as command
+from gsbench.effects.direction import without_direction
 from gsbench.effects.strength import probe
 from gsbench.measure import record
+from gsbench.measure.record import Gate
 from gsbench.run.load import load_run
 from gsbench.run.setup import build
-from gsbench.scenes.scene import Scene
+from gsbench.scenes.scene import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train import gating
 from gsbench.train.draws import generator
-from gsbench.train.gating import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating
+from gsbench.train.gating import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating, become
 from gsbench.train.loop import Trainer
+from gsbench.train.renderer import Renderer
 
 STEPS = 100
 
 
-def trainer(*words: str, model: str = "7dgs") -> Trainer:
-    """A trainer at step 0 of a scene with three views of val."""
+def trainer(*words: str, model: str = "7dgs", scene: Scene | None = None) -> Trainer:
+    """A trainer at step 0; unless a scene is given, of one with three views of val."""
     config = compose(model, STEPS, "train.densify.reset_every=1000000", *words)
-    square = moving_square()
-    scene = Scene(**{**vars(square), "val": square.train[:3], "test": square.train[3:5]})
+    if scene is None:
+        square = moving_square()
+        scene = replace(square, val=square.train[:3], test=square.train[3:5])
     made = build(config)
     assert scene.points is not None
     made.initialise(scene.points, scene.extent, generator(config.seed))
@@ -143,6 +148,54 @@ def test_agr_slows_down_after_a_gate(words: tuple[str, ...]) -> None:
     assert gated == bool(words)
     assert agr[60] == pytest.approx(2e-4)
     assert agr[-1] == pytest.approx(2e-4 * LAST_RATE ** (39 / 40) if gated else 2e-4)
+
+
+def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a loss measured on the views that the gate was fitted to, or on those that the run is evaluated by."""
+    probed: list[list[View]] = []
+    checked: list[list[View]] = []
+    monkeypatch.setattr(gating, "probe", lambda _, views, *__, **___: probed.append(views))
+    monkeypatch.setattr(Renderer, "psnr", lambda _, __, views: checked.append(views))
+    monkeypatch.setattr(gating, "gate_within", lambda model, _, __, measure, ___: measure(model))
+    one, square = trainer("effects.gate=end"), moving_square(views=17)
+    views, every_eighth = square.train, square.train[::8]
+    others = [view for i, view in enumerate(views) if i % 8]
+    for val, train, split, expected, notes in (
+        (views[:3], views[3:], "test", (views[3:], views[:3]), 1),
+        (views[:3], views, "val", (others, every_eighth), 1),
+        ([], views, "test", (others, every_eighth), 1),
+        ([], views[:8], "test", (views[:8], views[:8]), 2),  # too few to hold any out, which is said
+    ):
+        one.config.scene.eval_split = split
+        of = Trainer(one.model, replace(square, val=val, train=train), [], one.config)
+        of.gating.at_end(by_halves=False)
+        names = [[view.name for view in asked] for asked in (probed.pop(), checked.pop())]
+        assert names == [[view.name for view in asked] for asked in expected]
+        assert len(of.gating.notes) == notes
+
+
+def fit(x: float) -> Gate:
+    """A gate at the end that has measured nothing yet."""
+    return Gate(share=x, predicted_db=0.0, measured_db=0.0, rows={}, levels={}, bytes_before=2, bytes=1)
+
+
+def test_what_a_gate_costs_is_what_the_images_lost() -> None:
+    """Catches a loss with the wrong sign, or of the wrong model: of the gate at the end, and of freezing direction."""
+    one = trainer()
+    ungated, one.gating.gates = one.gating.now(), [fit(0.1)]
+    before = one.psnr(one.views)
+    faint = {name: x.clone() for name, x in ungated[0].items()} | {"opacities": ungated[0]["opacities"] - 1}
+    become(one.model, (faint, None))
+    after = one.psnr(one.views)
+    assert abs(after - before) > 0.1
+    one.gating.compare(ungated, one.views)
+    assert one.gating.gates[0].eval_loss_db == pytest.approx(before - after, abs=1e-6)
+    frozen = without_direction(one.model, one.scene.train)
+    assert frozen is not None
+    direction = one.gating.direction
+    assert direction is not None
+    assert direction.loss_db == pytest.approx(after - one.renderer.psnr(frozen, one.views), abs=1e-9)
+    assert direction.loss_db != 0
 
 
 @pytest.fixture(scope="module")

@@ -94,6 +94,17 @@ def test_a_choice_names_what_it_cannot_be_told_from():
     assert choice.level == []
 
 
+def test_a_winner_within_the_noise_of_the_seeds_is_not_told_apart():
+    """Catches the wrong end of the interval: a is 0.2 dB above b with an interval that holds zero, and far above c."""
+    of_seeds = {"a": (25.0, 25.0, 25.0), "b": (24.2, 25.1, 25.1), "c": (20.0, 20.1, 20.2)}
+    runs = [run(m, s, (v, v), metrics={**make().metrics, "psnr": v}) for m, each in of_seeds.items()
+            for s, v in enumerate(each)]  # fmt: skip
+    near = group(*runs)
+    choice = frontier.choose(near, frontier.points(near, ["suzanne"]), "seconds", 1e9)
+    assert choice.point.series == "a"
+    assert [p.series for p in choice.level] == ["b"]
+
+
 def test_targets_are_set_by_rule_and_never_is_an_answer():
     """Catches an interpolated time, a target on test, and a model that never reaches one but gets a number."""
     found = {t.rule: t for t in frontier.targets(group(*three_lengths().records, *arm("3dgs", "", 19.0, 5.0)))}

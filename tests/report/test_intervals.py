@@ -45,6 +45,16 @@ def test_seeds_and_views_add_in_squares():
     assert found.p == pytest.approx(brute_p(found), abs=1e-5)
 
 
+def test_what_seeds_and_views_share_is_counted_once():
+    """Catches a rest of the two-way ANOVA that is divided by too little, by numbers worked by hand.
+
+    Seeds differ by 5 and views by 3 from the mean, and each cell by 1 beside that: of the seeds' 25 the rest is 4 / 4,
+    the views have 18 / 2, and half the width is 12.706 sqrt(24 + 9), above the 12.706 sqrt(25) of the seeds alone.
+    """
+    found = estimate([np.array([[-9.0, -1.0], [3.0, 7.0]])])
+    assert found.half == pytest.approx(12.7062 * math.sqrt(24 + 9), rel=1e-5)
+
+
 def brute_p(found) -> float:
     """The p-value by trying levels."""
     levels = np.linspace(0, 1, 200_001)[:-1]

@@ -114,6 +114,16 @@ def test_resemblance_of_the_whole_model() -> None:
     assert diagnosis.resembles(rotated, 0) == "vanishing_quaternion"
 
 
+def test_resemblance_in_time_is_in_clips() -> None:
+    """Catches sizes in time of 4DGS that are compared in the scene's unit: a clip is as long as 100 units here."""
+    model = trainer("4dgs").model
+    model.clock.fill_(100.0)
+    for clips, name in ((-11.0, "instant"), (-8.0, None), (3.0, None), (11.0, "static")):
+        model.splats["scales"].data[POISONED, :3] = clips / 2
+        model.splats["scales"].data[POISONED, 3] = math.log(100.0) + clips
+        assert diagnosis.resembles(model, POISONED) == name, clips
+
+
 def test_spectrum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches condition numbers of something else than the factor: a diagonal one has max / min, in space too."""
     model = trainer("7dgs").model

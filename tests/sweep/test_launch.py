@@ -20,7 +20,7 @@ from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
 from gsbench.run.identity import flat
 from gsbench.sweep import hooks, status
-from gsbench.sweep.plan import identity
+from gsbench.sweep.plan import FOLDER, Plan, identity, write
 from gsbench.sweep.retry import retry
 from gsbench.train import checkpoint
 
@@ -103,6 +103,20 @@ def test_retry_takes_only_settings_of_the_launch(tmp_path: Path) -> None:
     """Catches a retry that may change what its runs are."""
     with pytest.raises(InputError, match=r"launch\.memory=16G, got 'train\.iterations=5'"):
         retry(status.read(tmp_path), ["train.iterations=5"], print)
+
+
+def test_a_retry_launches_with_the_settings_that_it_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches more memory that is asked for and never given, and a run that loses what decides its numbers."""
+    monkeypatch.chdir(tmp_path)  # a retry goes to where the command was given
+    experiment = tmp_path / "mini"
+    words = ["+exp=mini", "model=4dgs", "seed=3", "launch.memory=8G", "results=elsewhere"]
+    asked = Plan("basic", [words], [], str(tmp_path), "elsewhere", 1, 1, 0.0)
+    write(asked, experiment / FOLDER / "2026-11-22_00-00-00.000000")
+    launched: list[DictConfig] = []
+    assert retry(status.read(experiment), ["launch.memory=16G"], launched.append) == 1
+    (config,) = launched
+    assert (config.model.name, config.seed, config.launch.memory) == ("4dgs", 3, "16G")
+    assert config.results == str(tmp_path)
 
 
 def test_retry_does_what_is_missing_and_repeats_nothing(square: Path, tmp_path: Path) -> None:

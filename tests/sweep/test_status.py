@@ -169,6 +169,24 @@ def test_one_run_in_other_words_is_one_run(tmp_path: Path) -> None:
     assert only(tmp_path).state == "done"
 
 
+@pytest.mark.parametrize("newer", ["a", "b"])
+def test_of_two_traces_of_a_run_the_newer_counts(tmp_path: Path, newer: str) -> None:
+    """Catches the first one found, or the older one: folders of a run done again under another name remain."""
+    now = time.time()
+    for folder in ("a", "b"):
+        path = tmp_path / folder / "record.json"
+        path.parent.mkdir()
+        path.write_text(json.dumps(crowd.record(*RUN) | {"metrics": {"psnr": 20.0 + (folder == newer)}}, default=str))
+        os.utime(path, (now, now - 60 * (folder != newer)))
+    assert only(tmp_path).psnr == 21.0
+    for folder in ("a", "b"):
+        (tmp_path / folder / "record.json").unlink()
+        age = 0 if folder == newer else 60
+        at = Progress(WORDS, **HERE, job=None, step=100 - age, steps=400, seconds=5.0, updated=now - age)  # type: ignore[arg-type]
+        progress.write(tmp_path / folder, at)
+    assert only(tmp_path).step == 100
+
+
 def test_a_run_that_ended_without_a_record_is_failed(tmp_path: Path) -> None:
     """Catches a refused run that is lost: nothing broke down, it was refused."""
     plan.write_ended(planned(tmp_path), 0, Ended(None, "seed: expected >= 0, got -1"))

@@ -38,6 +38,17 @@ def test_the_floor_is_a_part_of_a_pixel_at_the_nearest_camera() -> None:
     torch.testing.assert_close(floor.least, torch.full((200,), LEAST_PIXELS * 2.5 / 100))
 
 
+def test_the_floor_is_of_the_finer_axis_of_the_pixels() -> None:
+    """Catches the smaller focal length of a camera whose pixels are not square: it resolves what the other does not."""
+    model, wide = flat("3dgs"), camera(2.0)
+    model.splats["means"].data.zero_()
+    for axis in (0, 1):
+        K = wide.K.clone()
+        K[axis, axis] = 80.0
+        least = Floor(model, [Camera(wide.viewmat, K, 48, 48)]).least
+        torch.testing.assert_close(least, torch.full((200,), LEAST_PIXELS * 2.0 / 80))
+
+
 @pytest.mark.parametrize("name", OPTIONS)
 def test_no_camera_sees_the_floor(name: str) -> None:
     """Catches a bound that touches the image, one on another axis or on time, and one that is not held."""

@@ -139,6 +139,20 @@ def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
     assert look(now_and_then[[0, 1, 3]], 1) == [0, 3]
 
 
+def test_counts_follow_the_rows_that_a_gate_kept() -> None:
+    """Catches counts of views that stay where they were while the Gaussians move, and gradients of other Gaussians."""
+    model, optimizer = fitted(4)
+    control = DensityControl(model, optimizer, DensifyConfig(), min_opacity=0.01, views=3)
+    for drawn in ([1, 0, 0, 0], [1, 1, 0, 1], [1, 0, 0, 1]):
+        control.observe(*drawn_with(torch.ones(4, 2), torch.tensor(drawn)), 10, 10, views=1)
+    assert control.unseen.tolist() == [0, 1, 3, 0]
+    rows = torch.tensor([3, 2, 1])
+    model.select(rows)
+    control.follow(rows)
+    assert control.unseen.tolist() == [0, 3, 1]
+    assert control.gradient.tolist() == control.seen.tolist() == [0, 0, 0]
+
+
 def test_large_gaussians_are_pruned_only_when_asked() -> None:
     """Catches pruning by size before the first opacity reset."""
     model, optimizer = fitted(4)

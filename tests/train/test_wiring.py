@@ -146,6 +146,18 @@ def test_large_gaussians_go_once_opacities_were_reset() -> None:
     assert asked == [False, False, True]
 
 
+def test_children_of_every_densification_are_drawn_anew() -> None:
+    """Catches children that are scattered alike in every densification, and draws that are not those of the seed."""
+    fitted = trainer("3dgs")
+    drawn: list[float] = []
+    fitted.density.densify = lambda random, _: drawn.append(torch.rand(1, generator=random).item())  # type: ignore[method-assign]
+    fitted.schedule.densifies = lambda _: True  # type: ignore[method-assign]
+    for fitted.config.seed, fitted.step in ((0, 3), (0, 4), (1, 3), (0, 3)):
+        fitted._descend()
+    assert len(set(drawn)) == 3
+    assert drawn[0] == drawn[3]
+
+
 def test_rates_fall_in_the_optimizer() -> None:
     """Catches rates that are set once: the optimizer's own are those of the step."""
     fitted = trainer("7dgs")
