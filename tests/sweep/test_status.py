@@ -144,6 +144,38 @@ def test_a_slurm_that_is_silent_is_said(tmp_path: Path) -> None:
     assert "squeue is not on this machine" in "\n".join(show.lines(tmp_path, [run], down.silent))
 
 
+@pytest.mark.parametrize(
+    ("job", "step", "log", "said"),
+    [
+        (
+            "FAILED|9:0", "OUT_OF_MEMORY|0:125",
+            ["step 5", "slurmstepd: error: Detected 1 oom_kill event", "srun: error: n1: task 0: Killed"],
+            "job 7 ended: OUT_OF_MEMORY; its log ends: slurmstepd: error: Detected 1 oom_kill event",
+        ),
+        ("FAILED|1:0", "COMPLETED|0:0", ["bar 50 %| gsbench: error: no such file", "bye"],
+         "job 7 ended: FAILED, exit 1:0; its log ends: gsbench: error: no such file"),
+        ("TIMEOUT|0:0", "CANCELLED|0:15", ["step 5", "step 6"], "job 7 ended: TIMEOUT; its log ends: step 6"),
+    ],
+    ids=["memory", "error", "time"],
+)  # fmt: skip
+def test_a_lost_job_says_how_it_ended(
+    job: str, step: str, log: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches memory that ran out told as a kill, as only the step of a job knows of it, and a log's last line."""
+    bin_of_slurm = tmp_path / "bin"
+    bin_of_slurm.mkdir()
+    sacct = bin_of_slurm / "sacct"
+    sacct.write_text(f"#!/bin/sh\nprintf '7|{job}\\n7.batch|{step}\\n8|COMPLETED|0:0\\n'\n")
+    sacct.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{bin_of_slurm}:{os.environ['PATH']}")
+    folder = planned(tmp_path / "crowd") / plan.JOBS / "7"
+    folder.mkdir(parents=True)
+    (folder / "7_0_log.err").write_text("\n".join(log))
+    run = only(tmp_path / "crowd", Queue({}))
+    assert run.state == "lost"
+    assert said in str(run.reason)
+
+
 def test_a_run_that_never_started_is_lost_with_its_sweep(tmp_path: Path) -> None:
     """Catches runs of a killed sweep that are planned for ever."""
     planned(tmp_path, **GONE)
