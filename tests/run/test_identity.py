@@ -44,6 +44,7 @@ def named(*words: str) -> Run:
         (["+trial=7dgs/fast", "train.batch_size=1"], "7dgs,trial=7dgs.fast,batch_size=1"),
         (["raster.antialias=true"], "7dgs,antialias=true"),
         (["protocol=published"], "7dgs,protocol=published"),
+        (["effects.gate=end", "effects.budget_db=0.2"], "7dgs,gate=end,budget_db=0.2"),
     ],
 )  # fmt: skip
 def test_a_folder_says_what_is_not_the_experiments_own(words: list[str], folder: str) -> None:
