@@ -3,6 +3,7 @@
 import argparse
 import importlib.util
 import sys
+import warnings
 from pathlib import Path
 
 from gsbench.errors import InputError, one_line
@@ -42,13 +43,15 @@ def serve(asked: argparse.Namespace) -> None:
     from gsbench.run.load import load_run
     from gsbench.view.viewer import Viewer
 
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # viser's, when a browser leaves
     check_device(asked.device)
     viewer = Viewer([load_run(run, asked.device) for run in asked.runs], asked.host, asked.port, asked.data_root)
     for painter in viewer.painters:
         print(f"{painter.run.folder}: {len(painter.run.model)} Gaussians")
     if isinstance(viewer.scene, str):
         print(f"no training cameras: {viewer.scene}")
-    print(f"Open http://{asked.host}:{viewer.server.get_port()} in a browser; Ctrl-C ends it.", flush=True)
+    host = f"[{asked.host}]" if ":" in asked.host else asked.host
+    print(f"Open http://{host}:{viewer.server.get_port()} in a browser; Ctrl-C ends it.", flush=True)
     try:
         viewer.server.sleep_forever()
     finally:

@@ -46,9 +46,13 @@ class Client:
         self.resolution = Resolution()
         self._views = None if isinstance(scene, str) else TrainingViews(scene)
         self._most_cost = most_cost
-        client.camera.on_update(lambda _: self.changed.set())
+        client.camera.on_update(self._move)
         self.thread = threading.Thread(target=self._work, daemon=True)
         self.thread.start()
+        self.changed.set()
+
+    async def _move(self, _: viser.CameraHandle) -> None:
+        """Take note of a camera in viser's own thread; for another function it would begin one."""
         self.changed.set()
 
     def leave(self) -> None:
@@ -61,12 +65,12 @@ class Client:
         while True:
             playing = self.controls.play.value
             changed = self.changed.wait(FRAME_S if playing else None if self.rests else REST_S)
-            if self.left:
-                return
             moving = changed or self.controls.play.value
             if moving:
                 self.rests = False
             self.changed.clear()
+            if self.left:  # asked once the event is clear: what `leave` sets from now on ends the next wait
+                return
             self.controls.advance()
             try:
                 self._show(moving)
@@ -90,18 +94,18 @@ class Client:
 
     def _frame(self, width: int, height: int) -> Frame:
         """Render one image or two as the controls say."""
-        shown, mode = self.controls.shown(), self.controls.mode.value
+        shown, mode = self.controls.shown(), self.controls.layout
         camera = self._camera(max(1, width // 2) if mode == SIDE else width, height)
         first, *others = [painter.paint(camera, self.controls.asked(colours)) for painter, colours in shown]
         if not others:
             return first
-        return beside(first, others[0]) if mode == SIDE else wiped(first, others[0], self.controls.wipe.value)
+        return beside(first, others[0]) if mode == SIDE else wiped(first, others[0], self.controls.wiped)
 
     def _compare(self) -> None:
         """Show the training view nearest to the camera beside what the models make of it, where that is asked for."""
         if self._views is None or not self.controls.compare.value:
             return
-        nearest = self._views.nearest(self._camera(1, 1), self.controls.time.value)
+        nearest = self._views.nearest(self._camera(1, 1), self.controls.now)
         asked = self.controls.asked_of(nearest.view)
         painters = dict.fromkeys(painter for painter, _ in self.controls.shown())
         compared = [compare(painter, nearest.view, asked) for painter in painters]

@@ -1,5 +1,6 @@
 """Offer the controls of one browser of the viewer, and say what they ask of a model."""
 
+import math
 import threading
 import time
 from collections.abc import Sequence
@@ -126,7 +127,7 @@ class Controls:
 
     def _hold(self, on: bool) -> None:
         """Keep the time that slices are of, or let it be the slider's again."""
-        self._held = self.time.value if on else None
+        self._held = self.now if on else None
         self.changed.set()
 
     def _freeze(self, on: bool) -> None:
@@ -152,19 +153,36 @@ class Controls:
         now = time.monotonic()
         if self.play.value:
             on = (now - self._played_at) / PLAYED_S
-            self.time.value = (self.time.value + on) % 1.0  # type: ignore[misc]  # as above
+            self.time.value = (self.now + on) % 1.0  # type: ignore[misc]  # as above
         self._played_at = now
 
-    # ---- what that asks for
+    # ---- what that asks for; a browser may say any value
+
+    @property
+    def now(self) -> float:
+        """The time of the slider, in [0, 1]."""
+        return _within(self.time.value, 0.0, 1.0)
+
+    @property
+    def wiped(self) -> float:
+        """The part of the width that the first image has in a wipe, in [0, 1]."""
+        return _within(self.wipe.value, 0.0, 1.0)
+
+    @property
+    def layout(self) -> str:
+        """How many images are shown, and how: ONE, SIDE or WIPE."""
+        return self.mode.value if self.mode.value in (SIDE, WIPE) else ONE
 
     def shown(self) -> list[Shown]:
         """Return the one or two images that are shown."""
-        choices = self._choices[:1] if self.mode.value == ONE else self._choices
-        return [Shown(self._painters[model.value], colours.value) for model, colours in choices]
+        choices = self._choices[:1] if self.layout == ONE else self._choices
+        first = next(iter(self._painters.values()))
+        return [Shown(self._painters.get(model.value, first), colours.value if colours.value in COLOURS else IMAGE)
+                for model, colours in choices]  # fmt: skip
 
     def asked(self, colours: str) -> Asked:
         """Return what is asked of a model now, in some colours."""
-        return self._asked_at(self.time.value, colours)
+        return self._asked_at(self.now, colours)
 
     def asked_of(self, view: View) -> Asked:
         """Return what is asked of a model at a training view: the same effects in the view's own time."""
@@ -175,4 +193,9 @@ class Controls:
             time = None
         elif self._held is not None:
             time = self._held
-        return Asked(time, self._frozen, self.agr.value, self.degree.value, colours)
+        return Asked(time, self._frozen, self.agr.value, max(0, self.degree.value), colours)
+
+
+def _within(value: float, low: float, high: float) -> float:
+    """Return the nearest number in [low, high]; low for NaN."""
+    return low if math.isnan(value) else min(max(value, low), high)

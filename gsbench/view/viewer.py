@@ -12,6 +12,7 @@ from gsbench.run.load import LoadedRun, scene_of
 from gsbench.scenes import Scene
 from gsbench.view import paths
 from gsbench.view.client import Client
+from gsbench.view.door import Door
 from gsbench.view.frame import Painter
 
 
@@ -24,13 +25,13 @@ class Viewer:
         Args:
             runs: one or more, of one scene.
             host: the address to listen on.
-            port: to listen on; where it is taken, viser takes the next free one.
+            port: to listen on, or the next free one.
             data_root: the folder of the data set, where it has moved.
 
         Raises:
-            InputError: the runs are of different scenes.
+            InputError: the runs are of different scenes, or nobody can listen on that host.
         """
-        first = runs[0]
+        door, first = Door(host, port), runs[0]
         for run in runs:
             if run.scene.fingerprint != first.scene.fingerprint:
                 raise InputError(f"expected runs of one scene to look at together, got {first.scene.name} in "
@@ -43,7 +44,8 @@ class Viewer:
         self.scene = scene_or_reason(first, data_root)
         self.clients: dict[int, Client] = {}
         self._lock = threading.Lock()
-        self.server = viser.ViserServer(host, port, label=f"gsbench: {first.scene.name}", verbose=False)
+        with door.guard():
+            self.server = viser.ViserServer(host, door.port, label=f"gsbench: {first.scene.name}", verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()  # beside the images, not above them
         self._stand(first)

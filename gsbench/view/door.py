@@ -1,0 +1,241 @@
+"""Guard the port of the viewer: refuse pages of other sites, and drop every message that the viewer's page never sends.
+
+viser listens by `websockets`, whose options for all of this it does not pass on. `Door.guard` puts them in.
+"""
+
+import asyncio
+import errno
+import ipaddress
+import logging
+import math
+import socket
+import sys
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgspec
+import websockets.asyncio.server as websockets_server
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from gsbench.errors import InputError, one_line
+
+MOST_BROWSERS = 16  # at once; each has a thread that renders for it
+MOST_BYTES = 4096  # of a message; those of the page have some 300
+MOST_PORTS = 1000  # that are tried
+FURTHEST = 1e9  # world units from the origin
+MOST_PIXELS = 16384  # of a side of a browser's window
+FIELDS_OF_VIEW = 0.01, 3.1  # radians
+
+Three = tuple[float, float, float]
+Answer = Response | None | Awaitable[Response | None]
+
+
+class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
+    """Where a browser looks from, as viser's page says it."""
+
+    wxyz: tuple[float, float, float, float]
+    position: Three
+    fov: float
+    near: float
+    far: float
+    image_height: int
+    image_width: int
+    look_at: Three
+    up_direction: Three
+
+    def is_usable(self) -> bool:
+        """Whether an image can be rendered from there."""
+        lengths = (*self.position, *self.look_at, *self.up_direction)
+        return (
+            all(abs(length) <= FURTHEST for length in lengths)  # which NaN is not
+            and 0.9 < math.hypot(*self.wxyz) < 1.1
+            and FIELDS_OF_VIEW[0] <= self.fov <= FIELDS_OF_VIEW[1]
+            and all(0 <= pixels <= MOST_PIXELS for pixels in (self.image_width, self.image_height))
+        )
+
+
+class Values(msgspec.Struct, forbid_unknown_fields=True):
+    """What a control may be changed in: its value."""
+
+    value: bool | int | float | str
+
+
+class GuiUpdateMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
+    """A control that is moved. What it may be moved to is for `gsbench.view.controls` to say."""
+
+    uuid: str
+    updates: Values
+
+    def is_usable(self) -> bool:
+        """Whether it is a value at all; NaN is none."""
+        return isinstance(self.updates.value, str) or math.isfinite(self.updates.value)
+
+
+class SceneNodeClickMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
+    """A click on a training camera."""
+
+    name: str
+    instance_index: int | None
+    ray_origin: Three
+    ray_direction: Three
+    screen_pos: tuple[float, float]
+    modifier: str | None
+    owner: str = ""
+
+    def is_usable(self) -> bool:
+        """Whether it can be worked with; nothing but the name is."""
+        return True
+
+
+KNOWN = msgspec.msgpack.Decoder(ViewerCameraMessage | GuiUpdateMessage | SceneNodeClickMessage)
+
+
+def is_known(message: object) -> bool:
+    """Whether a message is one that the viewer's page sends, with values that can be worked with."""
+    if not isinstance(message, bytes):
+        return False
+    try:
+        return KNOWN.decode(message).is_usable()
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return False
+
+
+class Connection(ServerConnection):
+    """A browser's connection, over which nothing but known messages arrives. viser stops or grows by others."""
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        """Wait for the next known message."""
+        while not is_known(message := await super().recv(decode)):
+            pass
+        return message
+
+
+class Door:
+    """A port to listen on, and the names by which a browser may ask for it."""
+
+    def __init__(self, host: str, port: int) -> None:
+        """Find a free port.
+
+        Args:
+            host: the address or the name to listen on.
+            port: the first to be tried.
+
+        Raises:
+            InputError: nobody can listen there.
+        """
+        addresses, self.port = asyncio.run(_free(host, port))
+        self._hosts = {host.lower(), *addresses}
+        self._is_open = any(ipaddress.ip_address(address).is_unspecified for address in addresses)
+        if self._is_open:  # to all who reach this machine, by any of its addresses
+            self._hosts.add(socket.gethostname().lower())
+        self._guards = False
+
+    @contextmanager
+    def guard(self) -> Iterator[None]:
+        """Let a server of viser that is begun in here listen behind this door.
+
+        viser's thread looks `websockets.asyncio.server.serve` up while its constructor waits for it, and there is no
+        other way in: so that name stands for ours meanwhile. The one place where gsbench changes a library.
+
+        Raises:
+            InputError: this version of viser listens in another way; it would be open to every page.
+        """
+        original = websockets_server.serve
+
+        def serve(*arguments: Any, process_request: Callable[..., Answer], **options: Any) -> Any:
+            asyncio.get_running_loop().set_exception_handler(_say)
+            self._guards = True
+            options |= {"max_size": MOST_BYTES, "create_connection": Connection, "logger": _silent()}
+
+            def check(connection: ServerConnection, request: Request) -> Answer:
+                return self._refusal(connection, request) or process_request(connection, request)
+
+            return original(*arguments, process_request=check, **options)
+
+        websockets_server.serve = serve  # type: ignore[assignment,misc]
+        try:
+            yield
+        finally:
+            websockets_server.serve = original  # type: ignore[misc]
+        if not self._guards:
+            raise InputError("expected a viser that the viewer can guard, such as 1.1.1, got another one: install that")
+
+    def admits(self, headers: Headers) -> bool:
+        """Whether a request is for this server and from its own page.
+
+        A page of another site has another `Origin`. One whose name its owner has made to stand for this machine's
+        address ("DNS rebinding") has that name as `Host`.
+        """
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        if len(hosts) != 1 or not self._is_ours(hosts[0]):
+            return False
+        own = hosts[0].lower()
+        return all(origin.lower() in (f"http://{own}", f"https://{own}") for origin in origins)
+
+    def _is_ours(self, host: str) -> bool:
+        """Whether `host`, perhaps with a port, is a name of this server; ports differ behind a tunnel."""
+        try:
+            parts = urlsplit(f"//{host}")
+            name = parts.hostname or ""
+        except ValueError:
+            return False
+        if parts.netloc != host or "@" in host:
+            return False
+        try:
+            address = ipaddress.ip_address(name)
+        except ValueError:
+            return name == "localhost" or name in self._hosts
+        return address.is_loopback or self._is_open or name in self._hosts
+
+    def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answer a request that is refused; None: it is not."""
+        if not self.admits(request.headers):
+            return _answer(HTTPStatus.FORBIDDEN, "a viewer of gsbench answers its own page alone: see --host")
+        if request.headers.get_all("Upgrade") and len(connection.server.connections) >= MOST_BROWSERS:
+            return _answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_BROWSERS} browsers are connected, which is the most")
+        return None
+
+
+async def _free(host: str, port: int) -> tuple[list[str], int]:
+    """Return the addresses that a host stands for here, and the first port that is free on all."""
+    asked = f"--host: expected an address or a name of this machine, such as localhost, got {host[:100]!a}"
+    if not host or "\0" in host:
+        raise InputError(asked)
+    loop = asyncio.get_running_loop()
+    for tried in range(port, min(port + MOST_PORTS, 65536)):
+        try:
+            server = await loop.create_server(asyncio.Protocol, host, tried)
+        except (OSError, ValueError) as error:  # ValueError: no name at all
+            if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+                continue
+            raise InputError(f"{asked}, port {tried}: {one_line(error)}") from None
+        addresses = [str(one.getsockname()[0]) for one in server.sockets]
+        server.close()
+        await server.wait_closed()
+        return addresses, tried
+    raise InputError(f"--port: expected a free one among the {MOST_PORTS} from {port} on, got none")
+
+
+def _answer(status: HTTPStatus, text: str) -> Response:
+    """Write a response of one line."""
+    return Response(status, status.phrase, Headers({"Content-Type": "text/plain"}), f"{text}\n".encode())
+
+
+def _silent() -> logging.Logger:
+    """Return a logger for `websockets`, which would write a stack trace for every peer that speaks no HTTP."""
+    logger = logging.getLogger("gsbench.view.door")
+    logger.propagate = False
+    logger.addHandler(logging.NullHandler())
+    return logger
+
+
+def _say(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Tell in one line what goes wrong in viser's thread: a value that a control cannot have, or no free files."""
+    error = context.get("exception")
+    said = f"{type(error).__name__}: {one_line(error)}" if error else context["message"]
+    print(f"gsbench.view: a browser's message or connection was dropped: {said}", file=sys.stderr)

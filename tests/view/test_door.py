@@ -1,0 +1,280 @@
+"""The port of the viewer: who is let in, and what a browser may say without harm to it, to others or to the machine."""
+
+import gc
+import http.client
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import viser
+from viser import _messages
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from gsbench.errors import InputError
+from gsbench.run.load import load_run
+from gsbench.view import __main__, door
+from gsbench.view.client import Client
+from gsbench.view.door import Door, is_known
+from gsbench.view.viewer import Viewer
+
+NAN, INF = float("nan"), float("inf")
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, -4], "fov": 0.7, "near": 0.1, "far": 100,
+    "image_height": 64, "image_width": 64, "look_at": [0, 0, 0], "up_direction": [0, 0, 1],
+}  # fmt: skip
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return int(probe.getsockname()[1])
+
+
+def packed(said: dict[str, Any], **changed: Any) -> bytes:
+    return msgspec.msgpack.encode(said | changed)
+
+
+@pytest.fixture(scope="module")
+def viewer(folder: Path) -> Iterator[Viewer]:
+    made = Viewer([load_run(folder)], "localhost", free_port())
+    yield made
+    made.stop()
+
+
+def joined(viewer: Viewer, **more: Any) -> ClientConnection:
+    """Connect as viser's page does."""
+    port = viewer.server.get_port()
+    return connect(f"ws://localhost:{port}/", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, **more)
+
+
+def until(holds: Any) -> None:
+    deadline = time.monotonic() + 20
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def rests(viewer: Viewer) -> bool:
+    """Whether a browser is there and has its picture."""
+    clients = list(viewer.clients.values())
+    return bool(clients) and all(one.thread.is_alive() and one.rests and not one.changed.is_set() for one in clients)
+
+
+@pytest.fixture(scope="module")
+def here() -> Door:
+    return Door("localhost", free_port())
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "admitted"),
+    [
+        ("localhost:8080", "http://localhost:8080", True),
+        ("localhost:9000", "http://localhost:9000", True),  # a tunnel
+        ("127.0.0.1:8080", "http://127.0.0.1:8080", True),
+        ("[::1]:8080", "http://[::1]:8080", True),
+        ("LOCALHOST:8080", "http://localhost:8080", True),
+        ("localhost:8080", None, True),  # no browser
+        ("localhost:8080", "http://localhost:3000", False),
+        ("localhost:8080", "http://127.0.0.1:8080", False),
+        ("localhost:8080", "http://evil.example", False),
+        ("localhost:8080", "http://localhost:8080.evil.example", False),
+        ("localhost:8080", "null", False),
+        ("localhost:8080", "", False),
+        ("evil.example:8080", "http://evil.example:8080", False),  # DNS rebinding
+        ("evil.example", None, False),
+        ("localhost.evil.example", None, False),
+        ("evil.example@localhost", "http://evil.example@localhost", False),
+        ("localhost@evil.example", None, False),
+        ("192.0.2.1:8080", "http://192.0.2.1:8080", False),
+        ("[::1", None, False),
+        ("", None, False),
+        (None, None, False),
+    ],
+)
+def test_only_its_own_page_is_admitted(host: str | None, origin: str | None, admitted: bool, here: Door) -> None:
+    """Catches a page of another site, or of another program on this machine, that reads the frames."""
+    assert here.admits(Headers(Host=host or "", **({} if origin is None else {"Origin": origin}))) == admitted
+    if host is None:
+        assert not here.admits(Headers())
+        twice = Headers(Host="localhost")
+        twice["Host"] = "evil.example"
+        assert not here.admits(twice)
+
+
+def test_a_door_to_all_is_asked_by_any_address_but_no_foreign_name() -> None:
+    """Catches a viewer for the whole network that its own address does not reach, or that any name does."""
+    wide = Door("0.0.0.0", free_port())
+    for host in ("192.0.2.1:8080", "localhost", socket.gethostname()):
+        assert wide.admits(Headers(Host=host, Origin=f"http://{host}"))
+    assert not wide.admits(Headers(Host="evil.example", Origin="http://evil.example"))
+
+
+def test_a_foreign_page_gets_no_frame(viewer: Viewer) -> None:
+    """Catches a check that is there but that nobody asks."""
+    port = viewer.server.get_port()
+    with pytest.raises(InvalidStatus, match="403"):
+        joined(viewer, origin="http://evil.example")
+    with pytest.raises(InvalidStatus, match="403"):
+        connect("ws://evil.example/", sock=socket.create_connection(("127.0.0.1", port)))
+    for host, status in (("evil.example", 403), (f"localhost:{port}", 200)):
+        page = http.client.HTTPConnection("127.0.0.1", port)
+        page.request("GET", "/", headers={"Host": host})
+        assert page.getresponse().status == status
+        page.close()
+    with joined(viewer, origin=f"http://localhost:{port}") as browser:
+        browser.send(packed(CAMERA))
+        assert browser.recv(timeout=20)
+
+
+BAD_CAMERAS: list[dict[str, Any]] = [
+    {"fov": 0}, {"fov": NAN}, {"fov": 4}, {"fov": 1e-300}, {"fov": "x"}, {"fov": None}, {"position": [1]},
+    {"position": [NAN, 0, 0]}, {"position": [INF, 0, 0]}, {"position": [1e38, 0, 0]}, {"wxyz": [0, 0, 0, 0]},
+    {"wxyz": [1, 0, 0]}, {"wxyz": [NAN, 0, 0, 0]}, {"image_width": -1}, {"image_height": 10**9}, {"look_at": "abc"},
+    {"more": 1}, {"type": "Nothing"}, {"type": ["x"]},
+]  # fmt: skip
+OTHERS: list[object] = [
+    "text", b"", b"\xc1", b"\x91" * 3000, packed({"type": "ShareUrlRequest"}), packed({"type": "ShareUrlDisconnect"}),
+    packed({"type": "GuiFormDirtyMessage", "uuid": "x"}), packed({"type": "RunJavascriptMessage", "source": "x"}),
+    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"update_cb": 1}}),
+    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": NAN}}),
+    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": [1]}}),
+    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": []}),
+]  # fmt: skip
+
+
+def test_what_the_page_never_sends_is_not_known() -> None:
+    """Catches a camera that stops its thread, a tunnel to the internet, and a control that is changed in its code."""
+    for changed in BAD_CAMERAS:
+        assert not is_known(packed(CAMERA, **changed)), changed
+    assert not any(map(is_known, OTHERS))
+    ray = {"ray_origin": [0, 0, 1.5], "ray_direction": [0, 0, 1], "screen_pos": [0.5, 0.5]}
+    click = {"type": "SceneNodeClickMessage", "name": "/training/1", "instance_index": None, "modifier": None}
+    assert is_known(packed(click | ray, owner=""))
+    for value in (True, 3, 0.5, "wipe"):
+        assert is_known(packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": value}}))
+    assert is_known(packed(CAMERA))
+
+
+def test_messages_of_the_door_are_those_of_viser() -> None:
+    """Catches a viser that has changed what its page sends, so that nothing would be known."""
+    for ours in (door.ViewerCameraMessage, door.GuiUpdateMessage, door.SceneNodeClickMessage):
+        theirs = getattr(_messages, ours.__name__)
+        assert set(ours.__struct_fields__) == set(theirs.__dataclass_fields__) - {"_cached_redundancy_key"}
+
+
+def test_a_browser_that_sends_nonsense_still_has_its_picture(viewer: Viewer, capfd: pytest.CaptureFixture[str]) -> None:
+    """Catches a thread or a connection that ends by one message, and a stack trace for it."""
+    with joined(viewer) as browser:
+        browser.send(packed(CAMERA))
+        until(lambda: rests(viewer))
+        (client,) = viewer.clients.values()
+        for changed in BAD_CAMERAS:
+            browser.send(packed(CAMERA, **changed))
+        for message in OTHERS:
+            browser.send(message)  # type: ignore[arg-type]
+        for control in (client.controls.time, client.controls.mode, client.controls.degree, client.controls.wipe,
+                        client.controls.play, *client.controls._choices[0]):  # fmt: skip
+            for value in ("x" * 100, "1e9", -(2**60), INF, False):
+                update = {"type": "GuiUpdateMessage", "uuid": control._impl.uuid, "updates": {"value": value}}
+                browser.send(packed(update))
+        browser.send(packed(CAMERA, position=[0, 0, -5], image_width=32))
+        until(lambda: viewer.server.get_clients()[client.client.client_id].camera.image_width == 32)
+        time.sleep(0.5)
+        until(lambda: rests(viewer))
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_large_or_many_messages_are_not_kept(viewer: Viewer) -> None:
+    """Catches memory that grows by whatever a browser sends, for as long as the viewer runs."""
+    with joined(viewer) as browser:
+        browser.send(packed({"type": "GuiFormDirtyMessage", "uuid": "x" * 2**20}))
+        with pytest.raises(ConnectionClosed, match="1009"):
+            list(browser)
+    with joined(viewer) as browser:
+        for i in range(100):
+            browser.send(packed({"type": "GuiFormDirtyMessage", "uuid": f"{i}"}))
+        browser.send(packed(CAMERA))
+        until(lambda: rests(viewer))
+    assert not [one for one in gc.get_objects() if type(one) is _messages.GuiFormDirtyMessage]
+
+
+def test_browsers_are_counted(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches threads without number."""
+    until(lambda: not viewer.clients)
+    monkeypatch.setattr(door, "MOST_BROWSERS", 2)
+    with joined(viewer), joined(viewer), pytest.raises(InvalidStatus, match="503"):
+        joined(viewer)
+
+
+def test_aborted_connections_leave_no_thread(viewer: Viewer) -> None:
+    """Catches a thread that renders for a browser that was cut off."""
+    threads = []
+    for pause in (0, 0.02, 0.1, 0.3):
+        browser = joined(viewer)
+        browser.send(packed(CAMERA))
+        time.sleep(pause)
+        threads += [client.thread for client in viewer.clients.values()]
+        browser.socket.shutdown(socket.SHUT_RDWR)
+    until(lambda: not viewer.clients and not any(thread.is_alive() for thread in threads))
+
+
+def test_a_browser_that_leaves_as_a_frame_begins_ends_its_thread() -> None:
+    """Catches the word of its leaving that is wiped off together with a change: the thread would wait for ever."""
+
+    class Controls:
+        class play:  # noqa: N801
+            value = False
+
+        def advance(self) -> None:
+            pass
+
+    client = object.__new__(Client)
+
+    class LeavesThen(threading.Event):
+        def clear(self) -> None:
+            if not client.left:
+                client.leave()
+            super().clear()
+
+    client.controls, client.changed, client.left, client.rests = Controls(), LeavesThen(), False, False  # type: ignore[assignment]
+    client._show, client._compare = lambda _: None, lambda: None  # type: ignore[method-assign]
+    thread = threading.Thread(target=client._work, daemon=True)
+    thread.start()
+    thread.join(5)
+    assert not thread.is_alive()
+
+
+@pytest.mark.parametrize(
+    "host", ["no.such.host.invalid", "", "\0", "a" * 300, "192.0.2.1", "\x1b[31m", "1.2.3.4.5", "é..x"]
+)
+def test_a_host_that_is_none_of_this_machine_is_refused_in_one_line(
+    host: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a viewer that waits for ever for a port, and one that "" opens to everybody."""
+    assert __main__.main([str(folder), "--host", host]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--host" in line
+    assert line.isprintable()
+    assert len(line) < 400
+
+
+def test_a_port_that_is_taken_is_passed_over() -> None:
+    """Catches a viewer that fails, or waits, because another one runs."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert port < Door("127.0.0.1", port).port < port + 50
+    with pytest.raises(InputError, match="--port"), socket.create_server(("127.0.0.1", 65535)):
+        Door("127.0.0.1", 65535)
+
+
+def test_a_viser_that_listens_in_another_way_is_refused(here: Door) -> None:
+    """Catches a guard that a newer viser goes past."""
+    with pytest.raises(InputError, match="viser"), here.guard():
+        pass
