@@ -11,6 +11,7 @@ import math
 import socket
 import sys
 from collections.abc import Awaitable, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
@@ -128,7 +129,8 @@ class Door:
         Raises:
             InputError: nobody can listen there.
         """
-        addresses, self.port = asyncio.run(_free(host, port))
+        with ThreadPoolExecutor(1) as pool:  # in a notebook this thread has a loop of its own
+            addresses, self.port = pool.submit(asyncio.run, _free(host, port)).result()
         self._hosts = {host.lower(), *addresses}
         self._is_open = any(ipaddress.ip_address(address).is_unspecified for address in addresses)
         if self._is_open:  # to all who reach this machine, by any of its addresses

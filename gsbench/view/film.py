@@ -73,6 +73,8 @@ def write_images(images: Iterable[Pixels], folder: Path) -> None:
 
 
 def check_parent(path: Path) -> None:
-    """Raise InputError unless the folder that is to hold `path` is there."""
+    """Raise InputError unless `path` can be a file's name and the folder that is to hold it is there."""
+    if not path.name or "\0" in str(path):
+        raise InputError(f"expected the name of a file or a folder to write, got {str(path)!a:.200}")
     if not path.parent.is_dir():
         raise InputError(f"{path}: expected a folder {path.parent} to write into, there is none: make it first")

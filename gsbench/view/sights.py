@@ -10,10 +10,10 @@ def find_view(scene: Scene, name: str) -> View:
     Raises:
         InputError: there is none.
     """
-    if name.isascii() and name.isdigit() and int(name) < len(scene.train):
+    if name.isascii() and name.isdigit() and len(name) < 10 and int(name) < len(scene.train):
         return scene.train[int(name)]
     for view in (*scene.train, *scene.val, *scene.test):
         if view.name == name:
             return view
     raise InputError(f"--camera: expected a training view's number, 0 to {len(scene.train) - 1}, or a view's name such "
-                     f"as {scene.train[0].name}, got '{name}'")  # fmt: skip
+                     f"as {scene.train[0].name}, got '{name[:100]}'")  # fmt: skip

@@ -1,5 +1,6 @@
 """The port of the viewer: who is let in, and what a browser may say without harm to it, to others or to the machine."""
 
+import asyncio
 import gc
 import http.client
 import socket
@@ -263,6 +264,15 @@ def test_a_host_that_is_none_of_this_machine_is_refused_in_one_line(
     assert "--host" in line
     assert line.isprintable()
     assert len(line) < 400
+
+
+def test_a_viewer_is_begun_in_a_notebook() -> None:
+    """Catches a door that only a program without a loop of its own can open."""
+
+    async def cell() -> int:
+        return Door("localhost", free_port()).port
+
+    assert asyncio.run(cell()) > 0
 
 
 def test_a_port_that_is_taken_is_passed_over() -> None:
