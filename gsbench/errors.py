@@ -21,5 +21,12 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or its type where it has no message."""
-    return (str(error) or type(error).__name__).splitlines()[0]
+    """Return the first line of an error's message, or its type where it has no message, as it can be printed."""
+    return printable((str(error) or type(error).__name__).splitlines()[0])
+
+
+def printable(text: str) -> str:
+    """Return a text with its control characters, and others that a terminal would obey, written as escapes."""
+    if text.isprintable():
+        return text
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)

@@ -119,14 +119,14 @@ def slice_place(asked: Asked) -> tuple[Query, bool]:
 
 
 def direction(text: str) -> torch.Tensor:
-    """Read a direction X,Y,Z; raises InputError where it is none."""
+    """Read a direction X,Y,Z as a unit vector [3]; raises InputError where it is none."""
     try:
-        found = torch.tensor([float(word) for word in text.split(",")])
+        found = torch.tensor([float(word) for word in text.split(",")], dtype=torch.float64)
     except ValueError:
         found = torch.zeros(0)
-    if found.shape != (3,) or not found.isfinite().all() or not found.norm() > 0:
-        raise InputError(f"--direction: expected three numbers X,Y,Z that are not all zero, got '{text}'")
-    return found
+    if found.shape != (3,) or not 0 < found.norm() < torch.inf:
+        raise InputError(f"--direction: expected three numbers X,Y,Z that are not all zero, got '{text[:100]}'")
+    return (found / found.norm()).float()
 
 
 def shots(asked: Asked) -> list[paths.Shot]:

@@ -37,6 +37,8 @@ def main(arguments: list[str] | None = None) -> int:
             raise InputError("expected one of SCENE_FOLDER, --checkpoint RUN_FOLDER and --picture RUN_FOLDER")
         if (asked.picture is None) != (asked.out is None):
             raise InputError("expected --picture RUN_FOLDER and --out FILE.png together")
+        if asked.out is not None and (not asked.out.name or "\0" in str(asked.out)):
+            raise InputError(f"--out: expected a file such as classes.png, got {str(asked.out)!a:.200}")
         if not math.isfinite(asked.budget_db) or not 0 <= asked.budget_db <= 10:
             raise InputError(f"--budget-db: expected 0 to 10 dB, got {asked.budget_db}")
         if asked.checkpoint is not None:

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from gsbench.errors import InputError, one_line
+from gsbench.errors import InputError, one_line, printable
 from gsbench.fetch.sources import Source, find, sources
 
 
@@ -18,7 +18,11 @@ def main(arguments: list[str] | None = None) -> int:
     asked = made.parse_args(arguments)
     if not asked.names and not asked.list:
         made.error("expected a NAME, or --list")
-    known = sources(asked.to.expanduser())
+    try:
+        known = sources(folder_of(asked.to))
+    except InputError as error:
+        print(f"gsbench.fetch: {one_line(error)}", file=sys.stderr)
+        return 2
     failed = 0
     for name in list(known) if asked.list else asked.names:
         try:
@@ -28,6 +32,16 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"gsbench.fetch: {one_line(error)}", file=sys.stderr)
             failed = 2
     return failed
+
+
+def folder_of(path: Path) -> Path:
+    """Return a folder by the name that a user gave it; raises InputError where it can be none's."""
+    try:
+        if "\0" not in str(path):
+            return path.expanduser()
+    except RuntimeError:  # a home of nobody
+        pass
+    raise InputError(f"--to: expected a folder, got {str(path)!a:.200}")
 
 
 def line_of(source: Source) -> str:
@@ -74,7 +88,7 @@ def scenes(found: dict[Path, list[str]]) -> str:
     """Say which data.root to name."""
     if not found:
         return "no scene with a transforms_train.json is in it"
-    return "; ".join(f"data.root={root} has {', '.join(names)}" for root, names in found.items())
+    return printable("; ".join(f"data.root={root} has {', '.join(names)}" for root, names in found.items()))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,8 @@ def download(source: Source, folder: Path) -> Path:
     anew the next time.
 
     Raises:
-        InputError: the server cannot be reached, has no such file, breaks off, or sends other bytes than expected.
+        InputError: the server cannot be reached, has no such file, breaks off, or sends other bytes than expected or
+            what is no answer.
     """
     url, path = source.address(), folder / source.file
     if path.is_file():
@@ -42,7 +43,10 @@ def download(source: Source, folder: Path) -> Path:
         broken = "broke off" if "Read" in repr(error) else "cannot be reached (is this machine online?)"
         raise InputError(f"{source.name}: {urlsplit(url).netloc} {broken}; behind a proxy set HTTPS_PROXY; or "
                          f"{by_hand(source, path)}") from None  # fmt: skip
-    except requests.exceptions.RequestException as error:
+    except InputError:
+        raise
+    # ValueError: a length or an address, perhaps of a redirection, that is none; not all of them are requests' own
+    except (requests.exceptions.RequestException, ValueError) as error:
         raise InputError(f"{source.name}: {url} broke off or is no answer ({type(error).__name__}): try again, or "
                          f"{by_hand(source, path)}") from None  # fmt: skip
     return path

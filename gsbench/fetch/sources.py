@@ -43,8 +43,8 @@ class Source:
         """
         mirror = os.environ.get(MIRROR)
         if mirror:
-            if urlsplit(mirror).scheme not in ("http", "https"):
-                raise InputError(f"{MIRROR}: expected an address such as https://host/folder, got {mirror!r:.200}")
+            if not _is_address(mirror):
+                raise InputError(f"{MIRROR}: expected an address such as https://host/folder, got {mirror!a:.200}")
             return f"{mirror.rstrip('/')}/{self.file}"
         if self.url is None:
             raise InputError(f"{self.name}: {self.what} has no address that a program can follow: download it in a "
@@ -83,6 +83,16 @@ def find(name: str, known: dict[str, Source]) -> Source:
     if name not in known:
         raise InputError(f"'{name}' is not known. {did_you_mean(name, known)}")
     return known[name]
+
+
+def _is_address(text: str) -> bool:
+    """Whether a text is an address that a program can ask: http or https, with a host and perhaps a port."""
+    try:
+        parts = urlsplit(text)
+        (parts.hostname or "").encode("idna")  # raises ValueError, as `port` does
+        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0 and text.isprintable()
+    except ValueError:
+        return False
 
 
 def _published(experiment: str) -> str:

@@ -1,8 +1,10 @@
 """Unpack a zip that was fetched, into one folder and nowhere else."""
 
+import lzma
 import secrets
 import shutil
 import stat
+import struct
 import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
@@ -10,6 +12,9 @@ from pathlib import Path, PurePosixPath
 from gsbench.errors import InputError, one_line
 
 MOST_FILES = 1_000_000
+# What zipfile raises on a damaged or an encrypted one; RecursionError, of folders 1000 deep, is a RuntimeError.
+DAMAGED = (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, zlib.error, lzma.LZMAError, struct.error,
+           ValueError, IndexError)  # fmt: skip
 
 
 def unpack(archive: Path, folder: Path) -> None:
@@ -30,18 +35,22 @@ def unpack(archive: Path, folder: Path) -> None:
                                  f"{folder.parent}, got {len(members)} and {size}")  # fmt: skip
             opened.extractall(part)
         part.replace(folder)
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, zlib.error) as error:
+    except InputError:
+        raise
+    except DAMAGED as error:
         raise InputError(f"{archive}: expected a zip, which can be unpacked: {one_line(error)}") from None
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
 
 def check(member: zipfile.ZipInfo, archive: Path) -> None:
-    """Raise InputError where a file of a zip would lie outside of its folder, or is no plain file or folder."""
+    """Raise InputError where a file of a zip has no name, would lie outside of its folder, or is a link or a device."""
     name = member.filename
     path = PurePosixPath(name.replace("\\", "/"))
     if path.is_absolute() or ".." in path.parts or ":" in name or not name.isprintable():
         raise InputError(f"{archive}: refused, as it would write outside of its folder: {name!a:.200}")
+    if not path.parts and not name.endswith("/"):  # "./" is the folder itself
+        raise InputError(f"{archive}: refused, as a file in it has no name: {name!a:.200}")
     kind = stat.S_IFMT(member.external_attr >> 16)
     if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
         raise InputError(f"{archive}: refused, as it holds a link or a device: {name!a:.200}")

@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from urllib.parse import quote, unquote
 
 import pytest
 
@@ -18,13 +19,13 @@ from gsbench.fetch.sources import MIRROR, Source
 PAYLOAD = bytes(range(256)) * 4000  # a megabyte, many chunks
 
 
-def zipped(files: dict[str, bytes], mode: int = 0o100644) -> bytes:
+def zipped(files: dict[str, bytes], mode: int = 0o100644, method: int = zipfile.ZIP_STORED) -> bytes:
     """A zip of files, whose names are written as they are."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
+    with zipfile.ZipFile(buffer, "w", method) as archive:
         for name, content in files.items():
             member = zipfile.ZipInfo("x")
-            member.filename, member.external_attr = name, mode << 16
+            member.filename, member.external_attr, member.compress_type = name, mode << 16, method
             archive.writestr(member, content)
     return buffer.getvalue()
 
@@ -40,6 +41,14 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         self.asked.append(self.path)
+        if self.path.startswith("/moved-to/"):
+            self.send_response(302)
+            self.send_header("Location", unquote(self.path.removeprefix("/moved-to/").rpartition("/")[0]))
+            self.end_headers()
+            return
+        if self.path.startswith("/said/"):  # as a server that is none would
+            self.wfile.write(unquote(self.path.removeprefix("/said/")).encode())
+            return
         if self.path.startswith("/moved/"):
             self.send_response(302)
             self.send_header("Location", self.path.removeprefix("/moved"))
@@ -97,6 +106,12 @@ def test_a_file_arrives_whole_and_once(path: str, address: str, tmp_path: Path) 
         ("/file.bin", "00000000", "expected file.bin with SHA-256 00000000"),
         ("/nothing.bin", None, "404"),
         ("/moved/nothing.bin", None, "404"),
+        ("/said/" + quote("HTTP/1.1 200 x\r\nContent-Length: abc\r\n\r\nabc", safe=""), None, "is no answer"),
+        ("/said/" + quote(f"HTTP/1.1 200 x\r\nContent-Length: {'9' * 5000}\r\n\r\nabc", safe=""), None, "is no answer"),
+        ("/said/" + quote("HTTP/1.1 404 \x1b[31mx\r\n\r\n", safe=""), None, "404"),
+        ("/moved-to/" + quote("http://[::1", safe="") + "/", None, "is no answer"),
+        ("/moved-to/" + quote(f"http://{'a' * 300}", safe="") + "/", None, "is no answer"),
+        ("/moved-to/" + quote("file:", safe="") + "/", None, "is no answer"),
     ],
 )
 def test_what_is_not_the_file_is_not_kept(
@@ -105,7 +120,7 @@ def test_what_is_not_the_file_is_not_kept(
     """Catches half a file, another file or a page of words in the place of weights."""
     with pytest.raises(InputError, match=said) as caught:
         download(source(address + path, tmp_path, sha256), tmp_path)
-    assert "\n" not in str(caught.value)
+    assert str(caught.value).isprintable()
     assert [*tmp_path.iterdir()] == []
 
 
@@ -157,6 +172,15 @@ def test_an_archive_is_unpacked_and_its_scenes_named(
         (b"<!DOCTYPE html>", "expected a zip"),
         (GOOD[:-30], "expected a zip"),
         (GOOD.replace(b"{}", b"[]", 1), "expected a zip"),  # its CRC is another one
+        (zipped({"": b""}), "no name"),
+        (zipped({"good": b"", ".": b""}), "no name"),
+        (zipped({"\x1b[31m": b""}), r"\x1b[31m"),
+        (zipped({"é": b""}).replace("é".encode(), b"\xff\xfe"), "expected a zip"),
+        (zipped({"a/" * 20_000 + "b": b""}), "expected a zip"),
+        (
+            zipped({"a": bytes(100)}, method=zipfile.ZIP_LZMA).replace(b"\x04\x05\x00]", b"\x04\x05\x00\xff"),
+            "expected a zip",
+        ),
     ],
 )
 def test_a_hostile_or_damaged_archive_is_refused(
@@ -168,6 +192,7 @@ def test_a_hostile_or_damaged_archive_is_refused(
     assert fetched(address, tmp_path, monkeypatch, "dnerf") == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench.fetch:")]
     assert said in line
+    assert line.isprintable()
     assert [*(tmp_path / "data").iterdir()] == []
     assert not (tmp_path / "evil").exists()
 
@@ -210,5 +235,27 @@ def test_what_cannot_be_fetched_is_told(
     err = capsys.readouterr().err.splitlines()
     assert "download it in a browser" in err[0]
     assert "Did you mean 'dnerf'" in err[1]
-    assert fetched("ftp://x", tmp_path, monkeypatch, "dnerf") == 2
-    assert MIRROR in capsys.readouterr().err
+    wrong = (
+        "ftp://x",
+        "http://[::1",
+        f"http://{'a' * 300}",
+        "http://a..b",
+        "http://x:port",
+        "http://",
+        "http://\x1b[31m",
+    )
+    for mirror in wrong:
+        for words in (["dnerf"], ["dnerf", "--dry-run"]):
+            assert fetched(mirror, tmp_path, monkeypatch, *words) == 2
+            (line,) = capsys.readouterr().err.splitlines()
+            assert MIRROR in line
+            assert line.isprintable()
+
+
+@pytest.mark.parametrize("to", ["a\0b", "~nobody.of.that.name/x"])
+def test_a_folder_that_cannot_be_is_told(to: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a stack trace of the file system."""
+    for words in (["dnerf"], ["--list"]):
+        assert main([*words, "--to", to]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "--to" in line

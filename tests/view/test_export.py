@@ -8,7 +8,7 @@ import cv2
 import pytest
 import torch
 
-from gsbench.export import main
+from gsbench.export import direction, main
 from gsbench.models.render import render
 from gsbench.run.load import load_run
 from gsbench.run.setup import load_scene
@@ -88,6 +88,14 @@ def test_an_orbit_looks_at_the_model(folder: Path) -> None:
         (("--ply", "a.ply", "--camera", "6"), "0 to 5"),
         (("--ply", "a.ply", "--camera", "²"), "0 to 5"),
         (("--ply", "a.ply", "--camera", "train/r_9"), "train/r_9"),
+        (("--ply", "a.ply", "--camera", "9" * 5000), "0 to 5"),
+        (("--ply", "a.ply", "--camera", "\x1b[31m"), r"\x1b[31m"),
+        (("--ply", "a\0.ply", "--camera", "0"), "a file"),
+        (("--ply", ".", "--camera", "0"), "a file"),
+        (("--images", "a\0"), "a file"),
+        (("--video", "a\0.mp4"), "a file"),
+        (("--ply", "a.ply", "--direction", "," * 5000), "--direction"),
+        (("--ply", "a.ply", "--direction", "1e300,1e300,1e300"), "--direction"),
         (("--ply", "a.ply", "--camera", "0", "--data-root", "/nowhere"), "--data-root"),
         (("--ply", "a.ply", "--direction", "0,0,0"), "--direction"),
         (("--ply", "a.ply", "--direction", "1,x"), "--direction"),
@@ -110,7 +118,15 @@ def test_what_is_asked_wrong_is_told_in_one_line(
     assert main([str(folder), *words]) == 2
     (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("gsbench.export:")]
     assert said in line
+    assert line.isprintable()
+    assert len(line) < 400
     assert [*tmp_path.iterdir()] == []
+
+
+def test_a_direction_has_no_length() -> None:
+    """Catches a slice seen from the middle of the model, as a long or a short direction is rounded to none."""
+    for text in ("0,3,4", "0,3e38,4e38", "0,3e-45,4e-45"):
+        torch.testing.assert_close(direction(text), torch.tensor([0, 0.6, 0.8]))
 
 
 def test_a_scene_without_times_has_none_to_ask_for(
