@@ -125,7 +125,8 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert answer["p"] == 0.001
     assert answer.keys() >= {"z", "free", "seconds", "reason"}
     for wrong in ([], ["/nowhere"], ["x", "--checkpoint", "y"], ["--checkpoint", "/nowhere"],
-                  ["x", "--budget-db", "nan"], ["--picture", "y", "--out", ""], ["--picture", "y", "--out", "a\0b"]):  # fmt: skip
+                  ["x", "--budget-db", "nan"], ["--picture", "y", "--out", ""],
+                  ["--picture", "y", "--out", "a\0b"]):  # fmt: skip
         assert command.main(wrong) == 2
         assert capsys.readouterr().err.count("\n") == 1
 
