@@ -12,29 +12,41 @@ RESULTS ?= results
 # The CUDA kernels, compiled for five architectures, take minutes: made where a GPU is to run them. CUDA=on|auto|off.
 CUDA := $(if $(shell nvidia-smi -L 2> /dev/null),auto,off)
 
-.PHONY: help table1 frontier tables test test-all stability stability-long bench gpu-check slurm-check sanitize lint format docs setup clean
+.PHONY: help table1 frontier tables test test-all stability stability-long bench gpu-check slurm-check sanitize lint format docs setup locks clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-setup: $(VENV)/installed  ## make .venv and install gsbench into it, with the pinned versions
+setup: $(VENV)/installed  ## make .venv and install gsbench into it, with pinned versions whose hashes are checked
+
+# locks/ has all that comes along, so pip resolves nothing and fetches no tools to build with; a file with another hash
+# is refused.
+PIP := $(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --use-pep517
+LOCKED := $(PIP) --require-hashes --requirement locks
 
 # Installed again whenever what is installed changes: the metadata, the pins, the native sources.
 NATIVE := CMakeLists.txt $(shell find gsbench/kernels -name '*.cpp' -o -name '*.h' -o -name '*.cu')
-$(VENV)/installed: pyproject.toml constraints.txt $(NATIVE)
+$(VENV)/installed: pyproject.toml $(wildcard locks/*.txt) $(NATIVE)
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \
 		{ echo "gsbench needs Python 3.11, 3.12 or 3.13; $(PYTHON) is $$($(PYTHON) --version). Try make PYTHON=python3.12"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		--config-settings cmake.define.CUDA=$(CUDA) --editable '.[dev,stability]'
+ifeq ($(CUDA),off)
+	$(LOCKED)/torch_cpu.txt || { echo "no torch for the CPU at hand (docs/install.md): PyPI's, several GB on Linux"; \
+		$(LOCKED)/torch.txt; }
+else
+	$(LOCKED)/torch.txt
+endif
+	$(LOCKED)/build.txt
+	$(LOCKED)/tests.txt
+	$(PIP) --config-settings cmake.define.CUDA=$(CUDA) --editable .
 	@$(BIN)/python -c 'import sys; from gsbench import kernels; sys.exit(not kernels.available())' || \
 		echo "gsbench is installed without its kernels, and slow: docs/install.md says what they need"
 	touch $@
 
-# Sphinx and the kernel of notebooks take pip 13 s more: for those who ask for the site or for all tests.
+# Sphinx and the kernel of notebooks: for those who ask for the site or for all tests.
 $(VENV)/installed-docs: $(VENV)/installed
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt 'gsbench[docs]'
+	$(LOCKED)/docs.txt
 	touch $@
 
 table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR, and model=auto, on the embedded scenes; print and write the table
@@ -96,6 +108,11 @@ docs: $(VENV)/installed-docs  ## build the site from docs/ into build/site
 	$(BIN)/python docs/site/tables.py
 	$(BIN)/python -m sphinx -q -E -W --keep-going -b html -d build/doctrees docs build/site
 	@echo "open build/site/index.html"
+
+locks:  ## resolve locks/ anew, after a change of pyproject.toml or constraints.txt; asks PyPI
+	$(PYTHON) -m venv build/uv
+	build/uv/bin/pip install --quiet --disable-pip-version-check --no-deps --require-hashes --requirement locks/uv.txt
+	build/uv/bin/python locks/write.py
 
 clean:  ## remove what was built and installed; results stay
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
