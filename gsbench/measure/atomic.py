@@ -1,11 +1,13 @@
 """Write files atomically, so that every file which a killed run leaves behind can be read."""
 
+import errno
 import os
 import re
 import secrets
 import socket
 from pathlib import Path
 
+WITHOUT_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # errors of a file system without them
 HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
 
 
@@ -16,7 +18,7 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
     `lasting` is flushed to the disk before it is renamed, and survives a power cut.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{HOST}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    temporary = _beside(path)
     try:
         with temporary.open("xb") as file:
             file.write(data)
@@ -24,8 +26,10 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
                 file.flush()
                 os.fsync(file.fileno())
         temporary.replace(path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):  # a disk that is full names no file, and a temporary name says nothing
+            error.filename, error.filename2 = str(path), None
         raise
     if not lasting:
         return
@@ -34,6 +38,41 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
         os.fsync(folder)  # the new name itself must survive a power cut
     finally:
         os.close(folder)
+
+
+def create_atomically(path: Path, data: bytes) -> bool:
+    """Make the file `path` with all of `data` in it; return False where it is there already. Its folder exists.
+
+    Of several processes, on several hosts too, that make one file, one does: a hard link to an existing name fails.
+    """
+    temporary = _beside(path)
+    try:
+        temporary.write_bytes(data)
+        try:
+            os.link(temporary, path)
+        except FileExistsError:
+            return temporary.stat().st_nlink == 2  # NFS may have made the link, and lost the answer
+        except OSError as error:
+            if error.errno not in WITHOUT_LINKS:
+                raise
+            return _create_here(path, data)
+        return True
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _create_here(path: Path, data: bytes) -> bool:
+    """Make a file on a file system without hard links, such as FAT; a reader may see its first part."""
+    try:
+        with path.open("xb") as file:
+            file.write(data)
+    except FileExistsError:
+        return False
+    return True
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{HOST}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
 
 
 def remove_leftovers(folder: Path) -> None:

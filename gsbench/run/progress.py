@@ -31,15 +31,19 @@ class Progress:
     started: float = field(default_factory=time.time)  # Unix seconds
     updated: float = field(default_factory=time.time)  # Unix seconds
     step: int = 0
-    steps: int = 0
+    steps: int = 0  # 0 while the run is claimed and does not train yet
     seconds: float = 0.0  # of training so far
     psnr_val: float | None = None  # dB, the last one measured
 
 
 def write(folder: Path, progress: Progress) -> None:
     """Write the progress of the run in `folder`, atomically."""
-    text = json.dumps(dataclasses.asdict(progress), indent=1, allow_nan=False)
-    write_atomically(folder / FILE_NAME, text.encode(), lasting=False)
+    write_atomically(folder / FILE_NAME, encode(progress), lasting=False)
+
+
+def encode(progress: Progress) -> bytes:
+    """Return what is written of a progress."""
+    return json.dumps(dataclasses.asdict(progress), indent=1, allow_nan=False).encode()
 
 
 class Reporter:

@@ -13,10 +13,11 @@ from gsbench.errors import InputError, one_line
 from gsbench.measure import record as records
 from gsbench.measure.atomic import remove_leftovers
 from gsbench.measure.record import Record
-from gsbench.run import progress
+from gsbench.run import claim
 from gsbench.run.attempt import Attempt
 from gsbench.run.checks import check_folder
 from gsbench.run.identity import Run, identify, is_same, training_hash
+from gsbench.run.progress import Progress
 from gsbench.train.diagnosis import explain
 from gsbench.train.watch import DivergedError
 
@@ -40,10 +41,35 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
     """
     this = identify(composed, choices, overrides)
     check_folder(this.folder)
-    if is_done_elsewhere(this):
+    mine = Progress(this.overrides)
+    if not _is_claimed(this, mine):
         return None
-    remove_leftovers(this.folder)
-    attempt = Attempt(this)
+    try:
+        remove_leftovers(this.folder)
+        return _done(Attempt(this))
+    finally:
+        claim.release(this.folder, mine)
+
+
+def _is_claimed(this: Run, mine: Progress) -> bool:
+    """Claim a run for this process; where another is at it, say so and return False.
+
+    Raises:
+        InputError: the claim cannot be written.
+    """
+    try:
+        other = claim.take(this.folder, mine)
+    except OSError as error:
+        raise InputError(f"{this.folder}: the run cannot be claimed: {one_line(error)}") from None
+    if other is not None:
+        print(f"{this.name}: left to process {other.pid} on {other.host}, which is at step {other.step} of it",
+              file=sys.stderr)  # fmt: skip
+    return other is None
+
+
+def _done(attempt: Attempt) -> Record:
+    """Do a run that this process has claimed, or keep the one that finished before; see `run`."""
+    this = attempt.this
     try:
         model, scene = attempt.prepare()
         done = finished(this, scene.fingerprint)
@@ -60,33 +86,11 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
         write(record, this.folder)
     except OSError as error:  # the other runs of the sweep go on; this one's checkpoint is what it was
         raise InputError(f"{summary(record)}; its record cannot be written: {error.strerror}") from None
-    (this.folder / progress.FILE_NAME).unlink(missing_ok=True)
     for line in words.lines(record.on_demand) if record.on_demand else []:
         print(f"{this.name}: {line}")
     print(f"{this.name}: {summary(record)}; {this.folder / records.FILE_NAME}")
     attempt.draw()
     return record
-
-
-def is_done_elsewhere(this: Run) -> bool:
-    """Tell whether another process is at this run; then say so."""
-    path = this.folder / progress.FILE_NAME
-    if not path.exists():
-        return False
-    try:
-        other = progress.read(path)
-    except InputError:
-        return False  # a damaged file says nothing; it is written anew
-    mine = progress.Progress([])
-    if (other.host, other.pid) == (mine.host, mine.pid) or not progress.is_alive(other):
-        return False
-    if other.job is not None and other.job == mine.job:  # put back into the queue after its node failed
-        return False
-    print(
-        f"{this.name}: left to process {other.pid} on {other.host}, which is at step {other.step} of it",
-        file=sys.stderr,
-    )
-    return True
 
 
 def finished(this: Run, fingerprint: str) -> Record | None:

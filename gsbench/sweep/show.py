@@ -26,7 +26,7 @@ def _details(run: Run) -> str:
     parts = []
     if run.state in ("running", "queued"):
         if run.step is not None:
-            parts.append(f"step {run.step}/{run.steps}")
+            parts.append(f"step {run.step}/{run.steps}" if run.steps else "loads")
         if run.psnr is not None:
             parts.append(f"val {run.psnr:.2f} dB")
         if run.seconds_left is not None:

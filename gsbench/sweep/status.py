@@ -110,7 +110,7 @@ def _judge(experiment: Experiment, one: Identity) -> Run:
         reason = outcome.reason if outcome.status == "failed" else f"{outcome.status}: {outcome.reason}"
         return Run(list(one), "failed", reason, record=str(outcome.path))
     if progress:
-        at = f"at step {progress.step} of {progress.steps}"
+        at = f"at step {progress.step} of {progress.steps}" if progress.steps else "before its first step"
         gone = f"process {progress.pid} on {progress.host} is gone, last seen {_ago(progress.updated)} {at}"
         return Run(list(one), "lost", gone, progress.job, progress.step, progress.steps, psnr=progress.psnr_val)
     if asked and asked.ended:

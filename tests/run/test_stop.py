@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from tiny_run import ROOT, command, environment, gsbench, overrides, write_moving_square
 
+from gsbench.errors import InputError
 from gsbench.measure.atomic import HOST
 from gsbench.run import progress, stop
 from gsbench.train import checkpoint
@@ -30,10 +31,18 @@ def started(*arguments: str, results: Path) -> subprocess.Popen[str]:
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests in the background ignore it
     )  # fmt: skip
     deadline = time.monotonic() + 120
-    while not list(results.rglob(progress.FILE_NAME)) and time.monotonic() < deadline:
+    while not trains(results, process.pid) and time.monotonic() < deadline:
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
     return process
+
+
+def trains(results: Path, pid: int) -> bool:
+    """Whether a process has begun the training of the only run there is."""
+    try:
+        return any(at.pid == pid and at.steps > 0 for at in map(progress.read, results.rglob(progress.FILE_NAME)))
+    except InputError:  # it was removed or replaced just now
+        return False
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
@@ -62,9 +71,6 @@ def test_a_run_that_another_process_does_is_left_to_it(square: Path, tmp_path: P
     (path,) = tmp_path.rglob(progress.FILE_NAME)
     assert not progress.is_alive(progress.read(path))
     third = started(*overrides(square, tmp_path, *LONG), results=tmp_path)
-    deadline = time.monotonic() + 60
-    while progress.read(path).pid != third.pid and time.monotonic() < deadline:
-        time.sleep(0.05)
     assert progress.read(path).pid == third.pid
     third.kill()
 

@@ -1,0 +1,142 @@
+"""A run is claimed before it is done: of equal commands one trains, and what a killed one left is taken over."""
+
+import errno
+import multiprocessing
+import os
+import re
+import signal
+import socket
+import subprocess
+import time
+from dataclasses import replace
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+
+import pytest
+from tiny_run import ROOT, command, environment, overrides, write_moving_square
+
+from gsbench.measure import atomic
+from gsbench.run import claim, progress
+from gsbench.run.progress import Progress
+
+CROWD, ROUNDS = 6, 15
+
+
+def compete(folder: Path, start: Barrier, ended: Barrier) -> None:
+    """Claim a run in many rounds at the same moment as others do, and note who had it."""
+    for number in range(ROUNDS):
+        at, mine = folder / str(number), Progress(["seed=0"])
+        start.wait(60)
+        if claim.take(at, mine) is None:
+            (at / f"won.{os.getpid()}").touch()
+        ended.wait(60)  # the winner lives until all have asked
+
+
+@pytest.mark.parametrize("left", ["nothing", "a dead claim", "half a claim"])
+@pytest.mark.parametrize("locks", [True, False])
+def test_of_many_processes_one_has_the_run(
+    left: str, locks: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a claim that is looked for and then made, so that several make it, and one that nobody takes over."""
+    if not locks:
+        if left != "nothing":
+            pytest.skip("a claim that is left over is taken over by one process where the file system has locks")
+        monkeypatch.setattr(claim, "_locked", without_locks)
+    for number in range(ROUNDS):
+        (tmp_path / str(number)).mkdir()
+        if left == "a dead claim":
+            progress.write(tmp_path / str(number), Progress(["seed=0"], born=1))
+        elif left == "half a claim":
+            (tmp_path / str(number) / progress.FILE_NAME).write_text('{"overrides": [')
+    fork = multiprocessing.get_context("fork")
+    start, ended = fork.Barrier(CROWD), fork.Barrier(CROWD)
+    crowd = [fork.Process(target=compete, args=(tmp_path, start, ended)) for _ in range(CROWD)]
+    for one in crowd:
+        one.start()
+    for one in crowd:
+        one.join(60)
+        assert one.exitcode == 0
+    for number in range(ROUNDS):
+        names = sorted(path.name for path in (tmp_path / str(number)).iterdir())
+        assert [name.partition(".")[0] for name in names] == ["progress", "won"], names
+        assert names[1] == f"won.{progress.read(tmp_path / str(number) / progress.FILE_NAME).pid}"
+
+
+def without_locks(_: Path) -> None:
+    raise OSError(errno.ENOLCK, "No locks available")
+
+
+def test_a_claim_is_left_to_the_living_and_taken_from_the_dead(tmp_path: Path) -> None:
+    """Catches a run that two commands of one job do, one that a requeued job waits for, and a later claim removed."""
+    mine = Progress([], job="7")
+    elsewhere = replace(mine, host="elsewhere", job=None)
+    sleeper = subprocess.Popen(["sleep", "60"])
+    beside = replace(mine, pid=sleeper.pid, born=progress.born(sleeper.pid))
+    requeued = replace(elsewhere, job="7")
+    silent = replace(elsewhere, updated=mine.updated - 2 * progress.SILENT)
+    try:
+        for other, living in ((elsewhere, True), (beside, True), (requeued, False), (silent, False), (mine, False)):
+            progress.write(tmp_path, other)
+            assert claim.take(tmp_path, mine) == (other if living else None)
+            claim.release(tmp_path, mine)
+            assert (tmp_path / progress.FILE_NAME).exists() == living  # what is another's stays
+    finally:
+        sleeper.kill()
+        sleeper.wait()
+    progress.write(tmp_path, beside)
+    assert claim.take(tmp_path, mine) is None
+    assert sorted(path.name for path in tmp_path.iterdir()) == [progress.FILE_NAME]
+    claim.release(tmp_path / "gone", mine)
+
+
+def test_a_lock_that_is_held_for_ever_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a command that hangs beside a process that was suspended while it claimed."""
+    monkeypatch.setattr(claim, "PATIENCE", 0.1)
+    held = claim._locked(tmp_path / claim.LOCK)
+    assert held is not None
+    assert claim.take(tmp_path, Progress([])) is None
+    held.close()
+
+
+@pytest.mark.parametrize("number", [errno.EPERM, errno.EOPNOTSUPP])
+def test_a_file_system_without_links_has_claims(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches runs that cannot be done on a FAT disk."""
+
+    def link(*_: object) -> None:
+        raise OSError(number, "no links here")
+
+    monkeypatch.setattr(atomic.os, "link", link)
+    assert claim.take(tmp_path, Progress(["a=1"])) is None
+    other = Progress(["a=1"], host=socket.gethostname() + "2")
+    found = claim.take(tmp_path, other)
+    assert found is not None
+    assert found.pid == os.getpid()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [progress.FILE_NAME]
+
+
+@pytest.mark.slow
+def test_of_three_commands_at_once_one_trains(tmp_path: Path) -> None:
+    """Catches a claim that is made once the scene is loaded: all three trained."""
+    data = write_moving_square(tmp_path / "data")
+    long = ("model=3dgs", "train.iterations=100000", "train.curve_points=1", "train.densify.stop=1")
+    arguments = overrides(data, tmp_path / "r", *long)
+    runs = [subprocess.Popen(command(*arguments), cwd=ROOT, env=environment(), stderr=subprocess.PIPE, text=True)
+            for _ in range(3)]  # fmt: skip
+    try:
+        deadline, others = time.monotonic() + 240, []
+        while len(others) < 2 and time.monotonic() < deadline:
+            time.sleep(0.1)
+            others = [run for run in runs if run.poll() is not None]
+        (winner,) = (run for run in runs if run.poll() is None)
+        for run in others:
+            said = run.communicate()[1]
+            assert run.returncode == 0, said
+            lines = [line for line in said.splitlines() if re.search(rf"left to process {winner.pid} on ", line)]
+            assert len(lines) == 1, said
+        winner.send_signal(signal.SIGTERM)
+        assert "stopped " in winner.communicate(timeout=60)[1]
+        assert not list((tmp_path / "r").rglob(progress.FILE_NAME))
+    finally:
+        for run in runs:
+            run.kill()
+            run.wait()
