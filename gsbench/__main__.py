@@ -7,19 +7,22 @@ import warnings
 from pathlib import Path
 
 import hydra
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from gsbench import __version__
 from gsbench.config import CONF, HERE, register_schema
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import InputError, one_line, printable
 from gsbench.run.stop import Stopped, stop_at_once
 from gsbench.sweep.axes import expand
+from gsbench.sweep.explain import explain, raised_by_hydra
 from gsbench.sweep.finish import see_through
 from gsbench.sweep.hooks import started
-from gsbench.sweep.task import do
+from gsbench.sweep.task import Problem, do
 
-_failures: list[str] = []  # one line for each run that did not end well; a Hydra sweep goes on after it
+BAD_INPUT, FAILED = 2, 1  # exit statuses: nothing could be run as asked; a run did not end well
+_problems: list[Problem] = []  # of the runs that did not end well; a Hydra sweep goes on after them
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
@@ -31,16 +34,18 @@ def entry(composed: DictConfig) -> None:
         from gsbench.stability.__main__ import main as audit
 
         if audit(["--out", str(Path(composed.results) / "stability")]):
-            _failures.append("stability: a default breaks its bound")
+            _problems.append(Problem("stability: a default breaks its bound", False))
         return
+    if OmegaConf.is_missing(composed.scene, "name"):
+        raise InputError("scene=custom: expected the name of a scene: add scene.name=FOLDER, a folder in data.root")
     if OmegaConf.is_missing(composed.data, "root"):
         raise InputError(f"data.root is not set: add data.root=PATH, the folder that holds the scenes of "
                          f"{composed.data.dataset} ({', '.join(composed.data.scenes)}), each with "
                          f"transforms_{{train,val,test}}.json and the images they name. "
                          f"Published at: {composed.data.published}")  # fmt: skip
     problem = do(composed)
-    if problem:
-        _failures.append(problem)
+    if problem is not None:
+        _problems.append(problem)
 
 
 def main() -> None:
@@ -51,22 +56,38 @@ def main() -> None:
         stream.reconfigure(errors="replace")  # type: ignore[union-attr]  # a terminal in ASCII shows ? for other letters
     signal.signal(signal.SIGTERM, stop_at_once)
     warnings.formatwarning = _in_one_line
+    if "--version" in sys.argv[1:]:  # Hydra would print its own
+        print(f"gsbench {__version__}")
+        return
     try:
         sys.argv[1:] = expand(sys.argv[1:])
         broken = see_through(entry, started)
-    except InputError as error:
-        sys.exit(f"gsbench: error: {error}")
-    except (HydraException, OmegaConfBaseException) as error:
-        sys.exit(f"gsbench: error: {_explain(error)}")
-    except OSError as error:  # of Hydra's own files; a run's errors end in its record
-        sys.exit(f"gsbench: error: {error.filename}: {error.strerror}")
     except (Stopped, KeyboardInterrupt) as stopped:
         print(f"gsbench: {str(stopped) or 'stopped by SIGINT'}", file=sys.stderr)
         sys.exit(stopped.code if isinstance(stopped, Stopped) else 128 + signal.SIGINT)
+    except Exception as error:
+        told = _told(error)
+        if told is None:
+            raise
+        print(f"gsbench: error: {printable(told)}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
     if broken:
         print(f"gsbench: {len(broken)} runs did not end well: python -m gsbench.sweep status "
               f"{started[0].parents[1]}", file=sys.stderr)  # fmt: skip
-    sys.exit(1 if _failures or broken else 0)
+    if _problems and all(problem.is_refused for problem in _problems) and not broken:
+        sys.exit(BAD_INPUT)
+    sys.exit(FAILED if _problems or broken else 0)
+
+
+def _told(error: Exception) -> str | None:
+    """Tell in one line what is wrong with a command line; None for an error that is none of its words'."""
+    if isinstance(error, InputError):
+        return str(error)
+    if isinstance(error, HydraException | OmegaConfBaseException):
+        return explain(error)
+    if isinstance(error, OSError):  # of Hydra's own files; a run's errors end in its record
+        return f"{error.filename}: {error.strerror}" if error.filename else one_line(error)
+    return one_line(error) if raised_by_hydra(error) else None
 
 
 _in_two_lines = warnings.formatwarning
@@ -83,22 +104,6 @@ def _in_one_line(
 
 def _group(name: str) -> list[str]:
     return sorted(path.stem for path in (CONF / name).glob("*.yaml"))
-
-
-def _explain(error: Exception) -> str:
-    """Explain an error of Hydra or OmegaConf in one line that names the key and the nearest valid one."""
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
-        group, _, name = error.missing_cfg_file.rpartition("/")
-        if group == "hydra/launcher":
-            return "+launch=slurm and +launch=parallel need packages of their own: pip install 'gsbench[cluster]'"
-        return f"{group} '{name}' is not known. {did_you_mean(name, error.options)}"
-    cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
-    if isinstance(cause, OmegaConfBaseException) and cause.key is not None and cause.parent_node is not None:
-        keys = [str(key) for key in cause.parent_node] if isinstance(cause.parent_node, DictConfig) else []
-        if keys and cause.key not in keys:
-            return f"config key '{cause.full_key}' is not known. {did_you_mean(str(cause.key), keys)}"
-        return f"config key '{cause.full_key}': {str(cause).splitlines()[0]}"
-    return " ".join(str(error).split())
 
 
 if __name__ == "__main__":

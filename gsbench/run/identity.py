@@ -5,7 +5,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config import Config
+from gsbench.errors import InputError
 from gsbench.measure import record as records
 from gsbench.measure.provenance import config_hash
 from gsbench.reading import read_file
@@ -64,8 +65,13 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
         InputError: a name cannot be that of a folder, or there is no file to start from. Hydra has already refused
             unknown keys and wrong types.
     """
+    for name in (one.name for one in fields(Config)):
+        if name not in composed:
+            raise InputError(f"config key '{name}': expected a value, it was deleted: leave '~{name}' out")
     config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
     plain: Plain = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
+    if not config.results:
+        raise InputError("results: expected a folder, got '': results=. is this one")
     if config.init.ply is not None:
         config.init.ply_sha256 = plain["init"]["ply_sha256"] = config.init.ply_sha256 or hash_of(config.init.ply)
     as_published = config.agr == config.model.published_with_agr

@@ -1,6 +1,9 @@
 """Do one run from its config to its record, which is on disk at the end, however the run ended."""
 
+import errno
+import re
 import sys
+import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +12,7 @@ import torch
 from omegaconf import DictConfig
 
 from gsbench.effects import words
-from gsbench.errors import InputError, one_line
+from gsbench.errors import InputError, one_line, printable
 from gsbench.measure import record as records
 from gsbench.measure.atomic import remove_leftovers
 from gsbench.measure.record import Record
@@ -21,7 +24,12 @@ from gsbench.run.progress import Progress
 from gsbench.train.diagnosis import explain
 from gsbench.train.watch import DivergedError
 
+TRACEBACK = "traceback.txt"
 STALE = "record.stale.json"  # that of a finished run, kept beside the record of a later attempt that did not finish
+
+
+class UnrecordedError(InputError):
+    """A run ended, and its record cannot be written."""
 
 
 def run(composed: DictConfig, choices: Mapping[str, str] | None = None, overrides: Sequence[str] = ()) -> Record | None:
@@ -36,7 +44,8 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
         The record, which is on disk whatever its status is; None where another process is at this run.
 
     Raises:
-        InputError: the run has no name that can be a folder, or its folder or its record cannot be written.
+        InputError: the run has no name that can be a folder, or its folder cannot be written.
+        UnrecordedError: its record cannot be written.
         Stopped: the process was told to end; the checkpoint is saved.
     """
     this = identify(composed, choices, overrides)
@@ -62,8 +71,8 @@ def _is_claimed(this: Run, mine: Progress) -> bool:
     except OSError as error:
         raise InputError(f"{this.folder}: the run cannot be claimed: {one_line(error)}") from None
     if other is not None:
-        print(f"{this.name}: left to process {other.pid} on {other.host}, which is at step {other.step} of it",
-              file=sys.stderr)  # fmt: skip
+        whose = f"process {other.pid} on {printable(other.host)}"
+        print(f"{this.name}: left to {whose}, which is at step {other.step} of it", file=sys.stderr)
     return other is None
 
 
@@ -72,20 +81,17 @@ def _done(attempt: Attempt) -> Record:
     this = attempt.this
     try:
         model, scene = attempt.prepare()
-        done = finished(this, scene.fingerprint)
-        if done is not None:
-            print(f"{this.name}: finished before, kept: {summary(done)}; {this.folder / records.FILE_NAME}")
-            return done
-        record = attempt.measure(attempt.fit(model, scene))
-    except DivergedError as error:
-        reason = f"{error}; {explain(attempt.model)}" if attempt.model else str(error)
-        record = attempt.describe("diverged", reason)
-    except (InputError, MemoryError, OSError, RuntimeError) as error:
-        record = attempt.describe("failed", reason_of(error))
+        kept = finished(this, scene.fingerprint)
+        record = kept or attempt.measure(attempt.fit(model, scene))
+    except Exception as error:
+        kept, record = None, _ended_badly(attempt, error)
+    if kept is not None:
+        print(f"{this.name}: finished before, kept: {summary(kept)}; {this.folder / records.FILE_NAME}")
+        return kept
     try:
         write(record, this.folder)
     except OSError as error:  # the other runs of the sweep go on; this one's checkpoint is what it was
-        raise InputError(f"{summary(record)}; its record cannot be written: {error.strerror}") from None
+        raise UnrecordedError(f"{summary(record)}; its record cannot be written: {error.strerror}") from None
     for line in words.lines(record.on_demand) if record.on_demand else []:
         print(f"{this.name}: {line}")
     print(f"{this.name}: {summary(record)}; {this.folder / records.FILE_NAME}")
@@ -117,21 +123,45 @@ def finished(this: Run, fingerprint: str) -> Record | None:
     return None
 
 
-def reason_of(error: Exception) -> str:
-    """Say in one line why a run failed; an error that nobody foresaw is raised again.
+def _ended_badly(attempt: Attempt, error: Exception) -> Record:
+    """Describe a run that an error has ended.
+
+    Raises:
+        InputError: the model is unknown, so that the run has no row in a table.
+    """
+    is_diverged = isinstance(error, DivergedError)
+    reason = one_line(error) if is_diverged else reason_of(error, attempt.this.folder)
+    if is_diverged and attempt.model is not None:
+        try:
+            reason = f"{reason}; {explain(attempt.model)}"
+        except Exception as unexplained:  # what it resembles is worth less than that it diverged
+            reason = f"{reason}; it cannot be explained: {one_line(unexplained)}"
+    return attempt.describe("diverged" if is_diverged else "failed", reason)
+
+
+def reason_of(error: Exception, folder: Path) -> str:
+    """Say in one line why a run failed. The stack of an error that nobody foresaw goes into TRACEBACK in `folder`.
 
     torch reports a CPU without memory as a RuntimeError.
     """
     text = one_line(error)
-    if isinstance(error, MemoryError | torch.OutOfMemoryError) or (
-        isinstance(error, RuntimeError) and "memory" in text
-    ):
+    if _is_of_memory(error):
         return f"out of memory: {text}"
-    if isinstance(error, RuntimeError):
-        raise error
     if isinstance(error, OSError):
-        return f"{error.filename or 'a file'}: {error.strerror or text}"
-    return text
+        return f"{error.filename or folder}: {error.strerror or text}"
+    if isinstance(error, InputError):
+        return text
+    path = folder / TRACEBACK
+    path.write_text("".join(traceback.format_exception(error)))
+    return f"an error that gsbench did not foresee, {type(error).__name__}: {text}; please report it, with {path}"
+
+
+def _is_of_memory(error: Exception) -> bool:
+    if isinstance(error, MemoryError | torch.OutOfMemoryError):
+        return True
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    return isinstance(error, RuntimeError) and re.search("memory|bad_alloc|bad alloc", str(error)) is not None
 
 
 def write(record: Record, folder: Path) -> None:

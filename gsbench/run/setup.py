@@ -1,26 +1,36 @@
 """Build the model and load the scene that a config names."""
 
+from typing import Any
+
 import torch
 
 from gsbench import models, scenes
 from gsbench.backends import resolve
 from gsbench.config import Config
+from gsbench.errors import InputError
 from gsbench.models import GaussianModel
 from gsbench.run.checks import BACKGROUNDS, scene_folder
 from gsbench.scenes import Scene
 
 
 def build(config: Config) -> GaussianModel:
-    """Build the model of a config, without Gaussians yet; raises InputError as `models.build` does."""
-    return models.build(
-        config.model.name,
-        module=config.model.module,
-        agr=config.agr,
-        agr_octaves=config.model.agr_octaves,
-        sh_degree=config.model.sh_degree,
-        backend=resolve(config.raster.backend, torch.device(config.device).type),
-        **config.model.options,
-    )
+    """Build the model of a config, without Gaussians yet.
+
+    Raises:
+        InputError: as `models.build`, or an option has a key of its own.
+    """
+    own: dict[str, Any] = {
+        "module": config.model.module,
+        "agr": config.agr,
+        "agr_octaves": config.model.agr_octaves,
+        "sh_degree": config.model.sh_degree,
+        "backend": resolve(config.raster.backend, torch.device(config.device).type),
+    }
+    for name in config.model.options:
+        if name in (*own, "name"):
+            key = {"agr": "agr", "backend": "raster.backend"}.get(name, f"model.{name}")
+            raise InputError(f"model.options: expected no '{name}', which has a key of its own: set {key}")
+    return models.build(config.model.name, **own, **config.model.options)
 
 
 def load_scene(config: Config) -> Scene:

@@ -12,7 +12,7 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, printable
 from gsbench.sweep.show import lines
 from gsbench.sweep.status import BROKEN, GOING, Run, read, status
 
@@ -38,7 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
             return _retry(asked.experiment, asked.launch)
         return _watch(asked.experiment, asked.json) if asked.watch else _verdict(_show(asked.experiment, asked.json))
     except InputError as error:
-        print(f"gsbench.sweep: {error}", file=sys.stderr)
+        print(f"gsbench.sweep: {printable(str(error))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

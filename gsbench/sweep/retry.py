@@ -11,14 +11,17 @@ from hydra import compose, initialize_config_dir
 from hydra._internal.callbacks import Callbacks
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, open_dict
+from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import CONF, register_schema
-from gsbench.errors import InputError
+from gsbench.errors import InputError, printable
 from gsbench.run.overrides import launches
 from gsbench.sweep import plan
 from gsbench.sweep.axes import SCENES_DEPEND_ON, scenes_of
+from gsbench.sweep.explain import explain
 from gsbench.sweep.finish import see_through
 from gsbench.sweep.hooks import plan_of
 from gsbench.sweep.plan import identity
@@ -41,17 +44,31 @@ def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfi
         more: overrides of `launch`, such as more memory.
         task: does a run of a composed config.
 
+    A group of runs that cannot be launched is told on stderr, and the others are: the folder where its command was
+    given may be gone, and its words may no longer be known.
+
     Raises:
-        InputError: `more` would change what is run.
+        InputError: `more` would change what is run, or is not known.
     """
     for one in more:
         if not launches(one):
             raise InputError(f"retry: expected overrides of launch, such as launch.memory=16G, got '{one}'")
+    register_schema()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            compose(CONFIG_NAME, list(more))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(f"retry: {explain(error)}") from None
     groups: dict[tuple[str, ...], list[Asked]] = defaultdict(list)
     for asked in broken(experiment):
         groups[(asked.plan.cwd, *_launch(asked), *asked.plan.hydra)].append(asked)
     for group in groups.values():
-        _relaunch(experiment, group, more, task)
+        try:
+            _relaunch(experiment, group, more, task)
+        except (InputError, HydraException, OmegaConfBaseException, OSError) as error:
+            why = explain(error) if isinstance(error, HydraException | OmegaConfBaseException) else str(error)
+            print(f"gsbench.sweep: {len(group)} runs of {group[0].folder / plan.FILE_NAME} cannot be launched again: "
+                  f"{printable(why)}", file=sys.stderr)  # fmt: skip
     return sum(map(len, groups.values()))
 
 
@@ -66,8 +83,11 @@ def _relaunch(
     """Launch runs that one command asked for: their lists are no grid, so the launcher is called without a sweeper."""
     first = group[0]
     results = str(experiment.folder.parent.resolve())
-    os.chdir(first.plan.cwd)
-    register_schema()
+    try:
+        os.chdir(first.plan.cwd)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{first.plan.cwd!r:.200}, the folder where its command was given and its paths start: "
+                         f"{getattr(error, 'strerror', error)}") from None  # fmt: skip
     # Scenes that have no file in conf/ become choices of the group `scene`, as when the command was given.
     scenes_of([one for one in first.overrides if one.partition("=")[0].lstrip("+") in SCENES_DEPEND_ON])
     runs = [[*(one for one in asked.overrides if not one.startswith("results=")), f"results={results}", *more]

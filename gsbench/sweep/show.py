@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsbench.errors import printable
 from gsbench.sweep.status import STATES, Run
 
 
@@ -19,7 +20,7 @@ def lines(experiment: Path, runs: Sequence[Run], silent: str | None = None) -> l
     width = max((len(name) for run, name in named if run.state != "done"), default=0)
     for state in STATES[1:]:
         shown += [f"  {state:8} {name:{width}}  {_details(run)}" for run, name in named if run.state == state]
-    return shown
+    return list(map(printable, shown))
 
 
 def _details(run: Run) -> str:

@@ -18,6 +18,7 @@ BROKEN = ("failed", "lost")
 # Of a log's lines, those that name a cause, and those that speak of an error: a bar of progress may stand before it.
 CAUSE = re.compile(r"exceeded.* memory|oom.kill|out of memory|no space left", re.IGNORECASE)
 ERROR = re.compile(r"([\w.-]+: )*\w*error\b.*", re.IGNORECASE)
+EFFECT = re.compile(r"\bexited with exit code|\bexit code \d+$", re.IGNORECASE)  # srun's, which names no cause
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def status(experiment: Experiment) -> list[Run]:
     known = {**dict.fromkeys(experiment.asked), **dict.fromkeys(experiment.traces.outcomes),
              **dict.fromkeys(experiment.traces.progress)}  # fmt: skip
     judged = {one: _judge(experiment, one) for one in known}
-    kept = {run.record for one, run in judged.items() if one in experiment.asked}
+    kept = {run.record for one, run in judged.items() if one in experiment.asked and run.record is not None}
     # A run that was asked for in other words than those in its record is not a second run.
     judged = {one: run for one, run in judged.items() if one in experiment.asked or run.record not in kept}
     lost = {run.job for run in judged.values() if run.state == "lost" and run.job}
@@ -165,15 +166,23 @@ def _explained(experiment: Experiment, one: Identity, run: Run, endings: dict[st
 
 
 def _told(log: Path) -> str:
-    """Return the last line of a log that names a cause, else that speaks of an error, else its last line."""
+    """Return the last line of a log that names a cause, else that speaks of an error, else its last line.
+
+    Of a log that only says by which code something ended, the first line: what a shell said before it.
+    """
+    if not log.is_file():  # a pipe would keep its reader waiting
+        return "(no log)"
     try:
         with log.open("rb") as file:
             file.seek(max(0, log.stat().st_size - 8192))
             lines = [line.strip() for line in file.read().decode(errors="replace").splitlines() if line.strip()]
     except OSError:
         return "(no log)"
-    errors = [match[0] for line in lines if (match := ERROR.search(line))]
+    told = [line for line in lines if not EFFECT.search(line)]
+    errors = [match[0] for line in told if (match := ERROR.search(line))]
     causes = [line for line in errors if CAUSE.search(line)]
+    if not errors and len(told) < len(lines):
+        lines = [*told[:1], *lines][:1]
     return (causes or errors or lines or ["(empty)"])[-1][:200]
 
 

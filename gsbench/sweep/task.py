@@ -1,23 +1,33 @@
 """Do the run of a config that a sweep composed, in whatever process or job the sweep put it."""
 
 import sys
+from dataclasses import dataclass
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, printable
 
 
-def do(composed: DictConfig) -> str | None:
+@dataclass(frozen=True)
+class Problem:
+    """Why a run did not end well."""
+
+    reason: str
+    is_refused: bool  # what was asked for cannot be a run, so that nothing was run and nothing recorded
+
+
+def do(composed: DictConfig) -> Problem | None:
     """Do a run; return why it did not end well, which is on stderr too, or None."""
-    from gsbench.run.run import run  # imports torch
+    from gsbench.run.run import UnrecordedError, run  # imports torch
 
     chosen = HydraConfig.get()
     try:
         record = run(composed, chosen.runtime.choices, chosen.overrides.task)
-        problem = None if record is None or record.status == "ok" else f"{record.status}: {record.reason}"
+        if record is None or record.status == "ok":
+            return None
+        problem = Problem(f"{record.status}: {record.reason}", False)
     except InputError as error:
-        problem = str(error)
-    if problem:
-        print(f"gsbench: error: {composed.scene.name}: {problem}", file=sys.stderr)
+        problem = Problem(str(error), not isinstance(error, UnrecordedError))
+    print(f"gsbench: error: {printable(f'{composed.scene.name}: {problem.reason}')}", file=sys.stderr)
     return problem

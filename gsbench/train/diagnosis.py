@@ -47,7 +47,7 @@ def resembles(model: GaussianModel, index: int) -> str | None:
         "direction_off_the_sphere": "directions" in raw and float(raw["directions"].norm()) > 10,
         "larger_than_the_scene": float(sizes.amax()) > math.log(FAR * max(model.extent, 1e-3)),
         "far_off_axis": float(raw["means"].norm()) > FAR * max(model.extent, 1e-3),
-        "loud_harmonics": max(float(raw["sh0"].abs().amax()), float(raw["shN"].abs().max())) > LOUD,
+        "loud_harmonics": float(torch.cat([raw["sh0"], raw["shN"]]).abs().amax()) > LOUD,  # shN has none at degree 0
         "oversensitive": any(value > math.log(1e3) for value in lambdas),
         "insensitive": any(value < math.log(1e-6) for value in lambdas),
     }

@@ -19,8 +19,9 @@ from tiny_run import ROOT, environment, gsbench, overrides, write_moving_square
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
 from gsbench.run.identity import flat
-from gsbench.sweep import hooks, status
-from gsbench.sweep.plan import FOLDER, Plan, identity, write
+from gsbench.sweep import hooks, plan, status
+from gsbench.sweep.__main__ import main as sweep_main
+from gsbench.sweep.plan import Plan, identity
 from gsbench.sweep.retry import retry
 from gsbench.train import checkpoint
 
@@ -103,6 +104,29 @@ def test_retry_takes_only_settings_of_the_launch(tmp_path: Path) -> None:
     """Catches a retry that may change what its runs are."""
     with pytest.raises(InputError, match=r"launch\.memory=16G, got 'train\.iterations=5'"):
         retry(status.read(tmp_path), ["train.iterations=5"], print)
+    with pytest.raises(InputError, match=r"retry: config key 'launch\.nosuch' is not known"):
+        retry(status.read(tmp_path), ["launch.nosuch=1"], print)
+
+
+def test_retry_passes_over_what_cannot_be_launched(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a stack trace, or a whole retry that ends, for a folder that is gone and words that are not known."""
+    monkeypatch.chdir(tmp_path)
+    experiment, gone = tmp_path / "mini", str(tmp_path / "gone")
+    asked = {
+        gone: ["+exp=mini", "scene=suzanne", "seed=0"],
+        str(tmp_path): ["+exp=mini", "scene=suzanne", "train.iteratons=5", "seed=1"],
+        "/": ["+exp=mini", "seed=[", "seed=2"],
+    }
+    for number, (cwd, words) in enumerate(asked.items()):
+        one = Plan("basic", [words], [], cwd, "elsewhere", 1, 1, 0.0)
+        plan.write(one, experiment / plan.FOLDER / f"2026-11-22_00-00-0{number}.000000")
+    assert sweep_main(["retry", str(experiment)]) == 1  # they are lost as before
+    told = [line for line in capsys.readouterr().err.splitlines() if "cannot be launched again" in line]
+    assert len(told) == 3
+    for line, said in zip(sorted(told), (f"'{gone}'", "Did you mean 'iterations'", "at input '['"), strict=True):
+        assert said in line
 
 
 def test_a_retry_launches_with_the_settings_that_it_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,7 +135,7 @@ def test_a_retry_launches_with_the_settings_that_it_was_given(tmp_path: Path, mo
     experiment = tmp_path / "mini"
     words = ["+exp=mini", "model=4dgs", "seed=3", "launch.memory=8G", "results=elsewhere"]
     asked = Plan("basic", [words], [], str(tmp_path), "elsewhere", 1, 1, 0.0)
-    write(asked, experiment / FOLDER / "2026-11-22_00-00-00.000000")
+    plan.write(asked, experiment / plan.FOLDER / "2026-11-22_00-00-00.000000")
     launched: list[DictConfig] = []
     assert retry(status.read(experiment), ["launch.memory=16G"], launched.append) == 1
     (config,) = launched

@@ -16,6 +16,7 @@ from tiny_run import ROOT
 from gsbench.run import progress
 from gsbench.run.progress import Progress, born
 from gsbench.sweep import plan, show, status
+from gsbench.sweep.__main__ import main
 from gsbench.sweep.plan import Ended, Plan
 from gsbench.sweep.slurm import Queue
 from gsbench.sweep.status import Run
@@ -217,6 +218,53 @@ def test_of_two_traces_of_a_run_the_newer_counts(tmp_path: Path, newer: str) -> 
         at = Progress(WORDS, **HERE, job=None, step=100 - age, steps=400, seconds=5.0, updated=now - age)  # type: ignore[arg-type]
         progress.write(tmp_path / folder, at)
     assert only(tmp_path).step == 100
+
+
+@pytest.mark.parametrize(("of", "state"), [(HERE, "running"), (GONE, "lost")])
+def test_runs_outside_the_plan_are_shown_beside_one_without_a_record(
+    tmp_path: Path, of: dict[str, object], state: str
+) -> None:
+    """Catches a live training that no status shows, and a killed one that is not lost: they were taken for the planned
+    one, which has no record either."""
+    planned(tmp_path)
+    other = tmp_path / "lego" / "7dgs" / "seed1"
+    other.mkdir(parents=True)
+    progress.write(other, Progress(crowd.overrides("7dgs", "lego", 1), **of, steps=400))  # type: ignore[arg-type]
+    found = {run.overrides[-1]: run.state for run in status.status(status.read(tmp_path))}
+    assert found == {"seed=0": "planned", "seed=1": state}
+
+
+def test_no_file_moves_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches escapes of a progress.json or a record that clear the screen, or write a line that gsbench did not."""
+    escape = "\x1b[2J\x07\x9b\r\nall is well"
+    trains(tmp_path, **GONE, overrides=[*WORDS, f"x={escape}"], host=f"a{escape}", job=f"1{escape}", updated=0.0)
+    recorded(tmp_path, overrides=[f"y={escape}"], status="failed", reason=escape, metrics=None, cost=None)
+    assert main(["status", str(tmp_path)]) == 1
+    shown = capsys.readouterr().out
+    assert len(shown.splitlines()) == 3
+    assert all(line.isprintable() for line in shown.splitlines())
+    assert r"x=\x1b[2J" in shown
+
+
+@pytest.mark.parametrize(
+    ("log", "told"),
+    [
+        ("/opt/python: Permission denied\nsrun: error: n1: task 0: Exited with exit code 13\n",
+         "/opt/python: Permission denied"),
+        ("srun: error: n1: task 0: Exited with exit code 13\n", "srun: error: n1: task 0: Exited with exit code 13"),
+        ("loading\nRuntimeError: this\nsrun: error: n1: task 0: Exited with exit code 1\n", "RuntimeError: this"),
+        ("step 5\nslurmd: error: Detected 1 oom_kill event\nstep 6", "slurmd: error: Detected 1 oom_kill event"),
+        ("", "(empty)"),
+    ],
+)  # fmt: skip
+def test_a_log_is_quoted_where_it_names_the_cause(log: str, told: str, tmp_path: Path) -> None:
+    """Catches `exit code 13` alone for a job whose log says in its first line that Python may not be run."""
+    path = tmp_path / "7_0_log.err"
+    path.write_text(log)
+    assert status._told(path) == told
+    path.unlink()
+    os.mkfifo(path)
+    assert status._told(path) == "(no log)"
 
 
 def test_a_run_that_ended_without_a_record_is_failed(tmp_path: Path) -> None:

@@ -1,0 +1,31 @@
+"""Explain in one line why Hydra or OmegaConf refuses a command line or a config."""
+
+import traceback
+
+from hydra.errors import MissingConfigException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from gsbench.errors import did_you_mean
+
+
+def explain(error: Exception) -> str:
+    """Explain an error of Hydra or OmegaConf in one line that names the key and the nearest valid one."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        if group == "hydra/launcher":
+            return "+launch=slurm and +launch=parallel need packages of their own: pip install 'gsbench[cluster]'"
+        return f"{group} '{name}' is not known. {did_you_mean(name, error.options)}"
+    cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
+    if isinstance(cause, OmegaConfBaseException) and cause.key is not None and cause.parent_node is not None:
+        keys = [str(key) for key in cause.parent_node] if isinstance(cause.parent_node, DictConfig) else []
+        if keys and cause.key not in keys:
+            return f"config key '{cause.full_key}' is not known. {did_you_mean(str(cause.key), keys)}"
+        return f"config key '{cause.full_key}': {str(cause).splitlines()[0]}"
+    return " ".join(str(error).split())
+
+
+def raised_by_hydra(error: Exception) -> bool:
+    """Tell whether an error comes from the insides of Hydra: it takes some words for what they cannot be."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    return str(frame.f_globals.get("__name__")).partition(".")[0] in ("hydra", "omegaconf", "antlr4")
