@@ -237,7 +237,7 @@ def test_runs_outside_the_plan_are_shown_beside_one_without_a_record(
 def test_no_file_moves_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches escapes of a progress.json or a record that clear the screen, or write a line that gsbench did not."""
     escape = "\x1b[2J\x07\x9b\r\nall is well"
-    trains(tmp_path, **GONE, overrides=[*WORDS, f"x={escape}"], host=f"a{escape}", job=f"1{escape}", updated=0.0)
+    trains(tmp_path, overrides=[*WORDS, f"x={escape}"], host=f"a{escape}", updated=0.0)
     recorded(tmp_path, overrides=[f"y={escape}"], status="failed", reason=escape, metrics=None, cost=None)
     assert main(["status", str(tmp_path)]) == 1
     shown = capsys.readouterr().out
