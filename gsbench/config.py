@@ -87,6 +87,7 @@ class DensifyConfig:
     grad_threshold: float = 2e-4  # mean gradient of a 2D mean, in units of half the image
     clone_below: float = 0.01  # clone if the largest scale is below this part of the extent, else split
     prune_above: float = 0.1  # prune if it is above this part, after the first opacity reset
+    max_gaussians: int | None = None  # more are not made: those of the largest gradients come first; None: 2,000,000
 
 
 @dataclass

@@ -42,6 +42,7 @@ RANGES = {  # of numbers that the schema types but does not bound, both ends inc
     "train.densify.grad_threshold": (0, math.inf),
     "train.densify.clone_below": (0, math.inf),
     "train.densify.prune_above": (0, math.inf),
+    "train.densify.max_gaussians": (LEAST_GAUSSIANS, ENDLESS),
     "train.curve_points": (1, ENDLESS),
     "train.checkpoint_minutes": (0, ENDLESS),
     "model.min_opacity": (0, 0.25),  # a reset lowers opacities to twice as much

@@ -19,7 +19,7 @@ from gsbench.models import GaussianModel
 from gsbench.scenes import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.train.checkpoint import whole_number
-from gsbench.train.density import DensityControl
+from gsbench.train.density import MOST_GAUSSIANS, DensityControl
 from gsbench.train.draws import batch, generator
 from gsbench.train.floor import Floor
 from gsbench.train.gating import NO_GATES, Gating
@@ -76,6 +76,7 @@ class Trainer:
         self.curve = Curve()
         self.best = Best()
         self.step = 0
+        self._is_full = False  # whether there were as many Gaussians as there may be
 
     def run(
         self, save: Callable[[dict[str, Any]], None], label: str, goes_on: Callable[[], bool] = lambda: True
@@ -155,12 +156,21 @@ class Trainer:
             self.floor.hold()
         with stages("density"):
             if self.schedule.densifies(step):
-                self.density.densify(generator(self.config.seed, step), self.schedule.has_reset(step))
+                refused = self.density.densify(generator(self.config.seed, step), self.schedule.has_reset(step))
+                self._tell_full(refused)
             if (step + 1) % self.schedule.densify_every == 0:
                 self.floor.update()
         if self.config.effects.gate == "both" and self.schedule.gates(step):
             with stages("gate"):
                 self.gating.in_training(step + 1)
+
+    def _tell_full(self, refused: int) -> None:
+        """Say once that no more Gaussians are made than the config allows."""
+        if refused and not self._is_full:
+            self._is_full = True
+            most = self.config.train.densify.max_gaussians or MOST_GAUSSIANS
+            tqdm.write(f"step {self.step + 1}: {most} Gaussians are the most that train.densify.max_gaussians allows: "
+                       f"{refused} of smaller gradients are not cloned or split", file=sys.stderr)  # fmt: skip
 
     def _measure(self) -> None:
         """Add a point to the curve; its seconds belong to no stage and so do not count as training time."""

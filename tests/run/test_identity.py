@@ -1,5 +1,6 @@
 """A run's name: made of what its training reads, equal for equal trainings, and fit for a folder."""
 
+import copy
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from gsbench.config import CONF, register_schema
-from gsbench.run.identity import LONGEST_VARIANT, Run, flat, identify, training_hash, training_part
+from gsbench.run.identity import LONGEST_VARIANT, Run, flat, identify, is_same, training_hash, training_part
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -99,8 +100,19 @@ def test_every_key_is_of_training_or_of_measuring() -> None:
         "model.agr_octaves", "model.sh_degree", "model.min_opacity", *(f"train.{name}" for name in (
             "iterations", "recipe_iterations", "batch_size", "ssim_weight", "sh_every", "refine_from",
             "modulation_from", "curve_points", *(f"densify.{name}" for name in (
-                "start", "stop", "every", "rounds", "reset_every", "grad_threshold", "clone_below", "prune_above")))),
+                "start", "stop", "every", "rounds", "reset_every", "grad_threshold", "clone_below", "prune_above",
+                "max_gaussians")))),
     }  # fmt: skip
+
+
+def test_a_cap_on_gaussians_is_training_and_none_changes_no_older_run() -> None:
+    """Catches a new key that trains every finished run again, and a budget that shares a folder with no budget."""
+    run, capped = named("model=3dgs"), named("model=3dgs", "train.densify.max_gaussians=50000")
+    older = copy.deepcopy(run.plain)
+    del older["train"]["densify"]["max_gaussians"]
+    assert training_hash(older) == training_hash(run.plain) != training_hash(capped.plain)
+    assert is_same(older, run.plain)
+    assert (run.variant, capped.variant) == ("", "densify.max_gaussians=50000")
 
 
 def test_long_names_are_cut_at_a_word_and_stay_different() -> None:

@@ -119,6 +119,29 @@ def test_density_control_clones_small_splits_large_prunes_faint() -> None:
     descend(model, optimizer, 1)
 
 
+def test_no_more_gaussians_than_the_cap_and_the_largest_gradients_first() -> None:
+    """Catches a threshold of 0 that makes 3.3 million Gaussians in 21 steps, and a cap that depends on the rows' order
+    in a sort that is not stable, or takes the first rows whatever their gradients."""
+    model, optimizer = fitted(6)
+    config = DensifyConfig(grad_threshold=0.0, max_gaussians=9)
+    control = DensityControl(model, optimizer, config, min_opacity=0.01, views=3)
+    with torch.no_grad():
+        model.splats["scales"].fill_(math.log(0.001))
+        model.splats["opacities"].fill_(0.0)
+        model.splats["means"].copy_(torch.arange(6.0)[:, None].expand(6, 3))
+    gradients = torch.zeros(6, 2)
+    gradients[:, 0] = torch.tensor([0.0, 0.2, 0.1, 0.3, 0.2, 0.2])
+    control.observe(*drawn_with(gradients), width=10, height=10, views=1)
+    assert control.densify(torch.Generator(), prune_large=False) == 2
+    assert model.splats["means"].detach()[:, 0].tolist() == [0, 1, 2, 3, 4, 5, 1, 3, 4]
+    control.observe(*drawn_with(torch.ones(9, 2)), width=10, height=10, views=1)
+    assert control.densify(torch.Generator(), prune_large=False) == 9
+    control.config = DensifyConfig(grad_threshold=0.0, max_gaussians=5)  # fewer than a file to start from has
+    control.observe(*drawn_with(torch.ones(9, 2)), width=10, height=10, views=1)
+    assert control.densify(torch.Generator(), prune_large=False) == 9
+    assert len(model) == 9
+
+
 def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
     """Catches dead weight that stays, Gaussians dropped before every view has looked, and miscounted rows."""
     model, optimizer = fitted(4)
