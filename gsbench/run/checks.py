@@ -57,6 +57,15 @@ RANGES = {  # of numbers that the schema types but does not bound, both ends inc
 
 def check_config(config: Config) -> None:
     """Raise InputError for a value of the config that no run can have on this machine."""
+    check_values(config)
+    check_device(config.device)
+    resolve(config.raster.backend, torch.device(config.device).type)
+    for backbone, file in lpips_weights(config).items():
+        perceptual.load(backbone, file, config.device)
+
+
+def check_values(config: Config) -> None:
+    """Raise InputError for a value of the config that no run can have on any machine."""
     check_keys(config, Config, "")
     _check_choice("data.background", config.data.background, BACKGROUNDS)
     _check_choice("scene.eval_split", config.scene.eval_split, SPLITS)
@@ -71,10 +80,6 @@ def check_config(config: Config) -> None:
             raise InputError(f"{key}: expected {expected}, got {value}")
     for name, rate in config.model.lr.items():
         _check_rate(f"model.lr.{name}", rate)
-    check_device(config.device)
-    resolve(config.raster.backend, torch.device(config.device).type)
-    for backbone, file in lpips_weights(config).items():
-        perceptual.load(backbone, file, config.device)
 
 
 def trained_start(config: Config) -> TrainedGaussians | None:

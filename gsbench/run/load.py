@@ -6,19 +6,24 @@ from typing import Any
 
 import torch
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import Config
-from gsbench.errors import InputError
+from gsbench.errors import InputError, one_line
+from gsbench.measure import record as records
 from gsbench.measure.schema import parse
 from gsbench.models import GaussianModel
 from gsbench.models.registry import is_registered
+from gsbench.run.checks import check_values
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Scene
 from gsbench.scenes.scene import Points
 from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
 from gsbench.train.draws import generator
+
+PACKAGE, EMBEDDED = "pkg://", "pkg://gsbench.scenes.sample"
+MOST_PIXELS = 1 << 16  # a side
+LARGEST_EXTENT = 1e18  # world units: squares stay finite in single precision
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,7 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     config = typed_config(found.config, path)
     config.device, config.raster.backend = device, backend
     scene = parse(SceneDescription, found.scene, str(path))
+    _check_scene(scene, path)
     model = build(config)
     points = torch.eye(4, 3)  # as few as there can be; `load_state` replaces them
     model.initialise(Points(points, points), scene.extent, generator(config.seed))
@@ -92,8 +98,10 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     try:
         model.load_state(found.state["model"])
         step = checkpoint.whole_number("step", found.state["step"], config.train.iterations)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: expected a training's state, it lacks {error}") from None
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # a part may be of any type
+        raise InputError(f"{path}: expected a training's state, it lacks {one_line(error)!s:.200}") from None
     schedule = Schedule(config.train, config.model.sh_degree, config.agr)
     model.set_phase(schedule.phase(max(0, step - 1)))
     return LoadedRun(model.requires_grad_(False), config, scene, step, Path(folder))
@@ -109,7 +117,8 @@ def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
     Raises:
         InputError: the data are gone, have a fault, or are others than those of the training.
     """
-    config = replace(run.config, data=replace(run.config.data, root=data_root or run.config.data.root))
+    root = data_root or own_root(run.config.data.root, run.folder)
+    config = replace(run.config, data=replace(run.config.data, root=root))
     try:
         scene = load_scene(config)
     except InputError as error:
@@ -120,24 +129,68 @@ def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
     return scene
 
 
+def own_root(root: str, where: Path) -> str:
+    """Return the data.root that a checkpoint names, where no one else names one.
+
+    Raises:
+        InputError: it is a package other than that of the embedded scenes: to look for its files would import it.
+    """
+    if root.startswith(PACKAGE) and root != EMBEDDED:
+        raise InputError(f"{where}: expected data in a folder or in {EMBEDDED}, its checkpoint names {root!r:.80}, "
+                         f"which would be imported: if you trust it, name it by --data-root")  # fmt: skip
+    return root
+
+
+def _check_scene(scene: SceneDescription, path: Path) -> None:
+    """Raise InputError unless a description is of a scene that can be rendered."""
+    sizes = 0 < scene.width <= MOST_PIXELS and 0 < scene.height <= MOST_PIXELS
+    if not sizes or not 0 < scene.extent < LARGEST_EXTENT:
+        raise InputError(f"{path}: scene: expected 1 to {MOST_PIXELS} pixels a side and a positive extent, got "
+                         f"{scene.width}x{scene.height} and {scene.extent}")  # fmt: skip
+    if len(scene.background) != 3 or not all(0 <= value <= 1 for value in scene.background):
+        raise InputError(
+            f"{path}: scene: expected a background of three numbers in [0, 1], got {scene.background!r:.80}"
+        )
+
+
 def plain_description(scene: Scene) -> dict[str, Any]:
     """Describe a scene in plain values, as a checkpoint holds it."""
     return asdict(SceneDescription.of(scene))
 
 
 def typed_config(plain: dict[str, Any], path: Path) -> Config:
-    """Type the plain config of a checkpoint; raises InputError where it is not one.
+    """Type the plain config of a checkpoint.
 
     A checkpoint is untrusted, so that the module it names for its model is never imported: the user does it.
+
+    Raises:
+        InputError: it is none, has a value that no run has, or a name that could lead out of the folder of the data.
     """
     try:
-        typed = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.create(plain))
+        typed = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.create(_without_interpolations(plain)))
         config: Config = OmegaConf.to_object(typed)  # type: ignore[assignment]
-    except (OmegaConfBaseException, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: expected the config of a run: {str(error).splitlines()[0]}") from None
+    except Exception as error:  # OmegaConf raises many kinds, some of them its own
+        raise InputError(f"{path}: expected the config of a run: {one_line(error)[:200]}") from None
+    names = [config.scene.name] + ([config.scene.released_as] if config.scene.released_as else [])
+    try:
+        check_values(config)
+        for name in names:
+            records.run_path(Path(), config.experiment, name, config.model.name, config.seed)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     module, config.model.module = config.model.module, None
     if module is not None and not is_registered(config.model.name):
         raise InputError(f"{path}: expected a model that is known, got '{config.model.name}' of the module "
                          f"{module!a:.80}, which a checkpoint cannot import: do it by --model-module, or `import` it "
                          f"before load_run")  # fmt: skip
     return config
+
+
+def _without_interpolations(value: Any) -> Any:
+    """Refuse text that OmegaConf would resolve: `${oc.env:NAME}` reads the environment of whoever loads it."""
+    if isinstance(value, str) and "${" in value:
+        raise ValueError(f"expected resolved values, got {value!r:.80}")
+    for key, one in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+        _without_interpolations(key)
+        _without_interpolations(one)
+    return value

@@ -9,7 +9,7 @@ from gsbench.measure.record import Record
 from gsbench.run.attempt import Attempt
 from gsbench.run.checks import check_folder
 from gsbench.run.identity import Plain, Run, training_hash
-from gsbench.run.load import typed_config
+from gsbench.run.load import own_root, typed_config
 from gsbench.run.run import write
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
@@ -31,13 +31,12 @@ def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tu
         raise InputError(f"{folder}: expected the folder of a run with a {checkpoint.FILE_NAME}, found none")
     found = checkpoint.read(path)
     plain: Plain = copy.deepcopy(found.config)
-    if plain.get("effects", {}).get("gate", "off") != "off":
-        raise InputError(f"{folder}: expected a run that was not gated at its end, got effects.gate="
-                         f"{plain['effects']['gate']}")  # fmt: skip
+    gate = typed_config(plain, path).effects.gate
+    if gate != "off":
+        raise InputError(f"{folder}: expected a run that was not gated at its end, got effects.gate={gate}")
     plain["effects"] = {"gate": "end", "budget_db": budget_db}
-    if data_root is not None:
-        plain["data"] = plain["data"] | {"root": data_root}
     config = typed_config(plain, path)
+    config.data.root = plain["data"]["root"] = data_root or own_root(config.data.root, folder)
     old = records.read(folder / records.FILE_NAME)
     words = ["gate=end"] + ([] if budget_db == 0.05 else [f"budget_db={budget_db}"])
     variant = ",".join(([old.variant] if old.variant else []) + words)

@@ -2,18 +2,16 @@
 
 import hashlib
 import io
-import pickle
 import stat
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import torch
 from torch import Tensor
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, TooLargeError, one_line
 from gsbench.measure.atomic import write_atomically
 
 MAGIC = b"gsbench checkpoint 4\n"  # then the SHA-256 of the rest in hex and a line feed, then what torch.save writes
@@ -69,17 +67,50 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
         if digest != hashlib.sha256(payload).hexdigest().encode() + b"\n":
             raise _fault(path, "a damaged one: its SHA-256 is not the one written with it")
         content = torch.load(io.BytesIO(payload), map_location=device, weights_only=True)
+        check_plain(content, len(payload))
         found = Checkpoint(**content)
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError, EOFError, BadZipFile,
-            pickle.UnpicklingError) as error:  # fmt: skip
-        if isinstance(error, InputError):
-            raise
-        raise _fault(path, str(error).splitlines()[0] if str(error) else type(error).__name__) from None
+    except InputError:
+        raise
+    except (MemoryError, torch.OutOfMemoryError):
+        raise TooLargeError(f"{path}: expected a checkpoint that fits into memory, its {len(payload)} bytes do not: "
+                            f"use a machine with more") from None  # fmt: skip
+    except Exception as error:  # a pickle whose bytes are hostile can make its reader raise anything
+        raise _fault(path, one_line(error)[:200]) from None
     for name, value in vars(found).items():
         expected = str if name in ("training", "data") else dict
         if not isinstance(value, expected):
             raise _fault(path, f"'{name}' as {type(value).__name__}")
     return found
+
+
+def check_plain(value: object, most: int) -> None:
+    """Check that a loaded state is made of containers, numbers, text and tensors that hold what they claim.
+
+    Args:
+        value: the state.
+        most: bytes of the file, which no tensor in it can exceed.
+
+    Raises:
+        InputError: it holds something else, or a tensor without memory of its own.
+        RecursionError: a container is in itself.
+    """
+    if isinstance(value, Tensor):
+        kind = "a sparse one" if value.layout != torch.strided else f"one on '{value.device.type}'"
+        if value.layout != torch.strided or value.device.type == "meta" or value.is_quantized:
+            raise InputError(f"checkpoint: expected dense tensors, got {kind}")
+        if value.numel() * value.element_size() > most:
+            raise InputError(f"checkpoint: expected tensors of at most {most} bytes, as many as the file has, "
+                             f"got one of shape {list(value.shape)!s:.80}")  # fmt: skip
+    elif isinstance(value, dict):
+        for key, one in value.items():
+            if not isinstance(key, str | int):
+                raise InputError(f"checkpoint: expected names as keys, got {key!r:.80}")
+            check_plain(one, most)
+    elif isinstance(value, list | tuple):
+        for one in value:
+            check_plain(one, most)
+    elif not (value is None or isinstance(value, str | int | float)):
+        raise InputError(f"checkpoint: expected containers, numbers, text and tensors, got {type(value).__name__}")
 
 
 def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
@@ -95,7 +126,7 @@ def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -
         InputError: it is missing, or its shape or type is not that of this training.
     """
     value = state.get(name) if isinstance(state, dict) else None
-    if not isinstance(value, Tensor) or value.layout != torch.strided:
+    if not isinstance(value, Tensor) or value.layout != torch.strided or value.device.type == "meta":
         raise InputError(f"checkpoint: expected '{name}' as a tensor, got {type(value).__name__}")
     if value.dtype != dtype or tuple(value.shape) != tuple(shape):
         raise InputError(f"checkpoint: expected '{name}' as {dtype} of shape {list(shape)}, "

@@ -167,6 +167,8 @@ class Gating:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from the `state_dict` of a checkpoint, once the model is loaded; raises InputError if it is none."""
+        if not isinstance(state, dict):
+            raise InputError(f"checkpoint: expected 'gating' as a dict, got {type(state).__name__}")
         gates, notes = state["gates"], state["notes"]
         if not isinstance(gates, list) or not isinstance(notes, list) or not all(isinstance(x, str) for x in notes):
             raise InputError("checkpoint: expected lists of gates and notes")

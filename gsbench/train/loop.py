@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gsbench.config import Config
-from gsbench.errors import InputError
+from gsbench.errors import InputError, one_line
 from gsbench.measure.curve import Curve
 from gsbench.measure.speed import Effort, StageClock
 from gsbench.models import GaussianModel
@@ -231,8 +231,8 @@ class Trainer:
             self.effort.load_state_dict(state.get("effort"))
             self.curve.load_state_dict(state["curve"])
             self.best = Best(**state["best"])
-        except InputError:
+        except (InputError, MemoryError):
             raise
-        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            raise InputError(f"checkpoint: expected the state of this training: {error!r:.200}") from None
+        except Exception as error:  # a part may be of any type
+            raise InputError(f"checkpoint: expected the state of this training: {one_line(error)!r:.200}") from None
         self.model.set_phase(self.schedule.phase(max(0, self.step - 1)))

@@ -1,7 +1,13 @@
 """Hostile checkpoints: any flipped bit and any misshapen tensor is one line, never a crash or a wrong continuation."""
 
+import hashlib
+import io
 import random
-from collections.abc import Callable
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +17,8 @@ from tiny_run import gsbench, overrides, write_moving_square
 
 from gsbench.errors import InputError
 from gsbench.measure import record
-from gsbench.run.load import load_run
+from gsbench.run.load import load_run, scene_of
+from gsbench.run.regate import gate_run
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes.points import random_points
 from gsbench.train import checkpoint
@@ -66,7 +73,7 @@ def harm(draw: random.Random) -> Callable[[Any], Any]:
                 lambda: value[:-1] if value.dim() else value[None], lambda: value.to(torch.float16),
                 lambda: value.double(), lambda: value[None], lambda: value.new_zeros(0), lambda: value.to_sparse(),
                 lambda: torch.zeros(1).expand((*value.shape[:1], 7) if value.dim() else (3,)), lambda: "text",
-                lambda: None, lambda: value.flatten()[: value.numel() // 2],
+                lambda: None, lambda: value.flatten()[: value.numel() // 2], lambda: value.to("meta"),
             ]  # fmt: skip
             return draw.choice(wrong)()
         return draw.choice((None, "text", -1, 10**30, [], {}, torch.zeros(3)))
@@ -115,6 +122,123 @@ def test_every_flipped_bit_is_noticed(folder: Path, tmp_path: Path) -> None:
         path.write_bytes(damaged)
         with pytest.raises(InputError, match=r"expected a checkpoint, got"):
             checkpoint.read(path)
+
+
+def rewritten(folder: Path, to: Path, **changed: Any) -> Path:
+    """Write the checkpoint of a run into another folder, with some of its parts changed and the right SHA-256."""
+    checkpoint.save(to / checkpoint.FILE_NAME, replace(checkpoint.read(folder / checkpoint.FILE_NAME), **changed))
+    return to
+
+
+HOSTILE_STATES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "a tensor without memory": lambda state: replaced(state, ("model", "splats.means"), lambda x: x.to("meta")),
+    "a moment without memory": lambda state: replaced(state, ("density", "unseen"), lambda x: x.to("meta")),
+    "a tensor that claims 4 TB": lambda state: replaced(
+        state, ("model", "splats.means"), lambda _: torch.zeros(1).expand(10**12, 3)
+    ),
+    "gates as a tensor": lambda state: {**state, "gating": torch.zeros(3)},
+    "gates as a list": lambda state: {**state, "gating": [1]},
+    "a container in itself": lambda state: endless(state),
+    "text for a state": lambda state: {**state, "model": "splats.means"},
+    "a key that is a tensor": lambda state: {**state, "density": {torch.zeros(1): 1}},
+}
+
+
+def endless(state: dict[str, Any]) -> dict[str, Any]:
+    """A state with a list that holds itself."""
+    own: list[Any] = []
+    own.append(own)
+    return {**state, "gating": own}
+
+
+@pytest.mark.parametrize("name", HOSTILE_STATES)
+def test_hostile_states_with_the_right_hash_are_one_line(name: str, folder: Path, tmp_path: Path) -> None:
+    """Catches what a hash does not: someone else has written the file, hash and all."""
+    fitted, found = trainer(folder), checkpoint.read(folder / checkpoint.FILE_NAME)
+    path = rewritten(folder, tmp_path, state=HOSTILE_STATES[name](found.state)) / checkpoint.FILE_NAME
+    with pytest.raises(InputError) as caught:
+        fitted.load_state_dict(checkpoint.read(path).state)
+    assert str(caught.value).isprintable()
+
+
+def is_refused(folder: Path, what: str) -> bool:
+    """Whether a run is refused in one line; any other error is a failure that says what was tried."""
+    try:
+        load_run(folder)
+    except InputError as error:
+        if "\n" in str(error):
+            raise AssertionError(f"{what}: {error}") from error
+        return True
+    except Exception as error:
+        raise AssertionError(f"{what}: {type(error).__name__}: {error}") from error
+    return False
+
+
+def test_any_byte_of_a_pickle_is_one_line(folder: Path, tmp_path: Path) -> None:
+    """Catches an opcode that makes the reader of pickles raise an error of its own."""
+    payload = (folder / checkpoint.FILE_NAME).read_bytes()[len(checkpoint.MAGIC) + checkpoint.DIGEST + 1 :]
+    path, draw = tmp_path / checkpoint.FILE_NAME, random.Random(1)
+    with zipfile.ZipFile(io.BytesIO(payload)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    (pickled,) = (name for name in members if name.endswith("data.pkl"))
+    for case in range(SAMPLE):
+        damaged = bytearray(members[pickled])
+        for _ in range(draw.choice((1, 1, 3))):
+            damaged[draw.randrange(len(damaged))] = draw.randrange(256)
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+            for name, content in members.items():
+                archive.writestr(name, bytes(damaged) if name == pickled else content)
+        digest = hashlib.sha256(buffer.getbuffer()).hexdigest().encode()
+        path.write_bytes(b"".join((checkpoint.MAGIC, digest, b"\n", buffer.getvalue())))
+        is_refused(tmp_path, f"case {case}")
+
+
+def test_a_checkpoint_names_no_package_to_import(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches data.root=pkg://MODULE of a checkpoint, which imported that module, and names that leave the data."""
+    (tmp_path / "evil").mkdir()
+    (tmp_path / "evil" / "__init__.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    config = checkpoint.read(folder / checkpoint.FILE_NAME).config
+    hostile = {**config, "data": {**config["data"], "root": "pkg://evil"}}
+    run = load_run(rewritten(folder, tmp_path, config=hostile))
+    with pytest.raises(InputError, match=r"names 'pkg://evil', which would be imported.*--data-root"):
+        scene_of(run)
+    (tmp_path / record.FILE_NAME).write_bytes((folder / record.FILE_NAME).read_bytes())
+    with pytest.raises(InputError, match="names 'pkg://evil'"):
+        gate_run(tmp_path, 0.05)
+    assert "evil" not in sys.modules
+    assert scene_of(run, config["data"]["root"]).name == "square"  # what the user names is taken
+    for names in ({"name": "../square"}, {"released_as": "/etc"}, {"released_as": "a/../.."}):
+        hostile = {**config, "scene": {**config["scene"], **names}}
+        with pytest.raises(InputError, match="scene: expected a name"):
+            load_run(rewritten(folder, tmp_path, config=hostile))
+
+
+VALUES = (None, -1, 0, 10**30, 1e300, "", "text", "../..", "${oc.env:HOME}", "${seed}", "\0", "???", [], {}, [1], True)
+
+
+def test_any_value_in_a_config_or_a_scene_is_one_line(folder: Path) -> None:
+    """Catches a division by recipe_iterations=0, and every other value that no run of gsbench has written."""
+    found, draw = checkpoint.read(folder / checkpoint.FILE_NAME), random.Random(2)
+    cases = [(part, path, draw.choice(VALUES)) for part in ("config", "scene")
+             for path in leaves(getattr(found, part)) if path]  # fmt: skip
+    never = [("config", ("train", "recipe_iterations"), 0), ("config", ("model", "options", "agr"), 1)]
+    cases = [*draw.sample(cases, SAMPLE), *never]
+    refused = 0
+    for part, path, value in cases:
+        state = replaced(getattr(found, part), path, lambda _, value=value: value)
+        with monkeyread(Checkpoint(**{**vars(found), part: state})):
+            refused += is_refused(folder, f"{part} {path} = {value!r}")
+    assert refused > 0.4 * len(cases)
+
+
+@contextmanager
+def monkeyread(content: Checkpoint) -> Iterator[None]:
+    """Let the reader find `content`, without writing a file for each case."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(checkpoint, "read", lambda *_: content)
+        yield
 
 
 def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
