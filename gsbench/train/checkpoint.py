@@ -17,6 +17,10 @@ from gsbench.measure.atomic import write_atomically
 MAGIC = b"gsbench checkpoint 4\n"  # then the SHA-256 of the rest in hex and a line feed, then what torch.save writes
 FILE_NAME = "checkpoint.pt"
 DIGEST = 64  # hex digits
+# Keys of a training's state. Every training of a seed ends with the same bits in these, interrupted or not ..
+REPRODUCED = frozenset({"step", "model", "optimizer", "density", "floor", "gating", "best"})
+# .. and no two have the same seconds: the state without these keys, at any depth, is what can be compared.
+TIMES = frozenset({"stages", "effort", "curve", "seconds", "frame_ms_before", "frame_ms", "frame_ms_without"})
 
 
 @dataclass(frozen=True)
@@ -111,6 +115,13 @@ def check_plain(value: object, most: int) -> None:
             check_plain(one, most)
     elif not (value is None or isinstance(value, str | int | float)):
         raise InputError(f"checkpoint: expected containers, numbers, text and tensors, got {type(value).__name__}")
+
+
+def without_times(state: Any) -> Any:
+    """Return a training's state without its TIMES: two trainings of one seed are equal to the bit in what is left."""
+    if isinstance(state, dict):
+        return {key: without_times(value) for key, value in state.items() if key not in TIMES}
+    return [without_times(value) for value in state] if isinstance(state, (list, tuple)) else state
 
 
 def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -> Tensor:

@@ -286,12 +286,11 @@ def differences(reference: Path, results: Path) -> list[str]:
     return found
 
 
-def checkpoint(path: Path) -> dict[str, Any]:
-    """The state in a checkpoint, less its seconds."""
-    from gsbench.train.checkpoint import read
+def checkpoint(path: Path) -> Any:
+    """The state in a checkpoint, less its times."""
+    from gsbench.train.checkpoint import read, without_times
 
-    state = read(path).state
-    return {key: value for key, value in state.items() if key not in ("stages", "curve")}
+    return without_times(read(path).state)
 
 
 def equal(one: Any, other: Any) -> bool:
@@ -300,7 +299,7 @@ def equal(one: Any, other: Any) -> bool:
         return isinstance(other, torch.Tensor) and one.dtype == other.dtype and torch.equal(one, other)
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
-    if isinstance(one, (list, tuple)):
+    if isinstance(one, list):
         return len(one) == len(other) and all(map(equal, one, other))
     return bool(one == other)
 
