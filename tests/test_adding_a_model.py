@@ -7,9 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from tiny_run import ROOT, environment, overrides, write_moving_square
 
 from gsbench.measure import record
+from gsbench.measure.record import Record
+from gsbench.scenes.trained import ply_of, read_trained
 
 
 def blocks() -> dict[str, str]:
@@ -20,28 +23,112 @@ def blocks() -> dict[str, str]:
     return dict(found)
 
 
-def test_the_worked_example_trains_with_and_without_agr(tmp_path: Path) -> None:
-    """Catches documentation that no longer runs: a copy of the project, the page's two files, a short run of each."""
-    project = tmp_path / "project"
+def methods_for_gates() -> str:
+    """The methods that the page adds to the example so that gates can simplify it."""
+    page = (ROOT / "docs" / "adding_a_model.md").read_text()
+    (found,) = re.findall(r"^```py\n(    def still.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    return str(found)
+
+
+# An editable install finds gsbench by a hook that goes before PYTHONPATH; the copy is what is to be run.
+START = (
+    "import runpy, sys\n"
+    "sys.meta_path[:] = [finder for finder in sys.meta_path if 'Redirecting' not in type(finder).__name__]\n"
+    "runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
+)
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the project with the page's two files; `gated_balls`, which have the page's two methods for gates, and
+    `blinks`, which are balls that are said to observe time."""
+    project = tmp_path_factory.mktemp("project")
     shutil.copytree(ROOT / "gsbench", project / "gsbench", ignore=shutil.ignore_patterns("__pycache__", "moving-matte"))
     shutil.copytree(ROOT / "conf", project / "conf")
     for path, text in blocks().items():
         (project / path).write_text(text)
-    data, results = write_moving_square(tmp_path / "data"), tmp_path / "results"
-    # An editable install finds gsbench by a hook that goes before PYTHONPATH; the copy is what is to be run.
-    start = (
-        "import runpy, sys\n"
-        "sys.meta_path[:] = [finder for finder in sys.meta_path if 'Redirecting' not in type(finder).__name__]\n"
-        "runpy.run_module('gsbench', run_name='__main__', alter_sys=True)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", start, "-m", *overrides(data, results, "model=balls", "agr=true,false")],
+        blinks = text.replace('"balls"', '"blinks"').replace("name: balls", "name: blinks")
+        blinks = blinks.replace("    geometry =", '    observes = ("time",)\n    geometry =')
+        (project / path.replace("balls", "blinks")).write_text(blinks)
+        gated = text.replace('"balls"', '"gated_balls"').replace("name: balls", "name: gated_balls")
+        gated = gated.replace("import math\n", "import math\nfrom collections.abc import Sequence\n")
+        gated = gated.replace("import SHRINK, Conditioned, GaussianModel, Raw\n",
+                              "import SHRINK, Conditioned, Raw\nfrom gsbench.models.gated import GatedModel\n")  # fmt: skip
+        gated = gated.replace("(GaussianModel)", "(GatedModel)")
+        more = "\n" + methods_for_gates() if path.endswith(".py") else ""
+        (project / path.replace("balls", "gated_balls")).write_text(gated + more)
+    return project
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_square(tmp_path_factory.mktemp("data"))
+
+
+def run(project: Path, module: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a module of the copy."""
+    return subprocess.run(
+        [sys.executable, "-c", START, module, *words],
         capture_output=True, text=True, cwd=project, check=False,
         env={**environment(), "PYTHONPATH": os.fspath(project)},
     )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def gated(project: Path, data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of the page's model with gates and of `blinks`, with and without AGR, gated at the end."""
+    words = ("model=gated_balls,blinks", "agr=true,false", "effects.gate=end")
+    results = tmp_path_factory.mktemp("gated")
+    done = run(project, "gsbench", "-m", *overrides(data, results, *words))
+    assert "Traceback" not in done.stderr, done.stderr
+    return results
+
+
+def records(results: Path) -> dict[str, Record]:
+    return {found.model: found for found in map(record.read, record.find(results))}
+
+
+def test_the_worked_example_trains_with_and_without_agr_and_is_gated(gated: Path) -> None:
+    """Catches documentation that no longer runs: a copy of the project, the page's two files, a short run of each."""
+    found = records(gated)
+    for label in ("gated_balls", "gated_balls_agr"):
+        assert found[label].status == "ok", found[label].reason
+        assert found[label].on_demand is not None
+        assert found[label].on_demand.gates
+
+
+def test_a_model_that_cannot_be_gated_is_refused_before_step_0(gated: Path) -> None:
+    """Catches a training that is lost at its gate, after the last step, to a method that the model lacks."""
+    found = records(gated)
+    for label in ("blinks", "blinks_agr"):
+        assert found[label].status == "failed"
+        assert found[label].reason == (
+            "effects.gate=end: expected a model that gates can simplify, blinks is no GatedModel: make it one "
+            "(docs/adding_a_model.md), or leave effects.gate=off"
+        )
+        assert not found[label].curve
+
+
+def test_export_start_from_a_ply_and_a_nan(project: Path, data: Path, gated: Path, tmp_path: Path) -> None:
+    """Catches what asks a model for parameters that only ours have: the PLY, what starts from it, a NaN's report.
+
+    The second PLY is so bright that the loss of its first image is not finite.
+    """
+    (folder,) = gated.glob("*/*/gated_balls,*/seed0")
+    done = run(project, "gsbench.export", str(folder), "--ply", str(tmp_path / "balls.ply"))
     assert done.returncode == 0, done.stderr
-    labels = {record.read(path).model for path in record.find(results)}
-    assert labels == {"balls", "balls_agr"}
+    trained = read_trained(tmp_path / "balls.ply")
+    trained.dc.fill_(1e20)
+    (tmp_path / "bright.ply").write_bytes(ply_of(trained))
+    start = f"+init.ply={tmp_path}/balls.ply,{tmp_path}/bright.ply"
+    done = run(project, "gsbench", "-m", *overrides(data, tmp_path / "started", "model=balls,blinks", start))
+    assert "Traceback" not in done.stderr, done.stderr
+    found = [record.read(path) for path in record.find(tmp_path / "started")]
+    assert sorted((one.model, one.status) for one in found) == [
+        ("balls", "diverged"), ("balls", "ok"), ("blinks", "diverged"), ("blinks", "ok")
+    ]  # fmt: skip
+    for one in found:
+        assert one.status == "ok" or "it resembles the stability case 'loud_harmonics'" in str(one.reason)
 
 
 def test_the_example_passes_the_linters(tmp_path: Path) -> None:

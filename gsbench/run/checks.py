@@ -16,6 +16,7 @@ from gsbench.measure import perceptual
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
+from gsbench.models.gated import GatedModel
 from gsbench.run.identity import hash_of
 from gsbench.scenes import Scene, View
 from gsbench.scenes.trained import TrainedGaussians, read_trained
@@ -200,6 +201,14 @@ def data_root(root: str) -> Path:
         return Path(str(importlib.resources.files(root.removeprefix("pkg://"))))
     except (ImportError, ValueError, TypeError) as error:
         raise InputError(f"data.root: expected pkg://MODULE of an installed package, got {root!r}: {error}") from None
+
+
+def check_gates(model: GaussianModel, config: Config) -> None:
+    """Raise InputError where the config asks for gates and the model cannot be gated."""
+    if config.effects.gate != "off" and not isinstance(model, GatedModel):
+        raise InputError(f"effects.gate={config.effects.gate}: expected a model that gates can simplify, "
+                         f"{config.model.name} is no GatedModel: make it one (docs/adding_a_model.md), or leave "
+                         f"effects.gate=off")  # fmt: skip
 
 
 def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:

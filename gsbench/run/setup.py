@@ -9,7 +9,7 @@ from gsbench.backends import resolve
 from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel
-from gsbench.run.checks import BACKGROUNDS, scene_folder
+from gsbench.run.checks import BACKGROUNDS, check_gates, scene_folder
 from gsbench.scenes import Scene
 
 
@@ -17,7 +17,8 @@ def build(config: Config) -> GaussianModel:
     """Build the model of a config, without Gaussians yet.
 
     Raises:
-        InputError: as `models.build`, or an option has a key of its own.
+        InputError: as `models.build`, an option has a key of its own, or the model cannot have the gates
+            that the config asks for.
     """
     own: dict[str, Any] = {
         "module": config.model.module,
@@ -30,7 +31,9 @@ def build(config: Config) -> GaussianModel:
         if name in (*own, "name"):
             key = {"agr": "agr", "backend": "raster.backend"}.get(name, f"model.{name}")
             raise InputError(f"model.options: expected no '{name}', which has a key of its own: set {key}")
-    return models.build(config.model.name, **own, **config.model.options)
+    model = models.build(config.model.name, **own, **config.model.options)
+    check_gates(model, config)
+    return model
 
 
 def load_scene(config: Config) -> Scene:

@@ -7,6 +7,10 @@ from torch import Tensor
 
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models import GaussianModel
+from gsbench.models.base import Raw
+from gsbench.models.gaussians3d import Gaussians3DModel
+from gsbench.models.gaussians4d import Gaussians4DModel
+from gsbench.models.triangular import TriangularModel
 
 THIN = -10.0  # log of a size in time: e^-10 of the clip is less than a frame of any scene
 NEEDLE = math.log(1e5)
@@ -19,7 +23,7 @@ def explain(model: GaussianModel) -> str:
     for name, parameter in model.splats.items():
         if parameter.grad is None:
             continue
-        bad = ~parameter.grad.reshape(len(parameter), -1).isfinite().all(1)
+        bad = ~parameter.grad.reshape(len(parameter), math.prod(parameter.shape[1:])).isfinite().all(1)
         if bad.any():
             index = int(bad.nonzero()[0])
             case = resembles(model, index)
@@ -35,8 +39,8 @@ def resembles(model: GaussianModel, index: int) -> str | None:
     raw = {name: parameter[index].flatten() for name, parameter in model.splats.items()}
     if not all(value.isfinite().all() for value in raw.values()):
         return "learning_rates_times_30"  # the previous step was too long
-    sizes = raw["log_diagonal"] if "log_diagonal" in raw else raw["scales"]
-    in_time = _log_size_in_time(model, sizes)
+    sizes, in_time = _log_sizes(model, raw, index), _log_size_in_time(model, raw)
+    colors = torch.cat([raw[name] for name in ("sh0", "shN") if name in raw])
     lambdas = [float(value) for value in model.log_modulation.parameters()]
     checks = {
         "refinement_pushes_sizes": float(sizes.abs().amax()) > LOG_SIZE_MAX,
@@ -47,19 +51,24 @@ def resembles(model: GaussianModel, index: int) -> str | None:
         "direction_off_the_sphere": "directions" in raw and float(raw["directions"].norm()) > 10,
         "larger_than_the_scene": float(sizes.amax()) > math.log(FAR * max(model.extent, 1e-3)),
         "far_off_axis": float(raw["means"].norm()) > FAR * max(model.extent, 1e-3),
-        "loud_harmonics": float(torch.cat([raw["sh0"], raw["shN"]]).abs().amax()) > LOUD,  # shN has none at degree 0
+        "loud_harmonics": bool((colors.abs() > LOUD).any()),
         "oversensitive": any(value > math.log(1e3) for value in lambdas),
         "insensitive": any(value < math.log(1e-6) for value in lambdas),
     }
     return next((name for name, found in checks.items() if found), None)
 
 
-def _log_size_in_time(model: GaussianModel, sizes: Tensor) -> float | None:
-    """Return the log size in time; None for a model that does not observe time."""
-    if "time" not in model.observes:
-        return None
-    rows = getattr(model, "rows", None)  # of triangular models
-    if rows:
-        return float(sizes[rows["t"][0]])
-    clock: Tensor = model.clock  # type: ignore[assignment]  # of 4DGS
-    return float(sizes[3] - clock.log())
+def _log_sizes(model: GaussianModel, raw: Raw, index: int) -> Tensor:
+    """Return the log sizes of a Gaussian, [n]; of a model that is not known here the largest in space, [1]."""
+    if isinstance(model, TriangularModel):
+        return raw["log_diagonal"]
+    if isinstance(model, Gaussians3DModel | Gaussians4DModel):
+        return raw["scales"]
+    return model.scales()[index : index + 1].log()
+
+
+def _log_size_in_time(model: GaussianModel, raw: Raw) -> float | None:
+    """Return the log size in time; None for a model that does not observe time, or is not known here."""
+    if isinstance(model, TriangularModel) and "time" in model.observes:
+        return float(raw["log_diagonal"][model.rows["t"][0]])
+    return float(raw["scales"][3] - model.clock.log()) if isinstance(model, Gaussians4DModel) else None

@@ -124,6 +124,21 @@ def test_resemblance_in_time_is_in_clips() -> None:
         assert diagnosis.resembles(model, POISONED) == name, clips
 
 
+def test_without_harmonics() -> None:
+    """Catches a diagnosis that takes the largest of no coefficients, so that the run leaves no record."""
+    model, points = models.build("3dgs", sh_degree=0), training_cases.moving_square().points
+    assert points is not None
+    model.initialise(points, 4.4, generator(0))
+    for parameter in model.splats.values():
+        parameter.grad = torch.zeros_like(parameter)
+    assert "learning rates" in diagnosis.explain(model)
+    model.splats["sh0"].data[POISONED] = 1e4
+    gradient = model.splats["sh0"].grad
+    assert gradient is not None
+    gradient[POISONED] = math.nan
+    assert "Gaussian 7 of 80 in 'sh0' (1 in all): it resembles the stability case 'loud" in diagnosis.explain(model)
+
+
 def test_spectrum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches condition numbers of something else than the factor: a diagonal one has max / min, in space too."""
     model = trainer("7dgs").model
