@@ -15,7 +15,9 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the audit or measure a checkpoint, see `--help`; return the exit code, 2 where neither can be done."""
     parser = argparse.ArgumentParser(prog="python -m gsbench.stability", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/stability"), help="folder of the results")
-    parser.add_argument("--long", action="store_true", help="train for 2,000 steps at 30 times the learning rates")
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--short", action="store_true", help="the defaults alone, in half a minute; writes no page")
+    length.add_argument("--long", action="store_true", help="train for 2,000 steps at 30 times the learning rates")
     parser.add_argument("--checkpoint", type=Path, metavar="FILE",
                         help="no audit: the condition numbers in a trained model")  # fmt: skip
     options = parser.parse_args(arguments)
@@ -29,7 +31,12 @@ def main(arguments: list[str] | None = None) -> int:
         return show_spectrum(options.checkpoint, options.out)
     from gsbench.stability import audit, page  # imports torch
 
-    found = audit.run(long=options.long)
+    found = audit.run(long=options.long, short=options.short)
+    if options.short:
+        for cell in found.broken:
+            print(f"{cell.case}, {cell.subject}, {cell.backend}: {page.show(cell)}; {cell.note}")
+        print(page.verdict(found))
+        return 1 if found.broken else 0
     page.write(found, options.out)
     print(page.table(found))
     print(page.verdict(found))

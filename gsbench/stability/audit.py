@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
 
@@ -15,7 +15,7 @@ from gsbench.errors import InputError
 from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS
 from gsbench.stability import colors, curves, pictures, population, slices, trainings
-from gsbench.stability.cases import Bound, Cell, backends_with, device_of, of_area
+from gsbench.stability.cases import CASES, Bound, Case, Cell, backends_with, device_of, of_area
 from gsbench.stability.training_cases import LONG_STEPS
 
 BACKENDS = ("cpu", "cuda", "reference")
@@ -24,7 +24,9 @@ NOT_DEFAULT = 100_000  # hard slices for the factor order that is not the defaul
 SUBTRACTING = 50_000  # Gaussians for the schemes that subtract, which fail often
 DEFAULT_ORDER = "conditioned_first"
 SEED = 0
+FEW, SHORT_STEPS, SLOWEST = 4_000, 40, "faint_crowd"  # hard slices, steps and the case left out of the short audit
 T = TypeVar("T")
+Step = Callable[[], None]
 
 
 @dataclass
@@ -56,16 +58,18 @@ def present() -> list[str]:
     return found
 
 
-def run(million: int = MILLION, *, long: bool = False) -> Audit:
+def run(million: int = MILLION, *, long: bool = False, short: bool = False) -> Audit:
     """Run the whole audit, with a progress bar on stderr.
 
     Args:
         million: the number of hard slices.
         long: train for 2,000 steps instead of 150, and use as many hard slices for each factor order.
+        short: judge only the defaults, with few slices and steps, one seed and no costs, in half a minute.
     """
     began = time.perf_counter()
     audit = Audit(present())
-    with tqdm(_steps(audit, million, long), desc="stability", file=sys.stderr) as steps:
+    listed = _short_steps(audit) if short else _steps(audit, million, long)
+    with tqdm(listed, desc="stability", file=sys.stderr) as steps:
         for name, step in steps:
             steps.set_postfix_str(name)
             step()
@@ -73,9 +77,37 @@ def run(million: int = MILLION, *, long: bool = False) -> Audit:
     return audit
 
 
-def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Callable[[], None]]]:
+def _short_steps(audit: Audit) -> list[tuple[str, Step]]:
+    """List the steps of the short audit."""
+    fastest = audit.backends[0]
+    judged: list[tuple[Case, Callable[[Case], Iterable[Cell]]]] = []
+    for case in of_area("slicing"):
+        some = only(case, *(model for model in case.subjects if model != "6dgs"))  # it is 7DGS without time
+        judged.append((some, partial(slices.judge, backends=audit.backends, schemes=["square_root"])))
+    for area, judge in (("colour", colors.judge), ("projection", pictures.judge), ("blending", pictures.judge)):
+        judged += [(case, partial(judge, backends=audit.backends)) for case in of_area(area) if case.name != SLOWEST]
+    driven, drifting = (only(CASES[name], "7dgs") for name in ("learning_rates_times_30", "single_against_double"))
+    judged += [
+        (driven, partial(trainings.judge, backend=fastest, steps=SHORT_STEPS)),
+        (CASES["poisoned_photograph"], partial(trainings.judge, backend=fastest)),
+        (drifting, partial(trainings.drift, backend=fastest, seeds=trainings.SEEDS[:1])),
+    ]
+    steps: list[tuple[str, Step]] = [(case.name, partial(_extend, audit.cells, judge, case)) for case, judge in judged]
+    return steps + [(f"hard slices, {order}", partial(hard_slices, audit, order, FEW)) for order in FACTOR_ORDERS]
+
+
+def only(case: Case, *subjects: str) -> Case:
+    """Return a case with some of its models."""
+    return replace(case, subjects=subjects)
+
+
+def _extend(cells: list[Cell], judge: Callable[[Case], Iterable[Cell]], case: Case) -> None:
+    cells.extend(judge(case))
+
+
+def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Step]]:
     """List the steps of the audit, as names and calls."""
-    steps: list[tuple[str, Callable[[], None]]] = []
+    steps: list[tuple[str, Step]] = []
 
     def add(name: str, found: list[T], more: Callable[[], Iterable[T]]) -> None:
         steps.append((name, lambda: found.extend(more())))

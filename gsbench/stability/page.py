@@ -77,7 +77,7 @@ def runs(audit: Audit) -> list[str]:
     lines = ["## training", "", "| case | model | backend | result | not finite | s | what came out |",
              "| --- | --- | --- | --- | ---: | ---: | --- |"]  # fmt: skip
     for cell in (cell for cell in audit.cells if cell.area in RUNS):
-        result = f"{cell.forward:.2f} dB" if cell.area == "drift" else "as it should" if cell.forward == 0 else "failed"
+        result = f"{cell.forward:.4f} dB" if cell.area == "drift" else "as it should" if cell.forward == 0 else "failed"
         lines.append(f"| {cell.case} | {cell.subject} | {cell.backend} | {'' if cell.holds else MARK}{result} | "
                      f"{100 * cell.bad:.3g} % | {cell.ms / 1e3:.1f} | {cell.note} |")  # fmt: skip
     return [*lines, ""]

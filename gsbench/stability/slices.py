@@ -2,7 +2,7 @@
 
 import functools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,12 +37,12 @@ class Truth:
     gradient: Tensor  # [COUNT, parameters], in the order of `Observed.raw`
 
 
-def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
+def judge(case: Case, backends: list[str], schemes: Sequence[str] = SCHEMES) -> Iterator[Cell]:
     """Judge every model, scheme and backend."""
     for model in case.subjects:
         observed = case(model=model)
         known = truth(observed)
-        for scheme in SCHEMES:
+        for scheme in schemes:
             for backend in backends_with(scheme, model, backends):
                 yield _cell(case, observed, known, scheme, backend)
 
