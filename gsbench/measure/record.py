@@ -22,6 +22,7 @@ from gsbench.reading import MAX_JSON, parse_json, read_file
 
 VERSION = 1
 FILE_NAME = "record.json"
+PUBLISHED = "published"  # the folder of records that came with the code: who is not told to read them passes it by
 STATUSES = ("ok", "failed", "diverged")
 METRICS = (
     "psnr",  # dB, joint over H x W x 3, final iteration, mean over the views of the evaluated split
@@ -205,12 +206,16 @@ def _validated(plain: Any, path: Path) -> Record:
 
 
 def find(root: Path) -> list[Path]:
-    """List the paths of all records under `root`, sorted; a broken link counts, as what it should show is missing."""
-    return sorted(
-        Path(folder, FILE_NAME)
-        for folder, folders, names in os.walk(root)
-        if FILE_NAME in names or FILE_NAME in folders
-    )
+    """List the paths of all records under `root`, sorted; a broken link counts, as what it should show is missing.
+
+    Folders named PUBLISHED below `root` are passed by; to read what was published, name it or a folder in it.
+    """
+    found = []
+    for folder, folders, names in os.walk(root):
+        if FILE_NAME in names or FILE_NAME in folders:
+            found.append(Path(folder, FILE_NAME))
+        folders[:] = [name for name in folders if name != PUBLISHED]
+    return sorted(found)
 
 
 def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, variant: str = "") -> Path:

@@ -69,6 +69,9 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
         if name not in composed:
             raise InputError(f"config key '{name}': expected a value, it was deleted: leave '~{name}' out")
     config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
+    for key, name in (("experiment", config.experiment), ("scene.name", config.scene.name)):
+        if name == records.PUBLISHED:
+            raise InputError(f"{key}: expected another name than {name!r}: tables pass by a folder of this name")
     plain: Plain = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
     if not config.results:
         raise InputError("results: expected a folder, got '': results=. is this one")

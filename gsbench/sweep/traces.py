@@ -9,6 +9,7 @@ from typing import Any
 
 from gsbench.errors import InputError, one_line
 from gsbench.measure.record import FILE_NAME as RECORD
+from gsbench.measure.record import PUBLISHED
 from gsbench.reading import MAX_JSON, read_file
 from gsbench.run import progress
 from gsbench.run.progress import Progress
@@ -57,10 +58,10 @@ def read(folders: list[Path]) -> Traces:
 
 
 def _files(folders: list[Path]) -> Iterator[Path]:
-    """Find the records and progress files; hidden folders hold those of sweeps and have none."""
+    """Find the records and progress files; hidden folders hold those of sweeps, and published ones are of no sweep."""
     for folder in folders:
         for at, below, names in os.walk(folder):
-            below[:] = sorted(name for name in below if not name.startswith("."))
+            below[:] = sorted(name for name in below if not name.startswith(".") and name != PUBLISHED)
             for name in (RECORD, progress.FILE_NAME):
                 path = Path(at, name)
                 if name in names and path.is_file():  # a pipe would keep its reader waiting

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tiny_run import ROOT
 
 from gsbench.errors import InputError
 from gsbench.measure import record as files
@@ -19,6 +20,7 @@ from gsbench.measure.curve import Point
 from gsbench.measure.provenance import git_commit, provenance
 from gsbench.measure.record import METRICS, Cost, Effects, Provenance, Record, ViewScore
 from gsbench.measure.speed import RenderTimes
+from gsbench.sweep import traces
 
 
 def make(**changes: object) -> Record:
@@ -295,6 +297,27 @@ def test_provenance_names_the_machine_and_hashes_the_config(tmp_path):
     assert one.time.endswith("+00:00")
     files.write(make(provenance=one), tmp_path / "record.json")
     assert files.read(tmp_path / "record.json").provenance == one
+
+
+def test_published_records_are_passed_by_unless_they_are_named(tmp_path):
+    """Would catch our numbers in a stranger's table, as his, and published records that cannot be read at all."""
+    own, ours = tmp_path / "mini/suzanne/7dgs/seed0", tmp_path / files.PUBLISHED / "mini/suzanne/7dgs/seed0"
+    for folder in (own, ours):
+        files.write(make(), folder / files.FILE_NAME)
+    assert files.find(tmp_path) == [own / files.FILE_NAME]
+    assert traces.read([tmp_path]).by_path.keys() == {own / files.FILE_NAME}
+    for root in (tmp_path / files.PUBLISHED, tmp_path / files.PUBLISHED / "mini"):
+        assert files.find(root) == [ours / files.FILE_NAME]
+
+
+def test_git_ignores_what_this_machine_measured_and_nothing_that_is_published():
+    """Would catch `make table1` that changes tracked files, and a published record that is not committed."""
+    if not (ROOT / ".git").exists():
+        pytest.skip("gsbench is not in a git checkout here")
+    own = [f"results/{name}" for name in ("table1.md", "mini/table.md", "mini/suzanne/7dgs/seed0/record.json")]
+    ours = [f"results/published/{name}" for name in ("new/table.md", "new/suzanne/7dgs/seed9/record.json")]
+    done = subprocess.run(["git", "check-ignore", *own, *ours], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == own
 
 
 def test_the_commit_is_that_of_this_checkout():

@@ -11,6 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from gsbench.config import CONF, register_schema
+from gsbench.errors import InputError
 from gsbench.run.identity import LONGEST_VARIANT, Run, flat, identify, is_same, training_hash, training_part
 
 
@@ -113,6 +114,13 @@ def test_a_cap_on_gaussians_is_training_and_none_changes_no_older_run() -> None:
     assert training_hash(older) == training_hash(run.plain) != training_hash(capped.plain)
     assert is_same(older, run.plain)
     assert (run.variant, capped.variant) == ("", "densify.max_gaussians=50000")
+
+
+@pytest.mark.parametrize("word", ["experiment=published", "scene.name=published"])
+def test_the_folder_of_published_records_is_no_run(word: str) -> None:
+    """Catches a run whose record every table passes by."""
+    with pytest.raises(InputError, match="another name than 'published'"):
+        named(word)
 
 
 def test_long_names_are_cut_at_a_word_and_stay_different() -> None:
