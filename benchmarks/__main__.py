@@ -13,7 +13,8 @@ from benchmarks.rows import SECTIONS, Row
 from benchmarks.timing import measure
 from gsbench import kernels
 from gsbench.measure.atomic import write_atomically
-from gsbench.measure.provenance import git_commit, processor_name, versions
+from gsbench.measure.machine import processor_name
+from gsbench.measure.provenance import git_commit, versions
 
 HEADER = "| | median ms | p10 | p90 | wall ms | target ms | least ms by the machine's limit | ratio |"
 

@@ -16,7 +16,8 @@ import torch
 from benchmarks import gpu_rows, gsplat_way
 from benchmarks.compare import Place, Row
 from gsbench.measure.atomic import write_atomically
-from gsbench.measure.provenance import git_commit, processor_name, versions
+from gsbench.measure.machine import processor_name
+from gsbench.measure.provenance import git_commit, versions
 
 # How many times as fast as theirs ours is to be, on a Hopper-class card.
 TARGETS = {("raster", "forward"): 1.3, ("raster", "backward"): 1.2, ("frame", "forward"): 3.0, ("step", "all"): 2.5}

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsbench.config import CONF, register_schema
-from gsbench.measure.provenance import processor_name
+from gsbench.measure.machine import processor_name
 from gsbench.measure.quality import evaluate
 from gsbench.run.attempt import Attempt
 from gsbench.run.identity import identify

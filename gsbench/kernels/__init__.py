@@ -33,6 +33,11 @@ def native() -> ModuleType:
     return _native
 
 
+def instruction_set() -> str | None:
+    """The instruction set that the CPU's kernels run with, such as `v3`; None where they are not built."""
+    return None if _native is None else str(_native.active())
+
+
 def use_instruction_set(name: str) -> None:
     """Run the kernels built for one instruction set (`v2`, `v3`, `v4`: x86-64 levels); the best one is the default.
 

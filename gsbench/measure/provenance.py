@@ -10,29 +10,40 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import __version__
+from gsbench.measure.machine import hardware
 from gsbench.measure.record import Provenance
 
 PACKAGES = ("torch", "numpy", "scikit-image", "lpips", "opencv-contrib-python-headless")
 
 
-def provenance(*, config: dict[str, Any], data_hash: str, threads: int, device: str | None = None) -> Provenance:
+def provenance(
+    *,
+    config: dict[str, Any],
+    data_hash: str,
+    threads: int,
+    device: str | None = None,
+    instruction_set: str | None = None,
+) -> Provenance:
     """Describe the provenance of a run that ends now; this imports none of the packages whose versions it notes.
 
     Args:
         config: the whole resolved config, plain JSON.
         data_hash: the fingerprint of the scene.
-        threads: of torch.
+        threads: of torch, and of the kernels, which use as many.
         device: the name of the GPU; None stands for the processor, which is then named.
+        instruction_set: that the CPU's kernels run with; None: they are not built.
     """
+    here = hardware(instruction_set)
     return Provenance(
         git_commit=git_commit(),
         versions=versions(),
-        device=device or processor_name(),
+        device=device or here.processor,
         threads=threads,
         config=config,
         config_hash=config_hash(config),
         data_hash=data_hash,
         time=datetime.now(UTC).isoformat(timespec="seconds"),
+        hardware=here,
     )
 
 
@@ -77,13 +88,3 @@ def _git(folder: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
-
-
-def processor_name() -> str:
-    """Return the processor's name, such as "AMD EPYC 9B14"."""
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()

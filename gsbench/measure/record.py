@@ -16,6 +16,7 @@ from typing import Any
 from gsbench.errors import InputError, did_you_mean
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
+from gsbench.measure.machine import Hardware, named
 from gsbench.measure.schema import parse
 from gsbench.measure.speed import RenderTimes
 from gsbench.reading import MAX_JSON, parse_json, read_file
@@ -132,16 +133,17 @@ class Provenance:
     git_commit: str | None  # "-dirty" at the end where tracked files were changed; None outside a git checkout
     versions: dict[str, str]  # python and the packages that the numbers depend on
     device: str  # the processor or GPU by name
-    threads: int
+    threads: int  # of torch and of the kernels
     config: dict[str, Any]  # the whole resolved config, plain JSON
     config_hash: str
     data_hash: str  # Scene.fingerprint
     time: str  # UTC, ISO 8601
+    hardware: Hardware | None = None  # None in older records, which tell machines apart by `device` alone
 
     @property
     def machine(self) -> str:
-        """The device and the threads: seconds compare only between runs of one machine."""
-        return f"{self.device}, {self.threads} thread{'' if self.threads == 1 else 's'}"
+        """The machine and the threads in words, by which machines are told apart: seconds compare only on one."""
+        return named(self.device, self.threads, self.hardware)
 
 
 @dataclass(frozen=True)
@@ -206,13 +208,10 @@ def _validated(plain: Any, path: Path) -> Record:
 
 
 def find(root: Path) -> list[Path]:
-    """List the paths of all records under `root`, sorted; a broken link counts, as what it should show is missing.
-
-    Folders named PUBLISHED below `root` are passed by; to read what was published, name it or a folder in it.
-    """
+    """List the paths of all records under `root`, sorted, but for those below it in a folder named PUBLISHED."""
     found = []
     for folder, folders, names in os.walk(root):
-        if FILE_NAME in names or FILE_NAME in folders:
+        if FILE_NAME in names or FILE_NAME in folders:  # a broken link counts, as what it should show is missing
             found.append(Path(folder, FILE_NAME))
         folders[:] = [name for name in folders if name != PUBLISHED]
     return sorted(found)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gsbench import models
+from gsbench import kernels, models
 from gsbench.config import Config, DataConfig
 from gsbench.effects import picture
 from gsbench.effects.choose import import_compiler
@@ -191,9 +191,8 @@ class Attempt:
                 trainer.model, first.camera, first.time, renderer.background, renderer.antialias
             )
         return replace(
-            record, protocol=record.protocol | made,
+            record, protocol=record.protocol | made, on_demand=on_demand,
             metrics=metrics, missing=missing, per_view=quality.per_view, cost=cost, curve=trainer.curve.points,
-            on_demand=on_demand,
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:
@@ -254,6 +253,7 @@ class Attempt:
                 config=this.plain,
                 data_hash=scene.fingerprint if scene else "not loaded",
                 threads=torch.get_num_threads(),
+                instruction_set=kernels.instruction_set(),
                 device=torch.cuda.get_device_name(config.device) if on_gpu else None,
             ),
             variant=this.variant,

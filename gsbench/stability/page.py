@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.measure.atomic import write_atomically
-from gsbench.measure.provenance import git_commit, processor_name, versions
+from gsbench.measure.machine import processor_name
+from gsbench.measure.provenance import git_commit, versions
 from gsbench.stability import plots
 from gsbench.stability.audit import Audit
 from gsbench.stability.cases import AREAS, CASES, Cell

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from tiny_run import ROOT
 
 from gsbench.errors import InputError
+from gsbench.measure import machine
 from gsbench.measure import record as files
 from gsbench.measure.curve import Point
 from gsbench.measure.provenance import git_commit, provenance
@@ -362,6 +363,60 @@ def test_results_make_no_commit_dirty(tmp_path: Path, monkeypatch: pytest.Monkey
     assert git_commit() == clean
     place.write_text("2")
     assert git_commit() == f"{clean}-dirty"
+
+
+@pytest.fixture
+def system(tmp_path, monkeypatch):
+    """Write what the system says of a machine, and return the machine that is read from it."""
+
+    def read(cpuinfo, memory="24684092 kB", **more):
+        for name, text in (("CPUINFO", cpuinfo), ("MEMINFO", f"MemTotal:       {memory}\nMemFree: 1 kB\n")):
+            (tmp_path / name).write_text(text)
+            monkeypatch.setattr(machine, name, tmp_path / name)
+        monkeypatch.setattr(os, "cpu_count", lambda: 2)
+        return machine.hardware(**more)
+
+    return read
+
+
+EPYC = "processor\t: {n}\ncpu family\t: {family}\nmodel\t\t: 1\nmodel name\t: AMD EPYC\nstepping\t: 1\n\n"
+
+
+def test_processors_of_one_name_are_told_apart(system):
+    """Would catch generations of EPYC that pool silently: their names are alike, their seconds are not."""
+    zen3, zen5 = (system("".join(EPYC.format(n=n, family=f) for n in range(2)), instruction_set="v3") for f in (25, 26))
+    assert str(zen3) == "AMD EPYC family 25 model 1 stepping 1, 2 cores, v3, 24 GiB"
+    assert str(zen5) == "AMD EPYC family 26 model 1 stepping 1, 2 cores, v3, 24 GiB"
+    of = dataclasses.replace(make().provenance, device="AMD EPYC", hardware=zen3)
+    assert of.machine == f"{zen3}, 2 threads"
+    assert of.machine != dataclasses.replace(of, hardware=zen5).machine
+    assert of.machine != dataclasses.replace(of, hardware=dataclasses.replace(zen3, instruction_set="v2")).machine
+    assert dataclasses.replace(of, device="A GPU").machine == f"A GPU in {zen3}, 2 threads"
+
+
+def test_a_boot_makes_no_other_machine(system):
+    """Would catch a machine whose seconds no longer compare with its own: the system keeps some MB more or fewer."""
+    cpuinfo = EPYC.format(n=0, family=25)
+    assert system(cpuinfo, "24684092 kB") == system(cpuinfo, "24690001 kB") != system(cpuinfo, "32690001 kB")
+
+
+def test_a_system_that_says_little_is_described(system):
+    """Would catch a run lost on aarch64, or where /proc is hidden, for want of a family."""
+    arm = "processor\t: 0\nCPU implementer\t: 0x41\nCPU part\t: 0xd0c\nCPU revision\t: 1\n"
+    assert "family 0x41 model 0xd0c stepping 1, 2 cores" in str(system(arm))
+    assert str(system("", "?")).endswith(", 2 cores")
+
+
+def test_a_record_without_its_machine_is_read(tmp_path):
+    """Would catch older records that can no longer be read, and a machine that is lost on the way to the disk."""
+    path = tmp_path / "record.json"
+    here = dataclasses.replace(make().provenance, hardware=machine.hardware("v3"))
+    files.write(make(provenance=here), path)
+    assert files.read(path).provenance == here
+    plain = json.loads(path.read_text())
+    del plain["provenance"]["hardware"]
+    path.write_text(json.dumps(plain))
+    assert files.read(path).provenance.machine == "a CPU, 2 threads"
 
 
 def test_a_machine_is_named_by_its_threads() -> None:

@@ -1,0 +1,80 @@
+"""Describe the machine that a run was measured on, as far as seconds depend on it: processor, cores, memory.
+
+The name "AMD EPYC" of a rented machine stands for several generations of processors; family, model and stepping
+tell them apart. Needs no torch.
+"""
+
+import math
+import os
+import platform
+from dataclasses import dataclass
+from pathlib import Path
+
+CPUINFO = Path("/proc/cpuinfo")
+MEMINFO = Path("/proc/meminfo")
+# Keys of /proc/cpuinfo, on x86-64 and on aarch64.
+_KEYS = {
+    "family": ("cpu family", "CPU implementer"),
+    "model": ("model", "CPU part"),
+    "stepping": ("stepping", "CPU revision"),
+}
+
+
+@dataclass(frozen=True)
+class Hardware:
+    """The processor and the memory of a machine; what the system does not tell is None."""
+
+    processor: str  # by name
+    cores: int | None  # that the system has, whether this run may use them or not
+    memory_gib: int | None  # rounded up, so that what the system keeps for itself at a boot changes nothing
+    family: str | None = None
+    model: str | None = None
+    stepping: str | None = None
+    instruction_set: str | None = None  # that the CPU's kernels ran with, such as "v3"; None: they are not built
+
+    def __str__(self) -> str:
+        kind = [f"{name} {value}" for name in _KEYS if (value := getattr(self, name)) is not None]
+        facts = [" ".join([self.processor, *kind])]
+        facts += [f"{self.cores} core{'' if self.cores == 1 else 's'}"] if self.cores is not None else []
+        facts += [self.instruction_set] if self.instruction_set is not None else []
+        facts += [f"{self.memory_gib} GiB"] if self.memory_gib is not None else []
+        return ", ".join(facts)
+
+
+def named(device: str, threads: int, hardware: Hardware | None) -> str:
+    """Name a machine in words that tell it from others: of two runs with equal names the seconds compare.
+
+    Args:
+        device: the processor or GPU by name.
+        threads: of torch and of the kernels.
+        hardware: None for older records, which do not say more.
+    """
+    where = "" if hardware is None or device == hardware.processor else f"{device} in "
+    return f"{where}{hardware or device}, {threads} thread{'' if threads == 1 else 's'}"
+
+
+def hardware(instruction_set: str | None = None) -> Hardware:
+    """Describe this machine.
+
+    Args:
+        instruction_set: that the CPU's kernels run with (`gsbench.kernels.instruction_set`).
+    """
+    facts = _facts(CPUINFO)
+    kind = {name: next((facts[key] for key in keys if key in facts), None) for name, keys in _KEYS.items()}
+    kilobytes = _facts(MEMINFO).get("MemTotal", "").partition(" ")[0]
+    memory = math.ceil(int(kilobytes) / 2**20) if kilobytes.isdecimal() else None
+    return Hardware(processor_name(), os.cpu_count(), memory, **kind, instruction_set=instruction_set)
+
+
+def processor_name() -> str:
+    """Return the processor's name, such as "AMD EPYC 9B14"."""
+    return _facts(CPUINFO).get("model name") or platform.processor() or platform.machine()
+
+
+def _facts(path: Path) -> dict[str, str]:
+    """Read the first value of each key of a file with lines `key : value`; nothing where there is no such file."""
+    try:
+        lines = path.read_text().splitlines()
+    except OSError:
+        return {}
+    return {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}
