@@ -15,14 +15,14 @@ SPREAD = (
 
 
 def mean(runs: Mapping[str, Sequence[Record]], key: str) -> Estimate:
-    """Estimate the mean of a quantity over scenes, of its mean over seeds; NaN where a run lacks it.
+    """Estimate the mean of a quantity over scenes, of its mean over seeds; NaN where it is missing from a run or scene.
 
     Args:
         runs: finished ones, by scene.
         key: a column of `gsbench.report.tables.tidy`.
     """
     scenes = [np.array([[_number(quantities(run).get(key))] for run in seeds]) for seeds in runs.values()]
-    if any(np.isnan(scene).any() for scene in scenes):
+    if any(len(scene) == 0 or np.isnan(scene).any() for scene in scenes):
         return Estimate(math.nan, len(scenes), 0, "")
     return estimate(scenes, generalise=False)
 

@@ -6,14 +6,14 @@ from typing import Any
 
 from gsbench.measure.record import Record
 from gsbench.report import paper, tables
+from gsbench.report.arms import Group
 from gsbench.report.conditions import conditions, printable
 from gsbench.report.layout import EMPTY, Column, Row, Section, Table
 from gsbench.report.paper_protocol import MODELS, Arm, Sorted, arm, arms, departure, finished
 from gsbench.report.seed_means import SPREAD, mean
-from gsbench.report.tables import LEAKS
+from gsbench.report.tables import LEAKS, OF_THE_MACHINE, of_one_machine
 
 COLUMNS = [*tables.COLUMNS[:1], Column(LEAKS, LEAKS, 2, "psnr"), *tables.COLUMNS[1:]]
-OF_THE_MACHINE = ("train_min", "fps")
 SEEDS = 3  # the fewest for an interval that holds
 
 PAPER = (
@@ -85,6 +85,7 @@ class _Builder:
         self.lines = lines
         self.kind = kind  # "paper", "other protocol" or "other data"
         self.arms = arms(records)
+        self.machine = Group(records).machine if records else ""
         self.names_experiment = len({r.experiment for r in records}) > 1
         self.marks: list[str] = []
 
@@ -93,7 +94,8 @@ class _Builder:
         sections = [self._scene(s) for s in scenes if any(r.scene == s for r in self.records)]
         if len(sections) > 1:
             sections.append(self._average(scenes))
-        footnotes = [*notes, *(conditions(self.records, SPREAD) if self.records else [])]
+        conditional = conditions(self.records, SPREAD) if self.records else []
+        footnotes = [*notes, *of_one_machine(self.records, self.machine), *conditional]
         return Table(title, COLUMNS, sections, self.marks, footnotes)
 
     def _scene(self, scene: str) -> Section:
@@ -119,7 +121,8 @@ class _Builder:
 
     def _rows(self, scene: str, one: Arm, runs: Runs) -> list[Row]:
         """Make the measured row, the paper's row and their difference; add them to the CSV."""
-        measured = {c.key: mean(runs, c.key) for c in COLUMNS}
+        here = {s: [r for r in seeds if r.provenance.machine == self.machine] for s, seeds in runs.items()}
+        measured = {c.key: mean(here if c.key in OF_THE_MACHINE else runs, c.key) for c in COLUMNS}
         seeds = min(map(len, runs.values()))
         cells = {c.key: c.show(measured[c.key].mean, measured[c.key].half) for c in COLUMNS}
         rows = [Row(self._label(one), cells, str(seeds))]

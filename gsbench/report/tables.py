@@ -1,6 +1,7 @@
 """Make tables from records: a row for each model and scene, with the row of the paper below it."""
 
 import math
+from collections import Counter
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -25,6 +26,7 @@ COLUMNS = (  # their keys are columns of `tidy`
     Column("fps", "FPS", None, "fps"),
     Column("num_gaussians", "#Gaussians", 0, "num_gaussians"),
 )
+OF_THE_MACHINE = ("train_min", "fps")  # columns that compare only between runs of one machine
 COSTS = ("fps", "num_gaussians", "bytes", "peak_memory", "train_cpu_s", "load")  # of a record, as it has them
 TRAIN = Column("psnr_train", "PSNR train", 2)  # shown on request
 EXTRA_COLUMNS = (Column("lpips_vgg", "LPIPS-VGG", 3), Column(LEAKS, LEAKS, 2))  # where a run has them
@@ -90,19 +92,43 @@ def quantities(r: Record) -> dict[str, Any]:
     flat |= {f"effect_{name}": value for name, value in vars(r.effects).items()}
     flat |= {f"protocol_{name}": value for name, value in sorted(r.protocol.items())}
     names = ("device", "threads", "git_commit", "config_hash", "data_hash", "time")
-    return flat | {name: getattr(r.provenance, name) for name in names}
+    return flat | {name: getattr(r.provenance, name) for name in names} | {"machine": r.provenance.machine}
 
 
-def build(records: list[Record], *, train: bool = False) -> list[Table]:
-    """Make a table for every experiment and data set in `records`, sorted by name; `train` adds `psnr_train`."""
-    return [_Builder(group.records, train).table() for group in groups(records)]
+def build(records: list[Record], *, train: bool = False, machine: str | None = None) -> list[Table]:
+    """Make a table for every experiment and data set in `records`, sorted by name.
+
+    Args:
+        records: of any number of experiments.
+        train: also show `psnr_train`.
+        machine: whose seconds and FPS are shown, by `Provenance.machine`; None: in each table that of most runs.
+    """
+    return [_Builder(group.records, train, machine or group.machine).table() for group in groups(records)]
+
+
+def of_one_machine(records: list[Record], machine: str) -> list[str]:
+    """Say whose seconds a table shows, and which runs' it leaves out; nothing where all were on one machine.
+
+    Args:
+        records: of the table.
+        machine: as of `build`.
+    """
+    others = Counter(r.provenance.machine for r in records if r.status == "ok" and r.provenance.machine != machine)
+    if not others:
+        return []
+    named = "; ".join(f"{printable(other)} ({count} run{'s' * (count > 1)})" for other, count in sorted(others.items()))
+    return [
+        f"train min and FPS are of one machine, {printable(machine)}; those of other machines are left out: {named}. "
+        "All other columns are means over every run."
+    ]
 
 
 class _Builder:
     """Makes the table of one experiment on one data set, and collects the footnotes of its cells."""
 
-    def __init__(self, records: list[Record], train: bool) -> None:
+    def __init__(self, records: list[Record], train: bool, machine: str) -> None:
         self.records = records
+        self.machine = machine
         self.scenes = sorted({r.scene for r in records})
         variants = {r.variant for r in records}
         self.common = variants.pop() if len(variants) == 1 else ""  # said once, below the table
@@ -115,10 +141,14 @@ class _Builder:
             if q["status"] == "ok":
                 finished.setdefault((q["scene"], name), []).append(q)
         self.values = {  # by scene and model, then column: a value for each seed, NaN where it is missing
-            run: {c.key: [math.nan if q[c.key] is None else float(q[c.key]) for q in seeds] for c in self.columns}
-            for run, seeds in finished.items()
+            run: {c.key: self._values(c, seeds) for c in self.columns} for run, seeds in finished.items()
         }
         self.marks: list[str] = []
+
+    def _values(self, column: Column, seeds: list[dict[str, Any]]) -> list[float]:
+        """Return a column's value of each run; of seconds those of the table's machine, NaN where it has none."""
+        counted = [q for q in seeds if column.key not in OF_THE_MACHINE or q["machine"] == self.machine]
+        return [math.nan if q[column.key] is None else float(q[column.key]) for q in counted] or [math.nan]
 
     def _name(self, record: Record) -> str:
         """Name the row of a run: its model, and what of its training is not the experiment's own."""
@@ -132,7 +162,8 @@ class _Builder:
             sections.append(self._average())
         title = f"experiment {first.experiment}, data {printable(first.dataset)}"
         common = [f"every run with {self.common}, not the experiment's own."] if self.common else []
-        return Table(title, self.columns, sections, self.marks, [*common, *conditions(self.records), *self._no_vgg()])
+        said = [*common, *of_one_machine(self.records, self.machine), *conditions(self.records), *self._no_vgg()]
+        return Table(title, self.columns, sections, self.marks, said)
 
     def _no_vgg(self) -> list[str]:
         """Say why there is no column for LPIPS-VGG, if there is none."""
@@ -171,6 +202,8 @@ class _Builder:
         values = self.values[finished[0].scene, self._name(finished[0])][column.key]
         if not math.isnan(fmean(values)):
             return column.show(fmean(values), stdev(values) if len(values) > 1 else math.nan)
+        if column.key in OF_THE_MACHINE:
+            return EMPTY  # a footnote of the table names the machines that are left out
         name = "psnr_best_on_test" if column.key == LEAKS else column.key
         why = {r.missing.get(name, "not measured") for r in finished if (r.metrics or {}).get(name) is None}
         return f"{EMPTY} " + self._mark(printable(f"{column.title} is empty: {'; '.join(sorted(why))}"))

@@ -38,6 +38,19 @@ def test_the_difference_is_of_like_with_like(tmp_path):
     assert "| difference | -0.22 | +0.28 |" in (tmp_path / "table1.md").read_text()
 
 
+def test_seconds_of_two_machines_are_never_averaged(tmp_path):
+    """Would catch minutes of a seed from another machine, or of a scene from another, in one mean."""
+    runs = [at_paper(seed=0, psnr=30.0), at_paper(seed=1, psnr=31.0), at_paper(seed=2, psnr=32.0)]
+    other = dataclasses.replace(runs[2].provenance, device="another CPU")
+    cost = dataclasses.replace(runs[2].cost, train_s=6.0)
+    runs[2] = dataclasses.replace(runs[2], provenance=other, cost=cost)
+    write(runs, tmp_path)
+    line = pd.read_csv(tmp_path / "table1.csv").iloc[0]
+    assert line["psnr"] == 31.0
+    assert line["train_min"] == pytest.approx((runs[0].cost.train_s + runs[1].cost.train_s) / 120)
+    assert "another CPU, 2 threads (1 run)" in (tmp_path / "table1.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [

@@ -175,6 +175,45 @@ def of_length(model, iterations, variant=""):
     return dataclasses.replace(run, provenance=dataclasses.replace(run.provenance, config=config))
 
 
+def elsewhere(record, seconds):
+    """The same run on another machine, which took so long."""
+    provenance = dataclasses.replace(record.provenance, device="another CPU")
+    return dataclasses.replace(
+        record, provenance=provenance, cost=dataclasses.replace(record.cost, train_s=seconds, fps=1000.0)
+    )
+
+
+def test_seconds_of_two_machines_are_never_averaged():
+    """Would catch a stranger's 0.4 +- 0.5 min, half of them ours, and a row ranked by another machine's seconds.
+
+    One seed of 7dgs and the only one of 4dgs were measured elsewhere; PSNR is the mean of all.
+    """
+    runs = [make("3dgs", psnr=20.0), make(psnr=25.0), make(seed=1, psnr=26.0), elsewhere(make(seed=2, psnr=27.0), 6.0)]
+    runs.append(elsewhere(make("4dgs", psnr=23.0), 6.0))
+    (table,) = tables.build(runs)
+    cells = {row.label: row.cells for row in table.sections[0].rows if row.seeds}
+    assert cells["7dgs"]["psnr"] == "26.00 ± 1.00"
+    assert cells["7dgs"]["train_min"] == "1.51 ± 0.01"  # of 90 and 91 s
+    assert cells["7dgs"]["fps"] == "20.0 ± 0.0"
+    assert cells["4dgs"]["train_min"] == cells["4dgs"]["fps"] == "–"
+    assert (
+        "train min and FPS are of one machine, Invented CPU, 2 threads; those of other machines are left out: "
+        "another CPU, 2 threads (2 runs). All other columns are means over every run."
+    ) in table.footnotes
+    assert "are left out" not in page(*runs[:3])
+    (other,) = tables.build(runs, machine="another CPU, 2 threads")
+    assert other.sections[0].rows[0].cells["train_min"] == "–"
+
+
+def test_an_average_over_scenes_is_of_one_machine():
+    """Would catch an average over two scenes whose minutes are of two machines."""
+    text = page(make("3dgs"), make("4dgs"), elsewhere(make("3dgs", "moving-matte"), 6.0), make("4dgs", "moving-matte"))
+    average = text[text.index("average over 2 of 2") :]
+    assert "| 3dgs | **25.00** | 0.900 | 0.100 | – | – | 5000 |" in average
+    assert "| 4dgs | **25.00** | 0.900 | 0.100 | 1.50 | 20.0 | 5000 |" in average
+    assert "– stands where a scene lacks the number" in average
+
+
 def test_the_load_is_told_as_far_as_it_is_known():
     """Would catch a load of some runs that passes for that of all, and records that are silent about it taken for 0."""
     busy, silent = make(seed=1), make("4dgs")

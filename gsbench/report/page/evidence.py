@@ -12,7 +12,7 @@ LONGEST_NOTE = 700
 
 def paper_tables(group: Group) -> list[layout.Table]:
     """Return the table of the runs at the common variant, with the rows of the paper."""
-    return tables.build(_compared(group))
+    return tables.build(_compared(group), machine=group.machine)
 
 
 def _compared(group: Group) -> list[Record]:
