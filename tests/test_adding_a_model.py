@@ -52,8 +52,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (project / path.replace("balls", "blinks")).write_text(blinks)
         gated = text.replace('"balls"', '"gated_balls"').replace("name: balls", "name: gated_balls")
         gated = gated.replace("import math\n", "import math\nfrom collections.abc import Sequence\n")
-        gated = gated.replace("import SHRINK, Conditioned, GaussianModel, Raw\n",
-                              "import SHRINK, Conditioned, Raw\nfrom gsbench.models.gated import GatedModel\n")  # fmt: skip
+        gated = gated.replace("GaussianModel, Raw\n", "Raw\nfrom gsbench.models.gated import GatedModel\n")
         gated = gated.replace("(GaussianModel)", "(GatedModel)")
         more = "\n" + methods_for_gates() if path.endswith(".py") else ""
         (project / path.replace("balls", "gated_balls")).write_text(gated + more)

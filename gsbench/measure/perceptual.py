@@ -137,7 +137,7 @@ def load(backbone: str = "alex", weights: Path | None = None, device: str = "cpu
     if package is None or package.origin is None:
         raise BackboneMissing("the lpips package, which holds the linear weights, is not installed")
     linear_path = Path(package.origin).parent / "weights" / "v0.1" / f"{backbone}.pth"
-    path = weights or Path(torch.hub.get_dir()) / "checkpoints" / chosen.file
+    path = weights or _trunk(backbone)
     if not path.is_file():
         if weights is not None:
             raise InputError(f"{path}: expected the weights of LPIPS' {backbone} trunk, found no such file")
@@ -151,6 +151,16 @@ def load(backbone: str = "alex", weights: Path | None = None, device: str = "cpu
     }
     linear = _read_weights(linear_path, (chosen.linear_sha256,))
     return Perceptual(chosen, trunk, [linear[f"lin{i}.model.1.weight"] for i in range(len(chosen.taps))]).to(device)
+
+
+def is_here(backbone: str, weights: Path | None = None) -> bool:
+    """Tell whether the weights of a backbone are on this machine; arguments as of `load`, which also checks them."""
+    return importlib.util.find_spec("lpips") is not None and (weights or _trunk(backbone)).is_file()
+
+
+def _trunk(backbone: str) -> Path:
+    """Return where torchvision keeps the weights of a trunk."""
+    return Path(torch.hub.get_dir()) / "checkpoints" / BACKBONES[backbone].file
 
 
 def _read_weights(path: Path, accepted: tuple[str, ...]) -> dict[str, Tensor]:

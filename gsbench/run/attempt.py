@@ -19,6 +19,7 @@ from gsbench.measure import record as records
 from gsbench.measure.provenance import provenance
 from gsbench.measure.quality import Quality, evaluate, evenly
 from gsbench.measure.record import Cost, Effects, OnDemand, Record, TimeScreen
+from gsbench.measure.settings import training_hash
 from gsbench.measure.speed import Effort, peak_memory, reset_peak_memory, synchroniser, time_renders
 from gsbench.models import GaussianModel
 from gsbench.models.replay import Replay
@@ -27,7 +28,7 @@ from gsbench.report.pictures import strip, write_png
 from gsbench.run import progress, stop
 from gsbench.run.auto import is_auto, plain_model, resolve, with_candidate
 from gsbench.run.checks import check_config, check_scene, evaluated_views, lpips_weights, trained_start
-from gsbench.run.identity import Run, training_hash
+from gsbench.run.identity import Run
 from gsbench.run.load import plain_description
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Points, Scene, View

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -15,21 +15,12 @@ from omegaconf import DictConfig, OmegaConf
 from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.measure import record as records
-from gsbench.measure.provenance import config_hash
+from gsbench.measure.settings import Plain, flat, training_part
 from gsbench.reading import read_file
 from gsbench.run.overrides import UNNAMED, deciding
 from gsbench.scenes.files import digest
 from gsbench.scenes.ply import MAX_FILE
 
-Plain = dict[str, Any]  # a resolved config in plain JSON
-
-# What is measured after a training, and where data and results lie, changes no training. `best_on_test` and
-# `eval_split` are not here: the best iteration is looked for while the model trains.
-MEASURING = (
-    "experiment", "results", "resume", "launch", "data.dataset", "data.paper_dataset", "data.published", "data.root",
-    "data.scenes", "init.ply", "scene.released_as", "train.checkpoint_minutes", "protocol.name", "protocol.quantise",
-    "protocol.lpips_alex", "protocol.lpips_vgg", "protocol.renders", "protocol.pictures",
-)  # fmt: skip
 OWN_NAMES = ("exp", "model", "scene")  # the groups that have a place in a run's path
 DEFAULTS = {"train": "default", "raster": "default", "protocol": "gsbench"}  # groups of conf/config.yaml
 LONGEST_VARIANT = 80  # characters: several such folders must fit into a path of 255
@@ -116,48 +107,6 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
     for (key, value), short in zip(changed.items(), shorts, strict=True):
         words.append(f"{short if shorts.count(short) == 1 else key}={_printed(value)}")
     return _cut(words)
-
-
-def training_part(plain: Plain) -> Plain:
-    """Return the part of a resolved config that a training reads."""
-    part: Plain = {key: dict(value) if isinstance(value, dict) else value for key, value in plain.items()}
-    if part.get("effects", {}).get("gate") == "off":
-        del part["effects"]
-    if isinstance(part.get("model"), dict):
-        part["model"].pop("gate", None)  # only the default of effects.gate
-    for dotted in MEASURING:
-        head, _, tail = dotted.partition(".")
-        if not tail:
-            part.pop(head, None)
-        elif isinstance(part.get(head), dict):
-            part[head].pop(tail, None)
-    return part
-
-
-def training_hash(plain: Plain) -> str:
-    """Compute the SHA-256 of what a training reads: equal for two runs whose checkpoints can be exchanged."""
-    return config_hash(given(training_part(plain)))
-
-
-def is_same(plain: Plain, other: Plain) -> bool:
-    """Tell whether two configs are of the same training and measure the same."""
-    measuring = [{key: one for key, one in given(config).items() if not key.startswith(("effects.", "model."))}
-                 for config in (plain, other)]  # fmt: skip
-    return training_hash(plain) == training_hash(other) and measuring[0] == measuring[1]
-
-
-def given(plain: Plain) -> Plain:
-    """Flatten a config; a key that is null counts as absent, so that a new one changes no older run."""
-    return {key: value for key, value in flat(plain) if value is not None}
-
-
-def flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the leaves of a nested config as (dotted key, value)."""
-    for key, value in plain.items():
-        if isinstance(value, dict):
-            yield from flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _storable(value: Any) -> Any:

@@ -6,9 +6,10 @@ from pathlib import Path
 from gsbench.errors import InputError
 from gsbench.measure import record as records
 from gsbench.measure.record import Record
+from gsbench.measure.settings import Plain, training_hash
 from gsbench.run.attempt import Attempt
 from gsbench.run.checks import check_folder
-from gsbench.run.identity import Plain, Run, training_hash
+from gsbench.run.identity import Run
 from gsbench.run.load import own_root, typed_config
 from gsbench.run.run import write
 from gsbench.train import checkpoint

@@ -19,13 +19,13 @@ from gsbench.measure.record import Record
 from gsbench.run import claim
 from gsbench.run.attempt import Attempt
 from gsbench.run.checks import check_folder
-from gsbench.run.identity import Run, identify, is_same, training_hash
+from gsbench.run.finished import STALE, finished, where
+from gsbench.run.identity import Run, identify
 from gsbench.run.progress import Progress
 from gsbench.train.diagnosis import explain
 from gsbench.train.watch import DivergedError
 
 TRACEBACK = "traceback.txt"
-STALE = "record.stale.json"  # that of a finished run, kept beside the record of a later attempt that did not finish
 
 
 class UnrecordedError(InputError):
@@ -81,12 +81,13 @@ def _done(attempt: Attempt) -> Record:
     this = attempt.this
     try:
         model, scene = attempt.prepare()
-        kept = finished(this, scene.fingerprint)
+        kept = finished(this, scene)
         record = kept or attempt.measure(attempt.fit(model, scene))
     except Exception as error:
         kept, record = None, _ended_badly(attempt, error)
     if kept is not None:
-        print(f"{this.name}: finished before, kept: {summary(kept)}; {this.folder / records.FILE_NAME}")
+        print(f"{this.name}: finished before, kept: {summary(kept)}; measured {where(this, kept)}; "
+              f"{this.folder / records.FILE_NAME}")  # fmt: skip
         return kept
     try:
         write(record, this.folder)
@@ -97,30 +98,6 @@ def _done(attempt: Attempt) -> Record:
     print(f"{this.name}: {summary(record)}; {this.folder / records.FILE_NAME}")
     attempt.draw()
     return record
-
-
-def finished(this: Run, fingerprint: str) -> Record | None:
-    """Read the record of this run, if it ended well before, with the same training, measuring and data."""
-    if not this.config.resume:
-        return None
-    for path in (this.folder / records.FILE_NAME, this.folder / STALE):
-        if not path.exists():
-            continue
-        try:
-            record = records.read(path)
-        except InputError as error:
-            print(f"{this.name}: {error}", file=sys.stderr)
-            continue
-        theirs = record.provenance
-        if record.status == "ok" and theirs.data_hash == fingerprint and is_same(theirs.config, this.plain):
-            path.replace(this.folder / records.FILE_NAME)
-            return record
-        if record.status == "ok":
-            same = theirs.data_hash == fingerprint and training_hash(theirs.config) == training_hash(this.plain)
-            what = "measured" if same else "running"
-            print(f"{this.name}: {'what is measured' if same else 'the config or the data'} is not that of {path}: "
-                  f"{what} again", file=sys.stderr)  # fmt: skip
-    return None
 
 
 def _ended_badly(attempt: Attempt, error: Exception) -> Record:

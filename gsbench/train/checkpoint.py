@@ -27,7 +27,7 @@ TIMES = frozenset({"stages", "effort", "curve", "seconds", "frame_ms_before", "f
 class Checkpoint:
     """Everything that goes on from where a training was, and that draws its model without the data set."""
 
-    training: str  # hash of what the training reads: gsbench.run.identity.training_hash
+    training: str  # hash of what the training reads: gsbench.measure.settings.training_hash
     data: str  # Scene.fingerprint
     state: dict[str, Any]  # Trainer.state_dict
     config: dict[str, Any] = field(default_factory=dict)  # the whole resolved config, plain

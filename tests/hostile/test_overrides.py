@@ -23,7 +23,7 @@ from tiny_run import overrides, write_moving_square
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
 from gsbench.measure import record
-from gsbench.run.identity import flat
+from gsbench.measure.settings import flat
 from gsbench.run.run import run
 from gsbench.sweep.axes import expand
 from gsbench.train import checkpoint

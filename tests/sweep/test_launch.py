@@ -18,7 +18,7 @@ from tiny_run import ROOT, environment, gsbench, overrides, write_moving_square
 
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
-from gsbench.run.identity import flat
+from gsbench.measure.settings import flat
 from gsbench.sweep import hooks, plan, status
 from gsbench.sweep.__main__ import main as sweep_main
 from gsbench.sweep.plan import Plan, identity

@@ -1,0 +1,95 @@
+"""Tell which settings of a config a training reads and which only its measuring, and in which two configs differ.
+
+Needs no torch.
+"""
+
+from collections.abc import Collection, Iterator
+from typing import Any
+
+from gsbench.measure.provenance import config_hash
+
+Plain = dict[str, Any]  # a resolved config in plain JSON
+
+# What is measured after a training, and where data and results lie, changes no training. `best_on_test` and
+# `eval_split` are not here: the best iteration is looked for while the model trains.
+MEASURING = (
+    "experiment", "results", "resume", "launch", "data.dataset", "data.paper_dataset", "data.published", "data.root",
+    "data.scenes", "init.ply", "scene.released_as", "train.checkpoint_minutes", "protocol.name", "protocol.quantise",
+    "protocol.lpips_alex", "protocol.lpips_vgg", "protocol.renders", "protocol.pictures",
+)  # fmt: skip
+# Of these, where things lie: no number of a record depends on it, for LPIPS weights are checked by their hash.
+PLACES = (
+    "results", "resume", "launch", "data.root", "data.published", "data.scenes", "init.ply", "scene.released_as",
+    "train.checkpoint_minutes", "protocol.lpips_alex", "protocol.lpips_vgg",
+)  # fmt: skip
+_MOST_NAMED = 5  # differences that are named
+
+
+def training_part(plain: Plain) -> Plain:
+    """Return the part of a resolved config that a training reads."""
+    part: Plain = {key: dict(value) if isinstance(value, dict) else value for key, value in plain.items()}
+    if part.get("effects", {}).get("gate") == "off":
+        del part["effects"]
+    if isinstance(part.get("model"), dict):
+        part["model"].pop("gate", None)  # only the default of effects.gate
+    for dotted in MEASURING:
+        head, _, tail = dotted.partition(".")
+        if not tail:
+            part.pop(head, None)
+        elif isinstance(part.get(head), dict):
+            part[head].pop(tail, None)
+    return part
+
+
+def training_hash(plain: Plain) -> str:
+    """Compute the SHA-256 of what a training reads: equal for two runs whose checkpoints can be exchanged."""
+    return config_hash(given(training_part(plain)))
+
+
+def given(plain: Plain) -> Plain:
+    """Flatten a config; a key that is null counts as absent, so that a new one changes no older run."""
+    return {key: value for key, value in flat(plain) if value is not None}
+
+
+def flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the leaves of a nested config as (dotted key, value)."""
+    for key, value in plain.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def training_differences(theirs: Plain, mine: Plain) -> list[str]:
+    """Name the settings that a training reads and in which two configs differ; none for one training."""
+    return _differences(given(training_part(theirs)), given(training_part(mine)))
+
+
+def measuring_differences(theirs: Plain, mine: Plain) -> list[str]:
+    """Name the settings that change only what is measured of a training, and in which two configs differ."""
+    read = [given(training_part(config)).keys() for config in (theirs, mine)]
+    return _differences(*(
+        {key: value for key, value in given(config).items() if key not in keys and not _is_of(key, PLACES)
+         and not key.startswith(("effects.", "model."))} for config, keys in zip((theirs, mine), read, strict=True)
+    ))  # fmt: skip
+
+
+def listed(differences: list[str]) -> str:
+    """Join differences in a line, the first few by name."""
+    more = len(differences) - _MOST_NAMED
+    return "; ".join(differences[:_MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
+
+
+def _differences(theirs: Plain, mine: Plain) -> list[str]:
+    return [f"{key}: {_shown(theirs, key)} there, {_shown(mine, key)} now"
+            for key in sorted(theirs.keys() | mine.keys())
+            if config_hash({"": theirs.get(key, [])}) != config_hash({"": mine.get(key, [])})]  # fmt: skip
+
+
+def _shown(config: Plain, key: str) -> str:
+    return f"{config[key]!s:.80}" if key in config else "not set"
+
+
+def _is_of(key: str, settings: Collection[str]) -> bool:
+    """Tell whether a dotted key is one of some settings, or of a group among them."""
+    return any(key == one or key.startswith(f"{one}.") for one in settings)

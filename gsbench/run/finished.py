@@ -1,0 +1,100 @@
+"""Find the record of a run that finished before, and say why it is kept, measured again or trained again."""
+
+import sys
+from pathlib import Path
+
+import torch
+
+from gsbench import kernels
+from gsbench.errors import InputError
+from gsbench.measure import perceptual
+from gsbench.measure import record as records
+from gsbench.measure.machine import hardware, named
+from gsbench.measure.record import Record
+from gsbench.measure.settings import listed, measuring_differences, training_differences, training_hash
+from gsbench.run.checks import evaluated_views, lpips_weights
+from gsbench.run.identity import Run
+from gsbench.scenes import Scene
+from gsbench.train import checkpoint
+
+STALE = "record.stale.json"  # that of a finished run, kept beside the record of a later attempt that did not finish
+
+
+def finished(this: Run, scene: Scene) -> Record | None:
+    """Read the record of this run, if it ended well before, with the same training, measuring and data.
+
+    Where one ended well otherwise, the reason why it does not count is said. LPIPS weights that are new here have the
+    run measured again from its checkpoint; where that is gone, the record is kept without them.
+    """
+    if not this.config.resume:
+        return None
+    for path in (this.folder / records.FILE_NAME, this.folder / STALE):
+        if not path.exists():
+            continue
+        try:
+            record = records.read(path)
+        except InputError as error:
+            _say(this, str(error))
+            continue
+        if record.status != "ok":
+            continue
+        reason = _outdated(this, scene, record) or _lacks_lpips(this, scene, record)
+        if reason:
+            _say(this, f"{path}: {reason}")
+            continue
+        path.replace(this.folder / records.FILE_NAME)
+        return record
+    return None
+
+
+def where(this: Run, record: Record) -> str:
+    """Say when and on which machine the record of a run was measured."""
+    here, device = hardware(kernels.instruction_set()), this.config.device
+    name = torch.cuda.get_device_name(device) if device.startswith("cuda") else here.processor
+    theirs = record.provenance.machine
+    own = theirs == named(name, torch.get_num_threads(), here)
+    return f"{record.provenance.time.partition('T')[0]:.20} on {'this machine' if own else theirs}"
+
+
+def _outdated(this: Run, scene: Scene, record: Record) -> str:
+    """Say why the record of a finished run is not that of this one; "" where it is."""
+    theirs = record.provenance
+    training = training_differences(theirs.config, this.plain)
+    if training:
+        return f"the training is another ({listed(training)}): running again"
+    if theirs.data_hash != scene.fingerprint:
+        return "the scene's data has changed: running again"
+    measuring = measuring_differences(theirs.config, this.plain)
+    if measuring:
+        again = "measured again" if _is_trained(this, scene) else "its checkpoint is gone: running again"
+        return f"what is measured is another ({listed(measuring)}): {again}"
+    return ""
+
+
+def _lacks_lpips(this: Run, scene: Scene, record: Record) -> str:
+    """Say why a record is measured again for LPIPS weights that were not there; "" where it is kept."""
+    camera, given = evaluated_views(scene, this.config.scene.eval_split)[0].camera, lpips_weights(this.config)
+    new = [name for name, known in perceptual.BACKBONES.items()
+           if (record.metrics or {}).get(f"lpips_{name}") is None and perceptual.is_here(name, given.get(name))
+           and min(camera.width, camera.height) >= known.least_side]  # fmt: skip
+    if not new:
+        return ""
+    what = f"it has no LPIPS ({', '.join(new)}), whose weights are here now"
+    if _is_trained(this, scene):
+        return f"{what}: measured again"
+    _say(this, f"{what}, but its checkpoint is gone: kept without")
+    return ""
+
+
+def _is_trained(this: Run, scene: Scene) -> bool:
+    """Tell whether the checkpoint of this run is there and holds all of its training."""
+    path: Path = this.folder / checkpoint.FILE_NAME
+    try:
+        state = checkpoint.load(path, training_hash(this.plain), scene.fingerprint, "cpu")
+    except InputError:
+        return False
+    return state is not None and state.get("step") == this.config.train.iterations
+
+
+def _say(this: Run, text: str) -> None:
+    print(f"{this.name}: {text}", file=sys.stderr)

@@ -1,0 +1,174 @@
+"""A run that finished before: kept, measured again or trained again, and the reason is said."""
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_run import overrides, run_here, write_moving_square
+
+from gsbench.errors import InputError
+from gsbench.measure import perceptual
+from gsbench.measure import record as files
+from gsbench.measure.record import Record
+from gsbench.train import checkpoint
+from gsbench.train.loop import Trainer
+
+WORDS = ("model=3dgs", "train.iterations=4")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_square(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory, data: Path) -> tuple[Record, Path, Path]:
+    """A finished run of 4 steps, its results and its folder."""
+    results = tmp_path_factory.mktemp("results")
+    record, folder = run_here(*overrides(data, results, *WORDS))
+    assert record.status == "ok"
+    return record, results, folder
+
+
+class Trained(Exception):  # noqa: N818
+    """A step of training, where none should be."""
+
+
+@pytest.fixture
+def again(tmp_path: Path, data: Path, done, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
+    """Do the finished run again with other words, and return the new record and what was said."""
+    first, before, folder = done
+    results = tmp_path / "results"
+    shutil.copytree(before, results)
+
+    def no_step(*_: object) -> None:
+        raise Trained
+
+    def repeat(*more: str, change: object = None, trains: bool = False) -> tuple[Record, str]:
+        if not trains:
+            monkeypatch.setattr(Trainer, "_descend", no_step)
+        if callable(change):
+            change(repeat.folder)
+        capfd.readouterr()
+        record, _ = run_here(*overrides(data, results, *WORDS, *more))
+        return record, "".join(capfd.readouterr())
+
+    repeat.first, repeat.folder = first, results / folder.relative_to(before)
+    return repeat
+
+
+def weights(monkeypatch: pytest.MonkeyPatch, *, here: bool) -> None:
+    """Pretend that the weights of LPIPS' VGG, which takes images as small as these, are or are not on this machine."""
+
+    def load(backbone: str, *_: object):
+        if backbone != "vgg" or not here:
+            raise perceptual.BackboneMissing("no trunk weights")
+        return lambda *_: torch.tensor([0.25])
+
+    monkeypatch.setattr(perceptual, "load", load)
+    monkeypatch.setattr(perceptual, "is_here", lambda backbone, _: here and backbone == "vgg")
+
+
+def no_checkpoint(folder: Path) -> None:
+    (folder / checkpoint.FILE_NAME).unlink()
+
+
+def test_what_is_kept_says_where_it_was_measured(again) -> None:
+    """Catches a stranger who takes a kept record's seconds for his own machine's."""
+
+    def elsewhere(folder: Path) -> None:
+        provenance = dataclasses.replace(
+            again.first.provenance, device="another CPU", hardware=None, time="2026-01-02T"
+        )
+        files.write(dataclasses.replace(again.first, provenance=provenance), folder / files.FILE_NAME)
+
+    assert "finished before, kept: PSNR " in again()[1]
+    assert "on this machine; " in again()[1]
+    threads = again.first.provenance.machine.rpartition(", ")[2]
+    assert f"measured 2026-01-02 on another CPU, {threads}; " in again(change=elsewhere)[1]
+
+
+def test_a_place_is_no_setting(again, data: Path, tmp_path: Path) -> None:
+    """Catches a training repeated, for want of its checkpoint, because the data were moved or are saved less often."""
+    (tmp_path / "moved").symlink_to(data)
+    record, said = again(f"data.root={tmp_path / 'moved'}", "train.checkpoint_minutes=9", change=no_checkpoint)
+    assert record == again.first
+    assert "finished before, kept" in said
+
+
+def test_what_is_measured_otherwise_is_named(again) -> None:
+    """Catches a user who is told that something differs and not what."""
+    record, said = again("protocol.quantise=true")
+    assert "what is measured is another (protocol.quantise: False there, True now): measured again" in said
+    assert record.protocol["quantise"] is True
+
+
+def test_a_checkpoint_that_is_gone_is_said(again) -> None:
+    """Catches a training of hours that is announced as a measurement."""
+    said = again("protocol.quantise=true", change=no_checkpoint, trains=True)[1]
+    assert "(protocol.quantise: False there, True now): its checkpoint is gone: running again" in said
+
+
+def test_another_training_is_named(again) -> None:
+    """Catches a run of an older config in the same folder that is trained again for no reason that is said."""
+
+    def older(folder: Path) -> None:
+        config = dict(again.first.provenance.config)
+        config["train"] = config["train"] | {"iterations": 1000}
+        provenance = dataclasses.replace(again.first.provenance, config=config)
+        files.write(dataclasses.replace(again.first, provenance=provenance), folder / files.FILE_NAME)
+        no_checkpoint(folder)
+
+    said = again(change=older, trains=True)[1]
+    assert "the training is another (train.iterations: 1000 there, 4 now): running again" in said
+
+
+def test_changed_data_are_named(again) -> None:
+    """Catches data that have changed and are called another config."""
+
+    def other(folder: Path) -> None:
+        provenance = dataclasses.replace(again.first.provenance, data_hash="0" * 64)
+        files.write(dataclasses.replace(again.first, provenance=provenance), folder / files.FILE_NAME)
+
+    assert "the scene's data has changed: running again" in again(change=other)[1]
+
+
+def test_weights_that_come_are_measured_from_the_checkpoint(again, monkeypatch) -> None:
+    """Catches a training that LPIPS weights cost, and a column that stays empty although they are there."""
+    assert again.first.metrics["lpips_vgg"] is None
+    weights(monkeypatch, here=True)
+    record, said = again()
+    assert "it has no LPIPS (vgg), whose weights are here now: measured again" in said
+    assert record.metrics["lpips_vgg"] == 0.25
+    assert record.metrics["psnr"] == again.first.metrics["psnr"]
+
+
+def test_weights_that_come_after_the_checkpoint_went_cost_nothing(again, monkeypatch) -> None:
+    """Catches a training repeated for an LPIPS column: a record without its checkpoint is kept as it is."""
+    weights(monkeypatch, here=True)
+    record, said = again("protocol.lpips_vgg=weights.pth", change=no_checkpoint)
+    assert "whose weights are here now, but its checkpoint is gone: kept without" in said
+    assert record == again.first
+
+
+def test_weights_that_go_take_nothing_with_them(again, monkeypatch) -> None:
+    """Catches LPIPS that is lost, or a training repeated, because the weights are no longer here or not named."""
+    weights(monkeypatch, here=True)
+    measured, _ = again("protocol.lpips_vgg=weights.pth")
+    weights(monkeypatch, here=False)
+    record, said = again(change=no_checkpoint)
+    assert record == measured
+    assert record.metrics["lpips_vgg"] == 0.25
+    assert "finished before, kept" in said
+
+
+def test_weights_that_are_named_and_missing_lose_no_record(again, tmp_path: Path) -> None:
+    """Catches a finished record lost to a path that is wrong: it is refused, and comes back with the right one."""
+    refused, _ = again(f"protocol.lpips_vgg={tmp_path / 'gone.pth'}")
+    assert refused.status == "failed"
+    assert "kept in record.stale.json" in str(files.read(again.folder / files.FILE_NAME).reason)
+    assert again()[0] == again.first
+    with pytest.raises(InputError):
+        perceptual.load("vgg", tmp_path / "gone.pth")
