@@ -5,14 +5,20 @@ import sys
 from pathlib import Path
 
 from gsbench.errors import InputError, one_line
-from gsbench.report import layout, live, paper_tables, tables
+from gsbench.measure.record import Record
+from gsbench.report import against_table, layout, live, paper_tables, tables
+from gsbench.report.against import DIFFERS, Comparison, compare
 from gsbench.report.page import build
+from gsbench.report.publish import publish
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print and write the tables and ``report.html``; return 1 if a record is left out, 2 if there is none.
+    """Print and write the tables and ``report.html``.
 
     A record that is damaged, or that of a run which has another record, is left out and named with the reason.
+
+    Returns:
+        1 if a record is left out or differs from those that it is held against, 2 if there is none.
     """
     parser = argparse.ArgumentParser(prog="python -m gsbench.report", description=__doc__)
     parser.add_argument("results", type=Path, metavar="RESULTS_DIR", help="a folder with records, at any depth")
@@ -20,25 +26,49 @@ def main(arguments: list[str] | None = None) -> int:
     either = parser.add_mutually_exclusive_group()
     either.add_argument("--tables", action="store_true", help="only Tables 1 and 2 of the paper: table1.* and table2.*")
     either.add_argument("--live", action="store_true", help="write again whenever a record arrives, until Ctrl-C")
+    either.add_argument("--publish", type=Path, metavar="DIR", help="copy the records to DIR, and write its table anew")
+    parser.add_argument("--against", type=Path, metavar="DIR", help="compare with the records in DIR; 1 if they differ")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the comparison to FILE")
     asked = parser.parse_args(arguments)
     folder = asked.results
+    if asked.json and not asked.against:
+        parser.error("--json: expected --against beside it")
+    if asked.against and (asked.live or asked.tables or asked.publish):
+        parser.error("--against: expected none of --live, --tables and --publish beside it")
     if asked.live:
         return live.watch(folder, train=asked.train)
+    differs = False
     try:
         records, faults = tables.load(folder)
-        if records and asked.tables:
+        if asked.publish:
+            print(publish(folder, asked.publish))
+        elif records and asked.tables:
             print(layout.terminal(paper_tables.write(records, folder)))
             print(f"Written: {', '.join(str(folder / name) for name in paper_tables.NAMES)}")
         elif records:
             print(layout.terminal(tables.write(records, folder, train=asked.train)))
-            page = build.write(records, folder, faults)
+            compared = _compared(records, folder, asked.against) if asked.against else None
+            page = build.write(records, folder, faults, against=compared)
             print(f"Written: {folder / 'table.md'}, {folder / 'table.csv'}, {page}")
+            if compared:
+                differs = compared.verdict == DIFFERS
+                if asked.json:
+                    against_table.write_json(compared, asked.json)
+                print(f"\n{layout.terminal(against_table.tables(compared))}\n{compared.line}")
     except (InputError, OSError) as error:
         print(f"gsbench.report: {one_line(error)}", file=sys.stderr)
         return 2
     for fault in faults:
         print(f"gsbench.report: left out: {fault}", file=sys.stderr)
-    return 1 if faults else 0
+    return 1 if faults or differs else 0
+
+
+def _compared(records: list[Record], folder: Path, other: Path) -> Comparison:
+    """Compare with the records of another folder; one that cannot be read is named."""
+    theirs, faults = tables.load(other)
+    for fault in faults:
+        print(f"gsbench.report: left out: {fault}", file=sys.stderr)
+    return compare(records, theirs, (str(folder), str(other)))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,9 @@ from markupsafe import Markup
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
 from gsbench.report import layout
+from gsbench.report.against import Comparison
 from gsbench.report.arms import Group, groups
+from gsbench.report.page import against as other
 from gsbench.report.page import cost, evidence, on_demand, time_to_quality, words, worth
 from gsbench.report.page.content import Canvas, Runs, Section, Table
 from gsbench.report.page.gallery import View, gallery
@@ -39,7 +41,14 @@ class Chapter:
     legend: list[tuple[str, Style]]
 
 
-def write(records: list[Record], folder: Path, faults: Sequence[str] = (), *, reload: int = 0) -> Path:
+def write(
+    records: list[Record],
+    folder: Path,
+    faults: Sequence[str] = (),
+    *,
+    reload: int = 0,
+    against: Comparison | None = None,
+) -> Path:
     """Write the page of `records`, which lie in `folder`, and return its path.
 
     Args:
@@ -47,13 +56,21 @@ def write(records: list[Record], folder: Path, faults: Sequence[str] = (), *, re
         folder: where the records and their pictures are, and where the page goes.
         faults: the records that are left out, and why.
         reload: seconds after which an open page loads itself again; 0: never.
+        against: with the runs of another folder; None: with none.
     """
     path = folder / FILE_NAME
-    write_atomically(path, render(records, folder, faults, reload=reload).encode())
+    write_atomically(path, render(records, folder, faults, reload=reload, against=against).encode())
     return path
 
 
-def render(records: list[Record], folder: Path, faults: Sequence[str] = (), *, reload: int = 0) -> str:
+def render(
+    records: list[Record],
+    folder: Path,
+    faults: Sequence[str] = (),
+    *,
+    reload: int = 0,
+    against: Comparison | None = None,
+) -> str:
     """Return the page as HTML; arguments as of `write`."""
     found = groups(records)
     look = styles(sorted({name for group in found for name in group.series}))
@@ -62,6 +79,8 @@ def render(records: list[Record], folder: Path, faults: Sequence[str] = (), *, r
         Canvas(f"g{i}", runs, {name: look[name] for name in group.series}, scenes) for i, group in enumerate(found)
     ]
     chapters = [_chapter(group, folder, canvas) for group, canvas in zip(found, canvases, strict=True)]
+    for group, chapter in zip(found, chapters, strict=True):
+        chapter.sections[-1:-1] = [other.against_section(against, group)] if against else []
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader(__package__, "."),
         autoescape=True,

@@ -1,0 +1,268 @@
+"""Compare the runs of two folders of records, such as this machine's with published ones, and judge each quantity.
+
+Runs are compared where model, variant, scene, data, training and measuring are equal. Another machine or instruction
+set rounds otherwise, and a training that rounds otherwise ends as one of another seed would: so the runs of a model on
+a scene are taken for draws of two samples, and their means for equal as far as the spread over seeds allows (Student's
+t, Holm over all rows). A few seeds say little of their own spread: it is pooled over the models and scenes of an
+experiment, and that of the row itself counts where it is larger. So one run can be held against three.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from statistics import fmean, variance
+
+from gsbench.measure.record import Record
+from gsbench.measure.settings import listed, training_differences
+from gsbench.report.arms import OF_THE_MACHINE, QUANTITIES
+from gsbench.report.conditions import printable
+from gsbench.report.intervals import LEVEL, Estimate, Spread, holm
+
+AGREES, DIFFERS, UNTOLD = "agrees", "differs", "cannot be told"
+MEASURING = ("eval_split", "quantise", "resolution", "background", "downscale")  # of a record's protocol
+SAME_LOAD = 0.5  # mean loads further apart than this make seconds of two runs incomparable
+
+
+@dataclass(frozen=True)
+class Limit:
+    """How near two means are equal, and how wide an interval still tells that they are; of theirs where relative."""
+
+    equal: float
+    widest: float
+    relative: bool = True
+
+
+LIMITS = {  # by quantities of gsbench.report.arms, and those below
+    "psnr": Limit(0.01, 1.0, relative=False),  # dB
+    "seconds": Limit(0.25, 0.5),
+    "ms": Limit(0.25, 0.5),
+    "gaussians": Limit(0.1, 0.25),
+    "mb": Limit(0.1, 0.25),
+}
+RULE = (
+    "Rule: runs of a model on a scene are compared where training, data and measuring are equal; seconds and ms only "
+    "of one machine with one load (within 0.5). A row agrees where the means are within 0.01 dB, 25 % of seconds or "
+    "ms, 10 % of Gaussians or MB, or the 95 % interval over seeds holds zero and is no wider than ± 1 dB, 50 %, 25 %; it "
+    "differs where p < 0.05 after Holm over all rows; else it cannot be told. The spread over seeds is pooled over all "
+    "rows; a row's own counts where it is larger. The verdict of the whole is that of PSNR: it differs where one row "
+    "does, and agrees where all rows do."
+)
+
+
+NONE = Estimate(math.nan, 0, 0, "")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A quantity of a model on a scene: the difference of the means, ours less theirs, and what it comes to."""
+
+    ours: list[float]  # by run
+    theirs: list[float]
+    reason: str = ""  # why it cannot be told
+    verdict: str = UNTOLD
+    difference: Estimate = NONE
+    p_holm: float = math.nan
+
+
+@dataclass(frozen=True)
+class Row:
+    """A model with its variant on a scene, in both folders."""
+
+    experiment: str
+    dataset: str
+    scene: str
+    model: str
+    ours: dict[int, Record]  # by seed
+    theirs: dict[int, Record]
+    judged: dict[str, Judged] = field(default_factory=dict)  # by quantity
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two folders side by side."""
+
+    ours: str  # the folder
+    theirs: str
+    rows: list[Row]
+    only_ours: list[str]  # models on scenes that the other folder lacks
+    only_theirs: list[str]
+
+    def of(self, quantity: str, verdict: str) -> list[Row]:
+        """List the rows whose quantity is judged so."""
+        return [row for row in self.rows if row.judged[quantity].verdict == verdict]
+
+    @property
+    def verdict(self) -> str:
+        """Differs where PSNR does in any row, and agrees where it does in every one."""
+        if self.of("psnr", DIFFERS):
+            return DIFFERS
+        return AGREES if self.rows and len(self.of("psnr", AGREES)) == len(self.rows) else UNTOLD
+
+    @property
+    def line(self) -> str:
+        """Say in one line what the comparison comes to."""
+        head = f"{self.ours} against {self.theirs}: {self.verdict}."
+        if not self.rows:
+            return f"{head} No model and scene is in both."
+        said = [f"PSNR agrees in {len(self.of('psnr', AGREES))} of {len(self.rows)} models on scenes{self._largest()}"]
+        for quantity, name in (("psnr", "PSNR"), ("gaussians", "Gaussians"), ("mb", "bytes"), ("seconds", "seconds"),
+                               ("ms", "ms a frame")):  # fmt: skip
+            differing = self.of(quantity, DIFFERS)
+            said += [f"{name} differ{'s' * (name == 'PSNR')}: {_places(differing)}"] if differing else []
+        untold = self.of("psnr", UNTOLD)
+        said += [f"PSNR cannot be told: {_places(untold)} ({untold[0].judged['psnr'].reason})"] if untold else []
+        seconds = self.of("seconds", UNTOLD)
+        if len(seconds) == len(self.rows):
+            said.append(f"seconds cannot be told ({seconds[0].judged['seconds'].reason})")
+        return f"{head} {'; '.join(said)}."
+
+    def _largest(self) -> str:
+        known = [row for row in self.rows if not math.isnan(row.judged["psnr"].difference.mean)]
+        if not known:
+            return ""
+        most = max(known, key=lambda row: abs(row.judged["psnr"].difference.mean))
+        apart = f"largest difference {most.judged['psnr'].difference.mean:+.2f} dB, {_places([most])}"
+        shared = [(row.ours[seed], row.theirs[seed]) for row in known for seed in row.ours.keys() & row.theirs.keys()]
+        equal = sum(abs(value(a, "psnr") - value(b, "psnr")) <= LIMITS["psnr"].equal for a, b in shared)
+        return f" ({apart}; of {len(shared)} equal seeds {equal} end within 0.01 dB)" if shared else f" ({apart})"
+
+
+def compare(ours: Sequence[Record], theirs: Sequence[Record], names: tuple[str, str]) -> Comparison:
+    """Compare the runs of two folders.
+
+    Args:
+        ours: records of the one.
+        theirs: records of the other.
+        names: of the two folders.
+    """
+    here, there = _arms(ours), _arms(theirs)
+    rows = [_row(here[key], there[key]) for key in sorted(here.keys() & there.keys())]
+    for quantity, limit in LIMITS.items():
+        experiments: dict[tuple[str, str], list[Row]] = {}
+        for row in rows:
+            if not row.judged[quantity].reason:
+                experiments.setdefault((row.experiment, row.dataset), []).append(row)
+        for of_one in experiments.values():
+            for row, found in zip(of_one, differences([r.judged[quantity] for r in of_one], limit), strict=True):
+                row.judged[quantity] = replace(row.judged[quantity], difference=found)
+        adjusted = holm([row.judged[quantity].difference.p for row in rows])
+        for row, p in zip(rows, adjusted, strict=True):
+            row.judged[quantity] = _judge(row.judged[quantity], limit, p)
+    return Comparison(*names, rows, _missing(here, there), _missing(there, here))
+
+
+Arms = dict[tuple[str, str, str, str, str], dict[int, Record]]
+
+
+def _arms(records: Sequence[Record]) -> Arms:
+    found: Arms = {}
+    for r in records:
+        found.setdefault((r.experiment, r.dataset, r.scene, r.model, r.variant), {})[r.seed] = r
+    return found
+
+
+def _missing(of: Arms, other: Arms) -> list[str]:
+    """Name the models on scenes that only one folder has."""
+    return [f"{model} {variant}".rstrip() + f" on {scene}" for _, _, scene, model, variant in sorted(of.keys() - other)]
+
+
+def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> Row:
+    """Put the runs of a model on a scene side by side, with each quantity's difference or why there is none."""
+    first = next(iter(ours.values()))
+    mine, other = ([r for r in runs.values() if r.status == "ok"] for runs in (ours, theirs))
+    why = _incomparable(mine, other)
+    judged = {}
+    for quantity in LIMITS:
+        known = [[v for r in runs if not math.isnan(v := value(r, quantity))] for runs in (mine, other)]
+        reason = why or (_other_machine(mine, other) if quantity in OF_THE_MACHINE else "")
+        if not reason and not all(known):
+            reason = f"{'here' if not known[0] else 'there'} it was not measured"
+        judged[quantity] = Judged(known[0], known[1], reason)
+    label = f"{first.model} {first.variant}".rstrip()
+    return Row(first.experiment, first.dataset, first.scene, label, ours, theirs, judged)
+
+
+def value(record: Record, quantity: str) -> float:
+    """Read a quantity of LIMITS from a record; NaN where it is missing."""
+    if quantity == "gaussians":
+        return record.cost.num_gaussians if record.cost else math.nan
+    return QUANTITIES[quantity](record)
+
+
+def differences(rows: list[Judged], limit: Limit) -> list[Estimate]:
+    """Estimate the difference of the means in each of some rows, with the spread over seeds that they share."""
+    units = [abs(fmean(row.theirs)) if limit.relative else 1.0 for row in rows]
+    samples = [[[v / (unit or 1.0) for v in runs] for runs in (row.ours, row.theirs)]
+               for row, unit in zip(rows, units, strict=True)]  # fmt: skip
+    own = [_squares(*of_row) for of_row in samples]
+    freedom = sum(free for _, free in own)
+    pooled = sum(squares for squares, _ in own) / freedom if freedom else math.nan
+    found = []
+    for (ours, theirs), (squares, free), unit in zip(samples, own, units, strict=True):
+        mean, count = (fmean(ours) - fmean(theirs)) * unit, min(len(ours), len(theirs))
+        spread = max(pooled, squares / free if free else 0.0) * unit**2 * (1 / len(ours) + 1 / len(theirs))
+        levels = (Spread(spread, freedom),) if freedom else ()
+        found.append(Estimate(mean, 1, count, "seeds" if freedom else "", levels))
+    return found
+
+
+def _squares(*samples: list[float]) -> tuple[float, int]:
+    """Sum the squares about the means of some samples, and count their degrees of freedom."""
+    squares = sum(variance(sample) * (len(sample) - 1) for sample in samples if len(sample) > 1)
+    return squares, sum(len(sample) - 1 for sample in samples)
+
+
+def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
+    """Say why no quantity of two samples of runs compares; "" where all do."""
+    if not ours or not theirs:
+        return f"no run finished {'here' if not ours else 'there'}"
+    first = theirs[0]
+    for r in (*ours, *theirs):
+        configs = ({**one.provenance.config, "seed": None} for one in (first, r))
+        if differing := training_differences(*configs):
+            return f"another training: {printable(listed(differing))}"
+        if r.provenance.data_hash != first.provenance.data_hash:
+            return "other data"
+        for name in MEASURING:
+            if r.protocol.get(name) != first.protocol.get(name):
+                return f"measured otherwise: {name} {printable(first.protocol.get(name))} there, " + printable(
+                    r.protocol.get(name)
+                )
+    return ""
+
+
+def _other_machine(ours: list[Record], theirs: list[Record]) -> str:
+    """Say why seconds do not compare; "" where all were measured on one machine under one load."""
+    here, there = ({r.provenance.machine for r in runs} for runs in (ours, theirs))
+    if here != there or len(here) > 1:
+        named = [printable("; ".join(sorted(machines)))[:200] for machines in (here, there)]
+        return f"other machines: {named[0]} here, {named[1]} there"
+    loads = [[r.cost.load for r in runs if r.cost and r.cost.load is not None] for runs in (ours, theirs)]
+    if not all(loads):
+        return "the load of the machine is not known"
+    means = [fmean(known) for known in loads]
+    if abs(means[0] - means[1]) > SAME_LOAD:
+        return f"the machine had other work: load {means[0]:.1f} here, {means[1]:.1f} there"
+    return ""
+
+
+def _judge(found: Judged, limit: Limit, p: float) -> Judged:
+    """Decide by RULE."""
+    if found.reason:
+        return found
+    unit = abs(fmean(found.theirs)) if limit.relative else 1.0
+    if abs(found.difference.mean) <= limit.equal * unit:
+        return replace(found, verdict=AGREES, p_holm=p)
+    if not found.difference.over:
+        return replace(found, reason="one run of each model on both sides: no spread over seeds is known")
+    if p < 1 - LEVEL:
+        return replace(found, verdict=DIFFERS, p_holm=p)
+    if found.difference.half > limit.widest * unit:
+        return replace(found, reason="the interval is too wide: more seeds are needed", p_holm=p)
+    return replace(found, verdict=AGREES, p_holm=p)
+
+
+def _places(rows: list[Row]) -> str:
+    """Name models on scenes, the first few."""
+    named = [f"{printable(row.model)} on {printable(row.scene)}" for row in rows[:3]]
+    return ", ".join(named) + (f" and {len(rows) - 3} more" if len(rows) > 3 else "")

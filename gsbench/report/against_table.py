@@ -1,0 +1,124 @@
+"""Write a comparison of two folders of records: as a table for the terminal and the page, and as JSON."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from gsbench.measure.atomic import write_atomically
+from gsbench.measure.record import Record
+from gsbench.report.against import LIMITS, RULE, Comparison, Judged, Row, value
+from gsbench.report.conditions import printable
+from gsbench.report.layout import EMPTY, Column, Section, Table
+from gsbench.report.layout import Row as Line
+
+COLUMNS = [
+    Column("psnr", "PSNR dB", 2),
+    Column("seconds", "training s", 1),
+    Column("ms", "ms a frame", 2),
+    Column("gaussians", "Gaussians", 0),
+    Column("mb", "MB", 2),
+]
+
+
+def tables(of: Comparison) -> list[Table]:
+    """Make a table: for each scene and model a line for every seed, ours / theirs, and one for the difference."""
+    scenes = sorted({(row.experiment, row.dataset, row.scene) for row in of.rows})
+    several = len({scene[:2] for scene in scenes}) > 1
+    sections = []
+    for scene in scenes:
+        rows = [row for row in of.rows if (row.experiment, row.dataset, row.scene) == scene]
+        title = ", ".join(map(printable, scene)) if several else printable(scene[2])
+        sections.append(Section(title, [line for row in rows for line in lines(row)], _reasons(rows)))
+    footnotes = [RULE]
+    for folder, missing in ((of.ours, of.only_ours), (of.theirs, of.only_theirs)):
+        more = f" and {len(missing) - 10} more" if len(missing) > 10 else ""
+        footnotes += [f"only in {folder}: {printable(', '.join(missing[:10]))}{more}"] if missing else []
+    return [Table(f"{of.ours} / {of.theirs}", COLUMNS, sections, [], footnotes)]
+
+
+def lines(row: Row) -> list[Line]:
+    """Make the lines of a model on a scene: its seeds, the differences with their intervals, the verdicts."""
+    made = []
+    for seed in sorted(row.ours.keys() | row.theirs.keys()):
+        pair = row.ours.get(seed), row.theirs.get(seed)
+        cells = {c.key: " / ".join(_shown(record, c) for record in pair) for c in COLUMNS}
+        made.append(Line(f"{printable(row.model)} seed {seed}", cells))
+    made.append(Line("  difference", {c.key: _difference(row.judged[c.key], c) for c in COLUMNS}))
+    made.append(Line("  verdict", {c.key: row.judged[c.key].verdict for c in COLUMNS}))
+    return made
+
+
+def _shown(record: Record | None, column: Column) -> str:
+    return EMPTY if record is None or record.status != "ok" else column.show(value(record, column.key))
+
+
+def _difference(found: Judged, column: Column) -> str:
+    """Show a difference with half its interval."""
+    mean, half = found.difference.mean, found.difference.half
+    if math.isnan(mean):
+        return EMPTY
+    width = "" if math.isnan(half) else f" ± {half:.{column.digits}f}"
+    return f"{mean:+.{column.digits}f}{width}"
+
+
+def _reasons(rows: list[Row]) -> list[str]:
+    """Say why something cannot be told; equal reasons once."""
+    titles = {c.key: c.title for c in COLUMNS}
+    why: dict[str, dict[str, list[str]]] = {}
+    for row in rows:
+        for quantity, found in row.judged.items():
+            if found.reason:
+                why.setdefault(found.reason, {}).setdefault(titles[quantity], []).append(printable(row.model))
+    said = []
+    for reason, of in why.items():
+        models = sorted({model for named in of.values() for model in named})
+        who = "" if len(models) == len(rows) else f" of {', '.join(models)}"
+        said.append(f"{', '.join(of)}{who} cannot be told: {reason}")
+    return said
+
+
+def write_json(of: Comparison, path: Path) -> None:
+    """Write a comparison as JSON, atomically; what is not known is null."""
+    content = {
+        "ours": of.ours,
+        "theirs": of.theirs,
+        "verdict": of.verdict,
+        "line": of.line,
+        "rule": RULE,
+        "rows": [_plain(row) for row in of.rows],
+        "only_ours": of.only_ours,
+        "only_theirs": of.only_theirs,
+    }
+    write_atomically(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+
+
+def _plain(row: Row) -> dict[str, Any]:
+    named = {name: getattr(row, name) for name in ("experiment", "dataset", "scene", "model")}
+    runs = [
+        {"seed": seed, "ours": _run(row.ours.get(seed)), "theirs": _run(row.theirs.get(seed))}
+        for seed in sorted(row.ours.keys() | row.theirs.keys())
+    ]
+    judged = {
+        quantity: {
+            "verdict": found.verdict,
+            "reason": found.reason or None,
+            "difference": _number(found.difference.mean),
+            "low": _number(found.difference.low),
+            "high": _number(found.difference.high),
+            "p_holm": _number(found.p_holm),
+        }
+        for quantity, found in row.judged.items()
+    }
+    return {**named, "runs": runs, "judged": judged}
+
+
+def _run(record: Record | None) -> dict[str, Any] | None:
+    if record is None:
+        return None
+    numbers = {quantity: _number(value(record, quantity)) for quantity in LIMITS}
+    return {"status": record.status, **numbers, "machine": record.provenance.machine}
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

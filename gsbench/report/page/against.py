@@ -1,0 +1,24 @@
+"""Write the section that holds the runs of a page against those of another folder, such as published ones."""
+
+from gsbench.report.against import AGREES, DIFFERS, RULE, UNTOLD, Comparison
+from gsbench.report.against_table import COLUMNS, lines
+from gsbench.report.arms import Group
+from gsbench.report.page import words
+from gsbench.report.page.content import Column, Section, Table, Value
+
+LONGEST = 400  # characters of the line
+
+
+def against_section(comparison: Comparison, group: Group) -> Section:
+    """Show the seeds of each model and scene of a group side by side, ours / theirs, with differences and verdicts."""
+    own = [row for row in comparison.rows if (row.experiment, row.dataset) == (group.experiment, group.dataset)]
+    columns = [Column("scene"), Column("run"), *(Column(c.title) for c in COLUMNS)]
+    rows: list[list[Value]] = [
+        [row.scene, line.label.strip(), *(line.cells[c.key] for c in COLUMNS)] for row in own for line in lines(row)
+    ]
+    said = [words.cut(comparison.line, LONGEST)]
+    if own:
+        counts = [f"{sum(r.judged['psnr'].verdict == v for r in own)} {v}" for v in (AGREES, DIFFERS, UNTOLD)]
+        said.append(f"PSNR of {words.count(len(own), 'model')} on scenes: {', '.join(counts)}.")
+    title = f"Against {words.cut(comparison.theirs, 80)}"
+    return Section("against", title, said, table=Table("against.csv", columns, rows) if own else None, notes=[RULE])
