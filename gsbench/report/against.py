@@ -42,10 +42,10 @@ LIMITS = {  # by quantities of gsbench.report.arms, and those below
 RULE = (
     "Rule: runs of a model on a scene are compared where training, data and measuring are equal; seconds and ms only "
     "of one machine with one load (within 0.5). A row agrees where the means are within 0.01 dB, 25 % of seconds or "
-    "ms, 10 % of Gaussians or MB, or the 95 % interval over seeds holds zero and is no wider than ± 1 dB, 50 %, 25 %; it "
-    "differs where p < 0.05 after Holm over all rows; else it cannot be told. The spread over seeds is pooled over all "
-    "rows; a row's own counts where it is larger. The verdict of the whole is that of PSNR: it differs where one row "
-    "does, and agrees where all rows do."
+    "ms, 10 % of Gaussians or MB, or the 95 % interval over seeds holds zero and is no wider than ± 1 dB, 50 %, 25 %; "
+    "it differs where p < 0.05 after Holm over all rows; else it cannot be told. The spread over seeds is pooled over "
+    "all rows; a row's own counts where it is larger. The verdict of the whole is that of PSNR: it differs where "
+    "one row does, and agrees where all rows do."
 )
 
 
