@@ -18,10 +18,15 @@ Values = npt.NDArray[np.float64]
 
 
 def psnr_val(record: Record) -> float:
-    """Return the PSNR on val at the end of the run, dB; NaN where it was not measured."""
+    """Return the PSNR on val at the end of the run, dB; NaN where it was not measured.
+
+    The curve ends before the gate at the end, whose loss on val is taken off.
+    """
     if record.protocol.get("eval_split") == "val":
         return _number((record.metrics or {}).get("psnr"))
-    return _number(record.curve[-1].psnr_val) if record.curve else math.nan
+    gates = record.on_demand.gates if record.on_demand else []
+    lost = sum(gate.measured_db for gate in gates if gate.step is None and gate.checked_on == "val")
+    return _number(record.curve[-1].psnr_val) - lost if record.curve else math.nan
 
 
 QUANTITIES: dict[str, Callable[[Record], float]] = {
@@ -143,6 +148,13 @@ class Group:
     def covered(self) -> list[str]:
         """The scenes that every model has finished at the common variant, over which averages are taken."""
         return [s for s in self.scenes if self.main_arms and all(s in arm.runs for arm in self.main_arms)]
+
+    @cached_property
+    def basis(self) -> list[str]:
+        """The scenes that answers are means of: the covered ones, or where there are none the one with most arms."""
+        if self.covered or not self.arms:
+            return self.covered
+        return [max(self.scenes, key=lambda s: sum(s in arm.runs for arm in self.arms))]
 
     @cached_property
     def machine(self) -> str:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsbench.report.arms import Arm, Group, Values, is_ablated
-from gsbench.report.intervals import LEVEL, Estimate, estimate, holm
+from gsbench.report.family import Family, Tested, Weights
+from gsbench.report.intervals import Estimate
 
 Cell = tuple[bool, bool, bool]  # simulates time, direction, AGR
 FACTORS = ("time", "direction", "AGR")
@@ -25,33 +26,36 @@ class Pair:
     other: Arm
     difference: Estimate  # dB
     improvement: float  # the probability that a run of `better` beats one of `other` on a view they share
-    p_holm: float  # of no difference, adjusted for all the pairs shown; NaN where no spread is known
-
-    @property
-    def differs(self) -> bool:
-        """Whether the pair is told apart after Holm's correction."""
-        return self.p_holm < 1 - LEVEL
+    p_holm: float  # of no difference, adjusted for all comparisons of the report; NaN where no spread is known
+    differs: bool  # whether the pair is told apart
 
 
-def pairs(group: Group) -> list[Pair]:
-    """Compare every two models at the common variant, gated ones too, on what both have finished.
+def paired(group: Group) -> list[Weights]:
+    """Return the differences that `pairs` asks for: of every two models at the common variant, gated ones too.
 
-    Ablations are compared with what they change a part of, not with one another. The largest difference comes first.
+    Ablations are compared with what they change a part of, not with one another.
+    """
+    every = itertools.combinations(group.compared, 2)
+    return [[(1.0, a), (-1.0, b)] for a, b in every if not (is_ablated(a.variant) and is_ablated(b.variant))]
+
+
+def pairs(group: Group, family: Family) -> list[Pair]:
+    """Compare the models that share a scene, on what both have finished; the largest difference comes first.
+
+    Args:
+        group: the records.
+        family: holds `paired`.
     """
     found = []
-    for a, b in itertools.combinations(group.compared, 2):
-        if is_ablated(a.variant) and is_ablated(b.variant):
+    for (_, a), (_, b) in paired(group):
+        tested = family.of([(1.0, a), (-1.0, b)])
+        if tested.difference.scenes == 0:
             continue
-        difference = estimate(group.contrast([(1.0, a), (-1.0, b)], "psnr"))
-        if difference.scenes == 0:
-            continue
-        if difference.mean < 0:
+        if tested.difference.mean < 0:
             a, b = b, a
-            difference = estimate(group.contrast([(1.0, a), (-1.0, b)], "psnr"))
-        found.append((a, b, difference))
-    adjusted = holm([difference.p for *_, difference in found])
-    compared = [Pair(a, b, d, improvement(group, a, b), p) for (a, b, d), p in zip(found, adjusted, strict=True)]
-    return sorted(compared, key=lambda pair: -pair.difference.mean)
+            tested = family.of([(1.0, a), (-1.0, b)])
+        found.append(Pair(a, b, tested.difference, improvement(group, a, b), tested.p, tested.told))
+    return sorted(found, key=lambda pair: -pair.difference.mean)
 
 
 def improvement(group: Group, a: Arm, b: Arm) -> float:
@@ -85,6 +89,7 @@ class Price:
     order: int  # 1: an effect, 2 and 3: an interaction
     models: str  # the sum of models it is computed from
     costs: dict[str, Estimate]  # by PRICES
+    told: dict[str, bool]  # by PRICES: whether it is told from nothing among all comparisons of the report
 
 
 @dataclass(frozen=True)
@@ -99,12 +104,38 @@ class Cube:
     on_demand: list[str]  # models whose Gaussians do not all have the effects, so that they price none
 
 
-def cube(group: Group) -> Cube:
+def priced(group: Group) -> list[Weights]:
+    """Return the contrasts that `cube` asks for, in every one of PRICES."""
+    cells, own, _ = _filled(group)
+    return [_sum(of, weights) for _, weights in _contrasts() for of in (cells, own) if weights.keys() <= of.keys()]
+
+
+def cube(group: Group, family: Family) -> Cube:
     """Price every effect whose cells were run at the common variant.
 
     An effect is priced given that the other two are on or off (12 differences), an interaction is the difference of
     two such prices (6), that of all three the difference of two interactions; the mean effects need all eight cells.
+
+    Args:
+        group: the records.
+        family: holds `priced`.
     """
+    cells, own, left_out = _filled(group)
+    every: list[Cell] = list(itertools.product((False, True), (False, True), (False, True)))
+    missing = [_words(cell) for cell in every if cell not in cells]
+    prices = [price for weights in _contrasts() if (price := _price(family, cells, *weights))]
+    nested = [
+        price
+        for name, weights in _contrasts()
+        if is_single(name)
+        and any(own.get(cell) is not cells.get(cell) for cell in weights)
+        and (price := _price(family, own, name, weights))
+    ]
+    return Cube(cells, prices, nested, missing, left_out, [arm.model for arm in group.main_arms if arm.on_demand])
+
+
+def _filled(group: Group) -> tuple[dict[Cell, Arm], dict[Cell, Arm], list[str]]:
+    """Return the arm of each cell, the same with the models of NESTED, and the models that another one stands for."""
     cells: dict[Cell, Arm] = {}
     left_out = []
     rank = {name: i for i, name in enumerate(PUBLISHED)}
@@ -112,18 +143,7 @@ def cube(group: Group) -> Cube:
     for arm in sorted(whole, key=lambda arm: (rank.get(arm.model, len(rank)), arm.model)):
         if cells.setdefault(_cell(arm), arm) is not arm and arm.model not in NESTED:
             left_out.append(arm.model)
-    every: list[Cell] = list(itertools.product((False, True), (False, True), (False, True)))
-    missing = [_words(cell) for cell in every if cell not in cells]
-    prices = [price for weights in _contrasts() if (price := _price(group, cells, *weights))]
-    own = cells | {_cell(arm): arm for arm in whole if arm.model in NESTED}
-    nested = [
-        price
-        for name, weights in _contrasts()
-        if is_single(name)
-        and any(own.get(cell) is not cells.get(cell) for cell in weights)
-        and (price := _price(group, own, name, weights))
-    ]
-    return Cube(cells, prices, nested, missing, left_out, [arm.model for arm in group.main_arms if arm.on_demand])
+    return cells, cells | {_cell(arm): arm for arm in whole if arm.model in NESTED}, left_out
 
 
 def is_single(name: str) -> bool:
@@ -175,15 +195,22 @@ def _weights(
     return weights
 
 
-def _price(group: Group, cells: dict[Cell, Arm], name: str, weights: dict[Cell, float]) -> Price | None:
-    """Estimate a contrast in each unit; None where a cell is missing or no scene has all of them."""
+def _price(family: Family, cells: dict[Cell, Arm], name: str, weights: dict[Cell, float]) -> Price | None:
+    """Read a contrast in each unit; None where a cell is missing or no scene has all of them."""
     if not weights.keys() <= cells.keys():
         return None
-    sums = sorted(((w, cells[cell]) for cell, w in weights.items()), key=lambda term: (-term[0], term[1].model))
-    costs = {unit: estimate(group.contrast(sums, unit)) for unit in PRICES}
-    if costs["psnr"].scenes == 0:
+    sums = _sum(cells, weights)
+    found: dict[str, Tested] = {unit: family.of(sums, unit) for unit in PRICES}
+    if found["psnr"].difference.scenes == 0:
         return None
     sign = {True: "+", False: "−"}
     share = "" if abs(sums[0][0]) == 1 else f"{abs(sums[0][0]):g} ("
     terms = " ".join(f"{sign[w > 0]} {arm.model}" for w, arm in sums).removeprefix("+ ")
-    return Price(name, name.count(" × ") + 1, f"{share}{terms}{')' if share else ''}", costs)
+    costs = {unit: tested.difference for unit, tested in found.items()}
+    told = {unit: tested.told for unit, tested in found.items()}
+    return Price(name, name.count(" × ") + 1, f"{share}{terms}{')' if share else ''}", costs, told)
+
+
+def _sum(cells: dict[Cell, Arm], weights: dict[Cell, float]) -> Weights:
+    """Return the arms of cells with their weights, those that are added first."""
+    return sorted(((w, cells[cell]) for cell, w in weights.items()), key=lambda term: (-term[0], term[1].model))

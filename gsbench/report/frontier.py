@@ -8,10 +8,13 @@ import numpy as np
 
 from gsbench.report import paper
 from gsbench.report.arms import Arm, Group, Values
+from gsbench.report.family import Family, Weights
 from gsbench.report.intervals import Estimate, estimate
 
 COSTS = ("seconds", "ms", "mb")
-BASELINE = "3dgs"
+BUDGETS = (("seconds", 10.0), ("seconds", 60.0), ("seconds", 600.0), ("ms", 1000 / 60))  # that a report answers
+STEPS = (2.0, 1.0, 0.5, 0.2, 0.1)  # dB between two targets
+FEWEST_TARGETS = 3  # of a scene
 
 
 @dataclass(frozen=True)
@@ -19,7 +22,8 @@ class Point:
     """An arm on a scene, or on the mean of scenes: what it costs and what it reaches."""
 
     arm: Arm
-    psnr: Estimate  # dB; the interval is of seeds, on these scenes and views
+    psnr: Estimate  # dB, the evaluated split; the interval is over seeds, on these scenes and views
+    val: float  # dB, PSNR on val; NaN where a run does not tell
     cost: dict[str, float]  # by COSTS; NaN where it is missing
 
     @property
@@ -35,7 +39,8 @@ def points(group: Group, scenes: list[str]) -> list[Point]:
         psnr = [group.sample(arm, s, "psnr")[:, None] for s in scenes]
         if scenes and all(map(len, psnr)):
             cost = {name: _mean([group.sample(arm, s, name) for s in scenes]) for name in COSTS}
-            found.append(Point(arm, estimate(psnr, generalise=False), cost))
+            val = _mean([group.sample(arm, s, "psnr_val") for s in scenes])
+            found.append(Point(arm, estimate(psnr, generalise=False), val, cost))
     return found
 
 
@@ -48,45 +53,80 @@ def frontier(of: Sequence[Point], cost: str) -> list[Point]:
     return best
 
 
-def dominated(of: Sequence[Point], cost: str) -> list[Point]:
-    """Return the points beside which another is at least as good and as cheap, and better in one of the two."""
+def beaten(of: Sequence[Point], cost: str) -> list[Point]:
+    """Return the points beside which another is at least as good and as cheap, and better in one, by their means."""
     known = [p for p in of if not math.isnan(p.cost[cost])]
-    return [p for p in known if any(dominates(q, p, cost) for q in known)]
+    return [p for p in known if any(beats(q, p, cost) for q in known)]
 
 
-def dominates(q: Point, p: Point, cost: str) -> bool:
-    """Tell whether `q` is at least as good and as cheap as `p`, and better in one of the two."""
+def beats(q: Point, p: Point, cost: str) -> bool:
+    """Tell whether the means of `q` are at least as good and as cheap as those of `p`, and better in one of the two."""
     as_good = q.psnr.mean >= p.psnr.mean and q.cost[cost] <= p.cost[cost]
     return as_good and (q.psnr.mean > p.psnr.mean or q.cost[cost] < p.cost[cost])
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The best point within a budget, and which other models it cannot be told from."""
+    """The point that a budget buys, and how the best of each other model compares with it on the evaluated split."""
 
     point: Point
-    level: list[Point]  # the best of other models within the budget, where the interval of the difference holds zero
-    unknown: bool  # whether no spread is known of the difference to the best of another model
+    on_val: bool  # whether it was chosen on val; otherwise on what is shown, as some runs have no PSNR on val
+    ahead: list[Point]  # those that it is told to be ahead of
+    level: list[Point]  # those that it is not told apart from
+    behind: list[Point]  # those that it is told to be behind
+    unknown: list[Point]  # those of which no spread is known
 
 
-def choose(group: Group, of: Sequence[Point], cost: str, budget: float) -> Choice | None:
-    """Choose the highest PSNR among the points that cost at most `budget`; None where there is none.
+def has_val(of: Sequence[Point]) -> bool:
+    """Tell whether every point has PSNR on val, so that one may be chosen there and shown on the evaluated split."""
+    return bool(of) and not any(math.isnan(p.val) for p in of)
+
+
+def ranked(of: Sequence[Point]) -> list[Point]:
+    """Return points by falling PSNR on val; by that on the evaluated split where `has_val` is not so."""
+    on_val = has_val(of)
+    return sorted(of, key=lambda p: -(p.val if on_val else p.psnr.mean))
+
+
+def contest(of: Sequence[Point], cost: str, budget: float) -> list[Point]:
+    """Return the best point of each model among those that cost at most `budget`, the best of all first."""
+    best: dict[str, Point] = {}
+    for point in ranked(of):
+        if point.cost[cost] <= budget:
+            best.setdefault(point.series, point)
+    return list(best.values())
+
+
+def contested(of: Sequence[Point]) -> list[Weights]:
+    """Return the differences that `choose` asks for, of all BUDGETS."""
+    contests = [contest(of, *budget) for budget in BUDGETS]
+    return [[(1.0, found[0].arm), (-1.0, other.arm)] for found in contests for other in found[1:]]
+
+
+def choose(of: Sequence[Point], cost: str, budget: float, family: Family) -> Choice | None:
+    """Choose the best point that costs at most `budget`; None where there is none.
 
     The best point of each other model within the budget is compared with it, paired over seeds and views.
+
+    Args:
+        of: the points.
+        cost: of COSTS.
+        budget: seconds, milliseconds or MB.
+        family: holds `contested`.
     """
-    best: dict[str, Point] = {}
-    for point in of:
-        if point.cost[cost] <= budget and point.psnr.mean > best.get(point.series, _NOTHING).psnr.mean:
-            best[point.series] = point
-    if not best:
+    found = contest(of, cost, budget)
+    if not found:
         return None
-    first, *others = sorted(best.values(), key=lambda p: -p.psnr.mean)
-    differences = [(p, estimate(group.contrast([(1.0, first.arm), (-1.0, p.arm)], "psnr"))) for p in others]
-    level = [p for p, d in differences if d.low <= 0 or d.mean <= 0]
-    return Choice(first, level, any(math.isnan(d.low) for _, d in differences))
-
-
-_NOTHING = Point(Arm("", "", {}, "", ""), Estimate(-math.inf, 0, 0, ""), {})
+    first, *others = found
+    tested = [(p, family.of([(1.0, first.arm), (-1.0, p.arm)])) for p in others]
+    return Choice(
+        first,
+        has_val(of),
+        [p for p, t in tested if t.told and t.difference.mean > 0],
+        [p for p, t in tested if t.known and not t.told],
+        [p for p, t in tested if t.told and t.difference.mean < 0],
+        [p for p, t in tested if not t.known],
+    )
 
 
 @dataclass(frozen=True)
@@ -103,7 +143,7 @@ def targets(group: Group) -> list[Target]:
     """Return the targets of every scene and the seconds that the frontier of each model needs for them.
 
     The seconds are those of the quickest finished arm whose mean over the seeds reaches the target: nothing is
-    interpolated, as a run of another length was not run. A model ends with the highest mean of its arms.
+    interpolated, as a run of another length was not run.
     """
     found = []
     for scene in group.scenes:
@@ -112,25 +152,34 @@ def targets(group: Group) -> list[Target]:
             quality, cost = (group.sample(arm, scene, name) for name in ("psnr_val", "seconds"))
             if len(quality) and len(cost):
                 reached.setdefault(arm.series, []).append((float(quality.mean()), float(cost.mean())))
-        for rule, psnr in _rules(group, scene, {m: max(p for p, _ in arms) for m, arms in reached.items()}):
+        for rule, psnr in _rules(group, scene, [p for arms in reached.values() for p, _ in arms]):
             needed = {m: min((s for p, s in arms if p >= psnr), default=math.inf) for m, arms in reached.items()}
             found.append(Target(scene, rule, psnr, needed))
     return found
 
 
-def _rules(group: Group, scene: str, ends: dict[str, float]) -> list[tuple[str, float]]:
-    """Return the targets of a scene: what 3dgs, the weakest and the strongest model end with, the paper's number."""
-    if not ends:
+def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, float]]:
+    """Return the targets of a scene: round numbers between the lowest and the highest arm, and the paper's number."""
+    if not reached:
         return []
-    weakest, strongest = min(ends, key=lambda m: (ends[m], m)), max(ends, key=lambda m: (ends[m], m))
-    rules = [(f"{BASELINE} ends", ends[BASELINE])] if BASELINE in ends else []
-    if weakest != BASELINE:
-        rules.append((f"weakest ends ({weakest})", ends[weakest]))
-    if strongest != weakest:
-        rules.append((f"strongest ends ({strongest})", ends[strongest]))
+    rules = [(f"{psnr:g} dB", psnr) for psnr in round_numbers(min(reached), max(reached))]
     run = next(r for r in group.records if r.scene == scene)
     row = paper.paper_row(run.dataset, scene, "7dgs") if run.protocol.get("paper_dataset") == run.dataset else None
     return [*rules, *([("paper's 7dgs (its best on test)", row.psnr)] if row else [])]
+
+
+def round_numbers(low: float, high: float) -> list[float]:
+    """Return the multiples of the widest of STEPS of which FEWEST_TARGETS lie above `low` and up to `high`.
+
+    No arm's own PSNR is a target, so none is favoured. Of arms that lie closer than the finest step allows, what lies
+    between.
+    """
+    found: list[float] = []
+    for step in STEPS:
+        found = [round(i * step, 1) for i in range(math.floor(low / step) + 1, math.floor(high / step) + 1)]
+        if len(found) >= FEWEST_TARGETS:
+            break
+    return found
 
 
 def profile(of: Sequence[Target]) -> dict[str, Values]:

@@ -10,6 +10,7 @@ from gsbench.measure.record import Effects, ViewScore
 from gsbench.measure.speed import RenderTimes
 from gsbench.report import compare
 from gsbench.report.arms import groups
+from gsbench.report.comparisons import comparisons
 
 
 def run(model="7dgs", seed=0, views=(25.0, 26.0), scene="suzanne", seconds=90.0, **changes):
@@ -25,9 +26,17 @@ def group(*runs):
     return only
 
 
+def pairs(of):
+    return compare.pairs(of, comparisons(of))
+
+
+def cube(of):
+    return compare.cube(of, comparisons(of))
+
+
 def test_a_pair_is_compared_on_common_seeds_and_views():
     """Catches a mean over views that only one model has, and a seed without a partner: (2 + 0.5) / 2 = 1.25 dB."""
-    found = compare.pairs(
+    found = pairs(
         group(
             run("a", 0, (20.0, 30.0, 99.0)),
             run("a", 5, (90.0, 90.0)),
@@ -45,7 +54,7 @@ def test_a_pair_is_compared_on_common_seeds_and_views():
 def test_only_the_common_variant_is_compared():
     """Catches a short run of one model that meets a long run of another."""
     runs = [run(m, s, (v, v + s / 10)) for m, v in (("a", 20.0), ("b", 21.0)) for s in range(3)]
-    found = compare.pairs(group(*runs, run("a", 0, (99.0, 99.0), variant="iterations=9000")))
+    found = pairs(group(*runs, run("a", 0, (99.0, 99.0), variant="iterations=9000")))
     assert [(p.better.name, p.other.name) for p in found] == [("b", "a")]
     assert found[0].difference.mean == pytest.approx(1.0)
     assert found[0].differs
@@ -63,7 +72,7 @@ def test_ablations_are_compared_with_the_whole_model_alone():
         run("7dgs", 0, (99.0, 99.0), variant="ablation=schur,iterations=9000"),
     )
     assert one.variant == "ablation=none"
-    found = compare.pairs(one)
+    found = pairs(one)
     assert [one.label(p.better) for p in found] == ["7dgs"] * 3
     assert [one.label(p.other) for p in found] == [
         "7dgs (ablation=cholesky)",
@@ -76,13 +85,13 @@ def test_ablations_are_compared_with_the_whole_model_alone():
 def test_models_that_share_no_scene_are_no_pair():
     """Catches a comparison of different scenes, and a crash where a model finished nothing."""
     failed = run("c", status="failed", reason="out of memory", metrics=None, missing={}, cost=None, per_view=[])
-    assert compare.pairs(group(run("a", scene="x"), run("b", scene="y"), failed)) == []
+    assert pairs(group(run("a", scene="x"), run("b", scene="y"), failed)) == []
 
 
 def test_models_that_tie_have_no_difference():
     """Catches a winner that is called by the order of names."""
     runs = [run(m, s, (20.0 + s, 21.0 + s)) for m in ("a", "b") for s in range(3)]
-    (pair,) = compare.pairs(group(*runs))
+    (pair,) = pairs(group(*runs))
     assert (pair.difference.mean, pair.difference.p, pair.improvement) == (0.0, 1.0, 0.5)
     assert not pair.differs
 
@@ -123,7 +132,7 @@ def cells(*names, seeds=range(3)):
 
 def test_the_price_of_effects_by_hand():
     """Catches a wrong sign or cell: time alone 4, with direction 6, so x direction 2; with AGR 3."""
-    full = compare.cube(group(*cells(*EIGHT)))
+    full = cube(group(*cells(*EIGHT)))
     psnr = {price.name: price.costs["psnr"].mean for price in full.prices}
     assert len(psnr) == 12 + 3 + 6 + 1
     assert not full.missing
@@ -140,7 +149,7 @@ def test_the_price_of_effects_by_hand():
 
 def test_missing_cells_are_said_and_not_guessed():
     """Catches an effect that is priced from cells nobody ran: the five published models fill five of eight."""
-    found = compare.cube(group(*cells("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")))
+    found = cube(group(*cells("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")))
     assert found.missing == ["AGR", "direction + AGR", "time + AGR"]
     assert [price.name for price in found.prices] == [
         "time alone",
@@ -157,7 +166,7 @@ def test_missing_cells_are_said_and_not_guessed():
 def test_a_second_model_with_the_same_effects_is_left_out_and_named():
     """Catches a cell that is silently another model than the published one."""
     extra = [dataclasses.replace(r, model="3dgs_new") for r in cells("3dgs")]
-    found = compare.cube(group(*extra, *cells("3dgs", "4dgs")))
+    found = cube(group(*extra, *cells("3dgs", "4dgs")))
     assert found.left_out == ["3dgs_new"]
     assert found.prices[0].models == "4dgs − 3dgs"
 
@@ -171,14 +180,14 @@ def test_effects_are_priced_within_one_parametrisation_too():
         for r in cells("4dgs")
     ]
     published = cells("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
-    found = compare.cube(group(*published, *less))
-    assert found.prices == compare.cube(group(*published)).prices
+    found = cube(group(*published, *less))
+    assert found.prices == cube(group(*published)).prices
     assert {p.models: p.costs["psnr"].mean for p in found.nested} == {
         "7dgs_nodir − 3dgs": pytest.approx(6.0),
         "7dgs_noagr − 7dgs_nodir": pytest.approx(1.0),
     }
     assert found.left_out == []
-    alone = compare.cube(group(*[r for r in published if r.model != "4dgs"], *less))
+    alone = cube(group(*[r for r in published if r.model != "4dgs"], *less))
     assert alone.nested == []
     assert "7dgs_noagr − 7dgs_nodir" in {p.models for p in alone.prices}
 
@@ -189,7 +198,7 @@ def test_seconds_of_another_machine_do_not_count():
     other = dataclasses.replace(runs[-1].provenance, device="another CPU")
     moved = [*runs[:-1], dataclasses.replace(runs[-1], provenance=other)]
     found = group(*moved)
-    (price,) = compare.cube(found).prices
+    (price,) = cube(found).prices
     assert found.elsewhere == 1
     assert price.costs["seconds"].seeds == 2
     assert price.costs["psnr"].seeds == 3

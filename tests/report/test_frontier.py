@@ -9,8 +9,18 @@ from make_golden import make
 from test_compare import group, run
 
 from gsbench.measure.curve import Point
+from gsbench.measure.record import Gate, OnDemand
 from gsbench.report import frontier
+from gsbench.report.arms import psnr_val
+from gsbench.report.family import Family
 from gsbench.report.frontier import Target
+
+
+def choose(runs, cost, budget):
+    points = frontier.points(runs, ["suzanne"])
+    wanted = frontier.contest(points, cost, budget)
+    weights = [[(1.0, wanted[0].arm), (-1.0, other.arm)] for other in wanted[1:]]
+    return frontier.choose(points, cost, budget, Family(runs, {"psnr": weights}))
 
 
 def arm(model, variant, psnr, seconds, seeds=(0,), scene="suzanne"):
@@ -46,14 +56,14 @@ def test_the_frontier_rises_and_leaves_out_what_is_dominated():
     of = frontier.points(three_lengths(), ["suzanne"])
     a = [p for p in of if p.series == "a"]
     assert [p.cost["seconds"] for p in frontier.frontier(a, "seconds")] == [10.0, 40.0]
-    assert {p.arm.name for p in frontier.dominated(of, "seconds")} == {"a, iterations=2", "b"}
-    assert frontier.dominated(a[:1], "seconds") == []
+    assert {p.arm.name for p in frontier.beaten(of, "seconds")} == {"a, iterations=2", "b"}
+    assert frontier.beaten(a[:1], "seconds") == []
 
 
 def test_equal_points_do_not_dominate_each_other():
     """Catches two equal models that are both called dominated."""
     of = frontier.points(group(*arm("a", "", 20.0, 10.0), *arm("b", "", 20.0, 10.0)), ["suzanne"])
-    assert frontier.dominated(of, "seconds") == []
+    assert frontier.beaten(of, "seconds") == []
     assert len(frontier.frontier(of, "seconds")) == 1
 
 
@@ -71,8 +81,28 @@ def test_a_point_is_the_mean_of_its_scenes():
 def test_a_budget_buys_the_best_that_costs_at_most_that(budget, expected):
     """Catches a choice over the budget, and one that exists where nothing is cheap enough."""
     runs = three_lengths()
-    choice = frontier.choose(runs, frontier.points(runs, ["suzanne"]), "seconds", budget)
+    choice = choose(runs, "seconds", budget)
     assert (choice and choice.point.arm.name) == expected
+
+
+def test_a_choice_is_made_on_val_and_shown_on_test():
+    """Catches the best of many arms chosen by the very number that is shown: a has more on test, b on val."""
+    a, b = arm("a", "", 21.0, 10.0), arm("b", "", 20.0, 10.0)
+    a = [dataclasses.replace(r, curve=[Point(1000, 10.0, 19.0)]) for r in a]
+    choice = choose(group(*a, *b), "seconds", 60)
+    assert (choice.point.series, choice.point.psnr.mean, choice.on_val) == ("b", 20.0, True)
+    without = [dataclasses.replace(r, curve=[]) for r in b]
+    choice = choose(group(*a, *without), "seconds", 60)
+    assert (choice.point.series, choice.on_val) == ("a", False)
+
+
+def test_what_the_gate_at_the_end_cost_on_val_counts():
+    """Catches a gated run that is chosen by the PSNR it had before its gate."""
+    (run,) = arm("auto", "", 20.0, 10.0)
+    gate = Gate(0.1, 0.4, 0.3, {}, {}, 2, 1)
+    gated = dataclasses.replace(run, on_demand=OnDemand(gates=[dataclasses.replace(gate, step=600), gate]))
+    assert psnr_val(run) == 20.5
+    assert psnr_val(gated) == pytest.approx(20.2)
 
 
 def test_a_choice_names_what_it_cannot_be_told_from():
@@ -84,13 +114,13 @@ def test_a_choice_names_what_it_cannot_be_told_from():
         for r in seed
     ]
     near = group(*noisy, *arm("b", "", 20.001, 10.0, (0, 1, 2)))
-    choice = frontier.choose(near, frontier.points(near, ["suzanne"]), "seconds", 60)
+    choice = choose(near, "seconds", 60)
     assert choice.point.series == "b"
     assert [p.series for p in choice.level] == ["a"]
     assert not choice.unknown
     one = three_lengths()
-    choice = frontier.choose(one, frontier.points(one, ["suzanne"]), "seconds", 1e9)
-    assert choice.unknown
+    choice = choose(one, "seconds", 1e9)
+    assert [p.series for p in choice.unknown] == ["a"]
     assert choice.level == []
 
 
@@ -99,19 +129,42 @@ def test_a_winner_within_the_noise_of_the_seeds_is_not_told_apart():
     of_seeds = {"a": (25.0, 25.0, 25.0), "b": (24.2, 25.1, 25.1), "c": (20.0, 20.1, 20.2)}
     runs = [run(m, s, (v, v), metrics={**make().metrics, "psnr": v}) for m, each in of_seeds.items()
             for s, v in enumerate(each)]  # fmt: skip
-    near = group(*runs)
-    choice = frontier.choose(near, frontier.points(near, ["suzanne"]), "seconds", 1e9)
+    choice = choose(group(*runs), "seconds", 1e9)
     assert choice.point.series == "a"
     assert [p.series for p in choice.level] == ["b"]
 
 
-def test_targets_are_set_by_rule_and_never_is_an_answer():
+def test_targets_are_round_numbers_and_never_is_an_answer():
     """Catches an interpolated time, a target on test, and a model that never reaches one but gets a number."""
     found = {t.rule: t for t in frontier.targets(group(*three_lengths().records, *arm("3dgs", "", 19.0, 5.0)))}
-    assert list(found) == ["3dgs ends", "strongest ends (b)"]
-    assert found["3dgs ends"].psnr == 19.5
-    assert found["3dgs ends"].seconds == {"3dgs": 5.0, "a": 10.0, "b": 15.0}
-    assert found["strongest ends (b)"].seconds == {"3dgs": math.inf, "a": math.inf, "b": 100.0}
+    assert list(found) == ["20 dB", "22 dB", "24 dB"]
+    assert found["20 dB"].psnr == 20.0
+    assert found["20 dB"].seconds == {"3dgs": math.inf, "a": 10.0, "b": 15.0}
+    assert found["24 dB"].seconds == {"3dgs": math.inf, "a": math.inf, "b": 100.0}
+
+
+def test_no_target_is_the_winners_own_mean():
+    """Catches targets that only the winner can reach, as they are what its own seeds ended with."""
+    runs = group(*arm("a", "", 19.23, 10.0), *arm("a", "iterations=4", 23.37, 40.0), *arm("b", "", 25.11, 100.0))
+    own = {float(runs.sample(a, "suzanne", "psnr_val").mean()) for a in runs.arms}
+    targets = frontier.targets(runs)
+    assert [t.psnr for t in targets] == [20.0, 22.0, 24.0]
+    assert not {t.psnr for t in targets} & own
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (19.2, 26.1, [20, 22, 24, 26]),
+        (20.0, 23.0, [21, 22, 23]),
+        (24.1, 25.3, [24.2, 24.4, 24.6, 24.8, 25.0, 25.2]),
+        (24.11, 24.19, []),
+        (-0.1, 0.05, [0]),
+    ],
+)
+def test_targets_are_as_far_apart_as_gives_three(low, high, expected):
+    """Catches a target at or below the lowest run, one above the highest, and a dozen where three will do."""
+    assert frontier.round_numbers(low, high) == expected
 
 
 def test_the_papers_number_is_a_target_only_on_its_own_data():
@@ -124,9 +177,9 @@ def test_the_papers_number_is_a_target_only_on_its_own_data():
         assert [t.psnr for t in frontier.targets(group(*runs)) if "paper" in t.rule] == expected
 
 
-def test_one_model_is_both_weakest_and_strongest():
-    """Catches a target that is shown twice, and a crash where nothing finished."""
-    assert [t.rule for t in frontier.targets(group(*arm("a", "", 20.0, 10.0)))] == ["weakest ends (a)"]
+def test_one_run_has_no_target():
+    """Catches a target that its own run set, and a crash where nothing finished."""
+    assert frontier.targets(group(*arm("a", "", 20.0, 10.0))) == []
     lost = run("a", status="failed", reason="no", metrics=None, missing={}, cost=None, per_view=[], curve=[])
     assert frontier.targets(group(lost)) == []
 

@@ -15,6 +15,7 @@ from gsbench.measure.record import OnDemand, Record, TimeScreen
 from gsbench.report import compare
 from gsbench.report import frontier as points
 from gsbench.report.arms import groups
+from gsbench.report.comparisons import comparisons
 from gsbench.report.on_demand import decided
 from gsbench.report.page import build, gallery, words, worth
 from gsbench.report.page import on_demand as page_part
@@ -49,8 +50,8 @@ def test_three_seeds_in_words():
         "On suzanne, auto: time is on, as what a static fit leaves over changes with time; the same with all 3 seeds. "
         "Of 1,000 Gaussians the gates left 710 (71 %): 310 refined by AGR, 150 sliced, 40 time frozen, 10 direction "
         "frozen and 200 still. At any one time AGR moves 75 % of its Gaussians; the others cannot be seen then. "
-        "The gate at the end changed PSNR on test by −0.030 dB (95 % −0.055 to −0.005) and a "
-        "frame of 4.00 ms by −1.00 ms (95 % −1.00 to −1.00)."
+        "The gate at the end changed PSNR on test by −0.030 dB (95 % −0.055 to −0.005 over seeds) and a "
+        "frame of 4.00 ms by −1.00 ms (95 % −1.00 to −1.00 over seeds)."
     )
 
 
@@ -223,10 +224,11 @@ def test_gated_models_price_no_effect():
     runs = frontier(("7dgs", "7dgs_noagr"), ("suzanne",), 3, (1000,))
     bare = [r for r in runs if r.model == "7dgs_noagr"]
     gated = on_demand([r for r in runs if r.model == "7dgs"])
-    assert compare.cube(group([*bare, *gated])).prices == []
-    cube = compare.cube(group([*runs, *gated]))
+    mixed, both = group([*bare, *gated]), group([*runs, *gated])
+    assert compare.cube(mixed, comparisons(mixed)).prices == []
+    cube = compare.cube(both, comparisons(both))
     assert [p.models for p in cube.prices] == ["7dgs − 7dgs_noagr"]
-    notes = worth.effects_section(group([*runs, *gated]), canvas()).notes
+    notes = worth.effects_section(both, comparisons(both), canvas()).notes
     assert "Left out, as their Gaussians keep only the effects that pay: auto." in notes
 
 

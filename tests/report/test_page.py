@@ -16,9 +16,11 @@ from many_records import EFFECTS, HOSTILE, frontier, hostile, write_all
 from gsbench.config import TrainConfig
 from gsbench.measure.curve import Point
 from gsbench.measure.record import Effects, ViewScore
-from gsbench.report import live
+from gsbench.report import compare, live
 from gsbench.report.__main__ import main
 from gsbench.report.arms import groups
+from gsbench.report.comparisons import comparisons
+from gsbench.report.frontier import choose, points
 from gsbench.report.page import build, cost, evidence, gallery, palette, time_to_quality, words, worth
 from gsbench.report.page.content import Canvas, Column, Runs, Table
 from gsbench.report.page.events import of as events_of
@@ -57,6 +59,18 @@ def group(records):
     return only
 
 
+def answers(records):
+    return cost.answers(group(records), comparisons(group(records)))
+
+
+def pairs_section(records):
+    return worth.pairs_section(group(records), comparisons(group(records)), canvas())
+
+
+def effects_section(records):
+    return worth.effects_section(group(records), comparisons(group(records)), canvas())
+
+
 def canvas():
     return Canvas("x", Runs(), styles(list(EFFECTS)), 8)
 
@@ -76,11 +90,11 @@ def lost(record):
 def test_the_first_screen_answers(tmp_path):
     """Catches answers over the budget, without an interval, or from another model than the best that fits."""
     records = frontier()
-    ten, minute, _, frames = cost.answers(group(records))
+    ten, minute, _, frames = answers(records)
     assert ten.budget == "10 s of training"
     assert minute.model == "7dgs"
     assert re.fullmatch(r"[\d.]+ dB", minute.value)
-    assert re.fullmatch(r"95 % [\d.]+ to [\d.]+", minute.interval)
+    assert re.fullmatch(r"95 % [\d.]+ to [\d.]+ over seeds", minute.interval)
     assert "2,000 iterations" in minute.detail
     assert frames.budget == "60 frames a second"
     text = Page(page(frontier(**SMALL), tmp_path)).text
@@ -96,9 +110,10 @@ def test_the_first_screen_names_the_run():
         variant="gate=both,iterations=2000,threshold=1e-4",
         metrics={**plain.metrics, "psnr": 40.0},
         per_view=[],
+        curve=[Point(2000, 90.0, 40.5)],
         provenance=dataclasses.replace(plain.provenance, config=config),
     )
-    (_, answer, *_) = cost.answers(group([plain, gated]))
+    (_, answer, *_) = answers([plain, gated])
     assert answer.model == "7dgs, gate=both"
     assert answer.detail.startswith("2,000 iterations, threshold=1e-4, ")
 
@@ -106,26 +121,90 @@ def test_the_first_screen_names_the_run():
 def test_sentences_where_models_tie():
     """Catches a winner among equal models, and a pair that is called a difference."""
     records = [dataclasses.replace(r, model=m) for m in ("a", "b") for r in frontier(("7dgs",), lengths=(1000,))]
-    (answer, *_) = cost.answers(group(records))
+    (answer, *_) = answers(records)
     assert "not told apart from b" in answer.detail.lower() or answer.model == ""
-    assert "The pair is not told apart" in worth.pairs_section(group(records), canvas()).sentences[0]
+    assert "The pair is not told apart" in pairs_section(records).sentences[1]
 
 
 def test_sentences_of_one_seed():
     """Catches an interval or a p-value that one seed cannot give."""
     records = frontier(seeds=1)
-    (_, minute, *_) = cost.answers(group(records))
+    (_, minute, *_) = answers(records)
     assert minute.interval == words.NO_SPREAD
     assert "One seed: whether it is ahead is not known." in minute.detail
-    said = worth.pairs_section(group(records), canvas())
+    said = pairs_section(records)
     assert said.sentences[0].startswith("No spread is known from one seed.")
-    assert "95 %" not in " ".join(worth.effects_section(group(records), canvas()).sentences)
+    assert "95 %" not in " ".join(effects_section(records).sentences)
+    assert effects_section(records).sentences[0] == "Two scenes, one seed: no interval is known."
+
+
+def test_the_answers_and_the_pairs_agree():
+    """Catches a model that an answer is "ahead" of by its own interval, and that the pairs do not tell apart."""
+    near = {"a": 0.0, "b": -0.25, "c": -0.5, "d": -0.75, "e": -1.0}
+    random = np.random.default_rng(3)
+    records = []
+    for run in frontier(("7dgs",), ("suzanne",), 3, (1000,)):
+        for model, less in near.items():
+            views = [dataclasses.replace(v, psnr=25 + less + 0.3 * random.normal()) for v in run.per_view]
+            psnr = float(np.mean([v.psnr for v in views]))
+            changed = {"per_view": views, "metrics": {**run.metrics, "psnr": psnr}, "curve": [Point(1000, 9.0, psnr)]}
+            records.append(dataclasses.replace(run, model=model, **changed))
+    of = group(records)
+    family = comparisons(of)
+    pairs = {frozenset((p.better.model, p.other.model)): p for p in compare.pairs(of, family)}
+    choice = choose(points(of, of.basis), "seconds", 60.0, family)
+    apart = {p.series for p in choice.ahead}
+    assert apart == {m for m in near if m != "a" and pairs[frozenset("a" + m)].differs}
+    raw = {m for m in near if m != "a" and pairs[frozenset("a" + m)].difference.low > 0}
+    assert apart < raw, "these records do not set the two rules apart"
+
+
+def test_differences_of_two_scenes_say_so_first():
+    """Catches prices and pairs of two scenes whose intervals read as if they held for others."""
+    said = "scenes; an interval over seeds and views, not over scenes: it does not tell what another scene would give."
+    records = frontier(lengths=(1000,))
+    assert effects_section(records).sentences[0] == f"Two {said}"
+    assert pairs_section(records).sentences[0] == f"Two {said}"
+    assert {row[-1] for row in effects_section(records).table.rows} == {"seeds and views, on 2 scenes"}
+    three = frontier(scenes=("a", "b", "c"), lengths=(1000,))
+    assert effects_section(three).sentences[0].startswith("3 scenes; an interval over scenes like these")
+
+
+def test_every_colour_is_defined(tmp_path):
+    """Catches a part of a bar that is black, as there are more stages than colours: eight of ours, and foreign ones."""
+    records = frontier(**SMALL)
+    stages = dict.fromkeys([*worth.STAGES, "mine", "theirs"], 1.0)
+    cost_of = dataclasses.replace(records[0].cost, stage_s=stages, train_s=10.0)
+    text = page([dataclasses.replace(records[0], cost=cost_of), *records[1:]], tmp_path)
+    used = set(re.findall(r"var\(--((?:stage|model)-\d+)\)", text))
+    assert {f"stage-{i}" for i in range(len(worth.STAGES) + 1)} <= used
+    assert not used - set(re.findall(r"--((?:stage|model)-\d+):", text))
+    assert len(palette.STAGES_LIGHT) == len(palette.STAGES_DARK) == len(set(palette.STAGES_LIGHT))
+
+
+def test_the_largest_part_of_a_difference_is_not_called_most():
+    """Catches "most of the difference" of a stage that has two fifths of it."""
+    parts = {"a": {"slice": 1.0, "raster": 1.0, "loss": 1.0}, "b": {"slice": 3.0, "raster": 2.5, "loss": 2.5}}
+    said = worth._slowest_words(parts, ["slice", "raster", "loss"])
+    assert said == " b takes 2.7 times the seconds of a; 40 % of the difference is in slice."
+    more = {"a": {"slice": 1.0, "loss": 1.0}, "b": {"slice": 3.0, "loss": 0.5}}
+    assert "all of the difference is in slice" in worth._slowest_words(more, ["slice", "loss"])
+
+
+def test_nothing_is_dominated_by_a_mean():
+    """Catches a word of certainty for what only the means say."""
+    records = [dataclasses.replace(r, model=m) for m in ("a", "b") for r in frontier(("7dgs",), lengths=(1000,))]
+    slow = [dataclasses.replace(r, cost=dataclasses.replace(r.cost, train_s=99.0)) for r in records if r.model == "b"]
+    (text, _) = cost.frontier_section(group([*records[: len(slow)], *slow]), canvas()).sentences
+    assert "By the means b is beaten by a" in text
+    assert "may be chance" in text
+    assert "dominated" not in text
 
 
 def test_sentences_where_nothing_finished(tmp_path):
     """Catches a crash, and a page that says less than that nothing finished."""
     records = [lost(r) for r in frontier(lengths=(1000,))]
-    assert all(a.model == "" for a in cost.answers(group(records)))
+    assert all(a.model == "" for a in answers(records))
     text = Page(page(records, tmp_path)).text
     assert "No run has finished" in text
     assert "What did not finish" in text
@@ -167,10 +246,10 @@ def test_every_figure_has_its_numbers():
     sections = [
         cost.frontier_section(of, on),
         time_to_quality.quality_section(of, on),
-        worth.effects_section(of, on),
+        effects_section(of.records),
         worth.stages_section(of, on),
         time_to_quality.anytime_section(of, on),
-        worth.pairs_section(of, on),
+        pairs_section(of.records),
         evidence.protocol_section(of),
     ]
     for section in sections:
@@ -251,10 +330,10 @@ def contrast(a, b):
 def test_prices_within_one_parametrisation_are_said_beside_the_others():
     """Catches a nested price without its name, its sentence or its note, and a name whose capitals are lost."""
     records = frontier(models=("3dgs", "4dgs", "7dgs_noagr"), scenes=("suzanne",), seeds=3, lengths=(1000,))
-    without = worth.effects_section(group(records), canvas())
+    without = effects_section(records)
     assert worth.NOT_NESTED in " ".join(without.notes)
     less = [dataclasses.replace(r, model="7dgs_nodir") for r in records if r.model == "4dgs"]
-    section = worth.effects_section(group([*records, *less]), canvas())
+    section = effects_section([*records, *less])
     assert worth.NESTED in " ".join(section.notes)
     assert any(said.startswith("Direction, with time, within one parametrisation: ") for said in section.sentences)
     assert {"direction, with time", "direction, with time, nested"} <= {row[0] for row in section.table.rows}
@@ -431,7 +510,7 @@ def test_a_view_without_a_number_is_left_out():
     """Catches a null of one view that empties the whole page."""
     records = frontier(**SMALL)
     records[0] = dataclasses.replace(records[0], per_view=[ViewScore("test/r_000"), *records[0].per_view[1:]])
-    assert "told apart" in worth.pairs_section(group(records), canvas()).sentences[0]
+    assert "told apart" in pairs_section(records).sentences[1]
 
 
 def test_hostile_is_hostile():

@@ -13,6 +13,8 @@ from gsbench.measure.record import Record
 from gsbench.report import layout
 from gsbench.report.against import Comparison
 from gsbench.report.arms import Group, groups
+from gsbench.report.comparisons import comparisons
+from gsbench.report.family import Family
 from gsbench.report.page import against as other
 from gsbench.report.page import cost, evidence, on_demand, time_to_quality, words, worth
 from gsbench.report.page.content import Canvas, Runs, Section, Table
@@ -117,14 +119,15 @@ def _variables(models: tuple[str, ...], stages: tuple[str, ...]) -> Markup:
 
 def _chapter(group: Group, folder: Path, canvas: Canvas) -> Chapter:
     counts = [words.count(n, what) for n, what in ((len(group.records), "run"), (len(group.models), "model"))]
+    family = comparisons(group)
     counts += [words.count(len(group.scenes), "scene"), words.count(len({r.seed for r in group.records}), "seed")]
     return Chapter(
         key=canvas.name,
         title=f"experiment {group.experiment}, data {words.cut(group.dataset, 60)}",
         summary=" · ".join([*counts, words.cut(group.machine, 80)]),
-        answers=cost.answers(group),
-        basis=cost.basis_words(group),
-        sections=_sections(group, folder, canvas),
+        answers=cost.answers(group, family),
+        basis=cost.basis_words(group, family),
+        sections=_sections(group, family, folder, canvas),
         views=gallery([r for r in group.finished if r.variant == group.variant], folder),
         tables=evidence.paper_tables(group),
         failures=evidence.failures(group),
@@ -132,15 +135,15 @@ def _chapter(group: Group, folder: Path, canvas: Canvas) -> Chapter:
     )
 
 
-def _sections(group: Group, folder: Path, canvas: Canvas) -> list[Section]:
+def _sections(group: Group, family: Family, folder: Path, canvas: Canvas) -> list[Section]:
     chosen = on_demand.on_demand_section(group, canvas, folder)
     return [
         cost.frontier_section(group, canvas),
         time_to_quality.quality_section(group, canvas),
-        worth.effects_section(group, canvas),
+        worth.effects_section(group, family, canvas),
         *([chosen] if chosen else []),
         worth.stages_section(group, canvas),
         time_to_quality.anytime_section(group, canvas),
-        worth.pairs_section(group, canvas),
+        worth.pairs_section(group, family, canvas),
         evidence.protocol_section(group),
     ]

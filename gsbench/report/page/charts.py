@@ -189,14 +189,14 @@ def bars(rows: list[Bar], colours: list[str], x: str) -> Panel:
     return panel
 
 
-def stages(rows: list[tuple[str, dict[str, float]]], names: list[str]) -> Panel:
-    """Draw where the seconds of training go: a bar for each model, a piece for each stage."""
+def stages(rows: list[tuple[str, dict[str, float]]], names: list[str], colours: list[int]) -> Panel:
+    """Draw where the seconds of training go: a bar for each model, a piece in its colour for each stage."""
     found = []
     for label, parts in rows:
         total = sum(parts.values())
         note = f"{total:,.0f} s" if total >= 100 else f"{total:.3g} s"
         found.append(Bar(label, [parts.get(name, 0.0) for name in names], note))
-    return bars(found, [stage_colour(i) for i in range(len(names))], "training seconds")
+    return bars(found, [stage_colour(i) for i in colours], "training seconds")
 
 
 def _scale_x(axes: Axes, values: Sequence[float]) -> None:

@@ -7,15 +7,19 @@ from gsbench.measure.record import Record
 from gsbench.report import frontier as f
 from gsbench.report import paper
 from gsbench.report.arms import Arm, Group, without
+from gsbench.report.family import Family
 from gsbench.report.frontier import Point
 from gsbench.report.page import charts, words
 from gsbench.report.page.content import Canvas, Column, Drawing, Runs, Section, Tab, Table, Value
 from gsbench.report.page.palette import Style
 
-BUDGETS = (10.0, 60.0, 600.0)  # seconds of training
-FRAMES = 60.0  # a second
 AXES = (("seconds", "training seconds"), ("ms", "ms a frame"), ("mb", "MB of the model"))
 MOST_RUNS = 300  # that are drawn singly in a panel
+MOST_NAMED = 3  # models in a list of an answer
+INTERVALS = (
+    "The 95 % interval of a model's own PSNR is over seeds: what other seeds would give on these scenes and views. "
+    "Whether two models differ says the section on differences."
+)
 
 
 @dataclass(frozen=True)
@@ -29,55 +33,72 @@ class Answer:
     detail: str
 
 
-def basis(group: Group) -> list[str]:
-    """Return the scenes that the answers are means of: those all models finished, or the one with most arms."""
-    if group.covered or not group.arms:
-        return group.covered
-    return [max(group.scenes, key=lambda s: sum(s in arm.runs for arm in group.arms))]
+def answers(group: Group, family: Family) -> list[Answer]:
+    """Answer which model to use for each budget of training, and for 60 frames a second; `family`: the comparisons."""
+    points = f.points(group, group.basis)
+    return [_answer(points, family, cost, budget) for cost, budget in f.BUDGETS]
 
 
-def answers(group: Group) -> list[Answer]:
-    """Answer which model to use for each budget of training, and for 60 frames a second."""
-    points = f.points(group, basis(group))
-    asked = [("seconds", b, f"{words.budget(b)} of training") for b in BUDGETS]
-    return [_answer(group, points, *one) for one in [*asked, ("ms", 1000 / FRAMES, f"{FRAMES:g} frames a second")]]
-
-
-def basis_words(group: Group) -> str:
-    """Say what the answers are from."""
-    scenes = basis(group)
+def basis_words(group: Group, family: Family) -> str:
+    """Say what the answers are from, and by which rule one is chosen and compared."""
+    scenes = group.basis
     if not scenes:
         return "Nothing has finished yet."
+    points = f.points(group, scenes)
     where = scenes[0] if len(scenes) == 1 else f"the mean of {len(scenes)} scenes"
-    text = f"Highest PSNR on {where} among the finished runs that fit, with the 95 % interval of seeds. "
+    split = _split(group)
+    chosen = "on val" if f.has_val(points) else f"on {split}, as some runs have no PSNR on val"
+    text = f"Chosen {chosen} among the finished runs that fit; shown is the PSNR on {split}, {where}. "
+    if split == "val" or not f.has_val(points):
+        text += "The same views choose and show, so the highest PSNR is a little too high. "
+    if family.size():
+        text += f"Told apart: after Holm, for all {words.count(family.size(), 'comparison')} of this page. "
     alone = group.variant if len({arm.variant for arm in group.arms}) == 1 else ""
     text += f"Every run with {alone}. " if alone else ""
-    return text + _lengths(f.points(group, scenes))
+    return text + _lengths(points)
 
 
-def _answer(group: Group, points: list[Point], cost: str, budget: float, title: str) -> Answer:
+def _split(group: Group) -> str:
+    return words.cut(group.finished[0].protocol.get("eval_split", "evaluated"), 20)
+
+
+def _answer(points: list[Point], family: Family, cost: str, budget: float) -> Answer:
+    timed = cost == "seconds"
+    title = f"{words.budget(budget)} of training" if timed else f"{1000 / budget:g} frames a second"
     known = [p.cost[cost] for p in points if not math.isnan(p.cost[cost])]
     if not known:
         return Answer(title, "", "not measured", "", "No finished run tells.")
-    write = words.duration if cost == "seconds" else lambda ms: f"{words.plain(ms)} ms a frame"
-    choice = f.choose(group, points, cost, budget)
+    write = words.duration if timed else lambda ms: f"{words.plain(ms)} ms a frame"
+    choice = f.choose(points, cost, budget, family)
     if choice is None:
         return Answer(title, "", "none fits", "", f"The quickest took {write(min(known))}.")
     point = choice.point
-    detail = f"{_told(point.arm)}{write(point.cost[cost])}. "
-    others = {p.series for p in points if p.cost[cost] <= budget} - {point.series}
-    if choice.level:
-        detail += f"Not told apart from {words.listing([p.series for p in choice.level])}."
-    elif choice.unknown:
-        detail += "One seed: whether it is ahead is not known."
-    elif others:
-        detail += "Ahead of every other model that fits." if len(others) > 1 else f"Ahead of {others.pop()}."
-    else:
-        detail += "No other model fits."
-    if cost == "seconds" and budget > 2 * max(known):
-        detail += f" Nothing here trained longer than {write(max(known))}."
-    value = f"{words.plain(point.psnr.mean)} dB"
-    return Answer(title, point.series, value, words.interval(point.psnr), detail)
+    detail = f"{_told(point.arm)}{write(point.cost[cost])}. {_compared(choice)}"
+    if timed and budget > 2 * max(known):
+        detail += f" No run here trained longer than {write(max(known))}."
+    return Answer(title, point.series, f"{words.plain(point.psnr.mean)} dB", words.interval(point.psnr), detail)
+
+
+def _compared(choice: f.Choice) -> str:
+    """Say which models that fit the chosen one is ahead of, which it is not told apart from, and which are ahead."""
+    others = len(choice.ahead) + len(choice.level) + len(choice.behind) + len(choice.unknown)
+    if not others:
+        return "No other model fits."
+    if len(choice.unknown) == others:
+        return "One seed: whether it is ahead is not known."
+    if len(choice.ahead) == others:
+        return f"Ahead of {choice.ahead[0].series}." if others == 1 else "Ahead of every other model that fits."
+    said = [f"Ahead of {len(choice.ahead)} of {words.count(others, 'other model')}."] if choice.ahead else []
+    said += [f"Not told apart from {_named(choice.level)}."] if choice.level else []
+    said += [f"On the views shown {_named(choice.behind)} did better."] if choice.behind else []
+    said += [f"No spread is known of the difference to {_named(choice.unknown)}."] if choice.unknown else []
+    return " ".join(said)
+
+
+def _named(points: list[Point]) -> str:
+    names = [p.series for p in points]
+    more = [f"{len(names) - MOST_NAMED} more"] if len(names) > MOST_NAMED else []
+    return words.listing(names[:MOST_NAMED] + more)
 
 
 def _told(arm: Arm) -> str:
@@ -90,19 +111,20 @@ def _told(arm: Arm) -> str:
 
 def frontier_section(group: Group, canvas: Canvas) -> Section:
     """Draw quality against seconds, milliseconds and megabytes, for the mean of scenes and for each scene."""
-    scenes = basis(group)
+    scenes = group.basis
     points = f.points(group, scenes)
     tabs = [_frontier_tab(group, canvas, "f0", _title(scenes), scenes)] if points else []
     single = [s for s in group.scenes if [s] != scenes and any(s in arm.runs for arm in group.arms)]
     drawn = single[: canvas.scenes]
     tabs += [_frontier_tab(group, canvas, f"f{i}", s, [s]) for i, s in enumerate(drawn, 1)]
     columns = [Column("scene"), Column("model"), Column("variant"), Column("seeds"), Column("PSNR dB", 2)]
-    columns += [Column("95 % low", 2), Column("95 % high", 2), Column("training s", 1), Column("ms a frame", 2)]
-    columns += [Column("MB", 2), Column("dominated in seconds")]
+    columns += [Column("95 % low", 2), Column("95 % high", 2), Column("PSNR val dB", 2), Column("training s", 1)]
+    columns += [Column("ms a frame", 2), Column("MB", 2), Column("beaten in seconds")]
     rows = [row for where in [scenes, *([s] for s in single)] for row in _rows(group, where)]
     table = Table("frontier.csv", columns, rows) if rows else None
     theirs = any(_paper(r, "ms") for r in group.finished)
-    notes = ["×: the paper's own number, which was measured on other hardware by another protocol."] if theirs else []
+    notes = [INTERVALS] if any(p.psnr.over for p in points) else []
+    notes += ["×: the paper's own number, which was measured on other hardware by another protocol."] if theirs else []
     if len(drawn) < len(single):
         notes.append(f"Of {len(single)} scenes {len(drawn) or 'none'} are drawn singly; the table has all.")
     return Section(
@@ -117,7 +139,7 @@ def _title(scenes: list[str]) -> str:
 def _rows(group: Group, scenes: list[str]) -> list[list[Value]]:
     """Return a row of the table for every point."""
     points = f.points(group, scenes)
-    beaten = f.dominated(points, "seconds")
+    beaten = f.beaten(points, "seconds")
     return [
         [
             _title(scenes),
@@ -127,6 +149,7 @@ def _rows(group: Group, scenes: list[str]) -> list[list[Value]]:
             p.psnr.mean,
             p.psnr.low,
             p.psnr.high,
+            p.val,
             p.cost["seconds"],
             p.cost["ms"],
             p.cost["mb"],
@@ -183,35 +206,39 @@ def _paper(record: Record, cost: str) -> tuple[float, float] | None:
 
 
 def _frontier_words(group: Group, points: list[Point]) -> list[str]:
-    """Say what is best, what is dominated, and what the points are from."""
+    """Say which point is chosen, which are beaten by their means, and what the points are from."""
     if not points:
         return ["No run has finished, so there is nothing to compare."]
-    best = max(points, key=lambda p: p.psnr.mean)
-    scenes = basis(group)
+    best, scenes, split = f.ranked(points)[0], group.basis, _split(group)
     where = (
         f"On {scenes[0]}" if len(scenes) == 1 else f"On the mean of {len(scenes)} scenes ({words.listing(scenes[:6])})"
     )
-    split = words.cut(group.finished[0].protocol.get("eval_split", "evaluated"), 20)
     reached = f"{words.plain(best.psnr.mean)} dB ({words.interval(best.psnr)})"
     took = f" in {words.duration(best.cost['seconds'])}" if not math.isnan(best.cost["seconds"]) else ""
-    text = f"{where}, {split} split, {best.arm.name} reaches most: {reached}{took}. "
-    timed = [p for p in points if not math.isnan(p.cost["seconds"])]
-    beaten = f.dominated(timed, "seconds")
-    if len(points) == 1:
-        text += "It is the only point."
-    elif len(beaten) == 1:
-        by = min(
-            (p for p in timed if p not in beaten and f.dominates(p, beaten[0], "seconds")),
-            key=lambda p: p.cost["seconds"],
-        )
-        text += (
-            f"{beaten[0].arm.name} is dominated: {by.arm.name} is no worse and no slower, and ahead in one of the two."
-        )
-    elif beaten:
-        text += f"{len(beaten)} of {len(timed)} points are dominated, as another is no worse and no slower."
-    elif len(timed) > 1:
-        text += "No point is dominated: each step in PSNR costs more training time."
+    leads = f"{best.arm.name} is highest on val" if f.has_val(points) else f"{best.arm.name} is highest"
+    text = f"{where}, {leads}: it has {reached} on {split}{took}. {_beaten_words(points)}"
     return [text, _lengths(points)]
+
+
+def _beaten_words(points: list[Point]) -> str:
+    """Say how many points another one beats; this is of means, so that it claims no difference."""
+    timed = [p for p in points if not math.isnan(p.cost["seconds"])]
+    beaten = f.beaten(timed, "seconds")
+    if len(points) == 1:
+        return "It is the only point."
+    if not beaten:
+        return "By the means no point is beaten: each step in PSNR costs more training time." if len(timed) > 1 else ""
+    if len(beaten) > 1:
+        return (
+            f"By the means {len(beaten)} of {len(timed)} points are beaten: another has at least the PSNR and takes "
+            "at most the seconds. This counts differences that may be chance, too."
+        )
+    rivals = [p for p in timed if p not in beaten and f.beats(p, beaten[0], "seconds")]
+    by = min(rivals, key=lambda p: p.cost["seconds"])
+    return (
+        f"By the means {beaten[0].arm.name} is beaten by {by.arm.name}, which has at least the PSNR and takes at most "
+        "the seconds; the difference may be chance."
+    )
 
 
 def _lengths(points: list[Point]) -> str:

@@ -13,7 +13,8 @@ def quality_section(group: Group, canvas: Canvas) -> Section:
     """Say how long each model needs for the targets, and draw the performance profile."""
     targets = f.targets(group)
     if not targets:
-        return Section("quality", "Time to quality", ["No finished run has PSNR on val and training seconds."])
+        text = "No target: no finished run has PSNR on val and training seconds, or all reach the same."
+        return Section("quality", "Time to quality", [text])
     ratios = f.profile(targets)
     problems = len(next(iter(ratios.values()), []))
     panel = charts.profile({m: (canvas.look[m], list(values)) for m, values in ratios.items()}, problems)
@@ -30,8 +31,9 @@ def quality_section(group: Group, canvas: Canvas) -> Section:
         beside=True,
         legend=True,
         notes=[
-            "Targets on val, set by rule: what 3dgs, the weakest and the strongest model end with, and the paper's "
-            "number where the data are the paper's. Seconds are of the quickest finished run, not interpolated."
+            "Targets are round numbers of dB on val between the lowest and the highest run of a scene, and the paper's "
+            "number where the data are the paper's: no model's own PSNR is a target. The step is the widest of 2, 1, "
+            "0.5, 0.2 and 0.1 dB that gives three. Seconds are means of the quickest finished runs, not interpolated."
         ],
     )
 
@@ -44,10 +46,8 @@ def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
     quick = [m for m in models if fastest[m] == max(fastest.values())]
     alone = sum(sum(map(math.isfinite, t.seconds.values())) == 1 < len(t.seconds) for t in targets)
     verb = "reaches" if len(most) == 1 else "reach"
-    text = f"{words.listing(most)} {verb} most targets ({reached[most[0]]} of {len(targets)}); "
-    text += (
-        f"{words.listing(quick)} {'is' if len(quick) == 1 else 'are'} the quickest most often ({fastest[quick[0]]})."
-    )
+    text = f"{words.listing(most)} {verb} most targets ({reached[most[0]]} of {len(targets)}). By mean seconds "
+    text += f"{words.listing(quick)} {'is' if len(quick) == 1 else 'are'} first most often ({fastest[quick[0]]} times)."
     if alone:
         text += f" {words.count(alone, 'target')} {'is' if alone == 1 else 'are'} reached by one model only."
     return [text]

@@ -67,14 +67,24 @@ def budget(seconds: float) -> str:
 
 
 def interval(of: Estimate, digits: int = 2, *, sign: bool = False) -> str:
-    """Write the 95 % interval, or that no spread is known."""
+    """Write the 95 % interval and what it is over, or that no spread is known."""
     write = signed if sign else plain
-    return f"95 % {write(of.low, digits)} to {write(of.high, digits)}" if of.over else NO_SPREAD
+    return f"95 % {write(of.low, digits)} to {write(of.high, digits)} over {of.over}" if of.over else NO_SPREAD
 
 
 def over(of: Estimate) -> str:
     """Say what an interval generalises to."""
     return {"scenes": "scenes like these", "": "–"}.get(of.over, f"{of.over}, on {count(of.scenes, 'scene')}")
+
+
+def scope(of: Estimate) -> str:
+    """Say in a sentence of how many scenes differences are, and what their intervals can and cannot tell."""
+    scenes = {1: "One scene", 2: "Two scenes"}.get(of.scenes, count(of.scenes, "scene"))
+    if not of.over:
+        return f"{scenes}, one seed: no interval is known."
+    if of.over == "scenes":
+        return f"{scenes}; an interval over scenes like these, with all seeds and views in it."
+    return f"{scenes}; an interval over {of.over}, not over scenes: it does not tell what another scene would give."
 
 
 def run_name(record: Record) -> str:

@@ -7,12 +7,12 @@ from statistics import fmean
 from gsbench.report import compare
 from gsbench.report.arms import Group
 from gsbench.report.compare import Cube, Pair, Price
-from gsbench.report.intervals import Estimate
+from gsbench.report.family import Family
 from gsbench.report.page import charts, words
 from gsbench.report.page.content import Canvas, Column, Drawing, Section, Swatch, Tab, Table, Value
 
 UNITS = (("psnr", "dB", 2), ("seconds", "training s", 1), ("ms", "ms a frame", 2), ("mb", "MB", 2))
-STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer")
+STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer", "screen", "gate")  # each has a colour
 REST = "other"
 MOST_PAIRS = 28  # that are drawn: those of eight models
 PARAMETRISATION = (
@@ -23,9 +23,9 @@ NOT_NESTED = "The nested comparison, with model=7dgs_nodir, needs runs that are 
 NESTED = "Nested: 7dgs_nodir, which is 7dgs less direction and nothing else, in the place of 4dgs."
 
 
-def effects_section(group: Group, canvas: Canvas) -> Section:
+def effects_section(group: Group, family: Family, canvas: Canvas) -> Section:
     """Price time, direction, AGR and their interactions in every unit, as far as the cells were run."""
-    cube = compare.cube(group)
+    cube = compare.cube(group, family)
     notes = []
     if cube.missing:
         notes.append(f"Not run, so not priced: models with {words.listing(cube.missing, 'or')}.")
@@ -41,32 +41,48 @@ def effects_section(group: Group, canvas: Canvas) -> Section:
     shown = cube.prices + [replace(price, name=f"{price.name}, nested") for price in cube.nested]
     drawings = []
     for unit, title, digits in UNITS:
-        rows = [_row(price, price.costs[unit], digits) for price in shown if price.costs[unit].scenes]
+        rows = [_row(price, unit, digits) for price in shown if price.costs[unit].scenes]
         if rows:
             alt = f"Change in {title} of {words.listing([row.label for row in rows])}"
             drawings.append(Drawing(f"in {title}", charts.differences(rows, title).svg(f"{canvas.name}e{unit}", alt)))
     columns = [Column("effect"), Column("computed from")]
     for _, title, digits in UNITS:
         columns += [Column(title, digits), Column(f"{title}: 95 % low", digits), Column(f"{title}: high", digits)]
+        columns.append(Column(f"{title}: told from nothing"))
+    columns.append(Column("interval of dB over"))
     priced: list[list[Value]] = [
         [
             p.name,
             p.models,
-            *(v for unit, _, _ in UNITS for v in (p.costs[unit].mean, p.costs[unit].low, p.costs[unit].high)),
+            *(v for unit, _, _ in UNITS for v in _cells(p, unit)),
+            words.over(p.costs["psnr"]),
         ]
         for p in shown
     ]
     table = Table("effects.csv", columns, priced)
-    return Section("effects", "The price of each effect", _effect_words(cube), [Tab("", drawings)], table, notes=notes)
+    first, *rule = _scope(cube, family)
+    said = [first, *_effect_words(cube)]
+    return Section("effects", "The price of each effect", said, [Tab("", drawings)], table, notes=[*rule, *notes])
 
 
-def _row(price: Price, of: Estimate, digits: int) -> charts.Row:
-    return charts.Row(price.name, of.mean, of.low, of.high, _is_real(of), words.signed(of.mean, digits))
+def _row(price: Price, unit: str, digits: int) -> charts.Row:
+    of = price.costs[unit]
+    return charts.Row(price.name, of.mean, of.low, of.high, price.told[unit], words.signed(of.mean, digits))
 
 
-def _is_real(of: Estimate) -> bool:
-    """Whether the interval does not hold zero."""
-    return of.low > 0 or of.high < 0
+def _cells(price: Price, unit: str) -> tuple[Value, ...]:
+    of = price.costs[unit]
+    told = "yes" if price.told[unit] else "no" if of.over else "not known"
+    return of.mean, of.low, of.high, told
+
+
+def _scope(cube: Cube, family: Family) -> list[str]:
+    """Say over what the intervals of prices are, and among how many comparisons a price is told from nothing."""
+    fewest = min((price.costs["psnr"] for price in cube.prices), key=lambda of: of.scenes)
+    if not family.size():
+        return [words.scope(fewest)]
+    told = f"Told from nothing: after Holm, in dB for all {words.count(family.size(), 'comparison')} of this page"
+    return [words.scope(fewest), f"{told}, which is less often than the interval of one price leaves out zero."]
 
 
 def _effect_words(cube: Cube) -> list[str]:
@@ -77,9 +93,9 @@ def _effect_words(cube: Cube) -> list[str]:
     text = f"Worth most: {best.name}, {words.signed(gain.mean)} dB ({words.interval(gain, sign=True)})"
     text += f", for {words.signed(seconds.mean, 1)} s of training." if seconds.scenes else "."
     if gain.mean <= 0:
-        text = f"No effect raises PSNR here; the least harm does {best.name}, {words.signed(gain.mean)} dB."
-    unclear = [p.name for p in single if p.costs["psnr"].over and not _is_real(p.costs["psnr"])]
-    said = [text, f"Not told from nothing in dB: {words.listing(unclear)}." if unclear else ""]
+        text = f"No effect raises PSNR here; {best.name} lowers it least: {words.signed(gain.mean)} dB."
+    unclear = [p.name for p in single if p.costs["psnr"].over and not p.told["psnr"]]
+    said = [text, f"Not told from nothing in dB: {'; '.join(unclear)}." if unclear else ""]
     for price in cube.nested:
         if price.name.startswith("direction"):
             of = price.costs["psnr"]
@@ -87,8 +103,8 @@ def _effect_words(cube: Cube) -> list[str]:
                         f"({words.interval(of, sign=True)}).")  # fmt: skip
     for price in cube.prices:
         of = price.costs["psnr"]
-        if price.order == 2 and _is_real(of):
-            side = f"{words.plain(abs(of.mean))} dB {'less' if of.mean < 0 else 'more'} than apart"
+        if price.order == 2 and price.told["psnr"]:
+            side = f"{words.plain(abs(of.mean))} dB {'less' if of.mean < 0 else 'more'} than the sum of each by itself"
             said.append(f"{words.sentence(price.name)}: together they bring {side} ({words.interval(of, sign=True)}).")
     return [s for s in said[:5] if s]
 
@@ -99,8 +115,8 @@ def stages_section(group: Group, canvas: Canvas) -> Section:
     if not parts:
         return Section("stages", "Where the seconds go", ["No finished run tells its seconds by stage."])
     every = {name for stages in parts.values() for name in stages}
-    names = [s for s in STAGES if s in every] + sorted(every - {*STAGES, REST}) + ([REST] if REST in every else [])
-    panel = charts.stages(list(parts.items()), names)
+    names = [name for name in (*STAGES, REST) if name in every]
+    panel = charts.stages(list(parts.items()), names, [_colour(name) for name in names])
     alt = f"Seconds of training by stage for {words.listing(list(parts))}"
     rows: list[list[Value]] = [
         [m, *(stages.get(s, 0.0) for s in names), sum(stages.values())] for m, stages in parts.items()
@@ -108,13 +124,9 @@ def stages_section(group: Group, canvas: Canvas) -> Section:
     columns = [Column("model"), *(Column(f"{s} s", 2) for s in names), Column("training s", 2)]
     share = {s: fmean(stages.get(s, 0.0) / sum(stages.values()) for stages in parts.values()) for s in names}
     first, *others = sorted(names, key=lambda s: -share[s])
-    text = f"{first.capitalize()} takes most, {100 * share[first]:.0f} % of training on the mean of the models"
+    text = f"The largest share of training, on the mean of the models, is {first} with {100 * share[first]:.0f} %"
     text += f", then {others[0]} with {100 * share[others[0]]:.0f} %." if others else "."
-    slow, quick = (pick(parts, key=lambda m: sum(parts[m].values())) for pick in (max, min))
-    if slow != quick:
-        ratio = sum(parts[slow].values()) / sum(parts[quick].values())
-        most = max(names, key=lambda s: parts[slow].get(s, 0.0) - parts[quick].get(s, 0.0))
-        text += f" {slow} takes {ratio:.2g} times the seconds of {quick}, most of the difference in {most}."
+    text += _slowest_words(parts, names)
     table = Table("stages.csv", columns, rows)
     drawing = Drawing("Seconds of training by stage", panel.svg(f"{canvas.name}s", alt))
     return Section(
@@ -124,28 +136,46 @@ def stages_section(group: Group, canvas: Canvas) -> Section:
         [Tab("", [drawing])],
         table,
         beside=True,
-        swatches=[Swatch(words.cut(name, 40), f"stage-{i}") for i, name in enumerate(names)],
+        swatches=[Swatch(name, f"stage-{_colour(name)}") for name in names],
     )
 
 
+def _colour(stage: str) -> int:
+    """Return the number of a stage's colour, the same whichever others are there."""
+    return (*STAGES, REST).index(stage)
+
+
+def _slowest_words(parts: dict[str, dict[str, float]], names: list[str]) -> str:
+    """Say how much longer the slowest model takes than the quickest, and which share of that one stage has."""
+    slow, quick = (pick(parts, key=lambda m: sum(parts[m].values())) for pick in (max, min))
+    took, least = sum(parts[slow].values()), sum(parts[quick].values())
+    if took == least:
+        return ""
+    more = {name: parts[slow].get(name, 0.0) - parts[quick].get(name, 0.0) for name in names}
+    most = max(names, key=lambda name: more[name])
+    share = 100 * more[most] / (took - least)
+    rest = f"{share:.0f} % of the difference is in {most}" if share < 100 else f"all of the difference is in {most}"
+    return f" {slow} takes {took / least:.2g} times the seconds of {quick}; {rest}."
+
+
 def _stage_seconds(group: Group, model: str) -> dict[str, float]:
-    """Return the mean seconds of each stage over scenes and seeds, and those that no stage has."""
+    """Return the mean seconds of each of STAGES over scenes and seeds, and those of all else."""
     (arm,) = (arm for arm in group.main_arms if arm.model == model)
     scenes = [s for s in group.covered or arm.runs if s in arm.runs]
     runs = [[r for r in arm.runs[s] if r.cost and not math.isnan(group.value(r, "seconds"))] for s in scenes]
     if not runs or not all(runs):
         return {}
     costs = [[r.cost for r in seeds if r.cost] for seeds in runs]
-    names = sorted({name for seeds in costs for cost in seeds for name in cost.stage_s})
-    found = {words.cut(n, 40): fmean(fmean(c.stage_s.get(n, 0.0) for c in seeds) for seeds in costs) for n in names}
+    names = [name for name in STAGES if any(name in cost.stage_s for seeds in costs for cost in seeds)]
+    found = {n: fmean(fmean(c.stage_s.get(n, 0.0) for c in seeds) for seeds in costs) for n in names}
     total = fmean(fmean(c.train_s for c in seeds) for seeds in costs)
     rest = total - sum(found.values())
     return found | ({REST: rest} if rest > 0.005 * total else {}) if total > 0 else {}
 
 
-def pairs_section(group: Group, canvas: Canvas) -> Section:
+def pairs_section(group: Group, family: Family, canvas: Canvas) -> Section:
     """Draw the difference of every two models with its interval."""
-    found = compare.pairs(group)
+    found = compare.pairs(group, family)
     if not found:
         text = "Fewer than two models have finished the same scene, so there is no pair to compare."
         return Section("pairs", "Is it a difference?", [text])
@@ -158,20 +188,20 @@ def pairs_section(group: Group, canvas: Canvas) -> Section:
     ]  # fmt: skip
     alt = f"Differences in PSNR of {words.count(len(rows), 'pair')} of models with 95 % intervals"
     columns = [Column("pair"), Column("dB", 2), Column("95 % low", 2), Column("95 % high", 2)]
-    columns += [Column("ahead on % of views", 0), Column("p, Holm"), Column("told apart")]
+    columns += [Column("ahead on % of views", 0), Column("p, Holm"), Column("told apart"), Column("interval over")]
     table = Table("pairs.csv", columns, [_pair_row(group, p) for p in found])
     drawing = Drawing("Difference in PSNR", charts.differences(rows, "dB").svg(f"{canvas.name}p", alt))
     first = found[0].difference
     notes = [
-        f"Paired over the seeds and views that both have; intervals are of {words.over(first)}. p is adjusted after "
-        f"Holm for {words.count(len(found), 'pair')}. Ahead: how likely a run of the first beats one of the second on "
-        "a view."
+        f"Paired over the seeds and views that both have; each interval, over {words.over(first)}, is of its pair "
+        f"alone. p is adjusted after Holm for all {words.count(family.size(), 'comparison')} of this page (pairs, "
+        "prices, answers to budgets); filled points are told apart, which is p below 5 %. Ahead: how likely a run of "
+        "the first beats one of the second on a view."
         if first.over
         else f"{words.NO_SPREAD.capitalize()}: no interval and no p-value is given."
     ]
-    return Section(
-        "pairs", "Is it a difference?", _pair_words(group, found), [Tab("", [drawing])], table, beside=True, notes=notes
-    )
+    said = [*([words.scope(first)] if first.over else []), *_pair_words(group, found)]
+    return Section("pairs", "Is it a difference?", said, [Tab("", [drawing])], table, beside=True, notes=notes)
 
 
 def _pair_name(group: Group, pair: Pair) -> str:
@@ -189,6 +219,7 @@ def _pair_row(group: Group, pair: Pair) -> list[Value]:
         100 * pair.improvement,
         words.probability(pair.p_holm),
         told,
+        words.over(d),
     ]
 
 

@@ -1,0 +1,13 @@
+"""Gather every comparison that a report makes of an experiment, so that all are adjusted together."""
+
+from gsbench.report import compare, frontier
+from gsbench.report.arms import Group
+from gsbench.report.family import Family
+
+
+def comparisons(group: Group) -> Family:
+    """Return all comparisons of an experiment: pairs of models, prices of effects, and what each budget buys."""
+    prices = compare.priced(group)
+    contested = frontier.contested(frontier.points(group, group.basis))
+    psnr = [*compare.paired(group), *prices, *contested]
+    return Family(group, {unit: psnr if unit == "psnr" else prices for unit in compare.PRICES})
