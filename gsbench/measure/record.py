@@ -22,6 +22,7 @@ from gsbench.measure.speed import RenderTimes
 from gsbench.reading import MAX_JSON, parse_json, read_file
 
 VERSION = 1
+MAX_POINTS = 10_000  # of a curve: more than a figure shows, and as many as a page draws in a moment
 FILE_NAME = "record.json"
 PUBLISHED = "published"  # the folder of records that came with the code: who is not told to read them passes it by
 STATUSES = ("ok", "failed", "diverged")
@@ -202,6 +203,10 @@ def _validated(plain: Any, path: Path) -> Record:
     version = plain.get("version") if isinstance(plain, dict) else VERSION
     if type(version) is not int or version != VERSION:  # first: another version has other keys
         raise InputError(f"{path}: version: expected {VERSION}, got {ascii(version)[:80]}; run again with this gsbench")
+    curve = plain.get("curve") if isinstance(plain, dict) else None
+    if isinstance(curve, list) and len(curve) > MAX_POINTS:  # before each point is parsed
+        raise InputError(f"{path}: curve: expected at most {MAX_POINTS:,} points, got {len(curve):,}; is it a record of "
+                         f"gsbench?")  # fmt: skip
     record = parse(Record, plain, str(path))
     check(record, str(path))
     return record

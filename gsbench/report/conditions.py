@@ -1,5 +1,6 @@
 """State the conditions under which the rows of a table were measured, and warn where they differ."""
 
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 
@@ -8,7 +9,9 @@ from gsbench.report.arms import without
 
 WARNING = "WARNING"
 MOST_RUNS_NAMED = 3
-SPREAD = "mean ± sample standard deviation over the seeds that finished, their number beside it"
+SPREAD = (
+    "± is half the width of the 95 % interval over seeds (Student's t; of these scenes and views); one seed has none"
+)
 DEFINITIONS = (
     "PSNR: joint over H x W x 3, final iteration, mean over views. SSIM: scikit-image, Gaussian window, data_range 1.",
     "FPS: 1000 / median ms of synchronised renders after warm-up, slicing and AGR included. "
@@ -26,22 +29,33 @@ def printable(text: object) -> str:
 def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:
     """List footnotes on protocol, data, machine, commit, versions and seeds; warnings come first.
 
+    They are those of the runs that finished, as only these have numbers: one that failed may have stopped before it
+    knew its backend or its data. Where none finished there is nothing to compare, so nothing is warned of.
+
     Args:
         records: of one table.
         spread: says what stands behind ± in it.
     """
+    finished = [r for r in records if r.status == "ok"]
+    notes = _stated(finished or records, spread)
+    return notes if finished else [note for note in notes if not note.startswith(WARNING)]
+
+
+def _stated(records: list[Record], spread: str) -> list[str]:
+    """List the footnotes of runs that are compared."""
     names = sorted({name for r in records for name in r.protocol} - {"paper_dataset"})
     protocol: dict[str, Get] = {name: partial(_protocol, name=name) for name in names}
     protocol["iterations"] = _iterations
-    data: dict[str, Get] = {printable(records[0].dataset): lambda r: r.provenance.data_hash[:8]}
+    data: dict[str, Get] = {printable(records[0].dataset): _data}
     notes = []
     for title, facts in (("protocol", protocol), ("data", data)):
         # both may differ between scenes (lego is measured on val), but not within a scene, unless a variant says so
-        notes.append(f"{title}: " + "; ".join(f"{name} {_by_scene(records, get)}" for name, get in facts.items()))
+        stated = [f"{printable(name)} {_by_scene(records, get)}" for name, get in facts.items()]
+        notes.append(f"{title}: {'; '.join(stated)}")
         for name, get in facts.items():
             silent = [r for r in records if without(r.variant, name) == r.variant]
             if not _goes_with_scene(silent, get):
-                notes.append(_differ(name, silent, get))
+                notes.append(_differ(printable(name), silent, get))
     if any(r.scene == "lego" and r.protocol.get("eval_split") == "val" for r in records):
         notes.append("lego is measured on val: the test split of D-NeRF's lego contradicts its motion.")
     for title, get in (("machine", _machine), ("commit", _commit), ("versions", _versions)):
@@ -63,13 +77,20 @@ def _iterations(record: Record) -> str:
     return printable(train.get("iterations", "not recorded")) if isinstance(train, dict) else "not recorded"
 
 
+def _data(record: Record) -> str:
+    """Return the beginning of the fingerprint of the data; the words in its place where it was not computed."""
+    of = printable(record.provenance.data_hash)
+    return of if " " in of else of[:8]
+
+
 def _machine(record: Record) -> str:
     return printable(record.provenance.machine)
 
 
 def _load(records: list[Record]) -> list[str]:
-    """Say how busy the machine was, as far as the records do."""
-    costs = [r.cost for r in records if r.cost]
+    """Say how busy the machine of most runs was, as far as the records do."""
+    machine = Counter(r.provenance.machine for r in records).most_common(1)[0][0]
+    costs = [r.cost for r in records if r.cost and r.provenance.machine == machine]
     loads = [cost.load for cost in costs if cost.load is not None]
     if not loads:
         return []

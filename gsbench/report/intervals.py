@@ -13,6 +13,7 @@ So the spread of each level is estimated and given its own quantile of t (docs/s
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -108,6 +109,15 @@ def estimate(scenes: list[Values], *, generalise: bool = True) -> Estimate:
     own = _combined([_without_rest(scene) for scene in scenes])
     of_views = _combined([Spread(s.mean(0).var(ddof=1) / s.shape[1], s.shape[1] - 1) for s in scenes])
     return Estimate(mean, count, seeds, "seeds and views", (own, of_views), of_seeds)
+
+
+def over_seeds(values: Sequence[float]) -> Estimate:
+    """Estimate the mean of one model's runs on a scene; its interval is over seeds, on this scene and these views.
+
+    Args:
+        values: one for each seed.
+    """
+    return estimate([np.array(values, dtype=np.float64)[:, None]], generalise=False)
 
 
 def _combined(scenes: list[Spread]) -> Spread:

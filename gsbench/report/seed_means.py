@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gsbench.measure.record import Record
+from gsbench.report import conditions
 from gsbench.report.intervals import Estimate, estimate
 from gsbench.report.tables import quantities
 
-SPREAD = (
-    "± is half the width of the 95 % interval over seeds (Student's t; of these scenes and views); one seed has none"
-)
+SPREAD = conditions.SPREAD  # every table has the same
 
 
 def mean(runs: Mapping[str, Sequence[Record]], key: str) -> Estimate:

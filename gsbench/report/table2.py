@@ -5,7 +5,7 @@ from typing import Any
 
 from gsbench.measure.record import Record
 from gsbench.report import paper
-from gsbench.report.conditions import conditions
+from gsbench.report.conditions import conditions, printable
 from gsbench.report.layout import EMPTY, Column, Row, Section, Table
 from gsbench.report.paper_protocol import MODELS, Arm, Sorted, arms, finished
 from gsbench.report.seed_means import SPREAD, mean
@@ -44,7 +44,7 @@ def build(found: Sorted) -> tuple[list[Table], list[Line]]:
         sections = [Section(f"average over {len(paper.PROTOCOLS[dataset].scenes)} scenes", rows)]
         made.append(Table(f"Table 2, {dataset}, at the paper's protocol", COLUMNS, sections, marks, notes))
     if found.other_data:
-        names = ", ".join(sorted({pool.dataset for pool in found.other_data}))
+        names = ", ".join(sorted({printable(pool.dataset) for pool in found.other_data}))
         made[-1].footnotes.append(f"OTHER DATA is in table1.md and has no average here: {names}.")
     return made, lines
 

@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Any
 
 import pandas as pd
@@ -14,7 +14,9 @@ from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import METRICS, Record
 from gsbench.report import layout, paper
 from gsbench.report.arms import groups
+from gsbench.report.cells import cell
 from gsbench.report.conditions import conditions, printable
+from gsbench.report.intervals import over_seeds
 from gsbench.report.layout import EMPTY, Column, Row, Section, Table
 
 LEAKS = "psnr_best_on_test (leaks)"  # its title always says that it leaks
@@ -201,7 +203,7 @@ class _Builder:
         """Show the mean and the spread over the seeds, or the reason why a seed lacks the number."""
         values = self.values[finished[0].scene, self._name(finished[0])][column.key]
         if not math.isnan(fmean(values)):
-            return column.show(fmean(values), stdev(values) if len(values) > 1 else math.nan)
+            return column.show(fmean(values), over_seeds(values).half)
         if column.key in OF_THE_MACHINE:
             return EMPTY  # a footnote of the table names the machines that are left out
         name = "psnr_best_on_test" if column.key == LEAKS else column.key
@@ -266,5 +268,5 @@ def write(records: list[Record], folder: Path, *, train: bool = False) -> list[T
     """Write ``table.md`` and ``table.csv`` to `folder` atomically and return the tables; `train` is as in `build`."""
     tables = build(records, train=train)
     write_atomically(folder / "table.md", layout.markdown(tables).encode())
-    write_atomically(folder / "table.csv", tidy(records).to_csv(index=False).encode())
+    write_atomically(folder / "table.csv", tidy(records).map(cell).rename(columns=cell).to_csv(index=False).encode())
     return tables

@@ -14,6 +14,7 @@ from gsbench.config import Config, LearningRate
 from gsbench.errors import InputError, did_you_mean, one_line
 from gsbench.measure import perceptual
 from gsbench.measure.atomic import write_atomically
+from gsbench.measure.record import MAX_POINTS
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
 from gsbench.models.gated import GatedModel
@@ -44,7 +45,7 @@ RANGES = {  # of numbers that the schema types but does not bound, both ends inc
     "train.densify.clone_below": (0, math.inf),
     "train.densify.prune_above": (0, math.inf),
     "train.densify.max_gaussians": (LEAST_GAUSSIANS, ENDLESS),
-    "train.curve_points": (1, ENDLESS),
+    "train.curve_points": (1, MAX_POINTS),
     "train.checkpoint_minutes": (0, ENDLESS),
     "model.min_opacity": (0, 0.25),  # a reset lowers opacities to twice as much
     "data.initial_points": (4, ENDLESS),

@@ -7,6 +7,7 @@ import os
 import random
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,20 @@ def test_a_metric_that_is_not_finite_becomes_null_with_its_reason(tmp_path, valu
     assert read.per_view[0].psnr is None
     assert read.per_view[0].ssim == 1.0
     assert read.curve == [Point(1, 1.0, None)]
+
+
+def test_a_curve_of_a_million_points_is_refused(tmp_path):
+    """Would catch a record of 33 MB that is read for seconds and drawn for minutes."""
+    path = tmp_path / "record.json"
+    files.write(make(), path)
+    many = json.loads(path.read_text())
+    many["curve"] = [[i, float(i), 20.0] for i in range(1_000_000)]
+    path.write_text(json.dumps(many))
+    started = time.process_time()
+    refused(path, "curve: expected at most 10,000 points, got 1,000,000")
+    assert time.process_time() - started < 10
+    with pytest.raises(InputError, match="at most 10,000"):
+        files.write(make(curve=[Point(i, float(i), 20.0) for i in range(10_001)]), path)
 
 
 def test_a_run_that_failed_needs_neither_metrics_nor_cost(tmp_path):

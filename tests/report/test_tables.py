@@ -1,5 +1,6 @@
 """The table: a golden page, the rules of averaging and of the paper's rows, warnings, the command."""
 
+import base64
 import dataclasses
 import subprocess
 import sys
@@ -11,6 +12,8 @@ from make_golden import GOLDEN, GOLDEN_TERMINAL, make, records
 from gsbench.measure import record as files
 from gsbench.report import layout, tables
 from gsbench.report.__main__ import main
+from gsbench.report.page.content import Column as PageColumn
+from gsbench.report.page.content import Table
 
 
 def page(*of: files.Record) -> str:
@@ -46,11 +49,11 @@ def test_no_run_is_dropped():
     assert frame.loc[frame["status"] == "failed", "reason"].tolist() == ["out of memory"]
 
 
-def test_seeds_become_mean_and_sample_deviation():
-    """Would catch a population deviation, or a failed seed that counts: 24, 25, 26 have mean 25 and deviation 1."""
+def test_seeds_become_mean_and_interval():
+    """Would catch another spread than the page's, or a failed seed that counts: 24, 25, 26 are 25 ± 4.30 / sqrt(3)."""
     runs = [make(seed=seed, psnr=psnr) for seed, psnr in enumerate((24.0, 25.0, 26.0))]
     text = section(page(*runs, failed(seed=3)), "suzanne")
-    assert "| 7dgs | **25.00 ± 1.00** |" in text
+    assert "| 7dgs | **25.00 ± 2.48** |" in text
     assert "| 3 |" in text
     assert "| 7dgs seed 3 | failed |" in text
 
@@ -156,6 +159,22 @@ def test_a_protocol_may_go_with_the_scene_but_not_within_it():
     )
 
 
+def test_a_run_that_failed_warns_of_nothing_it_never_reached():
+    """Would catch "the rows differ" by a run that stopped before its backend was resolved and its data were read."""
+    early = failed(seed=7, protocol={**make().protocol, "backend": "auto", "resolution": "not loaded"})
+    early = dataclasses.replace(
+        early, provenance=dataclasses.replace(make().provenance, data_hash="not loaded", git_commit="fedcba-dirty")
+    )
+    known = make(protocol={**make().protocol, "backend": "cpu"})
+    text = page(known, early)
+    assert "WARNING" not in text
+    assert "backend cpu" in text
+    assert "not load" not in text
+    alone = page(early, failed(seed=8))
+    assert "WARNING" not in alone
+    assert "not loaded" in alone
+
+
 def test_what_a_variant_names_may_differ():
     """Would catch a warning on every frontier, whose rows name their lengths, or none where no row names it."""
     lengths = {"": 1000, "iterations=250": 250, "iterations=4000": 4000}
@@ -247,6 +266,45 @@ def test_text_from_a_record_cannot_break_the_page_or_the_terminal():
     text = page(run)
     assert "a \\| b c \\<script> ?\\[31m \\*d\\*" in text
     assert not set(layout.terminal(tables.build([run]))) & {"\x1b", "\x07"}
+
+
+ESCAPE = "\x1b[31m\x9b\x07\u202e"
+
+
+def spoilt(record):
+    """The run with an escape code in every free text and every key that it may have."""
+    provenance = dataclasses.replace(
+        record.provenance, git_commit=ESCAPE, versions={ESCAPE: ESCAPE}, device=ESCAPE, data_hash=ESCAPE, time=ESCAPE
+    )
+    changes = {"dataset": ESCAPE, "protocol": {**record.protocol, f"{ESCAPE}a": ESCAPE}, "provenance": provenance}
+    missing = dict.fromkeys(record.missing, ESCAPE)
+    return dataclasses.replace(record, missing=missing, reason=record.reason and ESCAPE, **changes)
+
+
+def test_no_control_character_of_a_record_is_written(tmp_path, capsys):
+    """Would catch an escape code in a key, a note or a cell, which a terminal obeys: in every file and in the print."""
+    for i, record in enumerate([make(), make(seed=1), failed(seed=2)]):
+        path = tmp_path / f"run{i}" / "record.json"
+        changed = spoilt(record) if i else dataclasses.replace(spoilt(record), protocol=make().protocol)
+        files.write(changed, path)
+    assert main([str(tmp_path)]) == 0
+    assert main([str(tmp_path), "--tables"]) == 0
+    printed = capsys.readouterr().out
+    for text in (printed, *(p.read_text() for p in tmp_path.iterdir() if p.suffix in (".md", ".csv", ".html"))):
+        assert not {c for c in text if not c.isprintable()} - {"\n"}
+
+
+def test_a_cell_of_csv_is_no_formula(tmp_path):
+    """Would catch a text that a spreadsheet computes, and a negative number that is made a text."""
+    run = dataclasses.replace(failed(reason="=1+1"), protocol={**make().protocol, "name": "@SUM(A1)", "frames": "-2+3"})
+    psnr = dataclasses.replace(make(), metrics={**make().metrics, "psnr": -1.5})
+    tables.write([run, psnr], tmp_path)
+    frame = pd.read_csv(tmp_path / "table.csv")
+    lost, kept = frame[frame.status == "failed"].iloc[0], frame[frame.status == "ok"].iloc[0]
+    assert (lost.reason, lost.protocol_name, lost.protocol_frames) == ("'=1+1", "'@SUM(A1)", "'-2+3")
+    assert kept.psnr == -1.5
+    linked = Table("t.csv", [PageColumn("=a"), PageColumn("b", 1)], [["+cmd|' /C calc'!A0", -1.5]])
+    assert base64.b64decode(linked.href.partition(",")[2]).decode() == "'=a,b\n'+cmd|' /C calc'!A0,-1.5\n"
 
 
 @pytest.mark.parametrize("width", [120, 80, 40])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from gsbench.measure.record import Record
 from gsbench.report.arms import Arm, Group
+from gsbench.report.cells import cell
 from gsbench.report.page import words
 from gsbench.report.page.palette import Style
 
@@ -48,9 +49,9 @@ class Table:
         """The whole table as CSV in a data address."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow([c.title for c in self.columns])
+        writer.writerow([cell(c.title) for c in self.columns])
         writer.writerows(
-            [None if value != value else value for value in row] for row in self.rows
+            [None if value != value else cell(value) for value in row] for row in self.rows
         )  # NaN: an empty cell
         return f"data:text/csv;base64,{base64.b64encode(text.getvalue().encode()).decode()}"
 
