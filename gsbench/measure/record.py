@@ -205,8 +205,8 @@ def _validated(plain: Any, path: Path) -> Record:
         raise InputError(f"{path}: version: expected {VERSION}, got {ascii(version)[:80]}; run again with this gsbench")
     curve = plain.get("curve") if isinstance(plain, dict) else None
     if isinstance(curve, list) and len(curve) > MAX_POINTS:  # before each point is parsed
-        raise InputError(f"{path}: curve: expected at most {MAX_POINTS:,} points, got {len(curve):,}; is it a record of "
-                         f"gsbench?")  # fmt: skip
+        raise InputError(f"{path}: curve: expected at most {MAX_POINTS:,} points, got {len(curve):,}; run again with "
+                         f"fewer train.curve_points")  # fmt: skip
     record = parse(Record, plain, str(path))
     check(record, str(path))
     return record

@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 import pytest
 from make_golden import make
-from many_records import EFFECTS, HOSTILE, frontier, hostile, write_all
+from many_records import EFFECTS, HOSTILE, frontier, hostile, on_demand, write_all
 
 from gsbench.config import TrainConfig
 from gsbench.measure.curve import Point
-from gsbench.measure.record import Effects, ViewScore
+from gsbench.measure.record import Effects, OnDemand, ViewScore
+from gsbench.measure.speed import RenderTimes
 from gsbench.report import compare, live
 from gsbench.report.__main__ import main
 from gsbench.report.arms import groups
@@ -72,7 +73,7 @@ def effects_section(records):
 
 
 def canvas():
-    return Canvas("x", Runs(), styles(list(EFFECTS)), 8)
+    return Canvas("x", Runs(), styles([*EFFECTS, "auto"]), 8)
 
 
 def page(records, tmp_path):
@@ -199,6 +200,37 @@ def test_nothing_is_dominated_by_a_mean():
     assert "By the means b is beaten by a" in text
     assert "may be chance" in text
     assert "dominated" not in text
+
+
+def test_seconds_of_another_machine_are_nowhere(tmp_path):
+    """Catches one chart, card or table that still averages over two machines: theirs are a thousand times as slow."""
+    records = frontier(("3dgs", "7dgs"), ("suzanne",), 3, (1000,))
+    records += on_demand([r for r in records if r.model == "7dgs"])
+    other = dataclasses.replace(records[0].provenance, device="another CPU")
+
+    def elsewhere(run):
+        slow = {"train_s": 77777.0, "stage_s": {"slice": 77777.0}, "render_ms": RenderTimes(7777.0, 7777.0, 7777.0)}
+        spent = dataclasses.replace(run.cost, train_cpu_s=77777.0, load=777.0, **slow)
+        curve = [Point(p.iteration, 77777.0, p.psnr_val) for p in run.curve]
+        chosen = run.on_demand
+        if chosen:
+            gates = [dataclasses.replace(g, frame_ms_before=7777.0, frame_ms=7777.0) for g in chosen.gates]
+            chosen = OnDemand(dataclasses.replace(chosen.screen, seconds=7777.0), gates)
+        return dataclasses.replace(run, provenance=other, cost=spent, curve=curve, on_demand=chosen)
+
+    mixed = group([elsewhere(r) if r.seed == 2 else r for r in records])
+    family = comparisons(mixed)
+    sections = build._sections(mixed, family, tmp_path, canvas())
+    values = [v for s in sections if s.table for row in s.table.rows for v in row if isinstance(v, float)]
+    assert max(v for v in values if v < 1e6) < 2000, "a number of seconds or milliseconds is theirs"
+    said = " ".join(t for s in sections for t in (*s.sentences, *s.notes))
+    assert "3 runs on other machines are left out everywhere" in said
+    assert "777" not in said
+    assert "777" not in " ".join(a.detail for a in cost.answers(mixed, family))
+    runs = Runs()
+    for r in mixed.records:
+        runs.of_record(mixed, r)
+    assert "777" not in " ".join(e["facts"] for e in runs.entries)
 
 
 def test_sentences_where_nothing_finished(tmp_path):

@@ -39,9 +39,8 @@ def protocol_section(group: Group) -> Section:
     ]
     notes = [words.cut(note, LONGEST_NOTE) for note in conditions(_compared(group))]
     if group.elsewhere:
-        notes.insert(
-            0, f"Seconds and ms of {words.count(group.elsewhere, 'run')} on other machines are left out everywhere."
-        )
+        left = f"Seconds, ms and FPS of {words.count(group.elsewhere, 'run')} on other machines are left out everywhere"
+        notes.insert(0, f"{left}; this is of {words.cut(group.machine, 200)}.")
     ended = words.count(len(group.finished), "run")
     lost = len(group.records) - len(group.finished)
     said = [f"{ended} finished, {words.count(lost, 'run')} did not (below)." if lost else f"All {ended} finished."]

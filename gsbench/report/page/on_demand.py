@@ -42,7 +42,7 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> Section | N
         "Effects on demand",
         said,
         [Tab("", _drawings(gated[:MOST_BARS], canvas))] if gated else [],
-        _table(found),
+        _table(found, group.machine),
         notes=_notes(found, len(gated)),
         swatches=_swatches() if gated else [],
         images=_images(found, folder),
@@ -181,7 +181,7 @@ def _images(found: list[Decided], folder: Path) -> list[Image]:
 # ---- numbers
 
 
-def _table(found: list[Decided]) -> Table:
+def _table(found: list[Decided], machine: str) -> Table:
     columns = [Column("scene"), Column("model"), Column("variant"), Column("seeds"), Column("time")]
     columns += [Column("largest p", 3), Column("% free of the camera", 0), Column("screen s", 1), Column("seeds gated")]
     columns += [Column("Gaussians before", 0), *(Column(said, 0) for said in NAMES.values())]
@@ -189,11 +189,12 @@ def _table(found: list[Decided]) -> Table:
     columns += [Column("predicted dB", 3), Column("PSNR measured on"), Column("PSNR dB", 3), Column("95 % low", 3)]
     columns += [Column("95 % high", 3), Column("ms a frame before", 2), Column("change in ms", 2), Column("low", 2)]
     columns += [Column("high", 2), Column("MB before", 2), Column("MB", 2)]
-    return Table("effects_on_demand.csv", columns, [_row(one) for one in found])
+    return Table("effects_on_demand.csv", columns, [_row(one, machine) for one in found])
 
 
-def _row(one: Decided) -> list[Value]:
+def _row(one: Decided, machine: str) -> list[Value]:
     screens = _screens(one.runs)
+    seconds = [screen.seconds for screen in _screens([r for r in one.runs if r.provenance.machine == machine])]
     decisions = Counter(screen.decision for screen in screens)
     p = [screen.p for screen in screens if screen.p is not None]
     free = [100 * screen.free for screen in screens if screen.free is not None]
@@ -206,7 +207,7 @@ def _row(one: Decided) -> list[Value]:
         ", ".join(f"{decision} {n}" for decision, n in sorted(decisions.items())) or "not asked",
         max(p, default=math.nan),
         fmean(free) if free else math.nan,
-        fmean(screen.seconds for screen in screens) if screens else math.nan,
+        fmean(seconds) if seconds else math.nan,
         one.gated,
         one.before if one.gated else math.nan,
         *rows,
