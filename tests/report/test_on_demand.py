@@ -158,12 +158,23 @@ def test_hostile_choices_stay_text(tmp_path):
     assert "\u202e" not in part
 
 
+def test_lengths_stay_apart_in_labels_and_only_the_common_one_is_told():
+    """Catches bars of one name, whose ends were cut off, and a wall of sentences that differ in a length."""
+    runs = on_demand(frontier(("7dgs",), ("moving-matte",), 2, (250, 1000, 2000, 4000)))
+    section = page_part.on_demand_section(group(runs), canvas(), NOWHERE)
+    drawn = section.tabs[0].drawings[0].svg
+    assert all(f"iterations={n}" in drawn for n in (250, 2000, 4000))
+    assert len(section.sentences) == 2
+    assert section.sentences[0].startswith("On moving-matte, auto: ")
+    assert section.sentences[1] == "These are 1 of 4 scenes and runs; the table has all of them."
+
+
 def test_many_choices_are_cut(tmp_path):
     """Catches a section that grows with the scenes."""
     runs = on_demand(frontier(("7dgs",), tuple(f"s{i}" for i in range(30)), 1, (1000,)))
     section = page_part.on_demand_section(group(runs), canvas(), tmp_path)
     assert len(section.sentences) == 13
-    assert section.sentences[-1] == "Of 30 scenes and models 12 are said here; the table has all."
+    assert section.sentences[-1] == "These are 12 of 30 scenes and runs; the table has all of them."
     assert "Of 30 bars 24 are drawn; the table has all." in section.notes
     assert len(section.table.rows) == 30
 

@@ -197,7 +197,7 @@ def test_nothing_is_dominated_by_a_mean():
     records = [dataclasses.replace(r, model=m) for m in ("a", "b") for r in frontier(("7dgs",), lengths=(1000,))]
     slow = [dataclasses.replace(r, cost=dataclasses.replace(r.cost, train_s=99.0)) for r in records if r.model == "b"]
     (text, _) = cost.frontier_section(group([*records[: len(slow)], *slow]), canvas()).sentences
-    assert "By the means b is beaten by a" in text
+    assert "By their means b is beaten by a" in text
     assert "may be chance" in text
     assert "dominated" not in text
 

@@ -7,7 +7,7 @@ from many_records import frontier, hostile, on_demand, write_all
 from gsbench.report.page import build
 
 pytestmark = pytest.mark.slow
-WIDTHS = (375, 820, 1280)
+WIDTHS = (375, 820, 1440)
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +64,16 @@ def test_it_opens_in_silence(visit, name, scheme):
 @pytest.mark.parametrize("name", ["good", "hostile"])
 @pytest.mark.parametrize("width", WIDTHS)
 def test_nothing_is_wider_than_the_screen(visit, name, width):
-    """Catches a table, a word or a drawing that makes a phone scroll sideways."""
+    """Catches a table, a word or a drawing that makes a phone scroll sideways, and a table that cannot be scrolled."""
     page = visit(name, width=width)
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
     assert page.evaluate("document.documentElement.scrollWidth") <= width
+    loose = """() => [...document.querySelectorAll('table')].filter((table) => {
+        const box = table.closest('.scroll');
+        const fits = table.getBoundingClientRect().width <= box.getBoundingClientRect().width + 1;
+        return !fits && !(getComputedStyle(box).overflowX === 'auto' && box.tabIndex === 0);
+    }).length"""
+    assert page.evaluate(loose) == 0
 
 
 @pytest.mark.parametrize("width", WIDTHS)

@@ -18,7 +18,7 @@ MOST_RUNS = 300  # that are drawn singly in a panel
 MOST_NAMED = 3  # models in a list of an answer
 INTERVALS = (
     "The 95 % interval of a model's own PSNR is over seeds: what other seeds would give on these scenes and views. "
-    "Whether two models differ says the section on differences."
+    "It does not tell whether two models differ; the section “Is it a difference?” does."
 )
 
 
@@ -52,7 +52,8 @@ def basis_words(group: Group, family: Family) -> str:
     if split == "val" or not f.has_val(points):
         text += "The same views choose and show, so the highest PSNR is a little too high. "
     if family.size():
-        text += f"Told apart: after Holm, for all {words.count(family.size(), 'comparison')} of this page. "
+        many = words.count(family.size(), "comparison")
+        text += f"Models are told apart after Holm's correction for all {many} on this page. "
     alone = group.variant if len({arm.variant for arm in group.arms}) == 1 else ""
     text += f"Every run with {alone}. " if alone else ""
     return text + _lengths(points)
@@ -227,17 +228,19 @@ def _beaten_words(points: list[Point]) -> str:
     if len(points) == 1:
         return "It is the only point."
     if not beaten:
-        return "By the means no point is beaten: each step in PSNR costs more training time." if len(timed) > 1 else ""
+        return (
+            "By their means no point is beaten: each step in PSNR costs more training time." if len(timed) > 1 else ""
+        )
     if len(beaten) > 1:
         return (
-            f"By the means {len(beaten)} of {len(timed)} points are beaten: another has at least the PSNR and takes "
-            "at most the seconds. This counts differences that may be chance, too."
+            f"By their means {len(beaten)} of {len(timed)} points are beaten: another point has at least the PSNR in "
+            "at most the seconds. Some of these differences may be chance."
         )
     rivals = [p for p in timed if p not in beaten and f.beats(p, beaten[0], "seconds")]
     by = min(rivals, key=lambda p: p.cost["seconds"])
     return (
-        f"By the means {beaten[0].arm.name} is beaten by {by.arm.name}, which has at least the PSNR and takes at most "
-        "the seconds; the difference may be chance."
+        f"By their means {beaten[0].arm.name} is beaten by {by.arm.name}, which has at least the PSNR in at most the "
+        "seconds; the difference may be chance."
     )
 
 

@@ -21,6 +21,7 @@ MOST_BARS = 24
 MOST_NOTES = 12
 LONGEST_REASON = 200
 LONGEST_LABEL = 32  # of a bar, which has a number beside it
+LABEL_END = 15  # characters of its end, which tell lengths and capacities apart
 IN_TRAINING = (
     "What the gate in training changed is not in these dB and ms, as the training goes on after it: the frontier has "
     "runs with and without gates, where both were run."
@@ -33,9 +34,10 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> Section | N
     found = decided(group)
     if not found:
         return None
-    said = [_sentence(one) for one in found[:MOST_SAID]]
-    if len(found) > MOST_SAID:
-        said.append(f"Of {len(found)} scenes and models {MOST_SAID} are said here; the table has all.")
+    common = [one for one in found if one.arm in group.compared] or found
+    said = [_sentence(one) for one in common[:MOST_SAID]]
+    if len(found) > len(said):
+        said.append(f"These are {len(said)} of {len(found)} scenes and runs; the table has all of them.")
     gated = [one for one in found if one.gated]
     return Section(
         "on-demand",
@@ -129,7 +131,7 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
 
 def _drawings(gated: list[Decided], canvas: Canvas) -> list[Drawing]:
     """Draw a bar of classes and a bar of degrees for each scene and model."""
-    label = lambda one: words.cut(f"{one.scene}, {one.name}", LONGEST_LABEL)  # noqa: E731
+    label = lambda one: words.middle(f"{one.scene}, {one.name}", LONGEST_LABEL, LABEL_END)  # noqa: E731
     classes = [
         charts.Bar(label(one), _shares([one.rows[name] for name in NAMES]), f"{one.left:,.0f} of {one.before:,.0f}")
         for one in gated

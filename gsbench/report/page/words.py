@@ -17,6 +17,12 @@ def cut(text: object, longest: int = LONGEST) -> str:
     return line if len(line) <= longest else f"{line[: longest - 1]}…"
 
 
+def middle(text: str, longest: int, tail: int) -> str:
+    """Shorten a text to `longest` characters by leaving out its middle, so that `tail` characters of its end stay."""
+    line = cut(text)
+    return line if len(line) <= longest else f"{line[: longest - tail - 1].rstrip()}…{line[-tail:]}"
+
+
 def listing(words: list[str], last: str = "and") -> str:
     """Join words: "a", "a and b", "a, b and c"."""
     return f"{', '.join(words[:-1])} {last} {words[-1]}" if len(words) > 1 else "".join(words)
@@ -39,7 +45,7 @@ def plain(value: float, digits: int = 2) -> str:
 
 def probability(p: float) -> str:
     """Write a p-value; one too small for three digits as a bound."""
-    return "< 0.001" if p < 0.001 else plain(p, 3)
+    return "<\u00a00.001" if p < 0.001 else plain(p, 3)
 
 
 def signed(value: float, digits: int = 2) -> str:

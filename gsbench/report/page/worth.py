@@ -81,8 +81,12 @@ def _scope(cube: Cube, family: Family) -> list[str]:
     fewest = min((price.costs["psnr"] for price in cube.prices), key=lambda of: of.scenes)
     if not family.size():
         return [words.scope(fewest)]
-    told = f"Told from nothing: after Holm, in dB for all {words.count(family.size(), 'comparison')} of this page"
-    return [words.scope(fewest), f"{told}, which is less often than the interval of one price leaves out zero."]
+    many = words.count(family.size(), "comparison")
+    return [
+        words.scope(fewest),
+        f"Filled points are told from nothing after Holm's correction, in dB for all {many} on this page. An interval "
+        "is of its price alone, so one that leaves out zero may still be chance among so many.",
+    ]
 
 
 def _effect_words(cube: Cube) -> list[str]:
@@ -99,8 +103,9 @@ def _effect_words(cube: Cube) -> list[str]:
     for price in cube.nested:
         if price.name.startswith("direction"):
             of = price.costs["psnr"]
+            told = f", {'' if price.told['psnr'] else 'not '}told from nothing" if of.over else ""
             said.append(f"{words.sentence(price.name)}, within one parametrisation: {words.signed(of.mean)} dB "
-                        f"({words.interval(of, sign=True)}).")  # fmt: skip
+                        f"({words.interval(of, sign=True)}){told}.")  # fmt: skip
     for price in cube.prices:
         of = price.costs["psnr"]
         if price.order == 2 and price.told["psnr"]:
@@ -188,7 +193,7 @@ def pairs_section(group: Group, family: Family, canvas: Canvas) -> Section:
     ]  # fmt: skip
     alt = f"Differences in PSNR of {words.count(len(rows), 'pair')} of models with 95 % intervals"
     columns = [Column("pair"), Column("dB", 2), Column("95 % low", 2), Column("95 % high", 2)]
-    columns += [Column("ahead on % of views", 0), Column("p, Holm"), Column("told apart"), Column("interval over")]
+    columns += [Column("ahead on % of views", 0), Column("p, Holm"), Column("told apart")]
     table = Table("pairs.csv", columns, [_pair_row(group, p) for p in found])
     drawing = Drawing("Difference in PSNR", charts.differences(rows, "dB").svg(f"{canvas.name}p", alt))
     first = found[0].difference
@@ -219,7 +224,6 @@ def _pair_row(group: Group, pair: Pair) -> list[Value]:
         100 * pair.improvement,
         words.probability(pair.p_holm),
         told,
-        words.over(d),
     ]
 
 
@@ -245,4 +249,5 @@ def _pair_words(group: Group, found: list[Pair]) -> list[str]:
     if tested == 1:
         return ["The pair is not told apart at 95 %."]
     named = words.listing(level[:4]) + (f" and {len(level) - 4} more" if len(level) > 4 else "")
-    return [f"{tested - len(level)} of {words.count(tested, 'pair')} are told apart at 95 %, after Holm. Not: {named}."]
+    told = f"{tested - len(level)} of {words.count(tested, 'pair')} are told apart at 95 %, after Holm"
+    return [f"{told}. Not told apart: {named}."]
