@@ -3,6 +3,7 @@
 import argparse
 import importlib.util
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -53,7 +54,8 @@ def serve(asked: argparse.Namespace) -> None:
     host = f"[{asked.host}]" if ":" in asked.host else asked.host
     print(f"Open http://{host}:{viewer.server.get_port()} in a browser; Ctrl-C ends it.", flush=True)
     try:
-        viewer.server.sleep_forever()
+        while True:
+            time.sleep(1)  # not for ever: Ctrl-C may reach another thread, and is heard when this one wakes up
     finally:
         viewer.stop()
 

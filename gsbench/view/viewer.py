@@ -1,7 +1,9 @@
 """Serve the viewer: browsers come and go, each with controls of its own."""
 
-import threading
-from collections.abc import Sequence
+import asyncio
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import viser
@@ -43,20 +45,21 @@ class Viewer:
             painter.name = str(painter.run.folder)
         self.scene = scene_or_reason(first, data_root)
         self.clients: dict[int, Client] = {}
-        self._lock = threading.Lock()
+        self._porter = ThreadPoolExecutor(1)  # browsers come and go one after the other; viser would take 32 threads
         with door.guard():
             self.server = viser.ViserServer(host, door.port, label=f"gsbench: {first.scene.name}", verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()  # beside the images, not above them
         self._stand(first)
-        self.server.on_client_disconnect(self._forget)
-        self.server.on_client_connect(self._welcome)
+        self.server.on_client_disconnect(self._in_turn(self._forget))
+        self.server.on_client_connect(self._in_turn(self._welcome))
 
     def stop(self) -> None:
         """End the server and all that render for it."""
         for client in list(self.clients.values()):
             client.leave()
         self.server.stop()
+        self._porter.shutdown(wait=False)
 
     def _stand(self, run: LoadedRun) -> None:
         """Let every browser begin where an orbit begins."""
@@ -68,15 +71,19 @@ class Viewer:
         start.up = np.array(paths.UP)
         start.fov = 2 * float(np.arctan(camera.height / 2 / float(camera.K[1, 1])))
 
+    def _in_turn(self, callback: Callable[[viser.ClientHandle], None]) -> Callable[[viser.ClientHandle], Any]:
+        """Let a callback wait for those before it, so that no browser leaves before its controls are there."""
+
+        async def waits(client: viser.ClientHandle) -> None:
+            await asyncio.get_running_loop().run_in_executor(self._porter, callback, client)
+
+        return waits
+
     def _welcome(self, client: viser.ClientHandle) -> None:
-        with self._lock:
-            self.clients[client.client_id] = Client(client, self.painters, self.scene, self._most_cost)
-        if client.client_id not in self.server.get_clients():  # it has left before its controls were there
-            self._forget(client)
+        self.clients[client.client_id] = Client(client, self.painters, self.scene, self._most_cost)
 
     def _forget(self, client: viser.ClientHandle) -> None:
-        with self._lock:
-            gone = self.clients.pop(client.client_id, None)
+        gone = self.clients.pop(client.client_id, None)
         if gone is not None:
             gone.leave()
 

@@ -216,14 +216,19 @@ def test_browsers_are_counted(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -
 
 def test_aborted_connections_leave_no_thread(viewer: Viewer) -> None:
     """Catches a thread that renders for a browser that was cut off."""
-    threads = []
-    for pause in (0, 0.02, 0.1, 0.3):
-        browser = joined(viewer)
+    with joined(viewer) as browser:
         browser.send(packed(CAMERA))
+        until(lambda: rests(viewer))
+    until(lambda: not viewer.clients)
+    before = threading.active_count()
+    for pause in (0, 0, 0.02, 0.1, 0.3):
+        browsers = [joined(viewer) for _ in range(4)]
+        for browser in browsers:
+            browser.send(packed(CAMERA))
         time.sleep(pause)
-        threads += [client.thread for client in viewer.clients.values()]
-        browser.socket.shutdown(socket.SHUT_RDWR)
-    until(lambda: not viewer.clients and not any(thread.is_alive() for thread in threads))
+        for browser in browsers:
+            browser.socket.shutdown(socket.SHUT_RDWR)
+    until(lambda: not viewer.clients and threading.active_count() <= before)
 
 
 def test_a_browser_that_leaves_as_a_frame_begins_ends_its_thread() -> None:
