@@ -47,7 +47,8 @@ def load(
     """Load the scene in a folder and detect its layout.
 
     Images are composited over the background once, and then averaged over blocks of pixels, which must tile them
-    exactly. Everything is float32 on the CPU, in OpenCV axes.
+    exactly. Everything is float32 on the CPU, in OpenCV axes; the images of a large scene stay in 8 bits until they are
+    looked at, with the same result.
 
     Args:
         path: the scene's folder.

@@ -202,22 +202,26 @@ def _read_views(
     """Read all images on threads, in order; return the views by split and the images' digests by name.
 
     Threads suffice because reading and decoding release the interpreter's lock; a fork after OpenMP ran would hang.
-    Only the final float images are kept. An image of another size than the first is refused before it is decoded, so
-    that the memory of all of them is known at the first.
+    Only the final images are kept: floats of a small scene, the 8 bits of a large one. An image of another size than
+    the first is refused before it is decoded, so that the memory of all of them is known at the first.
     """
     listed = [(split, frame) for split in splits.values() for frame in split.frames]
     first = listed[0][1]
-    expected = images.png_size(images.read_png(first.path, first.where), first.where)
+    data = images.read_png(first.path, first.where)
+    expected = images.png_size(data, first.where)
+    in_8_bits = images.stays_in_8_bits(data, expected, len(listed), downscale)
 
     def read(entry: tuple[_Split, _Frame]) -> tuple[View, str]:
         split, frame = entry
         data = images.read_png(frame.path, frame.where)
         _check_size(images.png_size(data, frame.where), expected, split, frame)
-        image = images.composite(images.decode_png(data, frame.where), background, downscale, frame.where)
+        decoded = images.decode_png(data, frame.where)
+        is_kept = in_8_bits and decoded.dtype.name == "uint8"
+        image = torch.from_numpy(decoded) if is_kept else images.composite(decoded, background, downscale, frame.where)
         camera = Camera(frame.viewmat, split.intrinsics.matrix(*expected, downscale), image.shape[1], image.shape[0])
-        return View(frame.name[: -len(".png")], camera, frame.time, image), files.digest(data)
+        return View(frame.name[: -len(".png")], camera, frame.time, image, background), files.digest(data)
 
-    threads = images.count_readers(expected, len(listed), downscale, first.where)
+    threads = images.count_readers(expected, len(listed), downscale, first.where, 4 if in_8_bits else 12)
     with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
         decoded = pool.map(read, listed)
         digests = {}

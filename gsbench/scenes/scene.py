@@ -32,12 +32,26 @@ class View:
     name: str  # in the data set, such as "train/r_000"
     camera: Camera
     time: float | None  # in [0, 1]; None where the data set has no time
-    pixels: Tensor  # [H, W, 3], composited over the scene's background: floats in [0, 1], or 8 bits to save memory
+    pixels: Tensor  # [H, W, 3] of floats in [0, 1] or of 8 bits; or [H, W, 4] of 8 bits: straight alpha ..
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # .. which is composited over this when it is looked at
 
     @property
     def image(self) -> Tensor:
-        """The image, [H, W, 3] of floats in [0, 1]; one of 8 bits is converted each time it is looked at."""
-        return self.pixels if self.pixels.is_floating_point() else self.pixels.float() / 255
+        """The image, [H, W, 3] of floats in [0, 1]; one of 8 bits is converted each time it is looked at.
+
+        The result has the bits of an image that was composited when it was loaded.
+        """
+        if self.pixels.is_floating_point():
+            return self.pixels
+        # Divided by a tensor: by a number, a GPU would multiply by its reciprocal, which rounds in another way.
+        values = self.pixels.float().div_(torch.full((), 255.0, device=self.pixels.device))
+        if values.shape[-1] == 3:
+            return values
+        alpha = values[..., 3:]
+        image = values[..., :3] * alpha
+        if any(self.background):  # zeros would change nothing
+            image.add_(values.new_tensor(self.background) * (1 - alpha)).clamp_(0, 1)
+        return image
 
     def to(self, device: str) -> "View":
         """Return the same view with its tensors on `device`."""

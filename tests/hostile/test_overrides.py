@@ -5,6 +5,7 @@ Every case is a run of three steps in this process with one to three random over
 
 import errno
 import io
+import os
 import random
 import re
 import signal
@@ -24,6 +25,7 @@ from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
 from gsbench.measure import record
 from gsbench.measure.settings import flat
+from gsbench.run import claim
 from gsbench.run.run import run
 from gsbench.sweep.axes import expand
 from gsbench.train import checkpoint
@@ -91,6 +93,7 @@ def end(words: list[str], square: Path, results: Path) -> str:
     if done.status == "failed":
         assert done.reason
         assert "\n" not in done.reason
+        assert "did not foresee" not in done.reason
         assert not list(results.rglob("checkpoint.pt")), f"trained, and then lost: {done.reason}"
     return done.status
 
@@ -147,12 +150,30 @@ def test_a_full_disk_is_one_runs_end(square: Path, tmp_path: Path, monkeypatch: 
     done = run(composed)
     assert done is not None
     assert done.status == "ok"
+    fsync = os.fsync
+
+    def full_for_checkpoints(descriptor: int) -> None:
+        if os.fstat(descriptor).st_size > 10_000:
+            raise OSError(errno.ENOSPC, "No space left on device")  # as the system does, which names no file
+        fsync(descriptor)
+
     with monkeypatch.context() as patched:
-        patched.setattr(checkpoint, "save", full)
+        patched.setattr("gsbench.measure.atomic.os.fsync", full_for_checkpoints)
         composed.seed = 1
         done = run(composed)
     assert done is not None
-    assert (done.status, done.reason) == ("failed", "a file: No space left on device")
+    (path,) = (found.with_name(checkpoint.FILE_NAME) for found in tmp_path.rglob("seed1/record.json"))
+    assert (done.status, done.reason) == ("failed", f"{path}: No space left on device")
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoint, "save", full)
+        composed.seed = 2
+        done = run(composed)
+    assert done is not None
+    assert done.reason == f"{path.parents[1] / 'seed2'}: No space left on device"
+    with monkeypatch.context() as patched:
+        patched.setattr(claim, "create_atomically", full)
+        with pytest.raises(InputError, match="seed2: the run cannot be claimed: .*No space left on device"):
+            run(composed)
 
 
 @pytest.mark.parametrize(

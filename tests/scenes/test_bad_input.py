@@ -228,10 +228,10 @@ def test_memory_is_asked_for_before_an_image_is_decoded(tiny: Path, monkeypatch:
     for name in ("train/r_0.png", "train/r_1.png", "val/r_0.png", "test/r_0.png"):
         (tiny / name).write_bytes(png(8192, 8192, b""))
     monkeypatch.setattr(images, "decode_png", lambda *_: pytest.fail("decoded"))
-    monkeypatch.setattr(memory, "available", lambda: 6 * 2**30)
+    monkeypatch.setattr(memory, "available", lambda: int(4.5 * 2**30))
     with pytest.raises(TooLargeError) as caught:
         scenes.load(tiny)
-    check_message(caught.value, "4 images of 8192x8192", "need 7.0 GiB of memory, 6.0 GiB are available", "downscale")
+    check_message(caught.value, "4 images of 8192x8192", "need 5.0 GiB of memory, 4.5 GiB are available", "downscale")
 
 
 def test_images_are_decoded_by_as_many_threads_as_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:

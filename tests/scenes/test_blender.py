@@ -4,16 +4,19 @@ import hashlib
 import json
 import math
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from tiny_scene import edit, write_png
+from tiny_scene import edit, write_png, write_tiny
 
 from gsbench import scenes
 from gsbench.errors import InputError
+from gsbench.scenes import images
 from gsbench.scenes.sample import folder
 
 
@@ -93,6 +96,55 @@ def test_embedded_cameras_look_at_the_scene() -> None:
         assert (u, v) == pytest.approx((80, 80), abs=0.1)
         assert depth > 1
         assert project(view, [0, 0, 0.5])[1] < v  # the world's +z is up in these pictures
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 0.7)])
+@pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_large_scene_stays_in_8_bits_and_looks_the_same(
+    background: tuple[float, float, float], channels: int, dtype: type[np.generic], tiny: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Catches 500 views of 800 x 800 that take 4 GB, and 8 bits whose images differ by as much as one bit."""
+    random = np.random.default_rng(1)
+    for name in ("train/r_0", "train/r_1", "val/r_0", "test/r_0"):
+        rgba = random.integers(0, np.iinfo(dtype).max + 1, (240, 320, channels)).astype(dtype)
+        rgba[:20, ..., 3:], rgba[-20:, ..., 3:] = 0, np.iinfo(dtype).max
+        write_png(tiny / f"{name}.png", rgba)
+    floats = scenes.load(tiny, background=background)
+    monkeypatch.setattr(images, "_MOST_FLOATS", 0)
+    small, reduced = scenes.load(tiny, background=background), scenes.load(tiny, background=background, downscale=2)
+    for one, other in zip(floats.train + floats.val + floats.test, small.train + small.val + small.test, strict=True):
+        assert one.pixels.dtype == torch.float32
+        assert other.pixels.element_size() == (1 if dtype == np.uint8 else 4)
+        assert torch.equal(one.image, other.to("cpu").image)
+    assert floats.fingerprint == small.fingerprint
+    assert reduced.train[0].pixels.dtype == torch.float32  # a quarter of the pixels: fewer bytes than 8 bits of all
+
+
+@pytest.mark.slow
+def test_500_views_take_a_third_of_the_memory(tmp_path: Path) -> None:
+    """Catches floats that are made of all images at once: 500 views of 800 x 800 have 3.8 GB of them."""
+    write_tiny(tmp_path)
+    image = np.random.default_rng(0).integers(0, 256, (800, 800, 4), np.uint8)
+    image[:, 100:] = 0  # it compresses well
+    write_png(tmp_path / "train" / "r_0.png", image)
+    for name in ("val/r_0", "test/r_0"):
+        write_png(tmp_path / f"{name}.png", image)
+    edit(
+        tmp_path, lambda content: content.update(frames=[{**content["frames"][0], "time": i / 499} for i in range(500)])
+    )
+    code = (
+        "import resource\n"
+        "from gsbench import scenes\n"
+        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
+        "before = peak()\n"
+        f"scene = scenes.load({str(tmp_path)!r}, background=(1.0, 1.0, 1.0))\n"
+        "for view in scene.train: view.image\n"
+        "print(peak() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 1.45e9  # 1.29 GB of 8 bits, and what a few readers need meanwhile
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
