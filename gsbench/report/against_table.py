@@ -44,8 +44,8 @@ def lines(row: Row) -> list[Line]:
         pair = row.ours.get(seed), row.theirs.get(seed)
         cells = {c.key: " / ".join(_shown(record, c) for record in pair) for c in COLUMNS}
         made.append(Line(f"{printable(row.model)} seed {seed}", cells))
-    made.append(Line("  difference", {c.key: _difference(row.judged[c.key], c) for c in COLUMNS}))
-    made.append(Line("  verdict", {c.key: row.judged[c.key].verdict for c in COLUMNS}))
+    made.append(Line(f"{printable(row.model)} difference", {c.key: _difference(row.judged[c.key], c) for c in COLUMNS}))
+    made.append(Line(f"{printable(row.model)} verdict", {c.key: row.judged[c.key].verdict for c in COLUMNS}))
     return made
 
 

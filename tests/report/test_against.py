@@ -164,7 +164,7 @@ def test_the_command(tmp_path, capsys):
     assert row["judged"]["psnr"]["low"] < row["judged"]["psnr"]["difference"] < row["judged"]["psnr"]["high"]
     page = (ours / "report.html").read_text()
     assert f"Against {theirs}" in page
-    assert "10 agrees, 0 differs, 0 cannot be told" in page
+    assert "PSNR agrees in 10, differs in 0, cannot be told in 0 of 10 rows here." in page
     assert {path: path.read_bytes() for path in theirs.rglob("*") if path.is_file()} == before
     write([moved(r, 2.0) for r in runs(seeds=1)], ours)
     assert main([str(ours), "--against", str(theirs)]) == 1

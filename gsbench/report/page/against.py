@@ -14,11 +14,13 @@ def against_section(comparison: Comparison, group: Group) -> Section:
     own = [row for row in comparison.rows if (row.experiment, row.dataset) == (group.experiment, group.dataset)]
     columns = [Column("scene"), Column("run"), *(Column(c.title) for c in COLUMNS)]
     rows: list[list[Value]] = [
-        [row.scene, line.label.strip(), *(line.cells[c.key] for c in COLUMNS)] for row in own for line in lines(row)
+        [row.scene, line.label, *(line.cells[c.key] for c in COLUMNS)] for row in own for line in lines(row)
     ]
     said = [words.cut(comparison.line, LONGEST)]
+    ours, theirs = (words.cut(name, 80) for name in (comparison.ours, comparison.theirs))
     if own:
-        counts = [f"{sum(r.judged['psnr'].verdict == v for r in own)} {v}" for v in (AGREES, DIFFERS, UNTOLD)]
-        said.append(f"PSNR of {words.count(len(own), 'model')} on scenes: {', '.join(counts)}.")
-    title = f"Against {words.cut(comparison.theirs, 80)}"
-    return Section("against", title, said, table=Table("against.csv", columns, rows) if own else None, notes=[RULE])
+        counts = [f"{v} in {sum(r.judged['psnr'].verdict == v for r in own)}" for v in (AGREES, DIFFERS, UNTOLD)]
+        said.append(f"PSNR {', '.join(counts)} of {words.count(len(own), 'row')} here. Cells are {ours} / {theirs}.")
+    return Section(
+        "against", f"Against {theirs}", said, table=Table("against.csv", columns, rows) if own else None, notes=[RULE]
+    )
