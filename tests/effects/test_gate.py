@@ -11,6 +11,7 @@ from torch import Tensor
 from worlds import camera
 
 from gsbench.effects.budget import gate_within
+from gsbench.effects.direction import share_with_direction
 from gsbench.effects.gate import apply, choose
 from gsbench.effects.strength import Strength, probe
 from gsbench.errors import InputError
@@ -18,6 +19,7 @@ from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.measure.quality import psnr
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Gaussians3D
+from gsbench.models.classes import DIRECTION, Classes
 from gsbench.models.cuts import cuts_of
 from gsbench.models.render import render
 
@@ -178,6 +180,16 @@ def test_classes_of_a_checkpoint_are_checked(fault: str) -> None:
         del state["classes.levels"]
     with pytest.raises(InputError, match="checkpoint: "):
         trained_a_little("7dgs", 1).load_state(state)
+
+
+def test_the_share_with_direction_is_of_rows_that_change_with_it() -> None:
+    """Catches still rows that count as seen from each side otherwise: 20 of 60 are sliced, direction is frozen in 5."""
+    model = trained_a_little("7dgs", 0)
+    assert share_with_direction(model) == 1
+    frozen = torch.zeros(N, dtype=torch.uint8)
+    frozen[15:20] = DIRECTION
+    model.classes = Classes(0, 20, torch.zeros(N, dtype=torch.int32), frozen)
+    assert share_with_direction(model) == 15 / 60
 
 
 def test_the_loss_is_measured_and_not_only_predicted() -> None:

@@ -172,7 +172,7 @@ def test_a_full_disk_is_one_runs_end(square: Path, tmp_path: Path, monkeypatch: 
     assert done.reason == f"{path.parents[1] / 'seed2'}: No space left on device"
     with monkeypatch.context() as patched:
         patched.setattr(claim, "create_atomically", full)
-        with pytest.raises(InputError, match="seed2: the run cannot be claimed: .*No space left on device"):
+        with pytest.raises(InputError, match=r"seed2: the run cannot be claimed: .*No space left on device"):
             run(composed)
 
 

@@ -13,7 +13,7 @@ from gsbench import backends, kernels
 from gsbench.backends import AUTO, REFERENCE, resolve
 from gsbench.errors import InputError
 from gsbench.kernels import cuda
-from gsbench.raster import rasterize
+from gsbench.raster import native, rasterize
 
 TENSORS = {"means": (40, 3), "factors": (40, 3, 3), "opacities": (40,), "colors": (40, 3),
            "viewmats": (1, 4, 4), "Ks": (1, 3, 3), "background": (3,)}  # fmt: skip
@@ -51,6 +51,15 @@ def test_a_background_that_is_no_tensor_is_none() -> None:
     """Catches a list that is let in where the same scene was drawn without a background before."""
     rasterize(**case("tall"), background=None, backend="reference")
     refused({"background": [0.0, 0.0, 0.0]}, "background: expected a tensor, got list")
+
+
+def test_gaussians_are_counted_for_every_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches more splats than int32 numbers because there are several cameras: 40 Gaussians in 2 are 80."""
+    one = {name: x.float() if isinstance(x, Tensor) else x for name, x in case("tall").items()}
+    two = one | {"viewmats": one["viewmats"].repeat(2, 1, 1), "Ks": one["Ks"].repeat(2, 1, 1)}
+    monkeypatch.setattr(native, "MAX_PAIRS", 79)
+    with pytest.raises(InputError, match="at most 79 Gaussians times cameras, got 80"):
+        rasterize(**two, backend="cpu")
 
 
 def test_rows_that_differ() -> None:

@@ -156,6 +156,19 @@ def test_spectrum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (tmp_path / spectrum.FILE_NAME).exists()
 
 
+def test_indefinite_covariances_are_counted(tmp_path: Path) -> None:
+    """Catches a count that looks at the largest eigenvalue: in float32 a slice of 1e-5 is lost beside 1e3."""
+    model = trainer("7dgs").model
+    model.splats["log_diagonal"].data[:] = torch.tensor([0.0, 0.0, 0.0, 0.0, -11.5, -11.5, -11.5])
+    for kind, size in (("motion", 1e3), ("coupling", 1.0)):
+        model.splats[kind].data.normal_(0, size, generator=generator(0))
+    path = tmp_path / "checkpoint.pt"
+    checkpoint.save(path, Checkpoint("training", "data", {"model": model.state_dict()}))
+    for share, error in spectrum.failures(path).values():
+        assert share > 0.5
+        assert error > 1
+
+
 def test_spectrum_of_what_is_no_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a stack trace for a file that is none, or a model that slices nothing."""
     path = tmp_path / "checkpoint.pt"

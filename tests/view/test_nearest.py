@@ -43,6 +43,12 @@ def test_the_nearest_view_stands_and_looks_as_the_camera_does() -> None:
     assert found.degrees == pytest.approx(30.96 - 26.57, abs=0.02)
 
 
+def test_places_count_in_extents() -> None:
+    """Catches metres added to radians: 0.6 of an extent of 4 is less than the 17 degrees of the other view."""
+    views = TrainingViews(scene((camera(1.0), 0.0), (camera(0.4, towards=0.3), 0.0)))
+    assert views.nearest(camera(0.4), 0.0).view.name == "0"
+
+
 def test_of_views_of_one_camera_the_nearest_in_time_is_chosen() -> None:
     """Catches a rig whose first frame is always shown, and a time that outweighs the place."""
     views = TrainingViews(scene(*[(camera(x), time) for time in (0.0, 0.5, 1.0) for x in (0.0, 1.0)]))
