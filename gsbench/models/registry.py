@@ -109,6 +109,9 @@ def build(name: str, *, module: str | None = None, **options: Any) -> GaussianMo
         gsbench.errors.InputError: model '7dsg' is not known. Did you mean '7dgs'? Valid: 3dgs, ...
     """
     model = find(name, module)
+    if inspect.isabstract(model):
+        lacks = ", ".join(sorted(model.__abstractmethods__))
+        raise InputError(f"model '{name}': expected all methods that a model needs, {model.__name__} lacks {lacks}")
     # A constructor passes unknown options on to its base, so the options are those of all base classes.
     known: dict[str, inspect.Parameter] = {}
     for cls in (cls for cls in model.__mro__ if issubclass(cls, GaussianModel)):

@@ -1,31 +1,47 @@
-"""Which models can be gated: one that lacks a method of gates is refused, and a checkpoint cannot say otherwise."""
+"""Which models gates can simplify: a `GatedModel` with its methods, whatever a checkpoint says."""
 
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from gsbench import models
 from gsbench.errors import InputError
-from gsbench.models.classes import Classes, pack
+from gsbench.models import registry
+from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
+from gsbench.models.classes import Classes
+from gsbench.models.gated import GatedModel, as_gated
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.scenes.scene import Points
 
 
-class Blinking(Gaussians3DModel):
-    """Says that it observes time, and has no `still` and no `frozen`."""
+class Balls(GaussianModel):
+    """Balls, as docs/adding_a_model.md has them, without gates."""
 
-    observes = ("time",)
+    geometry = ("radii",)
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        return {"radii": distances.log()[:, None]}
+
+    def condition(self, raw: Raw, query: Any) -> Conditioned:
+        return Conditioned(raw["means"], raw["radii"].exp()[:, :, None] * torch.eye(3), torch.ones(len(raw["means"])))
+
+    def scales(self) -> Tensor:
+        return self.splats["radii"].detach()[:, 0].exp()
+
+    def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
+        return {"means": raw["means"], "radii": raw["radii"] / SHRINK}
 
 
-class Half(Blinking):
-    """Has one of the two."""
+class Half(GatedModel, Balls):
+    """Says that it can be gated, and has one of the two methods."""
 
-    def frozen(self, *_: Any) -> Any:
-        return {}
+    def still(self, raw: Raw) -> Conditioned:
+        return self.condition(raw, None)
 
 
-def made(kind: type[Gaussians3DModel]) -> Gaussians3DModel:
+def made(kind: type[GaussianModel]) -> GaussianModel:
     model, points = kind(), torch.rand(6, 3, generator=torch.Generator().manual_seed(0))
     model.initialise(Points(points, points), 1.0, torch.Generator().manual_seed(0))
     return model
@@ -33,16 +49,23 @@ def made(kind: type[Gaussians3DModel]) -> Gaussians3DModel:
 
 def test_models_that_can_be_gated() -> None:
     """Catches a model of ours whose gates are refused, and one without the methods whose gates are not."""
-    assert all(models.find(name).can_be_gated() for name in ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_nodir"))
-    assert not Blinking.can_be_gated()
-    assert not Half.can_be_gated()
+    assert all(issubclass(models.find(name), GatedModel) for name in ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_nodir"))
+    with pytest.raises(InputError, match="a GatedModel, Balls is none"):
+        as_gated(made(Balls))
+
+
+def test_a_model_that_lacks_a_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a TypeError of Python for a class that is not finished."""
+    monkeypatch.setattr(registry, "_REGISTRY", registry._REGISTRY | {"half": Half})
+    with pytest.raises(InputError, match="model 'half': expected all methods that a model needs, Half lacks frozen"):
+        models.build("half")
 
 
 def test_a_checkpoint_with_gates_of_a_model_without_them() -> None:
-    """Catches a checkpoint that loads and then ends in NotImplementedError at its first image."""
+    """Catches a checkpoint that loads and then fails at its first image."""
     model = made(Gaussians3DModel)
     model.classes = Classes(0, 0, torch.full((6,), 3, dtype=torch.int32), torch.zeros(6, dtype=torch.uint8))
-    state = pack(model)
+    state = model.pack()
     made(Gaussians3DModel).load_state(dict(state))
-    with pytest.raises(InputError, match="Blinking cannot be gated"):
-        made(Blinking).load_state(dict(state))
+    with pytest.raises(InputError, match=r"not of this model: expected classes\.counts of shape none"):
+        made(Balls).load_state(dict(state))
