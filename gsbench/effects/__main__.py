@@ -23,7 +23,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m gsbench.effects", description=__doc__.partition("\n")[0])
     parser.add_argument("scene", type=Path, nargs="?", metavar="SCENE_FOLDER", help="of a data set that gsbench reads")
     parser.add_argument("--json", action="store_true", help="the answer as JSON")
-    parser.add_argument("--seed", type=int, default=0, help="of the points and the permutations")
+    parser.add_argument("--seed", type=_whole, default=0, help="of the points and the permutations")
     parser.add_argument("--checkpoint", type=Path, metavar="RUN_FOLDER", help="gate this run into one beside it")
     parser.add_argument("--budget-db", type=float, default=0.05, help="PSNR on val that the gate may cost")
     parser.add_argument("--picture", type=Path, metavar="RUN_FOLDER", help="draw its Gaussians by class")
@@ -39,6 +39,8 @@ def main(arguments: list[str] | None = None) -> int:
             raise InputError("expected --picture RUN_FOLDER and --out FILE.png together")
         if asked.out is not None and (not asked.out.name or "\0" in str(asked.out)):
             raise InputError(f"--out: expected a file such as classes.png, got {str(asked.out)!a:.200}")
+        if not 0 <= asked.seed < 2**63:
+            raise InputError(f"--seed: expected 0 to 2^63 - 1, got {str(asked.seed)[:30]}")
         if not math.isfinite(asked.budget_db) or not 0 <= asked.budget_db <= 10:
             raise InputError(f"--budget-db: expected 0 to 10 dB, got {asked.budget_db}")
         if asked.checkpoint is not None:
@@ -51,6 +53,14 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     print(json.dumps({"time": asdict(found)}) if asked.json else words.of_screen(found))
     return 0
+
+
+def _whole(text: str) -> int:
+    """Read a whole number; one of more digits than int() takes is out of any range, too."""
+    try:
+        return int(text[:40])
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a whole number, got {text[:30]!r}") from None
 
 
 def _gate(folder: Path, budget_db: float, data_root: str | None) -> int:

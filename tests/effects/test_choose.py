@@ -12,8 +12,9 @@ import torch
 from worlds import World, brightening, filmed, moving, small_mover, still
 
 from gsbench.effects import __main__ as command
-from gsbench.effects import choose
-from gsbench.effects.choose import evidence, screen
+from gsbench.effects import choose, leftovers, waves
+from gsbench.effects.choose import screen
+from gsbench.effects.waves import evidence
 from gsbench.errors import InputError
 from gsbench.models.base import Gaussians3D
 from gsbench.scenes.scene import Scene
@@ -92,7 +93,7 @@ def test_what_is_too_little_to_tell() -> None:
 
 def test_the_level_of_the_test(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a permutation test that is wrong too often: leftovers that only the camera explains."""
-    monkeypatch.setattr(choose, "PERMUTATIONS", 199)
+    monkeypatch.setattr(waves, "PERMUTATIONS", 199)
     random = np.random.default_rng(0)
     camera = random.standard_normal((40, 9))
     gradients = camera @ random.standard_normal((9, 50)) * 3 + random.standard_normal((40, 50))
@@ -125,8 +126,8 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert answer["p"] == 0.001
     assert answer.keys() >= {"z", "free", "seconds", "reason"}
     for wrong in ([], ["/nowhere"], ["x", "--checkpoint", "y"], ["--checkpoint", "/nowhere"],
-                  ["x", "--budget-db", "nan"], ["--picture", "y", "--out", ""],
-                  ["--picture", "y", "--out", "a\0b"]):  # fmt: skip
+                  ["x", "--budget-db", "nan"], ["--picture", "y", "--out", ""], ["--picture", "y", "--out", "a\0b"],
+                  ["x", "--seed", "-1"], ["x", "--seed", str(2**63)], ["x", "--seed", "9" * 5000]):  # fmt: skip
         assert command.main(wrong) == 2
         assert capsys.readouterr().err.count("\n") == 1
 
@@ -135,8 +136,8 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
 def test_five_hundred_views_take_no_more_than_their_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a screen that draws the views of a long film more often: a fit of the same steps, and each view once."""
     drawn = []
-    draw = choose.rasterize_slice
-    monkeypatch.setattr(choose, "rasterize_slice", lambda *x: drawn.append(1) or draw(*x))
+    draw = leftovers.rasterize_slice
+    monkeypatch.setattr(leftovers, "rasterize_slice", lambda *x: drawn.append(1) or draw(*x))
     counts = {}
     for views in (100, 500):
         drawn.clear()

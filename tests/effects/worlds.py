@@ -60,6 +60,42 @@ def filmed(world: World, views: int = 48, seed: int = 1, *, orbit: bool = False,
     return Scene("world", film, [], [], (0.0, 0.0, 0.0), extent, None, "made in memory")
 
 
+def rigged(
+    world: World,
+    places: int = 6,
+    views: int = 8,
+    seed: int = 1,
+    *,
+    seen: Callable[[Tensor, float], Tensor] | None = None,
+    shake: float = 0.0,
+    together: bool = False,
+) -> Scene:
+    """Film a world from places that do not change, each seen several times.
+
+    Args:
+        world: its Gaussians at a time.
+        places: of cameras.
+        views: of each place.
+        seed: of the places.
+        seen: what becomes of an image at a time, before it is stored in 8 bits: noise, exposure.
+        shake: radians by which the cameras turn around the scene between views.
+        together: all cameras fire at the same moments, and not one after the other.
+    """
+    random = torch.Generator().manual_seed(seed)
+    film = []
+    stands = [(2 * math.pi * k / places, 1.2 * float(torch.rand(1, generator=random)) - 0.6) for k in range(places)]
+    for i in range(places * views):
+        moment = (i // places) / (views - 1) if together else i / (places * views - 1)
+        turned = shake * (2 * torch.rand(2, generator=random) - 1)
+        azimuth, height = stands[i % places]
+        at = camera(azimuth + float(turned[0]), height + float(turned[1]))
+        image = rasterize_slice(world(moment), at, torch.zeros(3), AUTO).image[0]
+        image = image if seen is None else seen(image, moment)
+        film.append(View(f"train/{i}", at, moment, (image.clamp(0, 1) * 255).round().to(torch.uint8)))
+    extent = scene_extent(torch.stack([view.camera.viewmat for view in film]))
+    return Scene("rig", film, [], [], (0.0, 0.0, 0.0), extent, None, "made in memory")
+
+
 def still(_: float) -> Gaussians3D:
     """Nothing changes."""
     return blobs()
@@ -79,6 +115,16 @@ def small_mover(moment: float) -> Gaussians3D:
     means = world.means.clone()
     means[0] = torch.tensor([1.2 * moment - 0.6, 0.0, 1.15])
     return world._replace(means=means)
+
+
+def appearing(moment: float) -> Gaussians3D:
+    """One ball, in about 1 % of the image, is there for an eighth of the time."""
+    world = blobs()
+    opacities = world.opacities.clone()
+    opacities[0] = 0.95 if 0.4 < moment < 0.525 else 0.0
+    means = world.means.clone()
+    means[0] = torch.tensor([0.0, 0.0, 1.15])
+    return world._replace(means=means, opacities=opacities)
 
 
 def brightening(moment: float) -> Gaussians3D:

@@ -1,0 +1,104 @@
+"""Take exposure out of the images of one camera place, so that what is left is noise or something that changes.
+
+An image of a static scene is y = clip(a x + b) of what the place sees, x, with a gain a and an offset b for each image
+and channel. Both are fitted by least absolute deviations (iteratively reweighted: Schlossmacher 1973), so that what
+moves through less than half of the image is an outlier and does not change them. x is the median over the images of
+(y - b) / a where y is not saturated, so that x may exceed 1.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+LEVEL_8_BIT = 1 / 255
+ROUNDS = 3  # of the fit and of x
+REWEIGHTINGS = 8
+FIT_PIXELS = 500  # that the fit looks at
+LEAST_PIXELS = 16  # with fewer nothing is fitted
+BLACK = 0.01  # weight of a pixel that is black in all images, in parts of all: of one shade only a gain is fitted
+GAINS = (0.25, 4.0)
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+def changes(
+    images: Array,  # [n, H, W, 3] of one camera place, in [0, 1]
+) -> Array:  # [n, H, W, 3]
+    """Return how each image differs from the place's mean once its gain and offset are taken out.
+
+    Where a saturated value is expected, a difference as small as three standard deviations of noise counts as none.
+    """
+    n, height, width, channels = images.shape
+    y = np.ascontiguousarray(images.transpose(0, 3, 1, 2), np.float32).reshape(n, channels, -1)
+    full = y >= 1 - LEVEL_8_BIT / 2
+    saturated = full | (y <= LEVEL_8_BIT / 2)
+    a, b = np.ones((n, channels, 1), np.float32), np.zeros((n, channels, 1), np.float32)
+    x, dead = np.sort(y, 0)[(n - 1) // 2], LEVEL_8_BIT
+    few = _telling(saturated)
+    y_few = y[..., few]
+    for _ in range(ROUNDS):
+        expected = a * x[:, few] + b
+        use = ~saturated[..., few] & (expected > dead) & (expected < 1 - dead)
+        a, b = _fit(y_few, x[:, few], use)
+        left = np.abs(y_few - a * x[:, few] - b)[use]
+        dead = LEVEL_8_BIT + (3 * 1.4826 * float(np.median(left)) if left.size else 0.0)
+        x = _seen((y - b) / a, saturated, full[0])
+    expected = np.clip(a * x + b, 0, 1)
+    left = y - expected
+    left[((expected < dead) | (expected > 1 - dead)) & (np.abs(left) < dead)] = 0
+    left -= left.mean(0)
+    return np.ascontiguousarray(left.reshape(n, channels, height, width).transpose(0, 2, 3, 1))
+
+
+def _telling(
+    saturated: Mask,  # [n, 3, P]
+) -> NDArray[np.int64]:
+    """Choose at most twice FIT_PIXELS pixels, evenly spaced, half of them such as no image saturates."""
+    inside = np.flatnonzero((~saturated.any(0)).any(0))
+    spaced = [every[:: max(1, -(-len(every) // FIT_PIXELS))] for every in (inside, np.arange(saturated.shape[2]))]
+    return np.unique(np.concatenate(spaced))
+
+
+def _fit(
+    y: Array,  # [n, 3, P]
+    x: Array,  # [3, P]
+    use: Mask,  # [n, 3, P]
+) -> tuple[Array, Array]:
+    """Fit y = a x + b to the pixels in `use`, and a little to black that stays black; return a and b, [n, 3, 1]."""
+    number = use.sum(-1, keepdims=True)
+    enough = number >= LEAST_PIXELS
+    y, x = np.pad(y, ((0, 0), (0, 0), (0, 1))), np.pad(x, ((0, 0), (0, 1)))
+    weights = np.concatenate([use, BLACK * number], -1).astype(np.float32)
+    weight = weights
+    for _ in range(REWEIGHTINGS):
+        weight = weight / np.maximum(weight.sum(-1, keepdims=True), 1e-9)
+        mean = (weight * x).sum(-1, keepdims=True)
+        weighted = weight * (x - mean)
+        slope = (weighted * y).sum(-1, keepdims=True) / np.maximum((weighted * x).sum(-1, keepdims=True), 1e-9)
+        a = np.clip(slope, *GAINS)
+        b = (weight * y).sum(-1, keepdims=True) - a * mean
+        weight = weights / np.maximum(np.abs(y - a * x - b), np.float32(LEVEL_8_BIT))
+    return _shared(a, enough, 1), _shared(b, enough, 0)
+
+
+def _shared(
+    values: Array,  # [n, 3, 1]
+    enough: Mask,  # [n, 3, 1]
+    otherwise: float,
+) -> Array:
+    """Replace what too few pixels say by what the image's other channels say on average."""
+    number = enough.sum(1, keepdims=True)
+    mean = (values * enough).sum(1, keepdims=True) / np.maximum(number, 1)
+    return np.where(enough, values, np.where(number > 0, mean, otherwise)).astype(np.float32)
+
+
+def _seen(
+    values: Array,  # [n, 3, P] (y - b) / a
+    saturated: Mask,  # [n, 3, P]
+    full: Mask,  # [3, P] where the first image is saturated, whether it is white and not black
+) -> Array:  # [3, P]
+    """Return the median of what is not saturated; where all is, the least that makes every image so."""
+    ordered = np.sort(np.where(saturated, np.float32(np.inf), values), 0)
+    number = (~saturated).sum(0)
+    middle = np.take_along_axis(ordered, np.maximum(number - 1, 0)[None] // 2, 0)[0]
+    return np.where(number > 0, middle, np.where(full, values.max(0), values.min(0)))

@@ -1,0 +1,123 @@
+"""Fit 3DGS for a moment and say what it leaves over of each view: the gradients of the squared errors by the means."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from gsbench.backends import resolve
+from gsbench.kernels.tape import Tape
+from gsbench.lanes import side_by_side
+from gsbench.models.appearance import sh_basis
+from gsbench.models.gaussians3d import Gaussians3DModel
+from gsbench.models.query import Query, unit
+from gsbench.models.render import rasterize_slice
+from gsbench.scenes import Camera, Points, Scene, View
+from gsbench.scenes.points import frustum_points
+
+LONG_SIDE = 40  # pixels of the images that are fitted, at least
+POINTS = 2_000
+STEPS = 50
+BATCH = 4  # views in a step
+RATES = {"means": 2e-3, "scales": 2e-2, "quats": 1e-2, "opacities": 5e-2, "sh0": 5e-2}  # means: parts of the extent
+CAMERA_DEGREE = 2  # of the harmonics of the camera's direction that are taken out
+# A point nearest to all optical axes is the scene's centre if they pass it within this part of its depth.
+NEAR_AXES = 0.5
+RADIUS = 0.4  # of the points around the centre, in distances of the cameras
+
+Array = NDArray[np.float64]
+
+
+def leftovers(views: Sequence[View], scene: Scene, seed: int, backend: str) -> Array:
+    """Fit 3DGS of degree 0 for STEPS steps; return the Gram matrix [V, V] of the views' gradients by the means."""
+    random = torch.Generator().manual_seed(seed)
+    points = scene_points(views, scene, random)
+    device = views[0].camera.viewmat.device
+    model = Gaussians3DModel(sh_degree=0, backend=resolve(backend, device.type))
+    model.initialise(points, scene.extent, random)
+    model.to(device)
+    background = torch.tensor(scene.background, device=device)
+    groups = [{"params": [model.splats[name]], "lr": rate * (scene.extent if name == "means" else 1.0)}
+              for name, rate in RATES.items()]  # fmt: skip
+    adam = torch.optim.Adam(groups, eps=1e-15)
+    fitted = [model.splats[name] for name in RATES]
+    lanes = model.backend.lanes(fitted[0])
+    of_view = partial(_gradients, model, fitted, background)
+    for _ in range(STEPS):
+        chosen = torch.randint(len(views), (BATCH,), generator=random).tolist()
+        by_view = list(side_by_side(of_view, [views[i] for i in chosen], lanes))
+        for parameter, gradients in zip(fitted, zip(*by_view, strict=True), strict=True):
+            parameter.grad = torch.stack(gradients).mean(0)
+        adam.step()
+    rows = [gradients[0].flatten() for gradients in side_by_side(of_view, views, lanes)]
+    matrix = torch.stack(rows).double().cpu().numpy()
+    return np.asarray(matrix @ matrix.T)
+
+
+def _gradients(model: Gaussians3DModel, by: list[nn.Parameter], background: Tensor, view: View) -> list[Tensor]:
+    """Compute the gradients of a view's mean squared error by some parameters."""
+    with Tape() as tape:
+        gaussians = model.slice(Query.of(view.camera, None))
+        image = rasterize_slice(gaussians, view.camera, background, model.backend).image
+    found: dict[int, Tensor] = {}
+    residual = image.detach() - view.image
+    tape.backward(image, 2 / residual.numel() * residual, by, found)
+    return [found.get(id(parameter), torch.zeros_like(parameter)) for parameter in by]
+
+
+def smaller(view: View) -> View:
+    """Return a view whose longer side has LONG_SIDE pixels or a few more."""
+    camera = view.camera
+    factor = max(1, max(camera.width, camera.height) // LONG_SIDE)
+    height, width = camera.height // factor, camera.width // factor
+    image = view.image[: height * factor, : width * factor].permute(2, 0, 1)[None]
+    K = camera.K.clone()
+    K[:2] /= factor
+    return replace(
+        view,
+        camera=Camera(camera.viewmat, K, width, height),
+        pixels=F.avg_pool2d(image, factor)[0].permute(1, 2, 0).contiguous(),
+    )
+
+
+def scene_points(views: Sequence[View], scene: Scene, random: torch.Generator) -> Points:
+    """Choose POINTS points to start a fit from: of those given with the scene, else where the cameras look."""
+    if scene.points is not None:
+        chosen = torch.randperm(len(scene.points.means), generator=random)[:POINTS]
+        return Points(scene.points.means[chosen], scene.points.colors[chosen])
+    center = center_of(views)
+    if center is None:
+        return frustum_points(POINTS, [view.to("cpu").camera for view in views], scene.extent, random)
+    distance = torch.stack([view.camera.center for view in views]).cpu().sub(center).norm(dim=-1).mean()
+    offset = torch.rand(POINTS, 3, generator=random) * 2 - 1
+    return Points(center + RADIUS * distance * offset, torch.full((POINTS, 3), 0.5))
+
+
+def center_of(views: Sequence[View]) -> Tensor | None:
+    """Return the point nearest to all optical axes, [3]; None where they do not meet before the cameras."""
+    centers = torch.stack([view.camera.center for view in views]).cpu().double()
+    axes = torch.stack([view.camera.viewmat[2, :3] for view in views]).cpu().double()
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    total = across.mean(0)
+    if float(torch.linalg.cond(total)) > 1e3:  # parallel axes meet nowhere
+        return None
+    meeting = torch.linalg.solve(total, (across @ centers[:, :, None]).mean(0)[:, 0])
+    depth = ((meeting - centers) * axes).sum(-1)
+    miss = (across @ (meeting - centers)[:, :, None])[..., 0].norm(dim=-1)
+    return meeting.float() if bool((depth > 0).all() and (miss < NEAR_AXES * depth).all()) else None
+
+
+def camera_basis(views: Sequence[View]) -> Array:
+    """Compute harmonics [V, 9] of the direction in which each camera lies from the middle of what they look at."""
+    center = center_of(views)
+    centers = torch.stack([view.camera.center for view in views]).cpu()
+    if center is None:  # cameras side by side: seen from so far in front of them that all lie close together
+        axes = torch.stack([view.camera.viewmat[2, :3] for view in views]).cpu()
+        spread = (centers - centers.mean(0)).norm(dim=-1).mean()
+        center = centers.mean(0) + 3 * spread * axes.mean(0)
+    return np.asarray(sh_basis(unit((centers - center).double()), CAMERA_DEGREE).numpy())

@@ -1,0 +1,95 @@
+"""Compare what follows slow waves of time with what does so when times are dealt at random."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+WAVES = 4  # cos(pi k t), k = 1 .. WAVES
+PERMUTATIONS = 999
+TIE = 1e-9  # relative; a deal that is the actual order again may differ from it by rounding
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The result of the permutation test."""
+
+    p: float
+    z: float
+    free: float
+
+
+def evidence(
+    leftovers: Array,  # [V, V] Gram matrix of the views' gradients
+    times: Array,  # [V] in [0, 1]
+    camera: Array,  # [V, B] what the camera explains, with a constant
+    seed: int,
+    places: Sequence[Sequence[int]] | None = None,
+) -> Evidence:
+    """Test whether gradients follow slow waves of time, given what the camera explains (Freedman and Lane 1983).
+
+    Args:
+        leftovers: g_v . g_w for all pairs of views.
+        times: of the views.
+        camera: functions of the camera; their span is taken out of gradients and waves.
+        seed: of the permutations.
+        places: groups of views among which times are dealt; all views are one by default.
+    """
+    waves = slow_waves(times)
+    known = _range(camera)
+    own = waves - known @ (known.T @ waves)
+    free = float(np.square(own).sum() / max(np.square(waves).sum(), 1e-300))
+    slow = _range(own)
+    residual = np.eye(len(times)) - known @ known.T
+    gram = residual @ leftovers @ residual
+    total = float(np.trace(gram))
+    random = np.random.default_rng(seed)
+
+    def share(rows: NDArray[np.int64]) -> float:
+        """Share of energy in the slow waves, of what is left once the camera is taken out of permuted leftovers too."""
+        turned = np.concatenate([slow, known], 1)[rows]
+        energies = np.einsum("vk,vk->k", turned, gram @ turned)
+        left = total - energies[slow.shape[1] :].sum()
+        return float(energies[: slow.shape[1]].sum() / left) if left > 0 else 0.0
+
+    actual = share(np.arange(len(times)))
+    null = np.array([share(_deal(len(times), places, random)) for _ in range(PERMUTATIONS)])
+    return Evidence(*compare(actual, null), free)
+
+
+def slow_waves(
+    times: Array,  # [V] in [0, 1]
+) -> Array:  # [V, WAVES]
+    """Return slow waves of time, each less its mean."""
+    waves = np.cos(math.pi * np.outer(times, np.arange(1, WAVES + 1)))
+    return np.asarray(waves - waves.mean(0))
+
+
+def compare(
+    actual: float,
+    null: Array,  # [PERMUTATIONS] the same of times that were dealt at random
+) -> tuple[float, float]:
+    """Return p, the share of deals that reach the actual value, itself counted, and z, its distance from their mean."""
+    p = (1 + int((null >= actual - TIE * abs(actual)).sum())) / (1 + len(null))
+    spread = float(null.std())
+    return p, (actual - float(null.mean())) / spread if spread > TIE * abs(actual) else 0.0
+
+
+def _deal(views: int, places: Sequence[Sequence[int]] | None, random: np.random.Generator) -> NDArray[np.int64]:
+    """Draw a permutation of the views that leaves each at its place."""
+    if places is None:
+        return random.permutation(views)
+    dealt = np.arange(views)
+    for place in places:
+        dealt[list(place)] = random.permutation(list(place))
+    return dealt
+
+
+def _range(columns: Array) -> Array:
+    """Return an orthonormal basis [V, R] of what columns [V, B] span."""
+    left, values, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left[:, values > 1e-6 * max(values.max(initial=0.0), 1e-300)])

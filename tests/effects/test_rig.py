@@ -1,0 +1,142 @@
+"""Whether a scene changes with time, asked of cameras that stand still, where images of one place are compared."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from worlds import World, appearing, brightening, filmed, moving, rigged, small_mover, still
+
+from gsbench.effects import rig
+from gsbench.effects.choose import screen
+from gsbench.effects.places import find_places
+from gsbench.scenes.scene import Scene
+
+Seen = Callable[[Tensor, float], Tensor]
+
+
+def noisy(seen: Seen | None = None, size: float = 0.02) -> Seen:
+    """Sensor noise, of what `seen` makes of an image."""
+    random = torch.Generator().manual_seed(3)
+    return lambda image, t: (seen(image, t) if seen else image) + size * torch.randn(image.shape, generator=random)
+
+
+def drifting(image: Tensor, moment: float) -> Tensor:
+    """An exposure that rises from 0.8 to 1.2, which saturates what is bright, and a white balance that wanders."""
+    return image * torch.tensor([0.8 + 0.4 * moment, 0.8 + 0.4 * moment, 0.9 + 0.2 * moment])
+
+
+def flickering(image: Tensor, moment: float) -> Tensor:
+    """A lamp that is brighter in some images than in others."""
+    return image * (1 + 0.2 * math.sin(997 * moment))
+
+
+def darkening(image: Tensor, moment: float) -> Tensor:
+    """A patch of 1 % of the frame that is seen to move in front of the still world."""
+    image = image.clone()
+    column = int(36 * moment)
+    image[18:22, column : column + 4] *= 0.5
+    return image
+
+
+@pytest.mark.parametrize("seen", [None, noisy(), drifting, flickering, noisy(drifting), noisy(flickering)])
+def test_a_still_rig_is_off(seen: Seen | None) -> None:
+    """Catches noise, rounding to 8 bits, an exposure that drifts (and saturates) or flickers, taken for a change."""
+    found = screen(rigged(still, seen=seen))
+    assert found.decision == "off", found
+    assert "exposure and noise only" in found.reason
+
+
+@pytest.mark.parametrize("world", [moving, small_mover, brightening])
+@pytest.mark.parametrize(("places", "views", "together"), [(6, 8, False), (4, 12, False), (6, 16, True)])
+def test_a_rig_sees_motion(world: World, places: int, views: int, together: bool) -> None:
+    """Catches "off" or "undecided" on a rig, one of four cameras, or one whose cameras fire together."""
+    found = screen(rigged(world, places, views, together=together))
+    assert found.decision == "on", found
+    assert found.p is not None
+    assert found.free is None
+
+
+@pytest.mark.parametrize("seen", [noisy(), noisy(drifting), noisy(flickering)])
+def test_exposure_hides_no_motion(seen: Seen) -> None:
+    """Catches a gain and an offset that take the mover out with the exposure."""
+    assert screen(rigged(moving, seen=seen)).decision == "on"
+    assert screen(rigged(small_mover, seen=seen)).decision == "on"
+
+
+def test_what_is_rare_or_small_is_never_off() -> None:
+    """Catches events of a moment (no slow wave is left) and movers of 1 % of the frame that are called static."""
+    for scene in (rigged(appearing), rigged(appearing, seen=noisy()), rigged(still, seen=noisy(darkening)),
+                  rigged(appearing, views=3), rigged(moving, views=2), rigged(moving, 4, 4),
+                  rigged(small_mover, 8, 3)):  # fmt: skip
+        assert screen(scene).decision != "off"
+
+
+def test_shuffled_times_are_undecided() -> None:
+    """Catches "off" where images of one place differ, though by no slow wave."""
+    scene = rigged(moving)
+    order = torch.randperm(len(scene.train), generator=torch.Generator().manual_seed(5)).tolist()
+    train = [replace(view, time=scene.train[i].time) for view, i in zip(scene.train, order, strict=True)]
+    found = screen(replace(scene, train=train))
+    assert found.decision == "undecided"
+    assert "differ" in found.reason
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_the_level_on_rigs(together: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches permutations that break what cameras see together: a light that flickers for all is no slow wave."""
+    monkeypatch.setattr(rig, "PERMUTATIONS", 199)
+    random = np.random.default_rng(0)
+    times = [np.linspace(0, 1, 8) if together else np.sort(random.random(8)) for _ in range(6)]
+    patterns = [random.standard_normal(30) for _ in times]
+    low = 0
+    for k in range(300):
+        light = random.standard_normal(8)
+        means = []
+        for pattern in patterns:
+            own = light if together else random.standard_normal(8)
+            images = np.outer(own, pattern) + 0.3 * random.standard_normal((8, 30))
+            means.append(images - images.mean(0))
+        low += rig._slow(means, times, k)[0] <= 0.05
+    assert low / 300 == pytest.approx(0.05, abs=0.035)
+
+
+def _both(fixed: Scene, loose: Scene) -> Scene:
+    return replace(loose, train=fixed.train + loose.train)
+
+
+def test_mixed_captures_are_asked_both_ways() -> None:
+    """Catches a capture of standing and of wandering cameras that is judged by one kind alone."""
+    found = screen(_both(rigged(moving, 4, 12), filmed(moving, 36)))
+    assert found.decision == "on"
+    assert "together p" in found.reason
+    assert screen(_both(rigged(still, 3, 6, seen=noisy()), filmed(still, 24))).decision == "off"
+    assert screen(_both(rigged(still, 3, 6), filmed(moving, 36))).decision == "on"
+    assert screen(_both(rigged(moving, 3, 6), filmed(still, 24, orbit=True))).decision != "off"
+
+
+def test_cameras_that_are_held_are_never_off() -> None:
+    """Catches nine harmonics for places that move a little: each has a misfit of its own, which drowned time."""
+    scene = rigged(moving, 6, 10, shake=0.005)
+    assert len(find_places(scene.train, scene.extent).held) == 6
+    assert screen(scene).decision != "off"
+    assert screen(rigged(still, 6, 10, shake=0.005)).decision == "undecided"
+
+
+def test_places_are_told_by_their_cameras() -> None:
+    """Catches places that are split by rounding, or joined though the lens differs; a film has none."""
+    scene = rigged(still, 4, 4)
+    random = torch.Generator().manual_seed(0)
+    train = [replace(v, camera=replace(v.camera, viewmat=v.camera.viewmat + 1e-6 * torch.randn(4, 4, generator=random)))
+             for v in scene.train]  # fmt: skip
+    assert sorted(map(len, find_places(train, scene.extent).fixed)) == [4] * 4
+    zoomed = [
+        replace(v, camera=replace(v.camera, K=v.camera.K * torch.tensor([[1.1], [1.1], [1.0]]))) for v in train[::2]
+    ]
+    assert len(find_places(train[1::2] + zoomed, scene.extent).fixed) == 4
+    for orbit in (False, True):
+        film = filmed(still, 60, orbit=orbit)
+        assert len(find_places(film.train[:-1], film.extent).other) == 59  # an orbit ends where it began
