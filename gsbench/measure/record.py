@@ -77,13 +77,13 @@ class Cost:
 
 @dataclass(frozen=True)
 class TimeScreen:
-    """What a test before the training said about time in the scene: gsbench.effects.choose.Screen."""
+    """What a test before the training said about time in the scene: gsbench.effects.choose.screen."""
 
     decision: str  # on, off or undecided
     reason: str
     p: float | None  # share of permutations with as much energy in slow waves of time; None: not tested
     z: float | None  # the energy's distance from that of permutations, in their standard deviations
-    free: float | None  # share of the waves' variance that the camera leaves free
+    free: float | None  # share of the waves' variance that the camera leaves free; None: it stood still, or not tested
     seconds: float  # that the test took
 
 

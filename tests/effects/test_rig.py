@@ -113,7 +113,7 @@ def test_mixed_captures_are_asked_both_ways() -> None:
     found = screen(_both(rigged(moving, 4, 12), filmed(moving, 36)))
     assert found.decision == "on"
     assert "together p" in found.reason
-    assert screen(_both(rigged(still, 3, 6, seen=noisy()), filmed(still, 24))).decision == "off"
+    assert screen(_both(rigged(still, 3, 6, seen=noisy()), filmed(still, 48))).decision == "off"
     assert screen(_both(rigged(still, 3, 6), filmed(moving, 36))).decision == "on"
     assert screen(_both(rigged(moving, 3, 6), filmed(still, 24, orbit=True))).decision != "off"
 
