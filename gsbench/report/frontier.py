@@ -165,7 +165,7 @@ def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, fl
     rules = [(f"{psnr:g} dB", psnr) for psnr in round_numbers(min(reached), max(reached))]
     run = next(r for r in group.records if r.scene == scene)
     row = paper.paper_row(run.dataset, scene, "7dgs") if run.protocol.get("paper_dataset") == run.dataset else None
-    return [*rules, *([("paper's 7dgs (its best on test)", row.psnr)] if row else [])]
+    return [*rules, *([("paper's 7dgs", row.psnr)] if row else [])]
 
 
 def round_numbers(low: float, high: float) -> list[float]:
