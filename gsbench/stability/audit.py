@@ -24,7 +24,8 @@ NOT_DEFAULT = 100_000  # hard slices for the factor order that is not the defaul
 SUBTRACTING = 50_000  # Gaussians for the schemes that subtract, which fail often
 DEFAULT_ORDER = "conditioned_first"
 SEED = 0
-FEW, SHORT_STEPS, SLOWEST = 4_000, 40, "faint_crowd"  # hard slices, steps and the case left out of the short audit
+# Of the short audit: hard slices, steps of trainings, and the case that is left out.
+FEW, SHORT_STEPS, SLOWEST = 4_000, 60, "faint_crowd"
 T = TypeVar("T")
 Step = Callable[[], None]
 
@@ -90,7 +91,7 @@ def _short_steps(audit: Audit) -> list[tuple[str, Step]]:
     judged += [
         (driven, partial(trainings.judge, backend=fastest, steps=SHORT_STEPS)),
         (CASES["poisoned_photograph"], partial(trainings.judge, backend=fastest)),
-        (drifting, partial(trainings.drift, backend=fastest, seeds=trainings.SEEDS[:1])),
+        (drifting, partial(trainings.drift, backend=fastest, seeds=trainings.SEEDS[:1], steps=SHORT_STEPS)),
     ]
     steps: list[tuple[str, Step]] = [(case.name, partial(_extend, audit.cells, judge, case)) for case, judge in judged]
     return steps + [(f"hard slices, {order}", partial(hard_slices, audit, order, FEW)) for order in FACTOR_ORDERS]

@@ -141,10 +141,11 @@ def poisoned_photograph(g: Generator, severity: float, model: str) -> Training: 
 
 
 @case("drift", "4dgs", "7dgs", "7dgs_noagr", forward=0.02, gradient=math.nan)
-def single_against_double(g: Generator, severity: float, model: str, run_seed: int = 0) -> Training:  # noqa: ARG001
+def single_against_double(
+    g: Generator, severity: float, model: str, run_seed: int = 0, steps: int = DRIFT_STEPS,  # noqa: ARG001
+) -> Training:  # fmt: skip
     """150 steps of suzanne at 40 x 40 in float32 and float64: rounding decides what splits; the error is dB on test."""
-    config = compose(model, DRIFT_STEPS, "scene=suzanne", "scene.downscale=4", f"seed={run_seed}",
-                     "train.batch_size=1",
-                     "train.densify.every=50")  # fmt: skip
+    config = compose(model, steps, "scene=suzanne", "scene.downscale=4", f"seed={run_seed}", "train.batch_size=1",
+                     f"train.densify.every={steps // 3}")  # fmt: skip
     points = random_points(DRIFT_POINTS, 1.0, generator(run_seed))
     return Training(model, config, replace(load_scene(config), points=points))

@@ -43,15 +43,15 @@ def judge(case: Case, backend: str, **more: Any) -> Iterator[Cell]:
         yield Cell(case.area, case.name, name, "-", backend, end, float("nan"), bad, ms, case.bound, note)
 
 
-def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS) -> Iterator[Cell]:
+def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS, **more: Any) -> Iterator[Cell]:
     """Compare PSNR on test of trainings in float32 with the same in float64 by the reference; the worst seed counts."""
     for name in case.subjects:
         differences, notes, bad, ms = [], [], 0.0, 0.0
         for seed in seeds:
-            training: Training = case(model=name, run_seed=seed)
+            training: Training = case(model=name, run_seed=seed, **more)
             exact = fit(replace(training, scene=double(training.scene)), "reference")
             start = time.perf_counter()
-            single = fit(case(model=name, run_seed=seed), backend)
+            single = fit(case(model=name, run_seed=seed, **more), backend)
             ms += 1e3 * (time.perf_counter() - start)
             found, true = (one.psnr(one.scene.test) for one in (single, exact))
             differences.append(found - true)
