@@ -51,7 +51,7 @@ def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS, **more: Any) -
             training: Training = case(model=name, run_seed=seed, **more)
             exact = fit(replace(training, scene=double(training.scene)), "reference")
             start = time.perf_counter()
-            single = fit(case(model=name, run_seed=seed, **more), backend)
+            single = fit(training, backend)
             ms += 1e3 * (time.perf_counter() - start)
             found, true = (one.psnr(one.scene.test) for one in (single, exact))
             differences.append(found - true)
