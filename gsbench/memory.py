@@ -3,10 +3,14 @@
 Needs no torch.
 """
 
+import errno
+import re
 from pathlib import Path
 
 from gsbench.errors import TooLargeError
 
+# What the loader of libraries, torch, C++, the system's threads and OpenCV say where there is no memory.
+WITHOUT_MEMORY = re.compile(r"memory|bad_alloc|bad alloc|failed to map segment|can't start new thread", re.IGNORECASE)
 SMALL = 1 << 26  # bytes not worth asking the system about
 
 
@@ -24,6 +28,14 @@ def require(size: int, what: str, instead: str) -> None:
     if free is not None and size > free:
         raise TooLargeError(f"{what} need {size / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are available: "
                             f"{instead}")  # fmt: skip
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Tell whether an error says that there is no memory: few of the libraries below raise a MemoryError."""
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    told = isinstance(error, RuntimeError | ImportError | SystemError) and WITHOUT_MEMORY.search(str(error)) is not None
+    return told or isinstance(error, MemoryError)
 
 
 def available() -> int | None:

@@ -1,14 +1,11 @@
 """Do one run from its config to its record, which is on disk at the end, however the run ended."""
 
-import errno
-import re
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import torch
 from omegaconf import DictConfig
 
 from gsbench.effects import words
@@ -16,6 +13,7 @@ from gsbench.errors import InputError, one_line, printable
 from gsbench.measure import record as records
 from gsbench.measure.atomic import remove_leftovers
 from gsbench.measure.record import Record
+from gsbench.memory import is_out_of_memory
 from gsbench.run import claim
 from gsbench.run.attempt import Attempt
 from gsbench.run.checks import check_folder
@@ -117,12 +115,9 @@ def _ended_badly(attempt: Attempt, error: Exception) -> Record:
 
 
 def reason_of(error: Exception, folder: Path) -> str:
-    """Say in one line why a run failed. The stack of an error that nobody foresaw goes into TRACEBACK in `folder`.
-
-    torch reports a CPU without memory as a RuntimeError.
-    """
+    """Say in one line why a run failed. The stack of an error that nobody foresaw goes into TRACEBACK in `folder`."""
     text = one_line(error)
-    if _is_of_memory(error):
+    if is_out_of_memory(error):
         return f"out of memory: {text}"
     if isinstance(error, OSError):
         return f"{error.filename or folder}: {error.strerror or text}"
@@ -131,14 +126,6 @@ def reason_of(error: Exception, folder: Path) -> str:
     path = folder / TRACEBACK
     path.write_text("".join(traceback.format_exception(error)))
     return f"an error that gsbench did not foresee, {type(error).__name__}: {text}; please report it, with {path}"
-
-
-def _is_of_memory(error: Exception) -> bool:
-    if isinstance(error, MemoryError | torch.OutOfMemoryError):
-        return True
-    if isinstance(error, OSError):
-        return error.errno == errno.ENOMEM
-    return isinstance(error, RuntimeError) and re.search("memory|bad_alloc|bad alloc", str(error)) is not None
 
 
 def write(record: Record, folder: Path) -> None:

@@ -131,6 +131,8 @@ def decode_png(
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryError(f"{where}: OpenCV has none for its pixels") from None
         raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again") from error
     if pixels is None:
         raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again")

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from gsbench.errors import InputError, printable
+from gsbench.errors import InputError, one_line, printable
+from gsbench.memory import is_out_of_memory
 
 
 @dataclass(frozen=True)
@@ -19,9 +20,13 @@ class Problem:
 
 def do(composed: DictConfig) -> Problem | None:
     """Do a run; return why it did not end well, which is on stderr too, or None."""
-    from gsbench.run.run import UnrecordedError, run  # imports torch
-
     chosen = HydraConfig.get()
+    try:
+        from gsbench.run.run import UnrecordedError, run  # imports torch
+    except (ImportError, OSError, MemoryError) as error:
+        if not is_out_of_memory(error):
+            raise
+        return _told(composed, Problem(f"out of memory while torch is loaded: {one_line(error)}", False))
     try:
         record = run(composed, chosen.runtime.choices, chosen.overrides.task)
         if record is None or record.status == "ok":
@@ -29,5 +34,11 @@ def do(composed: DictConfig) -> Problem | None:
         problem = Problem(f"{record.status}: {record.reason}", False)
     except InputError as error:
         problem = Problem(str(error), not isinstance(error, UnrecordedError))
+    except MemoryError as error:  # not even a record fitted
+        problem = Problem(f"out of memory: {one_line(error)}", False)
+    return _told(composed, problem)
+
+
+def _told(composed: DictConfig, problem: Problem) -> Problem:
     print(f"gsbench: error: {printable(f'{composed.scene.name}: {problem.reason}')}", file=sys.stderr)
     return problem
