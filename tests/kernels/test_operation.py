@@ -8,6 +8,7 @@ import torch
 
 from gsbench import kernels
 from gsbench.errors import InputError
+from gsbench.kernels.colors import show_colors
 from gsbench.kernels.library import library_of
 from gsbench.kernels.operation import MOST_KNOWN, Operation
 from gsbench.kernels.slices import _still, observe_rotated, observe_still
@@ -55,6 +56,14 @@ def test_what_does_not_fit_is_refused(given: tuple[torch.Tensor, ...], said: str
     """Catches arrays that a kernel would read past their end."""
     with pytest.raises(InputError, match=said):
         observe_still(*given)
+
+
+def test_coefficients_are_whole_harmonics_of_every_wave() -> None:
+    """Catches coefficients that are no multiple of the waves: the kernel would read one wave's as another's."""
+    N = 4
+    given = torch.zeros(N, 1, 3), torch.zeros(N, 6, 3), torch.zeros(N, 3), torch.ones(N), torch.zeros(3)
+    with pytest.raises(InputError, match="waves=2 and 7 coefficients"):
+        show_colors(*given, 0, torch.zeros(N, 1), torch.tensor(0.0), 2)
 
 
 def test_known_calls_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> None:

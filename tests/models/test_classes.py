@@ -78,6 +78,19 @@ def test_agr_that_moves_nothing_is_not_called(monkeypatch: pytest.MonkeyPatch) -
     assert all(x is model.splats[name] for name, x in model.refined(QUERY).items())
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_agr_moves_a_row_within_its_span_alone(dtype: torch.dtype) -> None:
+    """Catches a Gaussian that AGR moves before its first time, or after its last one, by torch and by the kernel."""
+    model = classed("7dgs_agr", N, 4, 10).to(dtype)
+    query = Query.at(CAMERA.to(dtype), 0.45)
+    whole = model.refined(query)
+    model.classes = model.classes._replace(spans=torch.tensor([[0.5, 0.9], [0.1, 0.4], [0.4, 0.5], [0.0, 1.0]]))
+    moved = model.refined(query)["means"]
+    assert torch.equal(moved[:2], model.splats["means"][:2])
+    torch.testing.assert_close(moved[2:], whole["means"][2:])
+    assert (moved[2:4] != model.splats["means"][2:4]).any(1).all()
+
+
 def freeze(model: GaussianModel) -> None:
     """Make every row an ordinary one that hardly changes: endlessly long in all that is observed, and not moving."""
     splats = model.splats

@@ -9,9 +9,11 @@ import pytest
 import torch
 
 from gsbench.export import direction, main
+from gsbench.models import build
 from gsbench.models.render import render
 from gsbench.run.load import load_run
 from gsbench.run.setup import load_scene
+from gsbench.scenes import Points
 from gsbench.scenes.trained import read_trained
 from gsbench.view import film, paths
 
@@ -78,6 +80,16 @@ def test_an_orbit_looks_at_the_model(folder: Path) -> None:
         assert rotation[1] @ torch.tensor(paths.UP) < 1e-3  # y points down
         center = camera.viewmat[:3, :3] @ paths.middle(run.model) + camera.viewmat[:3, 3]
         torch.testing.assert_close(center, torch.tensor([0, 0, run.scene.extent]), atol=1e-3, rtol=1e-3)
+
+
+def test_the_middle_is_a_median_by_opacity() -> None:
+    """Catches a mean, which one far Gaussian moves, a Gaussian that is hardly seen counted whole, and another rank."""
+    model = build("3dgs")
+    means = torch.tensor([0.0, 1, 2, 3, 100])[:, None].expand(5, 3)
+    model.initialise(Points(means, means), 1.0, torch.Generator())
+    torch.testing.assert_close(paths.middle(model), torch.full((3,), 2.0))
+    model.splats["opacities"].data[:] = torch.tensor([-9.0, -9, -9, 2, 1])
+    torch.testing.assert_close(paths.middle(model), torch.full((3,), 3.0))
 
 
 @pytest.mark.parametrize(
