@@ -16,7 +16,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m gsbench.stability", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/stability"), help="folder of the results")
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--short", action="store_true", help="the defaults alone, in half a minute; writes no page")
+    length.add_argument("--short", action="store_true", help="the defaults alone, in a minute; writes no page")
     length.add_argument("--long", action="store_true", help="train for 2,000 steps at 30 times the learning rates")
     parser.add_argument("--checkpoint", type=Path, metavar="FILE",
                         help="no audit: the condition numbers in a trained model")  # fmt: skip

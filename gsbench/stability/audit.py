@@ -65,7 +65,7 @@ def run(million: int = MILLION, *, long: bool = False, short: bool = False) -> A
     Args:
         million: the number of hard slices.
         long: train for 2,000 steps instead of 150, and use as many hard slices for each factor order.
-        short: judge only the defaults, with few slices and steps, one seed and no costs, in half a minute.
+        short: judge only the defaults, with few slices and steps, one seed and no costs.
     """
     began = time.perf_counter()
     audit = Audit(present())
