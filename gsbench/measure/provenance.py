@@ -82,9 +82,9 @@ def git_commit() -> str | None:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """Run git and return its output; None if git is not installed, fails or hangs."""
+    """Run git and return its output; None if git is not installed, fails, hangs or lacks memory."""
     try:
         done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True, timeout=10)
-    except (OSError, subprocess.SubprocessError):
+    except (OSError, subprocess.SubprocessError, MemoryError):
         return None
     return done.stdout.strip()

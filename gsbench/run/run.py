@@ -1,5 +1,6 @@
 """Do one run from its config to its record, which is on disk at the end, however the run ended."""
 
+import gc
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,7 @@ from gsbench.train.diagnosis import explain
 from gsbench.train.watch import DivergedError
 
 TRACEBACK = "traceback.txt"
+SPARE = 1 << 25  # bytes set aside, and never touched, for the record of a run that ends without memory
 
 
 class UnrecordedError(InputError):
@@ -76,12 +78,13 @@ def _is_claimed(this: Run, mine: Progress) -> bool:
 
 def _done(attempt: Attempt) -> Record:
     """Do a run that this process has claimed, or keep the one that finished before; see `run`."""
-    this = attempt.this
+    this, spare = attempt.this, [bytearray(SPARE)]
     try:
         model, scene = attempt.prepare()
         kept = finished(this, scene)
         record = kept or attempt.measure(attempt.fit(model, scene))
     except Exception as error:
+        spare.clear()
         kept, record = None, _ended_badly(attempt, error)
     if kept is not None:
         print(f"{this.name}: finished before, kept: {summary(kept)}; measured {where(this, kept)}; "
@@ -94,7 +97,10 @@ def _done(attempt: Attempt) -> Record:
     for line in words.lines(record.on_demand) if record.on_demand else []:
         print(f"{this.name}: {line}")
     print(f"{this.name}: {summary(record)}; {this.folder / records.FILE_NAME}")
-    attempt.draw()
+    try:
+        attempt.draw()
+    except Exception as error:  # the record is there; pictures are worth less than the next run
+        print(f"{this.name}: no pictures: {one_line(error)}", file=sys.stderr)
     return record
 
 
@@ -105,6 +111,9 @@ def _ended_badly(attempt: Attempt, error: Exception) -> Record:
         InputError: the model is unknown, so that the run has no row in a table.
     """
     is_diverged = isinstance(error, DivergedError)
+    if is_out_of_memory(error):
+        error.__traceback__ = None  # its frames hold what filled the memory, and a record takes some
+        gc.collect()
     reason = one_line(error) if is_diverged else reason_of(error, attempt.this.folder)
     if is_diverged and attempt.model is not None:
         try:
