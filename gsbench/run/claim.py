@@ -57,11 +57,17 @@ def release(folder: Path, mine: Progress) -> None:
 
 
 def _read(path: Path) -> Progress | str:
-    """Read a claim; NOTHING where there is none, DAMAGED where it cannot be read."""
-    try:
-        return progress.read(path)
-    except InputError:
-        return DAMAGED if os.path.lexists(path) else NOTHING
+    """Read a claim; NOTHING where there is none, DAMAGED where it cannot be read again and again.
+
+    Without locks one may be made just after it was looked for, which is no damage.
+    """
+    for _ in range(3):
+        try:
+            return progress.read(path)
+        except InputError:
+            if not os.path.lexists(path):
+                return NOTHING
+    return DAMAGED
 
 
 def _is_one(other: Progress, mine: Progress) -> bool:
