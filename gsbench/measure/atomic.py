@@ -28,7 +28,9 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
         temporary.replace(path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):  # a disk that is full names no file, and a temporary name says nothing
+        if (
+            isinstance(error, OSError) and error.errno
+        ):  # a disk that is full names no file, and a temporary name says nothing
             error.filename, error.filename2 = str(path), None
         raise
     if not lasting:

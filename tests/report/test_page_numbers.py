@@ -13,6 +13,7 @@ from gsbench.config import TrainConfig
 from gsbench.measure.curve import Point
 from gsbench.measure.record import Effects
 from gsbench.report import paper
+from gsbench.report.comparisons import comparisons
 from gsbench.report.page import charts, cost, events, time_to_quality, worth
 from gsbench.report.page.content import Canvas, Runs
 from gsbench.report.page.palette import Style, styles
@@ -24,12 +25,21 @@ def canvas():
     return Canvas("x", Runs(), styles(list(EFFECTS)), 8)
 
 
+def effects(runs):
+    """What is said of the prices of runs."""
+    found = group(*runs)
+    return worth.effects_section(found, comparisons(found), canvas()).sentences
+
+
 def circles(svg):
     """The number and the place across of each point that answers to a pointer."""
     return [(int(run), float(x)) for run, x in re.findall(r'data-run="(\d+)" cx="([\d.]+)"', svg)]
 
 
-@pytest.mark.parametrize(("both", "said"), [(22.0, "2.00 dB less than apart"), (26.0, "2.00 dB more than apart")])
+@pytest.mark.parametrize(
+    ("both", "said"),
+    [(22.0, "2.00 dB less than the sum of each by itself"), (26.0, "2.00 dB more than the sum of each by itself")],
+)
 def test_effects_that_are_real_are_said_with_their_interaction(both, said):
     """Catches an interval that counts as holding zero though it does not, and an interaction told the wrong way round.
 
@@ -37,7 +47,7 @@ def test_effects_that_are_real_are_said_with_their_interaction(both, said):
     """
     psnr = {"3dgs": 20.0, "4dgs": 23.0, "6dgs": 21.0, "7dgs_noagr": both}
     runs = [run(m, s, (v + s / 100, v + s / 50), effects=EFFECTS[m]) for m, v in psnr.items() for s in range(3)]
-    sentences = worth.effects_section(group(*runs), canvas()).sentences
+    sentences = effects(runs)
     assert any(s.startswith(f"Time × direction: together they bring {said}") for s in sentences)
     assert not any(s.startswith("Not told from nothing") for s in sentences)
 
@@ -46,7 +56,7 @@ def test_an_effect_that_may_be_nothing_is_said_to_be():
     """Catches a price whose interval holds zero, told as if it were there."""
     values = {"3dgs": (20.0, 20.0, 20.0), "4dgs": (19.0, 20.0, 21.5)}
     runs = [run(m, s, (v, v), effects=EFFECTS[m]) for m, each in values.items() for s, v in enumerate(each)]
-    assert "Not told from nothing in dB: time alone." in worth.effects_section(group(*runs), canvas()).sentences
+    assert "Not told from nothing in dB: time alone." in effects(runs)
 
 
 def test_a_point_is_drawn_once():
