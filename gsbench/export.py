@@ -11,6 +11,7 @@ import torch
 from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.models.query import Query
+from gsbench.models.registry import import_models
 from gsbench.run.checks import check_device, evaluated_views
 from gsbench.run.load import LoadedRun, load_run, scene_of
 from gsbench.scenes import Scene
@@ -66,6 +67,11 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--fps", type=float, default=30, help="frames a second (30)")
     made.add_argument("--seconds", type=float, default=4, help="length of an orbit or a spiral (4)")
     made.add_argument("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
+    made.add_argument(
+        "--model-module",
+        metavar="MODULE",
+        help="that registers the run's model",
+    )
     made.add_argument("--device", default="cpu", help="cpu or cuda")
     return made
 
@@ -82,6 +88,7 @@ def prepare(options: argparse.Namespace) -> Asked:
     for path in (path for path in (options.ply, options.video, options.images) if path):
         film.check_parent(path)
     check_device(options.device)
+    import_models(options.model_module)
     run = load_run(options.run, options.device)
     if options.time is not None and not run.scene.has_time:
         raise InputError(f"--time: expected a scene with times, {run.scene.name} has none: leave it out")

@@ -16,6 +16,7 @@ from gsbench import scenes
 from gsbench.effects import words
 from gsbench.effects.choose import screen
 from gsbench.errors import InputError, one_line
+from gsbench.models.registry import import_models
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -30,6 +31,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--camera", type=int, default=0, help="of --picture: the number of the evaluated view")
     parser.add_argument("--time", type=float, help="of --picture: in [0, 1]; that of the view by default")
     parser.add_argument("--out", type=Path, metavar="FILE.png", help="where --picture goes")
+    parser.add_argument(
+        "--model-module",
+        metavar="MODULE",
+        help="that registers the run's model",
+    )
     parser.add_argument("--data-root", help="where the data set of the run is now")
     asked = parser.parse_args(arguments)
     try:
@@ -43,6 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
             raise InputError(f"--seed: expected 0 to 2^63 - 1, got {str(asked.seed)[:30]}")
         if not math.isfinite(asked.budget_db) or not 0 <= asked.budget_db <= 10:
             raise InputError(f"--budget-db: expected 0 to 10 dB, got {asked.budget_db}")
+        import_models(asked.model_module)
         if asked.checkpoint is not None:
             return _gate(asked.checkpoint, asked.budget_db, asked.data_root)
         if asked.picture is not None:

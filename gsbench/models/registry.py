@@ -44,8 +44,7 @@ def find(name: str, module: str | None = None) -> type[GaussianModel]:
         InputError: the model is unknown, or a module cannot be imported.
     """
     _import_all()
-    if module is not None:
-        _import(module, f"model.module={module!a:.80}")
+    import_models(module, f"model.module={module!a:.80}")
     if not isinstance(name, str) or name not in _REGISTRY:
         raise InputError(f"model '{name}' is not known. {did_you_mean(name, _REGISTRY)}")
     return _REGISTRY[name]
@@ -67,11 +66,18 @@ def _import_all() -> None:
     for own in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"gsbench.models.{own.name}")
     for point in entry_points(group=ENTRY_POINTS):
-        _import(point.module, f"entry point {point.name} of {ENTRY_POINTS}")
+        import_models(point.module, f"entry point {point.name} of {ENTRY_POINTS}")
 
 
-def _import(module: str, named_by: str) -> None:
-    """Import a module of models; raises InputError that says in one line where it fails."""
+def import_models(module: str | None, named_by: str = "--model-module") -> None:
+    """Import a module that registers models; raises InputError that says in one line where it fails.
+
+    Args:
+        module: its name, such as package.module; None for nothing.
+        named_by: what named it, for the message.
+    """
+    if module is None:
+        return
     try:
         importlib.import_module(module)
     except InputError:

@@ -17,6 +17,11 @@ def main(arguments: list[str] | None = None) -> int:
     made.add_argument("--host", default="localhost", help="the address to listen on (localhost: this machine only)")
     made.add_argument("--port", type=int, default=8080, help="to listen on, or the next free one (8080)")
     made.add_argument("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
+    made.add_argument(
+        "--model-module",
+        metavar="MODULE",
+        help="that registers the run's model",
+    )
     made.add_argument("--device", default="cpu", help="cpu or cuda")
     asked = made.parse_args(arguments)
     try:
@@ -40,12 +45,14 @@ def serve(asked: argparse.Namespace) -> None:
         raise InputError("the viewer needs viser: pip install 'gsbench[view]'")
     if not 0 < asked.port < 65536:
         raise InputError(f"--port: expected 1 to 65535, got {asked.port}")
+    from gsbench.models.registry import import_models
     from gsbench.run.checks import check_device
     from gsbench.run.load import load_run
     from gsbench.view.viewer import Viewer
 
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # viser's, when a browser leaves
     check_device(asked.device)
+    import_models(asked.model_module)
     viewer = Viewer([load_run(run, asked.device) for run in asked.runs], asked.host, asked.port, asked.data_root)
     for painter in viewer.painters:
         print(f"{painter.run.folder}: {len(painter.run.model)} Gaussians")
