@@ -6,7 +6,8 @@ from collections.abc import Sequence
 import torch
 
 from gsbench.effects.gate import classes_of
-from gsbench.effects.strength import MOST_VIEWS, evenly_spaced
+from gsbench.effects.strength import MOST_VIEWS
+from gsbench.measure.quality import evenly
 from gsbench.models import GaussianModel, Query
 from gsbench.models.classes import DIRECTION
 from gsbench.models.cuts import STILL, shares_of
@@ -27,7 +28,7 @@ def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianMo
     """
     if not isinstance(model, GatedModel) or "direction" not in model.observes:
         return None
-    queries = [Query.of(view.camera, view.time) for view in evenly_spaced(views, MOST_VIEWS)]
+    queries = [Query.of(view.camera, view.time) for view in evenly(views, MOST_VIEWS)]
     weights = shares_of([model.slice(query).opacities for query in queries])
     frozen = model.frozen({name: value.detach() for name, value in model.splats.items()}, queries, weights)
     changed = copy.deepcopy(model)

@@ -30,6 +30,7 @@ from torch import Tensor
 
 from gsbench.kernels.tape import Tape
 from gsbench.lanes import side_by_side
+from gsbench.measure.quality import evenly
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Gaussians3D
 from gsbench.models.cuts import REMOVED, Cut, cuts_of
@@ -80,7 +81,7 @@ def probe(
         by_halves: whether time or direction alone may be frozen.
         hidden: Gaussians that none of all the views shows.
     """
-    looked_at = evenly_spaced(views, most)
+    looked_at = evenly(views, most)
     queries = [Query.of(view.camera, view.time) for view in looked_at]
     lanes = model.backend.lanes(model.splats["means"])
     seen = list(side_by_side(model.slice, queries, lanes))
@@ -111,12 +112,6 @@ def probe(
         unknown = (errors[REMOVED] == 0) if hidden is None else (errors[REMOVED] == 0) & ~hidden
         errors = {name: torch.where(unknown, math.inf, error) for name, error in errors.items()}
     return Strength(cuts, errors, total)
-
-
-def evenly_spaced(views: Sequence[View], most: int) -> list[View]:
-    """Choose at most `most` of the views, evenly spaced."""
-    count = min(len(views), most)
-    return [views[i * len(views) // count] for i in range(count)]
 
 
 class Drawn(NamedTuple):

@@ -28,9 +28,8 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
         temporary.replace(path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        if (
-            isinstance(error, OSError) and error.errno
-        ):  # a disk that is full names no file, and a temporary name says nothing
+        # A disk that is full names no file, and a temporary name says nothing.
+        if isinstance(error, OSError) and error.errno:
             error.filename, error.filename2 = str(path), None
         raise
     if not lasting:

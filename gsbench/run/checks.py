@@ -25,6 +25,7 @@ from gsbench.train.gating import GATES
 from gsbench.train.optim import OPTIMIZERS
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+PACKAGE = "pkg://"  # in front of the module whose files data.root names
 SPLITS = ("test", "val")
 LEAST_GAUSSIANS = 4  # to start from: sizes are those of three neighbours until they are known
 ENDLESS = 10**9  # more than any machine will do
@@ -196,10 +197,10 @@ def data_root(root: str) -> Path:
     """
     if "\0" in root:
         raise InputError(f"data.root: expected a path, got {root!r:.200}")
-    if not root.startswith("pkg://"):
+    if not root.startswith(PACKAGE):
         return Path(root).expanduser()
     try:
-        return Path(str(importlib.resources.files(root.removeprefix("pkg://"))))
+        return Path(str(importlib.resources.files(root.removeprefix(PACKAGE))))
     except (ImportError, ValueError, TypeError) as error:
         raise InputError(f"data.root: expected pkg://MODULE of an installed package, got {root!r}: {error}") from None
 

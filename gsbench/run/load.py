@@ -13,7 +13,7 @@ from gsbench.measure import record as records
 from gsbench.measure.schema import parse
 from gsbench.models import GaussianModel
 from gsbench.models.registry import is_registered
-from gsbench.run.checks import check_values
+from gsbench.run.checks import PACKAGE, check_values
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Scene
 from gsbench.scenes.scene import Points
@@ -21,7 +21,7 @@ from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
 from gsbench.train.draws import generator
 
-PACKAGE, EMBEDDED = "pkg://", "pkg://gsbench.scenes.sample"
+EMBEDDED = f"{PACKAGE}gsbench.scenes.sample"
 MOST_PIXELS = 1 << 16  # a side
 LARGEST_EXTENT = 1e18  # world units: squares stay finite in single precision
 
