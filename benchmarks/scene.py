@@ -9,8 +9,8 @@ from torch import Tensor
 from gsbench.models import GaussianModel, build
 from gsbench.models.factors import KINDS
 from gsbench.models.triangular import TriangularModel
-from gsbench.phase import Phase
 from gsbench.scenes.scene import Points
+from gsbench.schedule import Phase
 
 SIGMA = 0.0083  # median standard deviation along an axis: a mean 3-sigma radius of 5 pixels at 400 x 400
 SPREAD = 0.4  # of its logarithm

@@ -3,8 +3,8 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from gsbench.allocator import keep_freed_memory
-from gsbench.openmp import sleep_when_idle
+from gsbench.process.heap import keep_freed_memory
+from gsbench.process.threads import sleep_when_idle
 
 keep_freed_memory()  # both before anything of gsbench imports torch or the kernels
 sleep_when_idle()

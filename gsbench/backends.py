@@ -24,7 +24,7 @@ class Backend:
         device = tensor.device.type
         return tensor.dtype == torch.float32 and device in self.devices and _built(device)
 
-    def lanes(self, tensor: Tensor) -> int:
+    def workers(self, tensor: Tensor) -> int:
         """Tell how many independent pieces of work on such tensors are worth threads of Python's, side by side.
 
         Only the time of the CPU's kernels is: torch holds Python's lock between its operations, and a GPU does one

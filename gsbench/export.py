@@ -14,11 +14,10 @@ from gsbench.models.query import Query
 from gsbench.models.registry import import_models
 from gsbench.run.checks import check_device, evaluated_views
 from gsbench.run.load import LoadedRun, load_run, scene_of
-from gsbench.scenes import Scene
+from gsbench.scenes import Scene, View
 from gsbench.scenes.trained import ply_of
 from gsbench.view import film, paths
 from gsbench.view.gaussians import trained_of
-from gsbench.view.sights import find_view
 
 PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
 MOST_FRAMES = 100_000
@@ -151,6 +150,21 @@ def shots(asked: Asked) -> list[paths.Shot]:
         return [(camera, None) for camera in cameras]
     times = [i / max(1, count - 1) if options.time is None else options.time for i in range(count)]
     return list(zip(cameras, times, strict=True))
+
+
+def find_view(scene: Scene, name: str) -> View:
+    """Return the view of that name, such as test/r_003, or the training view of that number, from 0.
+
+    Raises:
+        InputError: there is none.
+    """
+    if name.isascii() and name.isdigit() and len(name) < 10 and int(name) < len(scene.train):
+        return scene.train[int(name)]
+    for view in (*scene.train, *scene.val, *scene.test):
+        if view.name == name:
+            return view
+    raise InputError(f"--camera: expected a training view's number, 0 to {len(scene.train) - 1}, or a view's name such "
+                     f"as {scene.train[0].name}, got '{name[:100]}'")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.errors import InputError
-from gsbench.memory import require
+from gsbench.process.memory import require
 
 MAX_JSON = 1 << 26  # bytes; the largest record and the largest transforms_train.json known have less than a million
 

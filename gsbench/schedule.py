@@ -4,9 +4,9 @@ This module needs no torch, so that the page of a report can mark what a schedul
 """
 
 import math
+from dataclasses import dataclass
 
 from gsbench.config import TrainConfig
-from gsbench.phase import Phase
 
 # Some intervals are a number of steps in a run of any length: clones need `densify.every` steps to move apart, so it is
 # not scaled, and Adam needs this many between two resets to raise opacities again at its rate of 0.05.
@@ -18,6 +18,15 @@ MOST_ROUNDS = 36
 
 GATE = 18_000  # the step of the recipe after which the model is gated in training, if densification is over ..
 STEPS_TO_RECOVER = 300  # .. and so many are left: with 120 left of 300, a gated training ended 0.4 dB lower
+
+
+@dataclass(frozen=True)
+class Phase:
+    """The parts of a model that are active at a step of the training."""
+
+    sh_degree: int
+    refine: bool  # AGR moves the parameters and learns
+    tune_modulation: bool  # lambda_t and lambda_d learn
 
 
 class Schedule:

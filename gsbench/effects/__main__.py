@@ -81,7 +81,7 @@ def _gate(folder: Path, budget_db: float, data_root: str | None) -> int:
 
 
 def _draw(folder: Path, camera: int, time: float | None, data_root: str | None, out: Path) -> int:
-    from gsbench.report.pictures import write_png
+    from gsbench.measure.images import write_png
     from gsbench.run.picture import draw_run
 
     write_png(draw_run(folder, camera, time, data_root), out)

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 from gsbench.backends import resolve
 from gsbench.kernels.tape import Tape
-from gsbench.lanes import side_by_side
 from gsbench.models.appearance import sh_basis
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.query import Query, unit
 from gsbench.models.render import rasterize_slice
+from gsbench.process.workers import side_by_side
 from gsbench.scenes import Camera, Points, Scene, View
 from gsbench.scenes.points import frustum_points
 
@@ -46,15 +46,15 @@ def leftovers(views: Sequence[View], scene: Scene, seed: int, backend: str) -> A
               for name, rate in RATES.items()]  # fmt: skip
     adam = torch.optim.Adam(groups, eps=1e-15)
     fitted = [model.splats[name] for name in RATES]
-    lanes = model.backend.lanes(fitted[0])
+    workers = model.backend.workers(fitted[0])
     of_view = partial(_gradients, model, fitted, background)
     for _ in range(STEPS):
         chosen = torch.randint(len(views), (BATCH,), generator=random).tolist()
-        by_view = list(side_by_side(of_view, [views[i] for i in chosen], lanes))
+        by_view = list(side_by_side(of_view, [views[i] for i in chosen], workers))
         for parameter, gradients in zip(fitted, zip(*by_view, strict=True), strict=True):
             parameter.grad = torch.stack(gradients).mean(0)
         adam.step()
-    rows = [gradients[0].flatten() for gradients in side_by_side(of_view, views, lanes)]
+    rows = [gradients[0].flatten() for gradients in side_by_side(of_view, views, workers)]
     matrix = torch.stack(rows).double().cpu().numpy()
     return np.asarray(matrix @ matrix.T)
 

@@ -6,12 +6,12 @@ by the constants of gsbench.effects.gate, black for none, bright yellow for a Ga
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from gsbench.effects.gate import classes_of, cost_of, most_cost
 from gsbench.effects.words import CLASSES
+from gsbench.measure.images import Pixels, inferno, to_bytes
 from gsbench.models import GaussianModel, Query
 from gsbench.models.classes import NAMES
 from gsbench.models.render import rasterize_slice
@@ -30,8 +30,6 @@ GAP = 4  # pixels
 GREY = 200
 LINE = 22  # pixels of a line of text
 COLUMNS = 3
-
-Pixels = npt.NDArray[np.uint8]
 
 
 @torch.no_grad()
@@ -60,8 +58,8 @@ def draw(
         rasterize_slice(seen._replace(colors=colors), camera, behind, model.backend, antialias).image[0]
         for colors, behind in layers
     ]
-    panels = [_bytes(image) for image in images]
-    panels[2] = _heat(panels[2][..., 0])
+    panels = [to_bytes(image.cpu().numpy()) for image in images]
+    panels[2] = inferno(panels[2][..., 0] / 255)
     return _arranged(panels, model.count_classes(), most_cost(model))
 
 
@@ -116,13 +114,3 @@ def _paper(lines: int, width: int) -> Pixels:
 
 def _write(image: Pixels, text: str, x: int, line: int) -> None:
     cv2.putText(image, text, (x, line * LINE + 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
-
-
-def _bytes(image: Tensor) -> Pixels:
-    """Convert an image in [0, 1] to 8 bits."""
-    return np.asarray((image.clamp(0, 1) * 255).round().byte().cpu().numpy(), np.uint8)
-
-
-def _heat(levels: Pixels) -> Pixels:  # [H, W]
-    """Map levels to OpenCV's inferno colours, [H, W, 3] RGB."""
-    return np.asarray(cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), np.uint8)

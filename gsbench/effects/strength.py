@@ -29,13 +29,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbench.kernels.tape import Tape
-from gsbench.lanes import side_by_side
 from gsbench.measure.quality import evenly
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Gaussians3D
 from gsbench.models.cuts import REMOVED, Cut, cuts_of
 from gsbench.models.gated import GatedModel
 from gsbench.models.render import rasterize_slice
+from gsbench.process.workers import side_by_side
 from gsbench.scenes import Camera, View
 
 MOST_VIEWS = 60  # evenly spaced ones stand for more
@@ -83,8 +83,8 @@ def probe(
     """
     looked_at = evenly(views, most)
     queries = [Query.of(view.camera, view.time) for view in looked_at]
-    lanes = model.backend.lanes(model.splats["means"])
-    seen = list(side_by_side(model.slice, queries, lanes))
+    workers = model.backend.workers(model.splats["means"])
+    seen = list(side_by_side(model.slice, queries, workers))
     cuts = cuts_of(model, queries, seen, by_halves)
     random = torch.Generator().manual_seed(seed)
     seeds = torch.randint(2**62, (len(looked_at),), generator=random).tolist()
@@ -104,7 +104,7 @@ def probe(
         return float(residual.square().sum()), [_error(cut, place, drawing) for cut in cuts]
 
     errors, total = {cut.name: torch.zeros_like(seen[0].opacities) for cut in cuts}, 0.0
-    for squared, added in side_by_side(errors_in, range(len(looked_at)), lanes):
+    for squared, added in side_by_side(errors_in, range(len(looked_at)), workers):
         total += squared
         for cut, error in zip(cuts, added, strict=True):
             errors[cut.name] += error

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.headers import ALPHA_MIN
-from gsbench.lanes import side_by_side
 from gsbench.models import GaussianModel, Query
+from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
 
 
@@ -39,8 +39,8 @@ def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
     gap = max((later - earlier for earlier, later in itertools.pairwise(ordered)), default=0.0)
     first = torch.full_like(model.splats["opacities"], math.inf)
     last = -first
-    lanes = model.backend.lanes(first)
-    for time, seen in zip(times, side_by_side(shown, views, lanes), strict=True):
+    workers = model.backend.workers(first)
+    for time, seen in zip(times, side_by_side(shown, views, workers), strict=True):
         first = torch.where(seen, first.clamp(max=time - gap), first)
         last = torch.where(seen, last.clamp(min=time + gap), last)
     return torch.stack([first, last], -1)

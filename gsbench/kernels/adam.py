@@ -6,7 +6,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.library import library_of
 from gsbench.kernels.operation import address, in_rows
-from gsbench.tensors import check_number, check_tensor
+from gsbench.kernels.tensors import check_number, check_tensor
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.library import Slots, allocate, library_of
 from gsbench.kernels.operation import Operation, Tensors, address, in_rows
-from gsbench.tensors import check_number, check_tensor
+from gsbench.kernels.tensors import check_number, check_tensor
 
 
 class _Similarity(Operation):

@@ -15,7 +15,7 @@ from gsbench.errors import InputError
 from gsbench.kernels import tape
 from gsbench.kernels.fields import Gradient, Input, Output, sizes_of
 from gsbench.kernels.library import Slots, allocate, library_of
-from gsbench.tensors import check_tensor
+from gsbench.kernels.tensors import check_tensor
 
 Tensors = list[Tensor]  # an input that is left out is an empty tensor of one dimension
 Sizes = dict[str, int]

@@ -12,7 +12,7 @@ from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.headers import TILE
 from gsbench.kernels.library import Library, allocate, library_of
 from gsbench.kernels.operation import Operation, address, in_rows
-from gsbench.memory import require
+from gsbench.process.memory import require
 
 TILE_PIXELS = TILE * TILE
 MAX_PAIRS = (1 << 31) - 1  # splats, and pairs of a tile and a splat, are numbered by int32

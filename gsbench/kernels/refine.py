@@ -11,7 +11,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.headers import HIDDEN, MAX_NETWORKS, MAX_VALUES
 from gsbench.kernels.library import Slots, allocate, library_of
 from gsbench.kernels.operation import EVERY_ROW, Operation, Tensors, address, first_rows, in_rows
-from gsbench.tensors import check_tensor
+from gsbench.kernels.tensors import check_tensor
 
 
 class _Inputs(NamedTuple):

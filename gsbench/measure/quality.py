@@ -16,11 +16,11 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.tensors import check_number, check_tensor
 from gsbench.measure import perceptual
 from gsbench.measure.perceptual import BACKBONES, BackboneMissing
 from gsbench.measure.record import ViewScore
-from gsbench.memory import require
-from gsbench.tensors import check_number, check_tensor
+from gsbench.process.memory import require
 
 T = TypeVar("T")
 

@@ -136,10 +136,10 @@ class StageClock:
             while self._ended and self._clock.has_passed(self._ended[0][2]):
                 self._add_one()
 
-    def share(self, lanes: list[dict[str, float]], wall: float) -> None:
-        """Add `wall` seconds in which lanes ran side by side, divided among stages as the lanes' own seconds are."""
-        total = sum(sum(seconds.values()) for seconds in lanes) or 1.0
-        for seconds in lanes:
+    def share(self, workers: list[dict[str, float]], wall: float) -> None:
+        """Add `wall` seconds of workers side by side; stages get them in proportion to the workers' own seconds."""
+        total = sum(sum(seconds.values()) for seconds in workers) or 1.0
+        for seconds in workers:
             for name, own in seconds.items():
                 self._seconds[name] = self._seconds.get(name, 0.0) + wall * own / total
 

@@ -18,10 +18,10 @@ from gsbench.models.classes import NAMES, Classes
 from gsbench.models.color_order import ColorOrder
 from gsbench.models.query import Query, unit
 from gsbench.models.refinement import OCTAVES, Refinement
-from gsbench.phase import Phase
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
+from gsbench.schedule import Phase
 
 Raw = dict[str, Tensor]  # raw parameters by name, N rows each
 CHILDREN = 2  # a split leaves two Gaussians ..

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsbench.lanes import side_by_side
 from gsbench.models.base import GaussianModel, Gaussians3D, Raw
 from gsbench.models.classes import Classes
 from gsbench.models.gated import GatedModel
 from gsbench.models.query import Query
+from gsbench.process.workers import side_by_side
 from gsbench.scenes.points import SH_C0
 
 LIVE, SLICED, STILL, REMOVED = "live", "sliced", "still", "removed"
@@ -98,8 +98,8 @@ def _averages(
         colors = [model.paint(moved | {"shN": cut["shN"]}, seen.means, seen.opacities, queries[v]) for cut in cuts]
         return [weight * moved[name] for name in names] + [weight * (seen.colors - less) for less in colors]
 
-    lanes = model.backend.lanes(weights)
-    total = functools.reduce(_add, side_by_side(at, range(len(queries)), lanes))
+    workers = model.backend.workers(weights)
+    total = functools.reduce(_add, side_by_side(at, range(len(queries)), workers))
     return dict(zip(names, total, strict=False)), total[len(names) :]
 
 

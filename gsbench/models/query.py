@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.tensors import check_number, check_tensor
 from gsbench.scenes.scene import Camera
-from gsbench.tensors import check_number, check_tensor
 
 
 class Query(NamedTuple):

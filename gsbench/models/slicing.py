@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
-from gsbench.tensors import check_tensor
+from gsbench.kernels.tensors import check_tensor
 
 SCHEMES = ("square_root", "schur", "cholesky")
 

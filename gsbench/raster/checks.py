@@ -8,8 +8,8 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.operation import MOST_KNOWN
 from gsbench.kernels.raster import LOWER
-from gsbench.memory import require
-from gsbench.tensors import check_tensor
+from gsbench.kernels.tensors import check_tensor
+from gsbench.process.memory import require
 
 _known: set[tuple[object, ...]] = set()  # what was found good: a training asks the same a thousand times
 

@@ -15,7 +15,7 @@ from gsbench.kernels.raster import (
     flag_values,
     project,
 )
-from gsbench.memory import require
+from gsbench.process.memory import require
 from gsbench.raster.checks import check_values
 from gsbench.raster.output import RasterInfo, RasterOutput
 

@@ -16,6 +16,7 @@ from gsbench.effects import picture
 from gsbench.effects.choose import import_compiler
 from gsbench.errors import InputError, one_line
 from gsbench.measure import record as records
+from gsbench.measure.images import Pixels, strip, write_png
 from gsbench.measure.provenance import provenance
 from gsbench.measure.quality import Quality, evaluate, evenly
 from gsbench.measure.record import Cost, Effects, OnDemand, Record, TimeScreen
@@ -24,7 +25,6 @@ from gsbench.measure.speed import Effort, peak_memory, reset_peak_memory, synchr
 from gsbench.models import GaussianModel
 from gsbench.models.replay import Replay
 from gsbench.models.start import start_from
-from gsbench.report.pictures import strip, write_png
 from gsbench.run import progress, stop
 from gsbench.run.auto import is_auto, plain_model, resolve, with_candidate
 from gsbench.run.checks import check_config, check_scene, evaluated_views, lpips_weights, trained_start
@@ -55,7 +55,7 @@ class Attempt:
         self.scene: Scene | None = None
         self.start: TrainedGaussians | None = None  # trained Gaussians to start from; None: points
         self._shown: list[tuple[npt.ArrayLike, npt.ArrayLike]] = []
-        self._classes: picture.Pixels | None = None
+        self._classes: Pixels | None = None
 
     def prepare(self) -> tuple[GaussianModel, Scene]:
         """Check everything that can be refused before step 0, build the model and load the scene.

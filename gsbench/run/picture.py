@@ -4,8 +4,9 @@ from pathlib import Path
 
 import torch
 
-from gsbench.effects.picture import Pixels, draw
+from gsbench.effects.picture import draw
 from gsbench.errors import InputError
+from gsbench.measure.images import Pixels
 from gsbench.run.checks import evaluated_views
 from gsbench.run.load import load_run, scene_of
 

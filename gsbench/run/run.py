@@ -14,7 +14,7 @@ from gsbench.errors import InputError, one_line, printable
 from gsbench.measure import record as records
 from gsbench.measure.atomic import remove_leftovers
 from gsbench.measure.record import Record
-from gsbench.memory import is_out_of_memory
+from gsbench.process.memory import is_out_of_memory
 from gsbench.run import claim
 from gsbench.run.attempt import Attempt
 from gsbench.run.checks import check_folder

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.memory import available, require
+from gsbench.process.memory import available, require
 from gsbench.reading import read_file
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]

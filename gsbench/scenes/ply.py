@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.memory import require
+from gsbench.process.memory import require
 from gsbench.reading import read_file
 
 _TYPES = {

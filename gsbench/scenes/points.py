@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.memory import require
+from gsbench.kernels.tensors import check_number, check_tensor
+from gsbench.process.memory import require
 from gsbench.scenes.ply import read_vertices
 from gsbench.scenes.scene import Camera, Points
-from gsbench.tensors import check_number, check_tensor
 
 SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic Y_00; 3DGS: colour = 0.5 + SH_C0 f_dc
 

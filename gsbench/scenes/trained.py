@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.memory import require
+from gsbench.process.memory import require
 from gsbench.scenes.ply import read_vertices
 
 MAX_DEGREE = 3  # of the harmonics that gsbench's models have; a file may have one more

@@ -7,7 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from gsbench.errors import InputError, one_line, printable
-from gsbench.memory import is_out_of_memory
+from gsbench.process.memory import is_out_of_memory
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsbench.lanes import side_by_side
 from gsbench.measure.quality import psnr
 from gsbench.models import GaussianModel
 from gsbench.models.render import render
+from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
 
 
@@ -32,4 +32,4 @@ class Renderer:
         def of_view(view: View) -> float:
             return psnr(self.image(model, view), view.image)
 
-        return sum(side_by_side(of_view, views, model.backend.lanes(model.splats["means"]))) / len(views)
+        return sum(side_by_side(of_view, views, model.backend.workers(model.splats["means"]))) / len(views)

@@ -14,10 +14,10 @@ from torch import Tensor, nn
 
 from gsbench.errors import InputError
 from gsbench.kernels.tape import Tape, add_to
-from gsbench.lanes import side_by_side
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
+from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
 from gsbench.train.losses import photometric
 from gsbench.train.watch import DivergedError
@@ -71,29 +71,29 @@ class Step:
             InputError: the rasterizer refuses a slice for another reason; TooLargeError: memory would not suffice.
         """
         sources = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
-        lanes = min(len(views), self.model.backend.lanes(self.model.splats["means"]))
+        workers = min(len(views), self.model.backend.workers(self.model.splats["means"]))
         total: Sums = {}
-        if lanes == 1:
+        if workers == 1:
             seen = [self._see(view, sources, total, len(views), self.stages) for view in views]
         else:
-            seen = self._in_lanes(views, sources, total, lanes)
+            seen = self._by_workers(views, sources, total, workers)
         with self.stages("backward"):
             for parameter in sources:
                 parameter.grad = total.get(id(parameter))
         return seen
 
-    def _in_lanes(self, views: Sequence[View], sources: list[nn.Parameter], total: Sums, lanes: int) -> list[Seen]:
-        """Deal the views to lanes: those of the first lane go into `total`, each other into sums of its own."""
+    def _by_workers(self, views: Sequence[View], sources: list[nn.Parameter], total: Sums, workers: int) -> list[Seen]:
+        """Deal the views to workers: those of the first worker go into `total`, each other into sums of its own."""
         started = time.perf_counter()
-        bounds = [len(views) * lane // lanes for lane in range(lanes + 1)]
+        bounds = [len(views) * worker // workers for worker in range(workers + 1)]
         sums = [total if i < bounds[1] else {} for i in range(len(views))]
-        clocks = [StageClock() for _ in range(lanes)]
+        clocks = [StageClock() for _ in range(workers)]
 
-        def run(lane: int) -> list[Seen]:
-            return [self._see(views[i], sources, sums[i], len(views), clocks[lane])
-                    for i in range(bounds[lane], bounds[lane + 1])]  # fmt: skip
+        def run(worker: int) -> list[Seen]:
+            return [self._see(views[i], sources, sums[i], len(views), clocks[worker])
+                    for i in range(bounds[worker], bounds[worker + 1])]  # fmt: skip
 
-        seen = [one for part in side_by_side(run, range(lanes), lanes) for one in part]
+        seen = [one for part in side_by_side(run, range(workers), workers) for one in part]
         for own in sums[bounds[1] :]:
             for key, gradient in own.items():
                 add_to(total, key, gradient)

@@ -6,20 +6,16 @@ from collections.abc import Generator, Iterable
 from pathlib import Path
 
 import cv2
-import numpy as np
-import numpy.typing as npt
 import torch
 from tqdm import tqdm
 
 from gsbench.errors import InputError
+from gsbench.measure.images import Pixels, to_bytes, write_png
 from gsbench.models.render import render
-from gsbench.report.pictures import write_png
 from gsbench.run.load import LoadedRun
 from gsbench.view.paths import Shot
 
 CODEC = "vp09"  # VP9, which browsers play; the encoder comes with OpenCV's wheel, unlike one for H.264
-
-Pixels = npt.NDArray[np.uint8]
 
 
 def frames(run: LoadedRun, shots: list[Shot]) -> Generator[Pixels, None, None]:
@@ -28,12 +24,7 @@ def frames(run: LoadedRun, shots: list[Shot]) -> Generator[Pixels, None, None]:
     with torch.inference_mode(), tqdm(shots, desc=run.scene.name, unit="frame") as bar:
         for camera, time in bar:
             image = render(run.model, camera.to(run.config.device), time, background, run.config.raster.antialias)
-            yield pixels(image)
-
-
-def pixels(image: torch.Tensor) -> Pixels:
-    """Convert an image [H, W, 3] of floats in [0, 1] to 8 bits."""
-    return np.asarray((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
+            yield to_bytes(image.cpu().numpy())
 
 
 def write_video(images: Iterable[Pixels], path: Path, fps: float) -> None:

@@ -5,20 +5,17 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from gsbench.effects.picture import class_colors, cost_colors
+from gsbench.measure.images import Pixels, inferno, to_bytes
 from gsbench.models.query import Query
 from gsbench.models.render import rasterize_slice
-from gsbench.phase import Phase
-from gsbench.report.pictures import inferno
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
-from gsbench.view.film import pixels
+from gsbench.schedule import Phase
 from gsbench.view.stages import RASTER, SLICE, StageWatch, part_of
 
-Pixels = npt.NDArray[np.uint8]
 DIVIDER = (255, 255, 255)  # RGB of the line between two models
 IMAGE, CLASS, COST = COLOURS = ("image", "class", "cost")  # what the colours of the Gaussians may say
 EVERY_DEGREE = 3  # of the harmonics
@@ -79,7 +76,7 @@ class Painter:
     def paint(self, camera: Camera, asked: Asked) -> Frame:
         """Render what a camera sees; raises InputError where it cannot be one."""
         image, ms = self._render(camera, asked)
-        shown = inferno(image[..., 0].cpu().numpy()) if asked.colours == COST else pixels(image)
+        shown = inferno(image[..., 0].cpu().numpy()) if asked.colours == COST else to_bytes(image.cpu().numpy())
         return Frame(shown, (Cost(self.name, ms),))
 
     def image(self, camera: Camera, asked: Asked) -> torch.Tensor:

@@ -8,9 +8,9 @@ import numpy.typing as npt
 import viser
 from scipy.spatial.transform import Rotation
 
+from gsbench.measure.images import to_bytes
 from gsbench.measure.quality import evenly
 from gsbench.scenes import Scene, View
-from gsbench.view.film import pixels
 
 MOST = 100  # frusta; evenly spaced among the training views where there are more
 THUMBNAIL = 96  # pixels of the longer side
@@ -62,7 +62,7 @@ class Frusta:
 
 def thumbnail(view: View) -> npt.NDArray[np.uint8]:
     """Return a view's image as uint8 [H, W, 3] RGB, made smaller where it is large."""
-    image = pixels(view.image)
+    image = to_bytes(view.image.cpu().numpy())
     factor = THUMBNAIL / max(image.shape[:2])
     if factor >= 1:
         return image

@@ -5,16 +5,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from gsbench.measure.images import Pixels, error_image, to_bytes
 from gsbench.measure.quality import psnr, quantise
-from gsbench.report.pictures import error_image
 from gsbench.scenes import Camera, Scene, View
-from gsbench.view.film import pixels
 from gsbench.view.frame import Asked, Painter
 
-Pixels = npt.NDArray[np.uint8]
 SAME = 1e-3  # extents and radians: views that are nearer to one another than that differ in their times only
 MOST_WIDTH = 480  # pixels of an image that is shown; larger ones are made smaller
 
@@ -33,7 +30,7 @@ class Compared(NamedTuple):
     name: str  # of the model
     truth: Pixels  # [H, W, 3] RGB, as the others
     render: Pixels
-    error: Pixels  # in the colours of `gsbench.report.pictures.error_image`
+    error: Pixels  # in the colours of `gsbench.measure.images.error_image`
     psnr: float  # dB, of all pixels
 
 
@@ -76,7 +73,11 @@ def compare(painter: Painter, view: View, asked: Asked) -> Compared:
     shown = quantise(image) if painter.run.config.protocol.quantise else image
     error = error_image(shown.numpy(), view.image.numpy())
     return Compared(
-        painter.name, _small(pixels(view.image)), _small(pixels(shown)), _small(error), psnr(shown, view.image)
+        painter.name,
+        _small(to_bytes(view.image.cpu().numpy())),
+        _small(to_bytes(shown.cpu().numpy())),
+        _small(error),
+        psnr(shown, view.image),
     )
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gsbench.effects.picture import COLOURS
 from gsbench.effects.words import CLASSES
-from gsbench.report.pictures import ERROR_SCALE, inferno
+from gsbench.measure.images import ERROR_SCALE, inferno
 from gsbench.view.controls import Shown
 from gsbench.view.frame import CLASS, COST, Cost
 from gsbench.view.nearest import Compared, Nearest

@@ -13,13 +13,14 @@ from gsbench.effects.__main__ import main
 from gsbench.effects.gate import COLORING, COSTS, LESS_TO_READ, REFINING, SLICING, cost_of, most_cost
 from gsbench.effects.words import CLASSES
 from gsbench.measure import record
+from gsbench.measure.images import Pixels
 from gsbench.models import GaussianModel, build
 from gsbench.models.base import Gaussians3D
 from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes
 from gsbench.models.cuts import STILL
-from gsbench.phase import Phase
 from gsbench.report.page.palette import CLASS_LIKE, LIGHT, MODELS
 from gsbench.scenes import Camera, Points
+from gsbench.schedule import Phase
 
 CAMERA = Camera(torch.eye(4), torch.tensor([[50.0, 0, 50], [0, 50, 10], [0, 0, 1]]), 100, 20)
 CENTRES = (10, 30, 50, 70, 90)  # pixels of five Gaussians, four standard deviations of which are between two
@@ -46,7 +47,7 @@ def one_of_each() -> GaussianModel:
     return five(classes=Classes(1, 4, levels, frozen))
 
 
-def panel(image: picture.Pixels, number: int) -> list[list[int]]:
+def panel(image: Pixels, number: int) -> list[list[int]]:
     """The colours of one panel at the five centres."""
     row = picture.LINE + ENLARGED * 10
     return [image[row, number * (ENLARGED * 100 + picture.GAP) + ENLARGED * x].tolist() for x in CENTRES]

@@ -10,8 +10,8 @@ from gsbench.models import GaussianModel, Query, build
 from gsbench.models.base import Gaussians3D
 from gsbench.models.cuts import Cut, cuts_of
 from gsbench.models.render import rasterize_slice
-from gsbench.phase import Phase
 from gsbench.scenes.scene import Points, View
+from gsbench.schedule import Phase
 
 N, SIZE, VIEWS = 60, 24, 30
 BLACK = torch.zeros(3)

@@ -10,7 +10,7 @@ from tiny_run import ROOT, command, environment, overrides, write_moving_square
 
 from gsbench.errors import InputError
 from gsbench.measure import record
-from gsbench.memory import is_out_of_memory
+from gsbench.process.memory import is_out_of_memory
 from gsbench.scenes import images
 
 

@@ -151,11 +151,11 @@ def test_stages_wait_for_no_device_until_they_are_read(monkeypatch):
     assert waits == [2, 4, 6, 8]
 
 
-def test_lanes_share_the_time_they_took_together():
+def test_workers_share_the_time_they_took_together():
     """Would catch training minutes that are those of all threads added up, and stages that lose what they had."""
     stages = speed.StageClock()
     stages.load_state_dict({"slice": 1.0, "density": 0.5})
-    stages.share([{"slice": 1.0, "raster": 3.0}, {"raster": 2.0, "loss": 2.0}], 4.0)  # 8 s of two lanes in 4
+    stages.share([{"slice": 1.0, "raster": 3.0}, {"raster": 2.0, "loss": 2.0}], 4.0)  # 8 s of two workers in 4
     assert stages.seconds == pytest.approx({"slice": 1.5, "density": 0.5, "raster": 2.5, "loss": 1.0})
     stages.share([{}, {}], 1.0)  # of no stage: nothing is divided by zero
     assert sum(stages.seconds.values()) == pytest.approx(5.5)

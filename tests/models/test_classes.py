@@ -10,7 +10,7 @@ from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Classes
 from gsbench.models.factors import rotation, rotation4d, turn_of_space
 from gsbench.models.triangular import TriangularModel
-from gsbench.phase import Phase
+from gsbench.schedule import Phase
 
 OBSERVING = [name for name in VARIANTS if not name.startswith("3dgs")]
 QUERY = Query.at(CAMERA, 0.45)

@@ -15,9 +15,9 @@ from gsbench.models import Query, build
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.factors import KINDS
 from gsbench.models.query import unit
-from gsbench.phase import Phase
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
+from gsbench.schedule import Phase
 
 # ---- the start
 

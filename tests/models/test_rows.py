@@ -11,7 +11,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import CHILDREN
-from gsbench.phase import Phase
+from gsbench.schedule import Phase
 
 TRIANGULAR = [v for v in VARIANTS if v.startswith(("6dgs", "7dgs")) and "row_scaled" not in v]
 IN_TIME = [v for v in TRIANGULAR if v.startswith("7dgs")]

@@ -11,9 +11,9 @@ from gsbench.models import GaussianModel, Query, build
 from gsbench.models.base import Conditioned, Raw
 from gsbench.models.factors import quaternions_in_space, rotation, rotation4d
 from gsbench.models.start import start_from
-from gsbench.phase import Phase
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
+from gsbench.schedule import Phase
 
 N = 12
 

@@ -8,9 +8,9 @@ from make_golden import make
 
 from gsbench.measure import record as files
 from gsbench.measure.curve import Point
+from gsbench.measure.images import Pixels, strip, write_png
 from gsbench.measure.record import Effects, Gate, OnDemand, Record, TimeScreen, ViewScore
 from gsbench.measure.speed import RenderTimes
-from gsbench.report.pictures import Pixels, strip, write_png
 
 EFFECTS = {
     "3dgs": Effects(False, False, False),

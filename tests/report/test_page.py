@@ -15,6 +15,7 @@ from many_records import EFFECTS, HOSTILE, frontier, hostile, on_demand, write_a
 
 from gsbench.config import TrainConfig
 from gsbench.measure.curve import Point
+from gsbench.measure.images import strip, write_png
 from gsbench.measure.record import Effects, OnDemand, ViewScore
 from gsbench.measure.speed import RenderTimes
 from gsbench.report import compare, live
@@ -26,7 +27,6 @@ from gsbench.report.page import build, cost, evidence, gallery, palette, time_to
 from gsbench.report.page.content import Canvas, Column, Runs, Table
 from gsbench.report.page.events import of as events_of
 from gsbench.report.page.palette import DARK, LIGHT, MARKERS, styles
-from gsbench.report.pictures import strip, write_png
 from gsbench.schedule import Schedule
 
 

@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import FRONT, edit, write_png, write_tiny
 
-from gsbench import memory, scenes
+from gsbench import scenes
 from gsbench.errors import InputError, TooLargeError
+from gsbench.process import memory
 from gsbench.scenes import images
 from gsbench.scenes.sample import folder
 

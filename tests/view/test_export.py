@@ -9,13 +9,14 @@ import pytest
 import torch
 
 from gsbench.export import direction, main
+from gsbench.measure.images import to_bytes
 from gsbench.models import build
 from gsbench.models.render import render
 from gsbench.run.load import load_run
 from gsbench.run.setup import load_scene
 from gsbench.scenes import Points
 from gsbench.scenes.trained import read_trained
-from gsbench.view import film, paths
+from gsbench.view import paths
 
 SHORT = ("--seconds", "0.5", "--fps", "8")
 
@@ -57,7 +58,8 @@ def test_images_are_what_the_model_renders(path: str, folder: Path, tmp_path: Pa
     views = load_scene(run.config).test
     assert len(images) == len(views)
     for image, view in zip(images, views, strict=True):
-        expected = film.pixels(render(run.model, view.camera, view.time, torch.tensor(run.scene.background)))
+        rendered = render(run.model, view.camera, view.time, torch.tensor(run.scene.background))
+        expected = to_bytes(rendered.numpy())
         assert (image[:, :, ::-1] == expected).all()
 
 

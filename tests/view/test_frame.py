@@ -14,16 +14,16 @@ from gsbench.config import Config
 from gsbench.effects import picture
 from gsbench.effects.gate import most_cost
 from gsbench.kernels.library import Library
+from gsbench.measure.images import to_bytes
 from gsbench.models import Query
 from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes
 from gsbench.models.render import rasterize_slice, render
-from gsbench.phase import Phase
 from gsbench.run.load import LoadedRun, SceneDescription
 from gsbench.scenes import Camera
+from gsbench.schedule import Phase
 from gsbench.view import paths
 from gsbench.view.__main__ import main
 from gsbench.view.client import camera_at
-from gsbench.view.film import pixels
 from gsbench.view.frame import CLASS, COST, Asked, Cost, Frame, Painter, beside, wiped
 from gsbench.view.resolution import LEAST_PIXELS, MOST_PIXELS, MOVING_MS, Resolution
 from gsbench.view.stages import RASTER, SLICE, STAGES
@@ -60,7 +60,7 @@ def test_a_frame_is_the_models_image(one: Painter) -> None:
     """Catches a viewer that shows another picture than the one that is measured, and times of zero."""
     camera = seen_from(0.5, one)
     frame = one.paint(camera, Asked(0.4))
-    assert (frame.image == pixels(render(one.run.model, camera, 0.4, torch.zeros(3)))).all()
+    assert (frame.image == to_bytes(render(one.run.model, camera, 0.4, torch.zeros(3)).cpu().numpy())).all()
     assert frame.image.max() > 30
     assert frame.ms(SLICE) > 0
     assert frame.ms(RASTER) > 0
@@ -71,7 +71,7 @@ def test_a_frozen_direction_slices_from_there_and_draws_from_here(one: Painter) 
     here, there = seen_from(0.5, one), seen_from(2.0, one)
     frozen = one.paint(here, Asked(0.4, there.center)).image
     gaussians = one.run.model.slice(Query.at(there.center, 0.4))
-    expected = pixels(rasterize_slice(gaussians, here, torch.zeros(3), AUTO).image[0])
+    expected = to_bytes(rasterize_slice(gaussians, here, torch.zeros(3), AUTO).image[0].cpu().numpy())
     assert (frozen == expected).all()
     assert (frozen != one.paint(here, Asked(0.4)).image).any()
 
@@ -94,7 +94,7 @@ def test_harmonics_are_cut_for_one_frame(one: Painter) -> None:
     assert (one.paint(camera, Asked(0.4)).image == images[2]).all()
     flat = lively("7dgs_agr", count=80).float()
     flat.splats["shN"].data.zero_()
-    assert (pixels(render(flat.requires_grad_(False), camera, 0.4, torch.zeros(3))) == images[0]).all()
+    assert (to_bytes(render(flat.requires_grad_(False), camera, 0.4, torch.zeros(3)).cpu().numpy()) == images[0]).all()
     assert len({image.tobytes() for image in images}) == 3
     early = painter()
     early.trained_phase = replace(early.trained_phase, sh_degree=1)

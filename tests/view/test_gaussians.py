@@ -11,10 +11,10 @@ from plyfile import PlyData
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query
 from gsbench.models.render import render
-from gsbench.phase import Phase
 from gsbench.raster import rasterize
 from gsbench.scenes import Camera
 from gsbench.scenes.trained import ply_of
+from gsbench.schedule import Phase
 from gsbench.view.gaussians import decompose, trained_of
 from gsbench.view.paths import intrinsics, look_at
 

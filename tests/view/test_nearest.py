@@ -7,13 +7,12 @@ import pytest
 import torch
 
 from gsbench.effects.gate import most_cost
+from gsbench.measure.images import error_image, to_bytes
 from gsbench.measure.quality import psnr, quantise
 from gsbench.models.render import render
-from gsbench.report.pictures import error_image
 from gsbench.run.load import load_run, scene_of
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view import paths
-from gsbench.view.film import pixels
 from gsbench.view.frame import Asked, Painter
 from gsbench.view.nearest import MOST_WIDTH, TrainingViews, compare
 
@@ -69,8 +68,8 @@ def test_a_model_is_compared_as_it_is_measured(folder: Path) -> None:
     image = render(run.model, view.camera, view.time, torch.tensor(run.scene.background))
     compared = compare(painter, view, Asked(view.time))
     assert compared.psnr == psnr(image, view.image)
-    assert (compared.truth == pixels(view.image)).all()
-    assert (compared.render == pixels(image)).all()
+    assert (compared.truth == to_bytes(view.image.cpu().numpy())).all()
+    assert (compared.render == to_bytes(image.cpu().numpy())).all()
     assert (compared.error == error_image(image.numpy(), view.image.numpy())).all()
     run.config.protocol.quantise = True
     assert compare(painter, view, Asked(view.time)).psnr == psnr(quantise(image), view.image) != compared.psnr

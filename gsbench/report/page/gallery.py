@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gsbench.measure.images import GAP, HEADER, Pixels
 from gsbench.measure.record import Record
 from gsbench.report.page.content import Image
 from gsbench.report.page.words import cut
-from gsbench.report.pictures import GAP, HEADER, Pixels
 
 FILE_NAME = "pictures.png"
 BUDGET = 900_000  # bytes of all images as text, which leaves the page below 2 MB

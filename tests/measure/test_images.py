@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsbench.errors import InputError
-from gsbench.report import pictures
-from gsbench.report.pictures import ERROR_SCALE, GAP, HEADER
+from gsbench.measure import images as pictures
+from gsbench.measure.images import ERROR_SCALE, GAP, HEADER
 
 
 def cells(picture: np.ndarray, height: int, width: int, row: int = 0) -> list[np.ndarray]:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gsbench.lanes import side_by_side
+from gsbench.process.workers import side_by_side
 
 
 def slowly(item: int) -> tuple[int, int, bool]:
@@ -13,20 +13,20 @@ def slowly(item: int) -> tuple[int, int, bool]:
 
 
 @pytest.mark.usefixtures("threads")
-@pytest.mark.parametrize("lanes", [1, 2, 5])
-def test_results_come_in_the_order_of_the_items(lanes: int) -> None:
-    """Catches results in the order that threads come by, and lanes that compute gradients for a caller without them."""
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_results_come_in_the_order_of_the_items(workers: int) -> None:
+    """Catches results out of order, and workers that compute gradients for a caller without them."""
     torch.set_num_threads(4)
     with torch.no_grad():
-        found = list(side_by_side(slowly, range(40), lanes))
+        found = list(side_by_side(slowly, range(40), workers))
     assert [one[0] for one in found] == list(range(40))
-    assert {one[1] for one in found} == {{1: 4, 2: 2, 5: 1}[lanes]}, "lanes that take more than their share of threads"
+    assert {one[1] for one in found} == {{1: 4, 2: 2, 5: 1}[workers]}, "workers with too many threads"
     assert not any(one[2] for one in found)
     assert torch.get_num_threads() == 4
-    assert all(one[2] for one in side_by_side(slowly, range(2), lanes))
+    assert all(one[2] for one in side_by_side(slowly, range(2), workers))
 
 
-def test_an_error_in_a_lane_is_the_caller_s() -> None:
+def test_an_error_in_a_worker_is_the_caller_s() -> None:
     """Catches a piece of work that fails in silence."""
 
     def fail(item: int) -> int:

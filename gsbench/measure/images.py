@@ -1,4 +1,4 @@
-"""Make image strips for people: a row of render | ground truth | error for each view."""
+"""Turn rendered colours into 8-bit images, error maps and strips (render | ground truth | error); write them as PNG."""
 
 from pathlib import Path
 
@@ -35,7 +35,9 @@ def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
         if image.shape != shape or image.ndim != 3 or shape[2] != 3 or 0 in shape:
             raise InputError(f"strip: expected images [H, W, 3] of one size, got {image.shape} beside {shape}")
     factor = -(-LEAST_WIDTH // shape[1])
-    lines = [_beside([_bytes(render), _bytes(truth), error_image(render, truth)], factor) for render, truth in pairs]
+    lines = [
+        _beside([to_bytes(render), to_bytes(truth), error_image(render, truth)], factor) for render, truth in pairs
+    ]
     gap = np.full((GAP, lines[0].shape[1], 3), GREY, np.uint8)
     picture = [_header(shape[1] * factor)]
     for line in lines:
@@ -51,6 +53,13 @@ def error_image(render: npt.NDArray[np.float32], truth: npt.NDArray[np.float32])
     return shown
 
 
+def to_bytes(image: npt.NDArray[np.float32]) -> Pixels:  # [H, W, 3]
+    """Convert colours from [0, 1], clamped, to 8 bits; NaN, which a diverged model renders, becomes magenta."""
+    shown = (np.clip(np.nan_to_num(image), 0, 1) * 255).round().astype(np.uint8)
+    shown[np.isnan(image).any(-1)] = (255, 0, 255)
+    return shown
+
+
 def inferno(values: npt.NDArray[np.floating]) -> Pixels:  # [H, W]
     """Map values from [0, 1], clamped, to OpenCV's inferno colours, [H, W, 3] RGB."""
     levels = (np.clip(values, 0, 1) * 255).round().astype(np.uint8)
@@ -63,13 +72,6 @@ def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB
     if not done:
         raise InputError(f"{path}: expected an image that PNG can hold, got {image.shape} of {image.dtype}")
     write_atomically(path, data.tobytes())
-
-
-def _bytes(image: npt.NDArray[np.float32]) -> Pixels:
-    """Convert [0, 1] to 8 bits; NaN, which a diverged model renders, becomes magenta."""
-    shown = (np.clip(np.nan_to_num(image), 0, 1) * 255).round().astype(np.uint8)
-    shown[np.isnan(image).any(-1)] = (255, 0, 255)
-    return shown
 
 
 def _beside(images: list[Pixels], factor: int) -> Pixels:

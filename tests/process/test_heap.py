@@ -7,7 +7,7 @@ import sys
 import pytest
 from tiny_run import ROOT
 
-from gsbench.allocator import OPTIONS
+from gsbench.process.heap import OPTIONS
 
 pytestmark = pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="another malloc than glibc's")
 
@@ -36,7 +36,7 @@ def page_faults(imports: str, **variables: str) -> int:
 
 
 @pytest.mark.parametrize("imports", ["gsbench, torch", "torch, gsbench"])
-def test_lanes_get_the_memory_they_freed(imports: str) -> None:
+def test_workers_get_the_memory_they_freed(imports: str) -> None:
     """Catches gradients that are mapped anew in every step: a third of a training at 517,000 Gaussians."""
     assert page_faults(imports) < 0.01 * ALL_ANEW
 

@@ -18,8 +18,8 @@ def keep_freed_memory() -> None:
 
     A step frees some hundred megabytes of gradients and asks for them again, which took a quarter of a step of 4DGS at
     150,000 Gaussians. The heap ("arena") of another thread than the first gives blocks beyond 64 MB back whatever the
-    thresholds are, so the lanes of gsbench.lanes share the first one's: docs/cpu.md has what that is worth. Where there
-    is no glibc, nothing is done.
+    thresholds are, so all workers share the first one's (docs/cpu.md has
+    what that is worth). Where there is no glibc, nothing is done.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None  # musl has none
     if mallopt is None:
