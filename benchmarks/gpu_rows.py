@@ -11,7 +11,7 @@ from benchmarks.compare import Call, Case, Cost, Place, Row, attempted, compared
 from benchmarks.gsplat_way import gsplat_image
 from benchmarks.rows import training_step, useful_alphas
 from benchmarks.scene import camera, gaussians, model
-from gsbench.backends import AUTO, REFERENCE
+from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.raster import backward_by_splat
 from gsbench.models import GaussianModel, Query

@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.scene import camera, gaussians, model
 from gsbench import kernels
-from gsbench.backends import BACKENDS, CPU, REFERENCE
+from gsbench.kernels.backends import BACKENDS, CPU, REFERENCE
 from gsbench.kernels.loss import l1_ssim
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from gsbench.backends import CPU, CUDA, Backend
+from gsbench.kernels.backends import CPU, CUDA, Backend
 from gsbench.run import attempt
 from gsbench.scenes.scene import Camera, View
 from gsbench.train.renderer import Renderer

@@ -16,7 +16,6 @@ FLOORS: tuple[set[str], ...] = (
     {"schedule"},
     {"kernels"},
     {"scenes"},
-    {"backends"},
     {"raster"},
     {"models", "measure"},
     {"effects"},

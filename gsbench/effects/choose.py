@@ -50,7 +50,7 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
     Args:
         scene: its training views are looked at, much reduced.
         seed: of the points and the permutations.
-        backend: renders the static fit; see `gsbench.backends.resolve`.
+        backend: renders the static fit; see `gsbench.kernels.backends.resolve`.
 
     Raises:
         InputError: the scene has no training view.

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from gsbench.backends import resolve
+from gsbench.kernels.backends import resolve
 from gsbench.kernels.tape import Tape
 from gsbench.models.appearance import sh_basis
 from gsbench.models.gaussians3d import Gaussians3DModel

@@ -10,8 +10,8 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from gsbench.backends import AUTO, Backend
 from gsbench.errors import InputError
+from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.colors import show_colors
 from gsbench.models.appearance import sh_colors
 from gsbench.models.classes import NAMES, Classes

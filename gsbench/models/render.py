@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from gsbench.backends import Backend
+from gsbench.kernels.backends import Backend
 from gsbench.models.base import GaussianModel, Gaussians3D
 from gsbench.models.query import Query
 from gsbench.raster import RasterOutput, rasterize

@@ -6,8 +6,8 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from gsbench.backends import resolve
 from gsbench.errors import InputError
+from gsbench.kernels.backends import resolve
 from gsbench.kernels.raster import Viewport
 from gsbench.models.base import GaussianModel
 from gsbench.models.query import Query

@@ -20,7 +20,7 @@ def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], workers:
     Args:
         work: must not write to what another item reads. Gradients are on or off as for the caller.
         items: are all begun as soon as a worker is free, however slowly the results are taken.
-        workers: see `gsbench.backends.Backend.workers`.
+        workers: see `gsbench.kernels.backends.Backend.workers`.
     """
     workers = min(workers, len(items))
     if workers <= 1:

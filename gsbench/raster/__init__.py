@@ -2,8 +2,8 @@
 
 from torch import Tensor
 
-from gsbench.backends import CPU, CUDA, Backend, resolve
 from gsbench.errors import InputError
+from gsbench.kernels.backends import CPU, CUDA, Backend, resolve
 from gsbench.kernels.raster import Viewport
 from gsbench.raster import native, reference
 from gsbench.raster.checks import check_arguments, check_values

@@ -9,9 +9,9 @@ from typing import Any
 
 import torch
 
-from gsbench.backends import resolve
 from gsbench.config import Config, LearningRate
 from gsbench.errors import InputError, did_you_mean, one_line
+from gsbench.kernels.backends import resolve
 from gsbench.measure import perceptual
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import MAX_POINTS

@@ -5,9 +5,9 @@ from typing import Any
 import torch
 
 from gsbench import models, scenes
-from gsbench.backends import resolve
 from gsbench.config import Config
 from gsbench.errors import InputError
+from gsbench.kernels.backends import resolve
 from gsbench.models import GaussianModel
 from gsbench.run.checks import BACKGROUNDS, check_gates, scene_folder
 from gsbench.scenes import Scene

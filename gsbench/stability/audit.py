@@ -10,8 +10,8 @@ from typing import TypeVar
 import torch
 from tqdm import tqdm
 
-from gsbench.backends import resolve
 from gsbench.errors import InputError
+from gsbench.kernels.backends import resolve
 from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS
 from gsbench.stability import colors, curves, pictures, population, slices, trainings

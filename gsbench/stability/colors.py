@@ -8,7 +8,7 @@ import torch
 from mpmath import mpf
 from torch import Generator, Tensor
 
-from gsbench.backends import BACKENDS
+from gsbench.kernels.backends import BACKENDS
 from gsbench.models import Query, build
 from gsbench.stability import oracle
 from gsbench.stability.cases import Case, Cell, case, device_of

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsbench import kernels
-from gsbench.backends import BACKENDS
+from gsbench.kernels.backends import BACKENDS
 from gsbench.measure.speed import synchroniser
 from gsbench.models import Query, build
 from gsbench.models.slicing import SCHEMES

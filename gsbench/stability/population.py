@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from gsbench.backends import BACKENDS
+from gsbench.kernels.backends import BACKENDS
 from gsbench.models import GaussianModel, Query, build
 from gsbench.models.factors import KINDS, Triangle
 from gsbench.models.slicing import subtract

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gsbench.backends import BACKENDS
+from gsbench.kernels.backends import BACKENDS
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import GaussianModel, Query, build
 from gsbench.models.slicing import SCHEMES

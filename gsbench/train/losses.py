@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.backends import AUTO, Backend
+from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.loss import l1_ssim
 
 WINDOW = 11

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gsbench.backends import AUTO
+from gsbench.kernels.backends import AUTO
 from gsbench.models.base import Gaussians3D
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes.scene import Camera, Scene, View, scene_extent

@@ -11,9 +11,9 @@ from test_observe import VARIANTS, assert_same, color_inputs, model_and_raw, rot
 from test_prefixes import SHARES, gradients, kept, spans_around
 from torch import Tensor
 
-from gsbench.backends import AUTO, REFERENCE, Backend
 from gsbench.errors import InputError
 from gsbench.kernels import colors, refine
+from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.appearance import sh_colors, sh_time_colors

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from benchmarks.scene import camera as benchmark_camera
 from benchmarks.scene import model
-from gsbench.backends import CUDA, REFERENCE
 from gsbench.errors import InputError
+from gsbench.kernels.backends import CUDA, REFERENCE
 from gsbench.kernels.raster import Viewport
 from gsbench.models import GaussianModel, Query, replay
 from gsbench.models.render import render

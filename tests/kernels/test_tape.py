@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.scene import camera, model
-from gsbench.backends import CPU
+from gsbench.kernels.backends import CPU
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.slices import observe_still

@@ -9,10 +9,10 @@ import torch
 from cases import case
 from torch import Tensor
 
-from gsbench import backends, kernels
-from gsbench.backends import AUTO, REFERENCE, resolve
+from gsbench import kernels
 from gsbench.errors import InputError
-from gsbench.kernels import cuda
+from gsbench.kernels import backends, cuda
+from gsbench.kernels.backends import AUTO, REFERENCE, resolve
 from gsbench.raster import native, rasterize
 
 TENSORS = {"means": (40, 3), "factors": (40, 3, 3), "opacities": (40,), "colors": (40, 3),

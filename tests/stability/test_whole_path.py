@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsbench.backends import BACKENDS
+from gsbench.kernels.backends import BACKENDS
 from gsbench.models import GaussianModel, Query
 from gsbench.raster import rasterize
 from gsbench.stability import colors, picture_cases, slices  # noqa: F401  # their cases enter the list

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsbench.backends import AUTO, REFERENCE
+from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
 from gsbench.models import Query

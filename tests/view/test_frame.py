@@ -9,10 +9,10 @@ import pytest
 import torch
 from models.small import lively
 
-from gsbench.backends import AUTO, REFERENCE, Backend
 from gsbench.config import Config
 from gsbench.effects import picture
 from gsbench.effects.gate import most_cost
+from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.kernels.library import Library
 from gsbench.measure.images import to_bytes
 from gsbench.models import Query
