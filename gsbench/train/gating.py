@@ -31,6 +31,9 @@ GATES = ("off", "end", "both")
 # makes up for on every scene tried, without AGR and with it (docs/effects.md).
 LOSS_IN_TRAINING = 0.1
 LOSS_WITH_AGR = 0.5
+# A model of fewer Gaussians is not gated in training, for it needs them all: limited to 300 and 600 Gaussians, models of
+# four of five scenes ended 0.2 to 0.5 dB lower on val by that gate (docs/effects.md).
+LEAST_IN_TRAINING = 1_000
 VIEWS_IN_TRAINING = 30  # that the probe looks at: the gate must cost less than it saves
 # AGR's rate is constant, and fewer Gaussians end farther from where its steps swing around: on trex a gated training
 # ended 0.4 dB lower by that (docs/effects.md).
@@ -95,6 +98,10 @@ class Gating:
 
     def in_training(self, step: int) -> None:
         """Gate before a step; what that costs on val at once is bounded by LOSS_WITH_AGR or LOSS_IN_TRAINING."""
+        if len(self.model) < LEAST_IN_TRAINING:
+            self.notes.append(f"at step {step} the model has {len(self.model)} Gaussians: of fewer than "
+                              f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
+            return
         most = LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING
         # Kernels keep the entries of still Gaussians; those of one that is frozen by halves would learn on.
         self._gate(step, most, VIEWS_IN_TRAINING, by_halves=False)

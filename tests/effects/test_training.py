@@ -63,6 +63,7 @@ def assert_same(a: object, b: object) -> None:
 def few_steps_recover(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trainings of a test are short."""
     monkeypatch.setattr("gsbench.schedule.STEPS_TO_RECOVER", 20)
+    monkeypatch.setattr("gsbench.train.gating.LEAST_IN_TRAINING", 10)
 
 
 def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,6 +89,15 @@ def test_off_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = trainer("effects.gate=off")
     end(plain)
     assert plain.model.classes is None
+
+
+def test_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a gate in training of a model that needs all of its Gaussians, and one that is left out in silence."""
+    one = trainer("effects.gate=both")
+    monkeypatch.setattr("gsbench.train.gating.LEAST_IN_TRAINING", len(one.model) * 100)
+    end(one)
+    assert [gate.step for gate in one.gating.gates if gate.step is not None] == []
+    assert "at step 60 the model has" in one.gating.notes[0]
 
 
 def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
