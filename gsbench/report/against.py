@@ -14,8 +14,8 @@ from statistics import fmean, variance
 
 from gsbench.measure.record import Record
 from gsbench.measure.settings import listed, training_differences
-from gsbench.report.arms import OF_THE_MACHINE, QUANTITIES
 from gsbench.report.conditions import printable
+from gsbench.report.configurations import OF_THE_MACHINE, QUANTITIES
 from gsbench.report.intervals import LEVEL, Estimate, Spread, holm
 
 AGREES, DIFFERS, UNTOLD = "agrees", "differs", "cannot be told"
@@ -32,7 +32,7 @@ class Limit:
     relative: bool = True
 
 
-LIMITS = {  # by quantities of gsbench.report.arms, and those below
+LIMITS = {  # by quantities of gsbench.report.configurations, and those below
     "psnr": Limit(0.01, 1.0, relative=False),  # dB
     "seconds": Limit(0.25, 0.5),
     "ms": Limit(0.25, 0.5),
@@ -135,7 +135,7 @@ def compare(ours: Sequence[Record], theirs: Sequence[Record], names: tuple[str, 
         theirs: records of the other.
         names: of the two folders.
     """
-    here, there = _arms(ours), _arms(theirs)
+    here, there = _by_configuration(ours), _by_configuration(theirs)
     rows = [_row(here[key], there[key]) for key in sorted(here.keys() & there.keys())]
     for quantity, limit in LIMITS.items():
         experiments: dict[tuple[str, str], list[Row]] = {}
@@ -151,17 +151,17 @@ def compare(ours: Sequence[Record], theirs: Sequence[Record], names: tuple[str, 
     return Comparison(*names, rows, _missing(here, there), _missing(there, here))
 
 
-Arms = dict[tuple[str, str, str, str, str], dict[int, Record]]
+RunsByConfiguration = dict[tuple[str, str, str, str, str], dict[int, Record]]
 
 
-def _arms(records: Sequence[Record]) -> Arms:
-    found: Arms = {}
+def _by_configuration(records: Sequence[Record]) -> RunsByConfiguration:
+    found: RunsByConfiguration = {}
     for r in records:
         found.setdefault((r.experiment, r.dataset, r.scene, r.model, r.variant), {})[r.seed] = r
     return found
 
 
-def _missing(of: Arms, other: Arms) -> list[str]:
+def _missing(of: RunsByConfiguration, other: RunsByConfiguration) -> list[str]:
     """Name the models on scenes that only one folder has."""
     return [f"{model} {variant}".rstrip() + f" on {scene}" for _, _, scene, model, variant in sorted(of.keys() - other)]
 

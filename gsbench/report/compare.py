@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsbench.report.arms import Arm, Group, Values, is_ablated
+from gsbench.report.configurations import Configuration, Group, Values, is_ablated
 from gsbench.report.family import Family, Tested, Weights
 from gsbench.report.intervals import Estimate
 
@@ -22,8 +22,8 @@ NESTED = ("7dgs_nodir", "7dgs_nodir_agr")  # 7dgs less direction: differ from it
 class Pair:
     """How much better one model is than another at the common variant."""
 
-    better: Arm  # by its mean; by name where they tie
-    other: Arm
+    better: Configuration  # by its mean; by name where they tie
+    other: Configuration
     difference: Estimate  # dB
     improvement: float  # the probability that a run of `better` beats one of `other` on a view they share
     p_holm: float  # of no difference, adjusted for all comparisons of the report; NaN where no spread is known
@@ -58,7 +58,7 @@ def pairs(group: Group, family: Family) -> list[Pair]:
     return sorted(found, key=lambda pair: -pair.difference.mean)
 
 
-def improvement(group: Group, a: Arm, b: Arm) -> float:
+def improvement(group: Group, a: Configuration, b: Configuration) -> float:
     """Return the probability that a run of `a` has a higher PSNR than one of `b` on the same view of the same scene.
 
     Every run of `a` meets every run of `b`; a tie counts half; scenes count equally (Agarwal et al. 2021,
@@ -74,9 +74,9 @@ def improvement(group: Group, a: Arm, b: Arm) -> float:
     return float(np.mean(shares)) if shares else math.nan
 
 
-def _views(group: Group, arm: Arm, scene: str) -> dict[str, Values]:
-    """Return the PSNR of an arm on a scene by view, [seeds]; views that a seed lacks are left out."""
-    runs = [group.scores(r, "psnr") for r in arm.runs[scene]]
+def _views(group: Group, configuration: Configuration, scene: str) -> dict[str, Values]:
+    """Return the PSNR of a configuration on a scene by view, [seeds]; views that a seed lacks are left out."""
+    runs = [group.scores(r, "psnr") for r in configuration.runs[scene]]
     common = set.intersection(*map(set, runs))
     return {view: np.array([scores[view] for scores in runs]) for view in common}
 
@@ -96,7 +96,7 @@ class Price:
 class Cube:
     """The 2 x 2 x 2 of time, direction and AGR, as far as it was run."""
 
-    cells: dict[Cell, Arm]
+    cells: dict[Cell, Configuration]
     prices: list[Price]
     nested: list[Price]  # of effects within one parametrisation, with a model of NESTED in the place of another's
     missing: list[str]  # the cells that no finished run fills, in words
@@ -131,19 +131,24 @@ def cube(group: Group, family: Family) -> Cube:
         and any(own.get(cell) is not cells.get(cell) for cell in weights)
         and (price := _price(family, own, name, weights))
     ]
-    return Cube(cells, prices, nested, missing, left_out, [arm.model for arm in group.main_arms if arm.on_demand])
+    return Cube(cells, prices, nested, missing, left_out, [c.model for c in group.main_configurations if c.on_demand])
 
 
-def _filled(group: Group) -> tuple[dict[Cell, Arm], dict[Cell, Arm], list[str]]:
-    """Return the arm of each cell, the same with the models of NESTED, and the models that another one stands for."""
-    cells: dict[Cell, Arm] = {}
+def _filled(group: Group) -> tuple[dict[Cell, Configuration], dict[Cell, Configuration], list[str]]:
+    """Fill the cells of the cube.
+
+    Returns:
+        The configuration of each cell, the same with the models of NESTED, and the models left out because another
+        model has the same effects.
+    """
+    cells: dict[Cell, Configuration] = {}
     left_out = []
     rank = {name: i for i, name in enumerate(PUBLISHED)}
-    whole = [arm for arm in group.main_arms if not arm.on_demand]
-    for arm in sorted(whole, key=lambda arm: (rank.get(arm.model, len(rank)), arm.model)):
-        if cells.setdefault(_cell(arm), arm) is not arm and arm.model not in NESTED:
-            left_out.append(arm.model)
-    return cells, cells | {_cell(arm): arm for arm in whole if arm.model in NESTED}, left_out
+    whole = [c for c in group.main_configurations if not c.on_demand]
+    for c in sorted(whole, key=lambda c: (rank.get(c.model, len(rank)), c.model)):
+        if cells.setdefault(_cell(c), c) is not c and c.model not in NESTED:
+            left_out.append(c.model)
+    return cells, cells | {_cell(c): c for c in whole if c.model in NESTED}, left_out
 
 
 def is_single(name: str) -> bool:
@@ -151,8 +156,8 @@ def is_single(name: str) -> bool:
     return " × " not in name and MEAN not in name
 
 
-def _cell(arm: Arm) -> Cell:
-    effects = next(iter(arm.runs.values()))[0].effects
+def _cell(configuration: Configuration) -> Cell:
+    effects = next(iter(configuration.runs.values()))[0].effects
     return effects.time, effects.direction, effects.refinement
 
 
@@ -195,7 +200,7 @@ def _weights(
     return weights
 
 
-def _price(family: Family, cells: dict[Cell, Arm], name: str, weights: dict[Cell, float]) -> Price | None:
+def _price(family: Family, cells: dict[Cell, Configuration], name: str, weights: dict[Cell, float]) -> Price | None:
     """Read a contrast in each unit; None where a cell is missing or no scene has all of them."""
     if not weights.keys() <= cells.keys():
         return None
@@ -205,12 +210,12 @@ def _price(family: Family, cells: dict[Cell, Arm], name: str, weights: dict[Cell
         return None
     sign = {True: "+", False: "−"}
     share = "" if abs(sums[0][0]) == 1 else f"{abs(sums[0][0]):g} ("
-    terms = " ".join(f"{sign[w > 0]} {arm.model}" for w, arm in sums).removeprefix("+ ")
+    terms = " ".join(f"{sign[w > 0]} {c.model}" for w, c in sums).removeprefix("+ ")
     costs = {unit: tested.difference for unit, tested in found.items()}
     told = {unit: tested.told for unit, tested in found.items()}
     return Price(name, name.count(" × ") + 1, f"{share}{terms}{')' if share else ''}", costs, told)
 
 
-def _sum(cells: dict[Cell, Arm], weights: dict[Cell, float]) -> Weights:
-    """Return the arms of cells with their weights, those that are added first."""
+def _sum(cells: dict[Cell, Configuration], weights: dict[Cell, float]) -> Weights:
+    """Return the configurations of cells with their weights, those that are added first."""
     return sorted(((w, cells[cell]) for cell, w in weights.items()), key=lambda term: (-term[0], term[1].model))

@@ -1,7 +1,7 @@
 """Gather every comparison that a report makes of an experiment, so that all are adjusted together."""
 
 from gsbench.report import compare, frontier
-from gsbench.report.arms import Group
+from gsbench.report.configurations import Group
 from gsbench.report.family import Family
 
 

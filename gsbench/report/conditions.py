@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import partial
 
 from gsbench.measure.record import Record
-from gsbench.report.arms import without
+from gsbench.report.configurations import without
 
 WARNING = "WARNING"
 MOST_RUNS_NAMED = 3

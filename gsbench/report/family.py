@@ -4,16 +4,16 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from gsbench.report.arms import Arm, Group
+from gsbench.report.configurations import Configuration, Group
 from gsbench.report.intervals import LEVEL, Estimate, estimate, holm
 
-Weights = list[tuple[float, Arm]]  # of a sum of arms, such as one minus another
+Weights = list[tuple[float, Configuration]]  # of a sum of configurations, such as one minus another
 Key = tuple[tuple[str, str, float], ...]
 
 
 @dataclass(frozen=True)
 class Tested:
-    """A contrast of arms with its own interval and with its p-value among all comparisons of the report."""
+    """A contrast of configurations with its own interval and with its p-value among all comparisons of the report."""
 
     difference: Estimate
     p: float  # of no difference, after Holm for the whole family; NaN where no spread is known
@@ -37,8 +37,8 @@ class Family:
 
         Args:
             group: the records.
-            asked: by quantity of `arms.QUANTITIES`, the contrasts; one that is asked for twice, or with the opposite
-                sign, counts once.
+            asked: the contrasts by quantity of `configurations.QUANTITIES`. A contrast that is asked for twice, or
+                with the opposite sign, counts once.
         """
         self._found = {quantity: _tested(group, quantity, contrasts) for quantity, contrasts in asked.items()}
 
@@ -61,7 +61,7 @@ def _tested(group: Group, quantity: str, contrasts: Iterable[Weights]) -> dict[K
     by_key: dict[Key, Weights] = {}
     for weights in contrasts:
         key, sign = _key(weights)
-        by_key[key] = weights if sign > 0 else [(-weight, arm) for weight, arm in weights]
+        by_key[key] = weights if sign > 0 else [(-weight, c) for weight, c in weights]
     found = [estimate(group.contrast(weights, quantity)) for weights in by_key.values()]
     adjusted = holm([difference.p for difference in found])
     return {key: Tested(one, p) for key, one, p in zip(by_key, found, adjusted, strict=True)}
@@ -69,7 +69,7 @@ def _tested(group: Group, quantity: str, contrasts: Iterable[Weights]) -> dict[K
 
 def _key(weights: Weights) -> tuple[Key, float]:
     """Name a contrast whatever the order and the sign of its terms, and return its sign."""
-    terms = sorted((arm.model, arm.variant, weight) for weight, arm in weights)
+    terms = sorted((c.model, c.variant, weight) for weight, c in weights)
     sign = math.copysign(1.0, terms[0][2])
     return tuple((model, variant, sign * weight) for model, variant, weight in terms), sign
 

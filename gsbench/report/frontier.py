@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsbench.report import paper
-from gsbench.report.arms import Arm, Group, Values
+from gsbench.report.configurations import Configuration, Group, Values
 from gsbench.report.family import Family, Weights
 from gsbench.report.intervals import Estimate, estimate
 
@@ -19,9 +19,9 @@ FEWEST_TARGETS = 3  # of a scene
 
 @dataclass(frozen=True)
 class Point:
-    """An arm on a scene, or on the mean of scenes: what it costs and what it reaches."""
+    """A configuration on a scene, or on the mean of scenes: what it costs and what it reaches."""
 
-    arm: Arm
+    configuration: Configuration
     psnr: Estimate  # dB, the evaluated split; the interval is over seeds, on these scenes and views
     val: float  # dB, PSNR on val; NaN where a run does not tell
     cost: dict[str, float]  # by COSTS; NaN where it is missing
@@ -29,18 +29,18 @@ class Point:
     @property
     def series(self) -> str:
         """The frontier that the point belongs to: that of a model, or of a gated one."""
-        return self.arm.series
+        return self.configuration.series
 
 
 def points(group: Group, scenes: list[str]) -> list[Point]:
-    """Return a point for every arm that has finished all of `scenes`, averaged over them."""
+    """Return a point for every configuration that has finished all of `scenes`, averaged over them."""
     found = []
-    for arm in group.arms:
-        psnr = [group.sample(arm, s, "psnr")[:, None] for s in scenes]
+    for configuration in group.configurations:
+        psnr = [group.sample(configuration, s, "psnr")[:, None] for s in scenes]
         if scenes and all(map(len, psnr)):
-            cost = {name: _mean([group.sample(arm, s, name) for s in scenes]) for name in COSTS}
-            val = _mean([group.sample(arm, s, "psnr_val") for s in scenes])
-            found.append(Point(arm, estimate(psnr, generalise=False), val, cost))
+            cost = {name: _mean([group.sample(configuration, s, name) for s in scenes]) for name in COSTS}
+            val = _mean([group.sample(configuration, s, "psnr_val") for s in scenes])
+            found.append(Point(configuration, estimate(psnr, generalise=False), val, cost))
     return found
 
 
@@ -100,7 +100,7 @@ def contest(of: Sequence[Point], cost: str, budget: float) -> list[Point]:
 def contested(of: Sequence[Point]) -> list[Weights]:
     """Return the differences that `choose` asks for, of all BUDGETS."""
     contests = [contest(of, *budget) for budget in BUDGETS]
-    return [[(1.0, found[0].arm), (-1.0, other.arm)] for found in contests for other in found[1:]]
+    return [[(1.0, found[0].configuration), (-1.0, other.configuration)] for found in contests for other in found[1:]]
 
 
 def choose(of: Sequence[Point], cost: str, budget: float, family: Family) -> Choice | None:
@@ -118,7 +118,7 @@ def choose(of: Sequence[Point], cost: str, budget: float, family: Family) -> Cho
     if not found:
         return None
     first, *others = found
-    tested = [(p, family.of([(1.0, first.arm), (-1.0, p.arm)])) for p in others]
+    tested = [(p, family.of([(1.0, first.configuration), (-1.0, p.configuration)])) for p in others]
     return Choice(
         first,
         has_val(of),
@@ -142,24 +142,24 @@ class Target:
 def targets(group: Group) -> list[Target]:
     """Return the targets of every scene and the seconds that the frontier of each model needs for them.
 
-    The seconds are those of the quickest finished arm whose mean over the seeds reaches the target: nothing is
-    interpolated, as a run of another length was not run.
+    The seconds are those of the quickest finished configuration whose mean over the seeds reaches the target. Nothing
+    is interpolated: a run of another length was not done.
     """
     found = []
     for scene in group.scenes:
-        reached: dict[str, list[tuple[float, float]]] = {}  # by model: PSNR on val, seconds of an arm
-        for arm in group.arms:
-            quality, cost = (group.sample(arm, scene, name) for name in ("psnr_val", "seconds"))
+        reached: dict[str, list[tuple[float, float]]] = {}  # by model: PSNR on val, seconds of a configuration
+        for configuration in group.configurations:
+            quality, cost = (group.sample(configuration, scene, name) for name in ("psnr_val", "seconds"))
             if len(quality) and len(cost):
-                reached.setdefault(arm.series, []).append((float(quality.mean()), float(cost.mean())))
-        for rule, psnr in _rules(group, scene, [p for arms in reached.values() for p, _ in arms]):
-            needed = {m: min((s for p, s in arms if p >= psnr), default=math.inf) for m, arms in reached.items()}
+                reached.setdefault(configuration.series, []).append((float(quality.mean()), float(cost.mean())))
+        for rule, psnr in _rules(group, scene, [p for ends in reached.values() for p, _ in ends]):
+            needed = {m: min((s for p, s in ends if p >= psnr), default=math.inf) for m, ends in reached.items()}
             found.append(Target(scene, rule, psnr, needed))
     return found
 
 
 def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, float]]:
-    """Return the targets of a scene: round numbers between the lowest and the highest arm, and the paper's number."""
+    """Return the targets of a scene: round numbers within the range of its configurations, and the paper's number."""
     if not reached:
         return []
     rules = [(f"{psnr:g} dB", psnr) for psnr in round_numbers(min(reached), max(reached))]
@@ -171,8 +171,8 @@ def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, fl
 def round_numbers(low: float, high: float) -> list[float]:
     """Return the multiples of the widest of STEPS of which FEWEST_TARGETS lie above `low` and up to `high`.
 
-    No arm's own PSNR is a target, so none is favoured. Of arms that lie closer than the finest step allows, what lies
-    between.
+    No configuration's own PSNR is a target, so none is favoured. Where the range holds fewer multiples of the finest
+    step, those are returned.
     """
     found: list[float] = []
     for step in STEPS:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsbench.effects.words import CLASSES
 from gsbench.measure.record import Gate, Record
-from gsbench.report.arms import Arm, Group
+from gsbench.report.configurations import Configuration, Group
 from gsbench.report.intervals import Estimate, estimate
 
 REMOVED = "removed"
@@ -20,11 +20,11 @@ DEGREES = 4  # of harmonics: 0, 1, 2, 3
 
 @dataclass(frozen=True)
 class Decided:
-    """What was decided on a scene for the runs of an arm, by means over the seeds."""
+    """What was decided on a scene for the runs of a configuration, by means over the seeds."""
 
     scene: str
-    arm: Arm
-    name: str  # of the arm: as short as tells it from the others here
+    configuration: Configuration
+    name: str  # of the configuration: as short as tells it from the others here
     runs: list[Record]  # those that chose effects, in order of the seeds
     gated: int  # how many of them a gate has changed: the numbers below are theirs
     rows: dict[str, float]  # Gaussians at the end by class, and how many all gates removed
@@ -50,19 +50,19 @@ class Decided:
 
 
 def decided(group: Group) -> list[Decided]:
-    """Return what was decided, by scene and arm; nothing where every Gaussian pays for every effect."""
-    arms = [arm for arm in group.arms if arm.on_demand]
-    shared = Counter(arm.series for arm in arms)
-    names = [arm.series if shared[arm.series] == 1 else arm.name for arm in arms]
+    """Return what was decided, by scene and configuration; nothing where every Gaussian pays for every effect."""
+    configurations = [c for c in group.configurations if c.on_demand]
+    shared = Counter(c.series for c in configurations)
+    names = [c.series if shared[c.series] == 1 else c.name for c in configurations]
     return [
-        _average(group, scene, arm, name, runs)
+        _average(group, scene, configuration, name, runs)
         for scene in group.scenes
-        for arm, name in zip(arms, names, strict=True)
-        if (runs := [r for r in arm.runs.get(scene, []) if r.on_demand])
+        for configuration, name in zip(configurations, names, strict=True)
+        if (runs := [r for r in configuration.runs.get(scene, []) if r.on_demand])
     ]
 
 
-def _average(group: Group, scene: str, arm: Arm, name: str, runs: list[Record]) -> Decided:
+def _average(group: Group, scene: str, configuration: Configuration, name: str, runs: list[Record]) -> Decided:
     gates = [r.on_demand.gates for r in runs if r.on_demand and r.on_demand.gates]
     at_end = [(r, r.on_demand.gates[-1]) for r in runs if r.on_demand and _ends(r.on_demand.gates)]
     evaluated = all(gate.eval_loss_db is not None for _, gate in at_end)
@@ -72,7 +72,7 @@ def _average(group: Group, scene: str, arm: Arm, name: str, runs: list[Record]) 
     kinds = [*CLASSES, REMOVED] if gates else []
     return Decided(
         scene,
-        arm,
+        configuration,
         name,
         runs,
         len(gates),

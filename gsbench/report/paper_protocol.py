@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from gsbench.measure.record import Record
-from gsbench.report.arms import iterations, without
 from gsbench.report.conditions import printable
+from gsbench.report.configurations import iterations, without
 from gsbench.report.paper import PROTOCOLS
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
@@ -15,7 +15,7 @@ MODELS = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
 _NOT_OF_THE_RECIPE = ("iterations", "downscale", "eval_split", "protocol", "best_on_test", "curve_points")
 
 
-class Arm(NamedTuple):
+class ModelRecipe(NamedTuple):
     """What the seeds of a row share beside their scene."""
 
     model: str
@@ -107,21 +107,24 @@ def departure(record: Record) -> str:
     return ", ".join(name for name, (theirs, papers) in expected.items() if theirs != papers)
 
 
-def arm(record: Record) -> Arm:
-    """Return the arm that a run is of."""
-    return Arm(record.model, record.experiment, without(record.variant, *_NOT_OF_THE_RECIPE))
+def model_recipe(record: Record) -> ModelRecipe:
+    """Return the model and recipe of a run."""
+    return ModelRecipe(record.model, record.experiment, without(record.variant, *_NOT_OF_THE_RECIPE))
 
 
-def arms(records: list[Record]) -> list[Arm]:
-    """List the arms of records in the order of MODELS."""
-    return sorted({arm(r) for r in records}, key=lambda one: (MODELS.index(one.model), one))
+def model_recipes(records: list[Record]) -> list[ModelRecipe]:
+    """List the models and recipes of records, in the order of MODELS."""
+    return sorted({model_recipe(r) for r in records}, key=lambda one: (MODELS.index(one.model), one))
 
 
-def finished(records: list[Record], one: Arm, scenes: Sequence[str]) -> dict[str, list[Record]]:
-    """Return the finished runs of an arm by scene, one a seed: that with the best on test, where two differ in it."""
+def finished(records: list[Record], one: ModelRecipe, scenes: Sequence[str]) -> dict[str, list[Record]]:
+    """Return the finished runs of a model and recipe by scene, one for each seed.
+
+    Where two runs of a seed differ in `protocol.best_on_test`, the run that has it counts.
+    """
     found: dict[str, dict[int, Record]] = {}
     for r in sorted(records, key=lambda r: (r.metrics or {}).get("psnr_best_on_test") is not None):
-        if r.status == "ok" and r.scene in scenes and arm(r) == one:
+        if r.status == "ok" and r.scene in scenes and model_recipe(r) == one:
             found.setdefault(r.scene, {})[r.seed] = r
     return {scene: [found[scene][seed] for seed in sorted(found[scene])] for scene in scenes if scene in found}
 

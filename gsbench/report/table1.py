@@ -6,10 +6,10 @@ from typing import Any
 
 from gsbench.measure.record import Record
 from gsbench.report import paper, tables
-from gsbench.report.arms import Group
 from gsbench.report.conditions import conditions, printable
+from gsbench.report.configurations import Group
 from gsbench.report.layout import EMPTY, Column, Row, Section, Table
-from gsbench.report.paper_protocol import MODELS, Arm, Sorted, arm, arms, departure, finished
+from gsbench.report.paper_protocol import MODELS, ModelRecipe, Sorted, departure, finished, model_recipe, model_recipes
 from gsbench.report.seed_means import SPREAD, mean
 from gsbench.report.tables import LEAKS, OF_THE_MACHINE, of_one_machine
 
@@ -53,7 +53,7 @@ def _other_protocol(runs: list[Record]) -> str:
 
 def missing(dataset: str, records: list[Record]) -> str:
     """Say in one line which scenes, models and seeds a data set lacks at the paper's protocol."""
-    own = [r for r in records if r.status == "ok" and not arm(r).recipe]
+    own = [r for r in records if r.status == "ok" and not model_recipe(r).recipe]
     scenes = paper.PROTOCOLS[dataset].scenes
     seeds = {(s, m): len({r.seed for r in own if (r.scene, r.model) == (s, m)}) for s in scenes for m in MODELS}
     none = [s for s in scenes if not any(seeds[s, m] for m in MODELS)]
@@ -84,7 +84,7 @@ class _Builder:
         self.records = records
         self.lines = lines
         self.kind = kind  # "paper", "other protocol" or "other data"
-        self.arms = arms(records)
+        self.recipes = model_recipes(records)
         self.machine = Group(records).machine if records else ""
         self.names_experiment = len({r.experiment for r in records}) > 1
         self.marks: list[str] = []
@@ -100,15 +100,15 @@ class _Builder:
 
     def _scene(self, scene: str) -> Section:
         rows: list[Row] = []
-        for one in self.arms:
+        for one in self.recipes:
             runs = finished(self.records, one, [scene])
             rows += self._rows(scene, one, runs) if runs else []
         lost = [r for r in self.records if r.scene == scene and r.status != "ok"]
-        notes = [f"{self._label(arm(r))} seed {r.seed} {r.status}: {printable(r.reason)}" for r in lost]
+        notes = [f"{self._label(model_recipe(r))} seed {r.seed} {r.status}: {printable(r.reason)}" for r in lost]
         return Section(scene, _with_best(rows), notes)
 
     def _average(self, scenes: list[str]) -> Section:
-        own = [one for one in self.arms if not one.recipe]  # another recipe is often tried on one scene only
+        own = [one for one in self.recipes if not one.recipe]  # another recipe is often tried on one scene only
         runs = {one: found for one in own if (found := finished(self.records, one, scenes))}
         covered = [s for s in scenes if runs and all(s in found for found in runs.values())]
         title = f"average over {len(covered)} of {len(scenes)} scenes"
@@ -119,7 +119,7 @@ class _Builder:
             rows += self._rows("avg", one, {s: found[s] for s in covered})
         return Section(f"{title}: {', '.join(covered)}", _with_best(rows))
 
-    def _rows(self, scene: str, one: Arm, runs: Runs) -> list[Row]:
+    def _rows(self, scene: str, one: ModelRecipe, runs: Runs) -> list[Row]:
         """Make the measured row, the paper's row and their difference; add them to the CSV."""
         here = {s: [r for r in seeds if r.provenance.machine == self.machine] for s, seeds in runs.items()}
         measured = {c.key: mean(here if c.key in OF_THE_MACHINE else runs, c.key) for c in COLUMNS}
@@ -154,7 +154,7 @@ class _Builder:
         values = {c.key: [getattr(row, c.paper) for row in rows] for c in COLUMNS}
         return {key: math.nan if None in given else fmean(given) for key, given in values.items()}
 
-    def _label(self, one: Arm) -> str:
+    def _label(self, one: ModelRecipe) -> str:
         """Name a row: the model, what of its training is not the experiment's own, the experiment where they differ."""
         return " ".join(filter(None, [one.model, one.recipe, f"({one.experiment})" * self.names_experiment]))
 

@@ -7,7 +7,7 @@ from gsbench.measure.record import Record
 from gsbench.report import paper
 from gsbench.report.conditions import conditions, printable
 from gsbench.report.layout import EMPTY, Column, Row, Section, Table
-from gsbench.report.paper_protocol import MODELS, Arm, Sorted, arms, finished
+from gsbench.report.paper_protocol import MODELS, ModelRecipe, Sorted, finished, model_recipes
 from gsbench.report.seed_means import SPREAD, mean
 from gsbench.report.table1 import missing
 from gsbench.report.tables import LEAKS
@@ -75,8 +75,10 @@ def _measured(dataset: str, records: list[Record], lines: list[Line]) -> list[Ro
     """Make a row for every model, without numbers where a scene is not finished."""
     scenes = paper.PROTOCOLS[dataset].scenes
     rows = []
-    found = arms(records)
-    found += [Arm(model, "", "") for model in MODELS if not any((a.model, a.recipe) == (model, "") for a in found)]
+    found = model_recipes(records)
+    found += [
+        ModelRecipe(model, "", "") for model in MODELS if not any((a.model, a.recipe) == (model, "") for a in found)
+    ]
     for one in sorted(found, key=lambda one: (MODELS.index(one.model), one)):
         runs = finished(records, one, scenes)
         label = f"measured: {one.model} {one.recipe}".rstrip()

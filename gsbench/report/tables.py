@@ -13,9 +13,9 @@ from gsbench.measure import record as files
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import METRICS, Record
 from gsbench.report import layout, paper
-from gsbench.report.arms import groups
 from gsbench.report.cells import cell
 from gsbench.report.conditions import conditions, printable
+from gsbench.report.configurations import groups
 from gsbench.report.intervals import over_seeds
 from gsbench.report.layout import EMPTY, Column, Row, Section, Table
 

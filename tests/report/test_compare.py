@@ -9,8 +9,8 @@ from make_golden import make
 from gsbench.measure.record import Effects, ViewScore
 from gsbench.measure.speed import RenderTimes
 from gsbench.report import compare
-from gsbench.report.arms import groups
 from gsbench.report.comparisons import comparisons
+from gsbench.report.configurations import groups
 
 
 def run(model="7dgs", seed=0, views=(25.0, 26.0), scene="suzanne", seconds=90.0, **changes):
@@ -99,7 +99,7 @@ def test_models_that_tie_have_no_difference():
 def test_the_probability_of_improvement_by_hand():
     """Catches pairing by seed alone: runs of a (1, 3) and b (2, 0) on a view: 1 > 0, 3 > 2, 3 > 0 of four are 0.75."""
     pair = group(run("a", 0, (1.0,)), run("a", 1, (3.0,)), run("b", 0, (2.0,)), run("b", 1, (0.0,)))
-    a, b = pair.main_arms
+    a, b = pair.main_configurations
     assert compare.improvement(pair, a, b) == 0.75
     assert compare.improvement(pair, b, a) == 0.25
 

@@ -11,7 +11,7 @@ from test_compare import group, run
 from gsbench.measure.curve import Point
 from gsbench.measure.record import Gate, OnDemand
 from gsbench.report import frontier
-from gsbench.report.arms import psnr_val
+from gsbench.report.configurations import psnr_val
 from gsbench.report.family import Family
 from gsbench.report.frontier import Target
 
@@ -19,11 +19,11 @@ from gsbench.report.frontier import Target
 def choose(runs, cost, budget):
     points = frontier.points(runs, ["suzanne"])
     wanted = frontier.contest(points, cost, budget)
-    weights = [[(1.0, wanted[0].arm), (-1.0, other.arm)] for other in wanted[1:]]
+    weights = [[(1.0, wanted[0].configuration), (-1.0, other.configuration)] for other in wanted[1:]]
     return frontier.choose(points, cost, budget, Family(runs, {"psnr": weights}))
 
 
-def arm(model, variant, psnr, seconds, seeds=(0,), scene="suzanne"):
+def runs_of(model, variant, psnr, seconds, seeds=(0,), scene="suzanne"):
     """Runs of a model at a variant whose PSNR on val is half a dB above that on test."""
     return [
         run(
@@ -43,11 +43,11 @@ def arm(model, variant, psnr, seconds, seeds=(0,), scene="suzanne"):
 def three_lengths():
     """Model a at 10, 20, 40 s, of which 20 is worse than 10; b at 15 s between them, and at 100 s the best."""
     return group(
-        *arm("a", "", 20.0, 10.0),
-        *arm("a", "iterations=2", 19.0, 20.0),
-        *arm("a", "iterations=4", 23.0, 40.0),
-        *arm("b", "", 19.5, 15.0),
-        *arm("b", "iterations=9", 25.0, 100.0),
+        *runs_of("a", "", 20.0, 10.0),
+        *runs_of("a", "iterations=2", 19.0, 20.0),
+        *runs_of("a", "iterations=4", 23.0, 40.0),
+        *runs_of("b", "", 19.5, 15.0),
+        *runs_of("b", "iterations=9", 25.0, 100.0),
     )
 
 
@@ -56,20 +56,20 @@ def test_the_frontier_rises_and_leaves_out_what_is_dominated():
     of = frontier.points(three_lengths(), ["suzanne"])
     a = [p for p in of if p.series == "a"]
     assert [p.cost["seconds"] for p in frontier.frontier(a, "seconds")] == [10.0, 40.0]
-    assert {p.arm.name for p in frontier.beaten(of, "seconds")} == {"a, iterations=2", "b"}
+    assert {p.configuration.name for p in frontier.beaten(of, "seconds")} == {"a, iterations=2", "b"}
     assert frontier.beaten(a[:1], "seconds") == []
 
 
 def test_equal_points_do_not_dominate_each_other():
     """Catches two equal models that are both called dominated."""
-    of = frontier.points(group(*arm("a", "", 20.0, 10.0), *arm("b", "", 20.0, 10.0)), ["suzanne"])
+    of = frontier.points(group(*runs_of("a", "", 20.0, 10.0), *runs_of("b", "", 20.0, 10.0)), ["suzanne"])
     assert frontier.beaten(of, "seconds") == []
     assert len(frontier.frontier(of, "seconds")) == 1
 
 
 def test_a_point_is_the_mean_of_its_scenes():
-    """Catches an arm that has not finished a scene and is averaged over fewer."""
-    runs = group(*arm("a", "", 20.0, 10.0), *arm("a", "", 30.0, 30.0, scene="x"), *arm("b", "", 20.0, 10.0))
+    """Catches a configuration that has not finished a scene and is averaged over fewer."""
+    runs = group(*runs_of("a", "", 20.0, 10.0), *runs_of("a", "", 30.0, 30.0, scene="x"), *runs_of("b", "", 20.0, 10.0))
     (point,) = frontier.points(runs, ["suzanne", "x"])
     assert (point.series, point.psnr.mean, point.cost["seconds"]) == ("a", 25.0, 20.0)
     assert frontier.points(runs, []) == []
@@ -82,12 +82,12 @@ def test_a_budget_buys_the_best_that_costs_at_most_that(budget, expected):
     """Catches a choice over the budget, and one that exists where nothing is cheap enough."""
     runs = three_lengths()
     choice = choose(runs, "seconds", budget)
-    assert (choice and choice.point.arm.name) == expected
+    assert (choice and choice.point.configuration.name) == expected
 
 
 def test_a_choice_is_made_on_val_and_shown_on_test():
-    """Catches the best of many arms chosen by the very number that is shown: a has more on test, b on val."""
-    a, b = arm("a", "", 21.0, 10.0), arm("b", "", 20.0, 10.0)
+    """Catches the best of many configurations chosen by the very number that is shown: a has more on test, b on val."""
+    a, b = runs_of("a", "", 21.0, 10.0), runs_of("b", "", 20.0, 10.0)
     a = [dataclasses.replace(r, curve=[Point(1000, 10.0, 19.0)]) for r in a]
     choice = choose(group(*a, *b), "seconds", 60)
     assert (choice.point.series, choice.point.psnr.mean, choice.on_val) == ("b", 20.0, True)
@@ -98,7 +98,7 @@ def test_a_choice_is_made_on_val_and_shown_on_test():
 
 def test_what_the_gate_at_the_end_cost_on_val_counts():
     """Catches a gated run that is chosen by the PSNR it had before its gate."""
-    (run,) = arm("auto", "", 20.0, 10.0)
+    (run,) = runs_of("auto", "", 20.0, 10.0)
     gate = Gate(0.1, 0.4, 0.3, {}, {}, 2, 1)
     gated = dataclasses.replace(run, on_demand=OnDemand(gates=[dataclasses.replace(gate, step=600), gate]))
     assert psnr_val(run) == 20.5
@@ -107,13 +107,13 @@ def test_what_the_gate_at_the_end_cost_on_val_counts():
 
 def test_a_choice_names_what_it_cannot_be_told_from():
     """Catches a winner by a hundredth of a dB with no word of the other, and a tie claimed from one seed."""
-    near = group(*arm("a", "", 20.0, 10.0, (0, 1, 2)), *arm("b", "", 20.001, 10.0, (0, 1, 2)))
-    (seed,) = near.main_arms[0].runs.values()
+    near = group(*runs_of("a", "", 20.0, 10.0, (0, 1, 2)), *runs_of("b", "", 20.001, 10.0, (0, 1, 2)))
+    (seed,) = near.main_configurations[0].runs.values()
     noisy = [
         dataclasses.replace(r, per_view=[dataclasses.replace(v, psnr=v.psnr + r.seed) for v in r.per_view])
         for r in seed
     ]
-    near = group(*noisy, *arm("b", "", 20.001, 10.0, (0, 1, 2)))
+    near = group(*noisy, *runs_of("b", "", 20.001, 10.0, (0, 1, 2)))
     choice = choose(near, "seconds", 60)
     assert choice.point.series == "b"
     assert [p.series for p in choice.level] == ["a"]
@@ -136,7 +136,7 @@ def test_a_winner_within_the_noise_of_the_seeds_is_not_told_apart():
 
 def test_targets_are_round_numbers_and_never_is_an_answer():
     """Catches an interpolated time, a target on test, and a model that never reaches one but gets a number."""
-    found = {t.rule: t for t in frontier.targets(group(*three_lengths().records, *arm("3dgs", "", 19.0, 5.0)))}
+    found = {t.rule: t for t in frontier.targets(group(*three_lengths().records, *runs_of("3dgs", "", 19.0, 5.0)))}
     assert list(found) == ["20 dB", "22 dB", "24 dB"]
     assert found["20 dB"].psnr == 20.0
     assert found["20 dB"].seconds == {"3dgs": math.inf, "a": 10.0, "b": 15.0}
@@ -145,8 +145,10 @@ def test_targets_are_round_numbers_and_never_is_an_answer():
 
 def test_no_target_is_the_winners_own_mean():
     """Catches targets that only the winner can reach, as they are what its own seeds ended with."""
-    runs = group(*arm("a", "", 19.23, 10.0), *arm("a", "iterations=4", 23.37, 40.0), *arm("b", "", 25.11, 100.0))
-    own = {float(runs.sample(a, "suzanne", "psnr_val").mean()) for a in runs.arms}
+    runs = group(
+        *runs_of("a", "", 19.23, 10.0), *runs_of("a", "iterations=4", 23.37, 40.0), *runs_of("b", "", 25.11, 100.0)
+    )
+    own = {float(runs.sample(a, "suzanne", "psnr_val").mean()) for a in runs.configurations}
     targets = frontier.targets(runs)
     assert [t.psnr for t in targets] == [20.0, 22.0, 24.0]
     assert not {t.psnr for t in targets} & own
@@ -172,14 +174,14 @@ def test_the_papers_number_is_a_target_only_on_its_own_data():
     theirs = {**make().protocol, "paper_dataset": "D-NeRF"}
     for dataset, expected in (("D-NeRF", [30.72]), ("mini", [])):
         runs = [
-            dataclasses.replace(r, dataset=dataset, protocol=theirs) for r in arm("a", "", 31.0, 10.0, scene="trex")
+            dataclasses.replace(r, dataset=dataset, protocol=theirs) for r in runs_of("a", "", 31.0, 10.0, scene="trex")
         ]
         assert [t.psnr for t in frontier.targets(group(*runs)) if "paper" in t.rule] == expected
 
 
 def test_one_run_has_no_target():
     """Catches a target that its own run set, and a crash where nothing finished."""
-    assert frontier.targets(group(*arm("a", "", 20.0, 10.0))) == []
+    assert frontier.targets(group(*runs_of("a", "", 20.0, 10.0))) == []
     lost = run("a", status="failed", reason="no", metrics=None, missing={}, cost=None, per_view=[], curve=[])
     assert frontier.targets(group(lost)) == []
 

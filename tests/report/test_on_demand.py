@@ -14,8 +14,8 @@ from test_page import Page, canvas, group
 from gsbench.measure.record import OnDemand, Record, TimeScreen
 from gsbench.report import compare
 from gsbench.report import frontier as points
-from gsbench.report.arms import groups
 from gsbench.report.comparisons import comparisons
+from gsbench.report.configurations import groups
 from gsbench.report.on_demand import decided
 from gsbench.report.page import build, gallery, words, worth
 from gsbench.report.page import on_demand as page_part

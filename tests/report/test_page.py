@@ -20,8 +20,8 @@ from gsbench.measure.record import Effects, OnDemand, ViewScore
 from gsbench.measure.speed import RenderTimes
 from gsbench.report import compare, live
 from gsbench.report.__main__ import main
-from gsbench.report.arms import groups
 from gsbench.report.comparisons import comparisons
+from gsbench.report.configurations import groups
 from gsbench.report.frontier import choose, points
 from gsbench.report.page import build, cost, evidence, gallery, palette, time_to_quality, words, worth
 from gsbench.report.page.content import Canvas, Column, Runs, Table
@@ -302,7 +302,7 @@ def test_a_point_names_its_run_and_its_command():
     entry = runs.entries[runs.of_record(of, records[1])]
     assert entry["name"] == "mini/suzanne/7dgs/seed1"
     assert entry["command"] == "python -m gsbench +exp=mini model=7dgs scene=suzanne seed=1 train.iterations=1000"
-    entry = runs.entries[runs.of_arm(of, of.arms[0], ["suzanne"])]
+    entry = runs.entries[runs.of_configuration(of, of.configurations[0], ["suzanne"])]
     assert entry["command"].startswith("python -m gsbench -m +exp=mini ")
     assert entry["command"].endswith(" seed=0,1,2")
     odd = dataclasses.replace(records[0], overrides=["scene.name=a b;rm"])

@@ -2,7 +2,7 @@
 
 from gsbench.report.against import AGREES, DIFFERS, RULE, UNTOLD, Comparison
 from gsbench.report.against_table import COLUMNS, lines
-from gsbench.report.arms import Group
+from gsbench.report.configurations import Group
 from gsbench.report.page import words
 from gsbench.report.page.content import Column, Section, Table, Value
 

@@ -12,8 +12,8 @@ from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
 from gsbench.report import layout
 from gsbench.report.against import Comparison
-from gsbench.report.arms import Group, groups
 from gsbench.report.comparisons import comparisons
+from gsbench.report.configurations import Group, groups
 from gsbench.report.family import Family
 from gsbench.report.page import against as other
 from gsbench.report.page import cost, evidence, on_demand, time_to_quality, words, worth

@@ -21,7 +21,7 @@ class Mark:
 
     x: float
     y: float
-    run: int  # the number of the run or arm that it stands for
+    run: int  # the number of the run or configuration that it stands for
     low: float = math.nan
     high: float = math.nan
 

@@ -6,8 +6,8 @@ import io
 from dataclasses import dataclass, field
 
 from gsbench.measure.record import Record
-from gsbench.report.arms import Arm, Group
 from gsbench.report.cells import cell
+from gsbench.report.configurations import Configuration, Group
 from gsbench.report.page import words
 from gsbench.report.page.palette import Style
 
@@ -116,7 +116,7 @@ class Section:
 
 
 class Runs:
-    """Number the runs and arms that points stand for, with what is shown when one is pointed at."""
+    """Number the runs and configurations that points stand for, with what is shown when one is pointed at."""
 
     def __init__(self) -> None:
         self.entries: list[dict[str, str]] = []
@@ -127,14 +127,14 @@ class Runs:
         facts = _facts(*(group.value(record, q) for q in ("psnr", "seconds", "ms", "mb")))
         return self._number((words.run_name(record),), facts, [record])
 
-    def of_arm(self, group: Group, arm: Arm, scenes: list[str]) -> int:
-        """Return the number of the runs of an arm on some scenes, by their means."""
-        runs = [r for s in scenes for r in arm.runs.get(s, [])]
+    def of_configuration(self, group: Group, configuration: Configuration, scenes: list[str]) -> int:
+        """Return the number of the runs of a configuration on some scenes, by their means."""
+        runs = [r for s in scenes for r in configuration.runs.get(s, [])]
         seeds = words.count(len({r.seed for r in runs}), "seed")
         where = scenes[0] if len(scenes) == 1 else f"mean of {words.count(len(scenes), 'scene')}"
-        name = f"{arm.name}, {where}, {seeds}"
+        name = f"{configuration.name}, {where}, {seeds}"
         means = [
-            [s.mean() if len(s := group.sample(arm, scene, q)) else float("nan") for scene in scenes]
+            [s.mean() if len(s := group.sample(configuration, scene, q)) else float("nan") for scene in scenes]
             for q in ("psnr", "seconds", "ms", "mb")
         ]
         facts = _facts(*(sum(m) / len(m) if m else float("nan") for m in means))
@@ -159,7 +159,7 @@ class Canvas:
 
     name: str  # keeps the ids of its drawings apart from those of others
     runs: Runs
-    look: dict[str, Style]  # by `Arm.series`
+    look: dict[str, Style]  # by `Configuration.series`
     scenes: int  # that have drawings of their own
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from gsbench.measure.record import Record
 from gsbench.report import frontier as f
 from gsbench.report import paper
-from gsbench.report.arms import Arm, Group, without
+from gsbench.report.configurations import Configuration, Group, without
 from gsbench.report.family import Family
 from gsbench.report.frontier import Point
 from gsbench.report.page import charts, words
@@ -54,7 +54,7 @@ def basis_words(group: Group, family: Family) -> str:
     if family.size():
         many = words.count(family.size(), "comparison")
         text += f"Models are told apart after Holm's correction for all {many} on this page. "
-    alone = group.variant if len({arm.variant for arm in group.arms}) == 1 else ""
+    alone = group.variant if len({c.variant for c in group.configurations}) == 1 else ""
     text += f"Every run with {alone}. " if alone else ""
     return text + _lengths(points)
 
@@ -74,7 +74,7 @@ def _answer(points: list[Point], family: Family, cost: str, budget: float) -> An
     if choice is None:
         return Answer(title, "", "none fits", "", f"The quickest took {write(min(known))}.")
     point = choice.point
-    detail = f"{_told(point.arm)}{write(point.cost[cost])}. {_compared(choice)}"
+    detail = f"{_told(point.configuration)}{write(point.cost[cost])}. {_compared(choice)}"
     if timed and budget > 2 * max(known):
         detail += f" No run here trained longer than {write(max(known))}."
     return Answer(title, point.series, f"{words.plain(point.psnr.mean)} dB", words.interval(point.psnr), detail)
@@ -102,11 +102,12 @@ def _named(points: list[Point]) -> str:
     return words.listing(names[:MOST_NAMED] + more)
 
 
-def _told(arm: Arm) -> str:
-    """Say what sets an arm apart from the others of its series: its length, and the rest of its variant."""
-    length = f"{arm.iterations:,} iterations, " if arm.iterations else ""
-    told = [name for name, known in (("iterations", length), ("gate", arm.series != arm.model)) if known]
-    rest = without(arm.variant, *told) if arm.name != arm.model else ""
+def _told(configuration: Configuration) -> str:
+    """Say what sets a configuration apart from the others of its series: its length, and the rest of its variant."""
+    length = f"{configuration.iterations:,} iterations, " if configuration.iterations else ""
+    is_gated = configuration.series != configuration.model
+    told = [name for name, known in (("iterations", length), ("gate", is_gated)) if known]
+    rest = without(configuration.variant, *told) if configuration.name != configuration.model else ""
     return length + (f"{rest.replace(',', ', ')}, " if rest else "")
 
 
@@ -115,7 +116,7 @@ def frontier_section(group: Group, canvas: Canvas) -> Section:
     scenes = group.basis
     points = f.points(group, scenes)
     tabs = [_frontier_tab(group, canvas, "f0", _title(scenes), scenes)] if points else []
-    single = [s for s in group.scenes if [s] != scenes and any(s in arm.runs for arm in group.arms)]
+    single = [s for s in group.scenes if [s] != scenes and any(s in c.runs for c in group.configurations)]
     drawn = single[: canvas.scenes]
     tabs += [_frontier_tab(group, canvas, f"f{i}", s, [s]) for i, s in enumerate(drawn, 1)]
     columns = [Column("scene"), Column("model"), Column("variant"), Column("seeds"), Column("PSNR dB", 2)]
@@ -144,8 +145,8 @@ def _rows(group: Group, scenes: list[str]) -> list[list[Value]]:
     return [
         [
             _title(scenes),
-            p.arm.model,
-            p.arm.variant or "none",
+            p.configuration.model,
+            p.configuration.variant or "none",
             p.psnr.seeds,
             p.psnr.mean,
             p.psnr.low,
@@ -171,7 +172,7 @@ def _frontier_tab(group: Group, canvas: Canvas, key: str, label: str, scenes: li
         ]
         drawn = [c for c in curves if c.best]
         if drawn:
-            alt = f"PSNR in dB against {title} of {words.listing([p.arm.name for p in points][:20])}, {label}"
+            alt = f"PSNR in dB against {title} of {words.listing([p.configuration.name for p in points][:20])}, {label}"
             drawings.append(
                 Drawing(f"PSNR against {title}", charts.frontier(drawn, title).svg(canvas.name + key + cost, alt))
             )
@@ -182,13 +183,13 @@ def _curve(group: Group, runs: Runs, style: Style, points: list[Point], cost: st
     """Gather what a panel shows of one model."""
     best = f.frontier(points, cost)
     beaten = [p for p in points if p not in best and not math.isnan(p.cost[cost])]
-    of = {id(p): runs.of_arm(group, p.arm, scenes) for p in points}
+    of = {id(p): runs.of_configuration(group, p.configuration, scenes) for p in points}
     mark = lambda p: charts.Mark(p.cost[cost], p.psnr.mean, of[id(p)], p.psnr.low, p.psnr.high)  # noqa: E731
     single: list[charts.Mark] = []
     theirs: list[charts.Mark] = []
     if len(scenes) == 1:
-        gated = any(p.arm.on_demand for p in points)  # the paper's models are not
-        own = [r for p in points for r in p.arm.runs[scenes[0]]]
+        gated = any(p.configuration.on_demand for p in points)  # the paper's models are not
+        own = [r for p in points for r in p.configuration.runs[scenes[0]]]
         if len(own) > len(points) and len(own) <= MOST_RUNS // max(1, len(group.series)):
             pairs = [(group.value(r, cost), group.value(r, "psnr"), runs.of_record(group, r)) for r in own]
             single = [charts.Mark(x, y, run) for x, y, run in pairs if not math.isnan(x + y)]
@@ -216,7 +217,7 @@ def _frontier_words(group: Group, points: list[Point]) -> list[str]:
     )
     reached = f"{words.plain(best.psnr.mean)} dB ({words.interval(best.psnr)})"
     took = f" in {words.duration(best.cost['seconds'])}" if not math.isnan(best.cost["seconds"]) else ""
-    leads = f"{best.arm.name} is highest on val" if f.has_val(points) else f"{best.arm.name} is highest"
+    leads = f"{best.configuration.name} is highest{' on val' if f.has_val(points) else ''}"
     text = f"{where}, {leads}: it has {reached} on {split}{took}. {_beaten_words(points)}"
     return [text, _lengths(points)]
 
@@ -239,14 +240,14 @@ def _beaten_words(points: list[Point]) -> str:
     rivals = [p for p in timed if p not in beaten and f.beats(p, beaten[0], "seconds")]
     by = min(rivals, key=lambda p: p.cost["seconds"])
     return (
-        f"By their means {beaten[0].arm.name} is beaten by {by.arm.name}, which has at least the PSNR in at most the "
-        "seconds; the difference may be chance."
+        f"By their means {beaten[0].configuration.name} is beaten by {by.configuration.name}, which has at least the "
+        "PSNR in at most the seconds; the difference may be chance."
     )
 
 
 def _lengths(points: list[Point]) -> str:
     """Say of which lengths of training the points are."""
-    lengths = sorted({n for p in points if (n := p.arm.iterations)})
+    lengths = sorted({n for p in points if (n := p.configuration.iterations)})
     if len(lengths) > 1:
         return f"Each point is a finished run: {len(lengths)} lengths, {lengths[0]:,} to {lengths[-1]:,} iterations."
     length = f"{lengths[0]:,} iterations" if lengths else "one length"

@@ -2,8 +2,8 @@
 
 from gsbench.measure.record import Record
 from gsbench.report import layout, tables
-from gsbench.report.arms import Group, iterations
 from gsbench.report.conditions import conditions
+from gsbench.report.configurations import Group, iterations
 from gsbench.report.page import words
 from gsbench.report.page.content import Column, Section, Table, Value
 

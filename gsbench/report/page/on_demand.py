@@ -7,7 +7,7 @@ from statistics import fmean
 
 from gsbench.effects.words import CLASSES, of_decision
 from gsbench.measure.record import Record, TimeScreen
-from gsbench.report.arms import Group
+from gsbench.report.configurations import Group
 from gsbench.report.intervals import Estimate
 from gsbench.report.on_demand import DEGREES, REMOVED, Decided, decided
 from gsbench.report.page import charts, gallery, words
@@ -34,7 +34,7 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> Section | N
     found = decided(group)
     if not found:
         return None
-    common = [one for one in found if one.arm in group.compared] or found
+    common = [one for one in found if one.configuration in group.compared] or found
     said = [_sentence(one) for one in common[:MOST_SAID]]
     if len(found) > len(said):
         said.append(f"These are {len(said)} of {len(found)} scenes and runs; the table has all of them.")
@@ -203,8 +203,8 @@ def _row(one: Decided, machine: str) -> list[Value]:
     rows = [one.rows[name] for name in NAMES] if one.gated else [math.nan] * len(NAMES)
     return [
         one.scene,
-        one.arm.model,
-        one.arm.variant or "none",
+        one.configuration.model,
+        one.configuration.variant or "none",
         len(one.runs),
         ", ".join(f"{decision} {n}" for decision, n in sorted(decisions.items())) or "not asked",
         max(p, default=math.nan),

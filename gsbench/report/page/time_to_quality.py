@@ -4,7 +4,7 @@ import math
 from statistics import fmean
 
 from gsbench.report import frontier as f
-from gsbench.report.arms import Arm, Group
+from gsbench.report.configurations import Configuration, Group
 from gsbench.report.page import charts, events, words
 from gsbench.report.page.content import Canvas, Column, Drawing, Section, Tab, Table, Value
 
@@ -62,17 +62,16 @@ def anytime_section(group: Group, canvas: Canvas) -> Section:
     seen: set[str] = set()
     for i, scene in enumerate(group.scenes):
         curves = []
-        for arm in group.main_arms:
-            if curve := _mean_curve(group, arm, scene):
+        for configuration in group.main_configurations:
+            if curve := _mean_curve(group, configuration, scene):
                 steps, seconds, psnr = curve
-                marks = events.of(arm.runs[scene][0])
+                marks = events.of(configuration.runs[scene][0])
                 seen |= {letter for _, letters in marks for letter in letters}
                 at = [(_when(step, steps, seconds), letters) for step, letters in marks]
-                curves.append(
-                    charts.Anytime(canvas.look[arm.series], seconds, psnr, canvas.runs.of_arm(group, arm, [scene]), at)
-                )
-                rows += [[scene, arm.model, *point] for point in zip(steps, seconds, psnr, strict=True)]
-                tails.setdefault(arm.model, []).append(max(psnr) - psnr[-1])
+                run = canvas.runs.of_configuration(group, configuration, [scene])
+                curves.append(charts.Anytime(canvas.look[configuration.series], seconds, psnr, run, at))
+                rows += [[scene, configuration.model, *point] for point in zip(steps, seconds, psnr, strict=True)]
+                tails.setdefault(configuration.model, []).append(max(psnr) - psnr[-1])
         if curves and i < max(1, canvas.scenes):
             alt = f"PSNR on val against training seconds on {scene}, one curve for each of {len(curves)} models"
             drawings.append(Drawing(scene, charts.anytime(curves).svg(f"{canvas.name}a{i}", alt)))
@@ -90,11 +89,13 @@ def anytime_section(group: Group, canvas: Canvas) -> Section:
     )
 
 
-def _mean_curve(group: Group, arm: Arm, scene: str) -> tuple[list[int], list[float], list[float]] | None:
+def _mean_curve(
+    group: Group, configuration: Configuration, scene: str
+) -> tuple[list[int], list[float], list[float]] | None:
     """Return iterations, mean seconds and mean PSNR over the seeds, at the iterations that all of them measured."""
     seeds = [
         {p.iteration: p for p in r.curve if p.psnr_val is not None}
-        for r in arm.runs.get(scene, [])
+        for r in configuration.runs.get(scene, [])
         if not math.isnan(group.value(r, "seconds"))
     ]
     steps = sorted(set.intersection(*map(set, seeds))) if seeds else []

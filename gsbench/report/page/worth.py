@@ -5,8 +5,8 @@ from dataclasses import replace
 from statistics import fmean
 
 from gsbench.report import compare
-from gsbench.report.arms import Group
 from gsbench.report.compare import Cube, Pair, Price
+from gsbench.report.configurations import Group
 from gsbench.report.family import Family
 from gsbench.report.page import charts, words
 from gsbench.report.page.content import Canvas, Column, Drawing, Section, Swatch, Tab, Table, Value
@@ -33,7 +33,7 @@ def effects_section(group: Group, family: Family, canvas: Canvas) -> Section:
         notes.append(f"Left out, as another model has the same effects: {words.listing(cube.left_out)}.")
     if cube.on_demand:
         notes.append(f"Left out, as their Gaussians keep only the effects that pay: {words.listing(cube.on_demand)}.")
-    if {"4dgs", "7dgs_noagr"} <= {arm.model for arm in cube.cells.values()}:
+    if {"4dgs", "7dgs_noagr"} <= {c.model for c in cube.cells.values()}:
         notes.append(f"{PARAMETRISATION} {NESTED if cube.nested else NOT_NESTED}")
     if not cube.prices:
         text = "No two finished models differ in one effect alone, so no effect can be priced."
@@ -116,7 +116,7 @@ def _effect_words(cube: Cube) -> list[str]:
 
 def stages_section(group: Group, canvas: Canvas) -> Section:
     """Draw where the seconds of training go, by stage."""
-    parts = {arm.model: found for arm in group.main_arms if (found := _stage_seconds(group, arm.model))}
+    parts = {c.model: found for c in group.main_configurations if (found := _stage_seconds(group, c.model))}
     if not parts:
         return Section("stages", "Where the seconds go", ["No finished run tells its seconds by stage."])
     every = {name for stages in parts.values() for name in stages}
@@ -165,9 +165,9 @@ def _slowest_words(parts: dict[str, dict[str, float]], names: list[str]) -> str:
 
 def _stage_seconds(group: Group, model: str) -> dict[str, float]:
     """Return the mean seconds of each of STAGES over scenes and seeds, and those of all else."""
-    (arm,) = (arm for arm in group.main_arms if arm.model == model)
-    scenes = [s for s in group.covered or arm.runs if s in arm.runs]
-    runs = [[r for r in arm.runs[s] if r.cost and not math.isnan(group.value(r, "seconds"))] for s in scenes]
+    (configuration,) = (c for c in group.main_configurations if c.model == model)
+    scenes = [s for s in group.covered or configuration.runs if s in configuration.runs]
+    runs = [[r for r in configuration.runs[s] if r.cost and not math.isnan(group.value(r, "seconds"))] for s in scenes]
     if not runs or not all(runs):
         return {}
     costs = [[r.cost for r in seeds if r.cost] for seeds in runs]

@@ -1,6 +1,7 @@
 """Group the records of an experiment by model, variant and scene, and read quantities from them.
 
-An arm is a model with a variant (another length, another capacity): what its seeds repeat, and one point of a frontier.
+A configuration is a model with a variant, such as another length or capacity. Its runs differ only in scene and seed;
+on a frontier it is one point.
 """
 
 import math
@@ -43,7 +44,7 @@ OF_THE_MACHINE = ("seconds", "cpu_s", "ms")  # quantities that compare only betw
 
 
 @dataclass(frozen=True)
-class Arm:
+class Configuration:
     """The finished runs of a model at one variant."""
 
     model: str
@@ -96,7 +97,7 @@ class Group:
         return sorted({r.model for r in self.records})
 
     @cached_property
-    def arms(self) -> list[Arm]:
+    def configurations(self) -> list[Configuration]:
         """The models with their variants that finished somewhere, by name; without a variant first."""
         runs: dict[tuple[str, str], dict[str, list[Record]]] = {}
         for r in self.finished:
@@ -104,7 +105,7 @@ class Group:
         several = len({variant for _, variant in runs}) > 1
         names = {(m, v): f"{m}, {v}" if v and several else m for m, v in runs}
         series = {(r.model, r.variant): self.series_of(r) for r in self.finished}
-        return [Arm(m, v, scenes, names[m, v], series[m, v]) for (m, v), scenes in sorted(runs.items())]
+        return [Configuration(m, v, scenes, names[m, v], series[m, v]) for (m, v), scenes in sorted(runs.items())]
 
     @cached_property
     def series(self) -> list[str]:
@@ -127,34 +128,42 @@ class Group:
     @cached_property
     def variant(self) -> str:
         """The variant at which models are compared: the one that most of them share, first what is not ablated."""
-        shared = Counter(arm.variant for arm in self.arms)
+        shared = Counter(c.variant for c in self.configurations)
         return min(shared, key=lambda variant: (-shared[variant], is_ablated(variant), variant), default="")
 
     @cached_property
-    def main_arms(self) -> list[Arm]:
-        """The arm of every model at the common variant."""
-        return [arm for arm in self.arms if arm.variant == self.variant]
+    def main_configurations(self) -> list[Configuration]:
+        """The configuration of every model at the common variant."""
+        return [c for c in self.configurations if c.variant == self.variant]
 
     @cached_property
-    def compared(self) -> list[Arm]:
-        """The arms that are told apart in pairs: those at the common variant but for their gates and ablations."""
-        return [arm for arm in self.arms if _common(arm.variant) == _common(self.variant)]
+    def compared(self) -> list[Configuration]:
+        """The configurations that are compared in pairs.
 
-    def label(self, arm: Arm) -> str:
-        """Name an arm among the compared ones: its model, and in brackets a variant that is not the common one."""
-        return arm.model if arm.variant == self.variant else f"{arm.model} ({arm.variant or 'default'})"
+        Their variants equal the common one, apart from gates and ablations.
+        """
+        return [c for c in self.configurations if _common(c.variant) == _common(self.variant)]
+
+    def label(self, configuration: Configuration) -> str:
+        """Name a compared configuration: its model, and in brackets its variant where it is not the common one."""
+        model, variant = configuration.model, configuration.variant
+        return model if variant == self.variant else f"{model} ({variant or 'default'})"
 
     @cached_property
     def covered(self) -> list[str]:
         """The scenes that every model has finished at the common variant, over which averages are taken."""
-        return [s for s in self.scenes if self.main_arms and all(s in arm.runs for arm in self.main_arms)]
+        main = self.main_configurations
+        return [s for s in self.scenes if main and all(s in c.runs for c in main)]
 
     @cached_property
     def basis(self) -> list[str]:
-        """The scenes that answers are means of: the covered ones, or where there are none the one with most arms."""
-        if self.covered or not self.arms:
+        """The scenes over which answers are averaged.
+
+        These are the covered scenes; where there are none, the scene with most configurations.
+        """
+        if self.covered or not self.configurations:
             return self.covered
-        return [max(self.scenes, key=lambda s: sum(s in arm.runs for arm in self.arms))]
+        return [max(self.scenes, key=lambda s: sum(s in c.runs for c in self.configurations))]
 
     @cached_property
     def machine(self) -> str:
@@ -172,23 +181,23 @@ class Group:
             return math.nan
         return QUANTITIES[quantity](record)
 
-    def sample(self, arm: Arm, scene: str, quantity: str) -> Values:
-        """Return a quantity of an arm's runs on a scene, [seeds], without the missing ones."""
-        values = np.array([self.value(r, quantity) for r in arm.runs.get(scene, [])])
+    def sample(self, configuration: Configuration, scene: str, quantity: str) -> Values:
+        """Return a quantity of a configuration's runs on a scene, [seeds], without the missing ones."""
+        values = np.array([self.value(r, quantity) for r in configuration.runs.get(scene, [])])
         return values[np.isfinite(values)]
 
-    def contrast(self, weights: list[tuple[float, Arm]], quantity: str) -> list[Values]:
-        """Return a weighted sum of arms, paired: for each scene that all of them have, [seeds, views].
+    def contrast(self, weights: list[tuple[float, Configuration]], quantity: str) -> list[Values]:
+        """Return a paired weighted sum of configurations, [seeds, views] for each scene that all of them have.
 
-        Only seeds and views that all arms have on the scene count. PSNR is paired view by view; other quantities, and
-        PSNR of records without views, have one column.
+        Only the seeds and views count that all configurations have on the scene. PSNR is paired view by view. Other
+        quantities, and PSNR of records without views, have one column.
         """
-        scenes = [s for s in self.scenes if all(s in arm.runs for _, arm in weights)]
+        scenes = [s for s in self.scenes if all(s in c.runs for _, c in weights)]
         return [paired for s in scenes if (paired := self._paired(weights, s, quantity)).size]
 
-    def _paired(self, weights: list[tuple[float, Arm]], scene: str, quantity: str) -> Values:
-        """Return the weighted sum on one scene, [seeds, views], empty where the arms share no seed or no view."""
-        by_seed = [{r.seed: s for r in arm.runs[scene] if (s := self.scores(r, quantity))} for _, arm in weights]
+    def _paired(self, weights: list[tuple[float, Configuration]], scene: str, quantity: str) -> Values:
+        """Return the weighted sum on one scene, [seeds, views]; it is empty where no seed or no view is shared."""
+        by_seed = [{r.seed: s for r in c.runs[scene] if (s := self.scores(r, quantity))} for _, c in weights]
         seeds = sorted(set.intersection(*map(set, by_seed)))
         every = [scores[seed] for scores in by_seed for seed in seeds]
         views = sorted(set.intersection(*map(set, every))) if every else []
