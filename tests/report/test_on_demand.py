@@ -17,7 +17,7 @@ from gsbench.report import frontier as points
 from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import groups
 from gsbench.report.on_demand import decided
-from gsbench.report.page import build, gallery, words, worth
+from gsbench.report.page import build, gallery, messages, worth
 from gsbench.report.page import on_demand as page_part
 from gsbench.report.page.palette import MODELS, styles
 
@@ -253,7 +253,7 @@ def test_nothing_is_measured_where_nothing_was_chosen():
 
 def test_a_change_that_rounds_to_nothing_has_no_sign():
     """Catches a minus before zero."""
-    assert [words.signed(x) for x in (-0.001, 0.0, 0.001, -0.01, 0.01)] == ["0.00", "0.00", "0.00", "−0.01", "+0.01"]
+    assert [messages.signed(x) for x in (-0.001, 0.0, 0.001, -0.01, 0.01)] == ["0.00", "0.00", "0.00", "−0.01", "+0.01"]
 
 
 def test_the_command_line_for_a_gated_run_names_it(tmp_path):

@@ -23,7 +23,7 @@ from gsbench.report.__main__ import main
 from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import groups
 from gsbench.report.frontier import choose, points
-from gsbench.report.page import build, cost, evidence, gallery, palette, time_to_quality, words, worth
+from gsbench.report.page import build, cost, evidence, gallery, messages, palette, time_to_quality, worth
 from gsbench.report.page.content import Canvas, Column, Runs, Table
 from gsbench.report.page.events import of as events_of
 from gsbench.report.page.palette import DARK, LIGHT, MARKERS, styles
@@ -131,7 +131,7 @@ def test_sentences_of_one_seed():
     """Catches an interval or a p-value that one seed cannot give."""
     records = frontier(seeds=1)
     (_, minute, *_) = answers(records)
-    assert minute.interval == words.NO_SPREAD
+    assert minute.interval == messages.NO_SPREAD
     assert "One seed: whether it is ahead is not known." in minute.detail
     said = pairs_section(records)
     assert said.sentences[0].startswith("No spread is known from one seed.")
@@ -265,7 +265,7 @@ def test_the_best_value_is_the_tables():
     records = frontier(("3dgs", "7dgs"), lengths=(250, 1000))
     section = cost.frontier_section(group(records), canvas())
     best = max(row[4] for row in section.table.rows if row[0] == "mean of 2 scenes")
-    assert words.plain(best) in section.sentences[0]
+    assert messages.plain(best) in section.sentences[0]
     csv = base64.b64decode(section.table.href.partition(",")[2]).decode()
     assert repr(best) in csv
     assert len(csv.splitlines()) == len(section.table.rows) + 1
@@ -306,8 +306,8 @@ def test_a_point_names_its_run_and_its_command():
     assert entry["command"].startswith("python -m gsbench -m +exp=mini ")
     assert entry["command"].endswith(" seed=0,1,2")
     odd = dataclasses.replace(records[0], overrides=["scene.name=a b;rm"])
-    assert words.command([odd]) == "python -m gsbench 'scene.name=a b;rm'"
-    assert words.command([make()]) == ""
+    assert messages.command([odd]) == "python -m gsbench 'scene.name=a b;rm'"
+    assert messages.command([make()]) == ""
 
 
 def test_hostile_texts_stay_text(tmp_path):
@@ -369,7 +369,7 @@ def test_prices_within_one_parametrisation_are_said_beside_the_others():
     assert worth.NESTED in " ".join(section.notes)
     assert any(said.startswith("Direction, with time, within one parametrisation: ") for said in section.sentences)
     assert {"direction, with time", "direction, with time, nested"} <= {row[0] for row in section.table.rows}
-    assert words.sentence("with AGR") == "With AGR"
+    assert messages.sentence("with AGR") == "With AGR"
 
 
 def test_colours_are_readable_in_both_themes():

@@ -3,7 +3,7 @@
 from gsbench.report.against import AGREES, DIFFERS, RULE, UNTOLD, Comparison
 from gsbench.report.against_table import COLUMNS, lines
 from gsbench.report.configurations import Group
-from gsbench.report.page import words
+from gsbench.report.page import messages
 from gsbench.report.page.content import Column, Section, Table, Value
 
 LONGEST = 400  # characters of the line
@@ -16,11 +16,11 @@ def against_section(comparison: Comparison, group: Group) -> Section:
     rows: list[list[Value]] = [
         [row.scene, line.label, *(line.cells[c.key] for c in COLUMNS)] for row in own for line in lines(row)
     ]
-    said = [words.cut(comparison.line, LONGEST)]
-    ours, theirs = (words.cut(name, 80) for name in (comparison.ours, comparison.theirs))
+    said = [messages.shorten(comparison.line, LONGEST)]
+    ours, theirs = (messages.shorten(name, 80) for name in (comparison.ours, comparison.theirs))
     if own:
         counts = [f"{v} in {sum(r.judged['psnr'].verdict == v for r in own)}" for v in (AGREES, DIFFERS, UNTOLD)]
-        said.append(f"PSNR {', '.join(counts)} of {words.count(len(own), 'row')} here. Cells are {ours} / {theirs}.")
+        said.append(f"PSNR {', '.join(counts)} of {messages.count(len(own), 'row')} here. Cells are {ours} / {theirs}.")
     return Section(
         "against", f"Against {theirs}", said, table=Table("against.csv", columns, rows) if own else None, notes=[RULE]
     )

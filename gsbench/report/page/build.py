@@ -16,7 +16,7 @@ from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import Group, groups
 from gsbench.report.family import Family
 from gsbench.report.page import against as other
-from gsbench.report.page import cost, evidence, on_demand, time_to_quality, words, worth
+from gsbench.report.page import cost, evidence, messages, on_demand, time_to_quality, worth
 from gsbench.report.page.content import Canvas, Runs, Section, Table
 from gsbench.report.page.gallery import View, gallery
 from gsbench.report.page.palette import DARK, LIGHT, STAGES_DARK, STAGES_LIGHT, Style, styles
@@ -90,12 +90,12 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"safe_svg": Markup, "cut": words.cut, "asdict": asdict}
+    environment.filters |= {"safe_svg": Markup, "shorten": messages.shorten, "asdict": asdict}
     return environment.get_template("page.html.j2").render(
-        title=words.cut(folder.resolve().name, 80) or "results",
+        title=messages.shorten(folder.resolve().name, 80) or "results",
         chapters=chapters,
         runs=runs.entries,
-        faults=[words.cut(fault) for fault in faults[:MOST_FAULTS]],
+        faults=[messages.shorten(fault) for fault in faults[:MOST_FAULTS]],
         more_faults=max(0, len(faults) - MOST_FAULTS),
         reload=reload,
         light=_variables(LIGHT, STAGES_LIGHT),
@@ -118,13 +118,13 @@ def _variables(models: tuple[str, ...], stages: tuple[str, ...]) -> Markup:
 
 
 def _chapter(group: Group, folder: Path, canvas: Canvas) -> Chapter:
-    counts = [words.count(n, what) for n, what in ((len(group.records), "run"), (len(group.models), "model"))]
+    counts = [messages.count(n, what) for n, what in ((len(group.records), "run"), (len(group.models), "model"))]
     family = comparisons(group)
-    counts += [words.count(len(group.scenes), "scene"), words.count(len({r.seed for r in group.records}), "seed")]
+    counts += [messages.count(len(group.scenes), "scene"), messages.count(len({r.seed for r in group.records}), "seed")]
     return Chapter(
         key=canvas.name,
-        title=f"experiment {group.experiment}, data {words.cut(group.dataset, 60)}",
-        summary=" · ".join([*counts, words.cut(group.machine, 80)]),
+        title=f"experiment {group.experiment}, data {messages.shorten(group.dataset, 60)}",
+        summary=" · ".join([*counts, messages.shorten(group.machine, 80)]),
         answers=cost.answers(group, family),
         basis=cost.basis_words(group, family),
         sections=_sections(group, family, folder, canvas),

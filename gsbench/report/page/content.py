@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from gsbench.measure.record import Record
 from gsbench.report.cells import cell
 from gsbench.report.configurations import Configuration, Group
-from gsbench.report.page import words
+from gsbench.report.page import messages
 from gsbench.report.page.palette import Style
 
 Value = str | float | int | None
@@ -61,8 +61,10 @@ def show(value: Value, column: Column) -> str:
     if value is None:
         return "–"
     if isinstance(value, float):
-        return "never" if value == float("inf") else words.plain(value, 3 if column.digits is None else column.digits)
-    return f"{value:,}" if isinstance(value, int) else words.cut(value)
+        return (
+            "never" if value == float("inf") else messages.plain(value, 3 if column.digits is None else column.digits)
+        )
+    return f"{value:,}" if isinstance(value, int) else messages.shorten(value)
 
 
 @dataclass(frozen=True)
@@ -125,13 +127,13 @@ class Runs:
     def of_record(self, group: Group, record: Record) -> int:
         """Return the number of a single run."""
         facts = _facts(*(group.value(record, q) for q in ("psnr", "seconds", "ms", "mb")))
-        return self._number((words.run_name(record),), facts, [record])
+        return self._number((messages.run_name(record),), facts, [record])
 
     def of_configuration(self, group: Group, configuration: Configuration, scenes: list[str]) -> int:
         """Return the number of the runs of a configuration on some scenes, by their means."""
         runs = [r for s in scenes for r in configuration.runs.get(s, [])]
-        seeds = words.count(len({r.seed for r in runs}), "seed")
-        where = scenes[0] if len(scenes) == 1 else f"mean of {words.count(len(scenes), 'scene')}"
+        seeds = messages.count(len({r.seed for r in runs}), "seed")
+        where = scenes[0] if len(scenes) == 1 else f"mean of {messages.count(len(scenes), 'scene')}"
         name = f"{configuration.name}, {where}, {seeds}"
         means = [
             [s.mean() if len(s := group.sample(configuration, scene, q)) else float("nan") for scene in scenes]
@@ -148,8 +150,8 @@ class Runs:
     def _number(self, key: tuple[str, ...], facts: str, records: list[Record]) -> int:
         if key not in self._numbers:
             self._numbers[key] = len(self.entries)
-            command = words.command(records) if records else ""
-            self.entries.append({"name": words.cut(key[-1], 160), "facts": facts, "command": command})
+            command = messages.command(records) if records else ""
+            self.entries.append({"name": messages.shorten(key[-1], 160), "facts": facts, "command": command})
         return self._numbers[key]
 
 
@@ -166,8 +168,8 @@ class Canvas:
 def _facts(psnr: float, seconds: float, ms: float, mb: float) -> str:
     """Write what a point has reached and cost, without what is not known."""
     known = [
-        (psnr, f"{words.plain(psnr)} dB"),
-        (seconds, words.duration(seconds)),
-        (ms, f"{words.plain(ms)} ms a frame"),
+        (psnr, f"{messages.plain(psnr)} dB"),
+        (seconds, messages.duration(seconds)),
+        (ms, f"{messages.plain(ms)} ms a frame"),
     ]
-    return " · ".join(text for value, text in [*known, (mb, f"{words.plain(mb, 1)} MB")] if value == value)
+    return " · ".join(text for value, text in [*known, (mb, f"{messages.plain(mb, 1)} MB")] if value == value)

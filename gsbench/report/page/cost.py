@@ -9,7 +9,7 @@ from gsbench.report import paper
 from gsbench.report.configurations import Configuration, Group, without
 from gsbench.report.family import Family
 from gsbench.report.frontier import Point
-from gsbench.report.page import charts, words
+from gsbench.report.page import charts, messages
 from gsbench.report.page.content import Canvas, Column, Drawing, Runs, Section, Tab, Table, Value
 from gsbench.report.page.palette import Style
 
@@ -52,7 +52,7 @@ def basis_words(group: Group, family: Family) -> str:
     if split == "val" or not f.has_val(points):
         text += "The same views choose and show, so the highest PSNR is a little too high. "
     if family.size():
-        many = words.count(family.size(), "comparison")
+        many = messages.count(family.size(), "comparison")
         text += f"Models are told apart after Holm's correction for all {many} on this page. "
     alone = group.variant if len({c.variant for c in group.configurations}) == 1 else ""
     text += f"Every run with {alone}. " if alone else ""
@@ -60,16 +60,16 @@ def basis_words(group: Group, family: Family) -> str:
 
 
 def _split(group: Group) -> str:
-    return words.cut(group.finished[0].protocol.get("eval_split", "evaluated"), 20)
+    return messages.shorten(group.finished[0].protocol.get("eval_split", "evaluated"), 20)
 
 
 def _answer(points: list[Point], family: Family, cost: str, budget: float) -> Answer:
     timed = cost == "seconds"
-    title = f"{words.budget(budget)} of training" if timed else f"{1000 / budget:g} frames a second"
+    title = f"{messages.budget(budget)} of training" if timed else f"{1000 / budget:g} frames a second"
     known = [p.cost[cost] for p in points if not math.isnan(p.cost[cost])]
     if not known:
         return Answer(title, "", "not measured", "", "No finished run tells.")
-    write = words.duration if timed else lambda ms: f"{words.plain(ms)} ms a frame"
+    write = messages.duration if timed else lambda ms: f"{messages.plain(ms)} ms a frame"
     choice = f.choose(points, cost, budget, family)
     if choice is None:
         return Answer(title, "", "none fits", "", f"The quickest took {write(min(known))}.")
@@ -77,7 +77,7 @@ def _answer(points: list[Point], family: Family, cost: str, budget: float) -> An
     detail = f"{_told(point.configuration)}{write(point.cost[cost])}. {_compared(choice)}"
     if timed and budget > 2 * max(known):
         detail += f" No run here trained longer than {write(max(known))}."
-    return Answer(title, point.series, f"{words.plain(point.psnr.mean)} dB", words.interval(point.psnr), detail)
+    return Answer(title, point.series, f"{messages.plain(point.psnr.mean)} dB", messages.interval(point.psnr), detail)
 
 
 def _compared(choice: f.Choice) -> str:
@@ -89,7 +89,7 @@ def _compared(choice: f.Choice) -> str:
         return "One seed: whether it is ahead is not known."
     if len(choice.ahead) == others:
         return f"Ahead of {choice.ahead[0].series}." if others == 1 else "Ahead of every other model that fits."
-    said = [f"Ahead of {len(choice.ahead)} of {words.count(others, 'other model')}."] if choice.ahead else []
+    said = [f"Ahead of {len(choice.ahead)} of {messages.count(others, 'other model')}."] if choice.ahead else []
     said += [f"Not told apart from {_named(choice.level)}."] if choice.level else []
     said += [f"On the views shown {_named(choice.behind)} did better."] if choice.behind else []
     said += [f"No spread is known of the difference to {_named(choice.unknown)}."] if choice.unknown else []
@@ -99,7 +99,7 @@ def _compared(choice: f.Choice) -> str:
 def _named(points: list[Point]) -> str:
     names = [p.series for p in points]
     more = [f"{len(names) - MOST_NAMED} more"] if len(names) > MOST_NAMED else []
-    return words.listing(names[:MOST_NAMED] + more)
+    return messages.listing(names[:MOST_NAMED] + more)
 
 
 def _told(configuration: Configuration) -> str:
@@ -172,7 +172,7 @@ def _frontier_tab(group: Group, canvas: Canvas, key: str, label: str, scenes: li
         ]
         drawn = [c for c in curves if c.best]
         if drawn:
-            alt = f"PSNR in dB against {title} of {words.listing([p.configuration.name for p in points][:20])}, {label}"
+            alt = f"PSNR in dB against {title} of {messages.listing([p.configuration.name for p in points][:20])}, {label}"
             drawings.append(
                 Drawing(f"PSNR against {title}", charts.frontier(drawn, title).svg(canvas.name + key + cost, alt))
             )
@@ -213,10 +213,12 @@ def _frontier_words(group: Group, points: list[Point]) -> list[str]:
         return ["No run has finished, so there is nothing to compare."]
     best, scenes, split = f.ranked(points)[0], group.basis, _split(group)
     where = (
-        f"On {scenes[0]}" if len(scenes) == 1 else f"On the mean of {len(scenes)} scenes ({words.listing(scenes[:6])})"
+        f"On {scenes[0]}"
+        if len(scenes) == 1
+        else f"On the mean of {len(scenes)} scenes ({messages.listing(scenes[:6])})"
     )
-    reached = f"{words.plain(best.psnr.mean)} dB ({words.interval(best.psnr)})"
-    took = f" in {words.duration(best.cost['seconds'])}" if not math.isnan(best.cost["seconds"]) else ""
+    reached = f"{messages.plain(best.psnr.mean)} dB ({messages.interval(best.psnr)})"
+    took = f" in {messages.duration(best.cost['seconds'])}" if not math.isnan(best.cost["seconds"]) else ""
     leads = f"{best.configuration.name} is highest{' on val' if f.has_val(points) else ''}"
     text = f"{where}, {leads}: it has {reached} on {split}{took}. {_beaten_words(points)}"
     return [text, _lengths(points)]

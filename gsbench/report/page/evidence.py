@@ -4,7 +4,7 @@ from gsbench.measure.record import Record
 from gsbench.report import layout, tables
 from gsbench.report.conditions import conditions
 from gsbench.report.configurations import Group, iterations
-from gsbench.report.page import words
+from gsbench.report.page import messages
 from gsbench.report.page.content import Column, Section, Table, Value
 
 LONGEST_NOTE = 700
@@ -27,23 +27,25 @@ def protocol_section(group: Group) -> Section:
     columns += [Column("commit"), Column("command")]
     rows: list[list[Value]] = [
         [
-            words.run_name(r),
+            messages.run_name(r),
             r.status,
             *(group.value(r, q) for q in ("psnr", "seconds", "cpu_s", "load", "ms", "mb")),
             iterations(r),
             r.provenance.machine,
             r.provenance.git_commit,
-            words.command([r]) or "not in its record",
+            messages.command([r]) or "not in its record",
         ]
         for r in group.records
     ]
-    notes = [words.cut(note, LONGEST_NOTE) for note in conditions(_compared(group))]
+    notes = [messages.shorten(note, LONGEST_NOTE) for note in conditions(_compared(group))]
     if group.elsewhere:
-        left = f"Seconds, ms and FPS of {words.count(group.elsewhere, 'run')} on other machines are left out everywhere"
-        notes.insert(0, f"{left}; this is of {words.cut(group.machine, 200)}.")
-    ended = words.count(len(group.finished), "run")
+        left = (
+            f"Seconds, ms and FPS of {messages.count(group.elsewhere, 'run')} on other machines are left out everywhere"
+        )
+        notes.insert(0, f"{left}; this is of {messages.shorten(group.machine, 200)}.")
+    ended = messages.count(len(group.finished), "run")
     lost = len(group.records) - len(group.finished)
-    said = [f"{ended} finished, {words.count(lost, 'run')} did not (below)." if lost else f"All {ended} finished."]
+    said = [f"{ended} finished, {messages.count(lost, 'run')} did not (below)." if lost else f"All {ended} finished."]
     return Section("protocol", "Protocol, machine, seeds", said, table=Table("runs.csv", columns, rows), notes=notes)
 
 
@@ -51,5 +53,5 @@ def failures(group: Group) -> Table | None:
     """List the runs that did not finish and why."""
     lost = [r for r in group.records if r.status != "ok"]
     columns = [Column("run"), Column("status"), Column("reason")]
-    rows: list[list[Value]] = [[words.run_name(r), r.status, words.cut(r.reason, 2000)] for r in lost]
+    rows: list[list[Value]] = [[messages.run_name(r), r.status, messages.shorten(r.reason, 2000)] for r in lost]
     return Table("not_finished.csv", columns, rows) if lost else None

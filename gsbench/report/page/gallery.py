@@ -1,4 +1,4 @@
-"""Cut the image strips beside the records into images small enough to be part of the page."""
+"""StripRow the image strips beside the records into images small enough to be part of the page."""
 
 import base64
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import numpy as np
 from gsbench.measure.images import GAP, HEADER, Pixels
 from gsbench.measure.record import Record
 from gsbench.report.page.content import Image
-from gsbench.report.page.words import cut
+from gsbench.report.page.messages import shorten
 
 FILE_NAME = "pictures.png"
 BUDGET = 900_000  # bytes of all images as text, which leaves the page below 2 MB
@@ -32,7 +32,7 @@ class View:
     height: int
 
 
-Cut = tuple[Pixels, Pixels, Pixels]  # render, truth, error
+StripRow = tuple[Pixels, Pixels, Pixels]  # render, truth, error
 
 
 def gallery(records: list[Record], folder: Path) -> list[View]:
@@ -50,10 +50,10 @@ def gallery(records: list[Record], folder: Path) -> list[View]:
     return shown
 
 
-def _strips(records: list[Record], folder: Path) -> dict[str, dict[str, tuple[Record, list[Cut]]]]:
+def _strips(records: list[Record], folder: Path) -> dict[str, dict[str, tuple[Record, list[StripRow]]]]:
     """Find, by scene and model, the record and the cut strip of the first seed that has one."""
     at = places(folder, FILE_NAME)
-    found: dict[str, dict[str, tuple[Record, list[Cut]]]] = {}
+    found: dict[str, dict[str, tuple[Record, list[StripRow]]]] = {}
     for r in sorted(records, key=lambda r: r.seed):
         path = at.get(r.path)
         models = found.setdefault(r.scene, {})
@@ -86,8 +86,8 @@ def _image(caption: str, image: Pixels, quality: int) -> Image:
     return Image(caption, _encode(image, IMAGE_SIDE, quality), image.shape[1], image.shape[0])
 
 
-def cut_strip(path: Path) -> list[Cut]:
-    """Cut a strip into its rows of (render, truth, error), enlarged pixels made single again; nothing if it is none."""
+def cut_strip(path: Path) -> list[StripRow]:
+    """StripRow a strip into its rows of (render, truth, error), enlarged pixels made single again; nothing if it is none."""
     data = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if data is None:
         return []
@@ -126,7 +126,9 @@ def _blocks(image: Pixels, factor: int) -> bool:
     return bool((small.repeat(factor, 0).repeat(factor, 1) == image).all())
 
 
-def _views(scene: str, models: dict[str, tuple[Record, list[Cut]]], side: int, quality: int, most: int) -> list[View]:
+def _views(
+    scene: str, models: dict[str, tuple[Record, list[StripRow]]], side: int, quality: int, most: int
+) -> list[View]:
     """Encode the views that every model's strip has."""
     shown = []
     shared = min(len(rows) for _, rows in models.values())
@@ -147,7 +149,7 @@ def _names(record: Record, rows: int) -> list[str]:
     """Name the rows of a strip: it shows evenly spaced views of those that were evaluated."""
     views = [view.name for view in record.per_view]
     step = max(1, len(views) // max(1, rows))
-    spaced = [cut(name, 60) for name in views[::step][:rows]]
+    spaced = [shorten(name, 60) for name in views[::step][:rows]]
     return [*spaced, *(f"view {i + 1}" for i in range(len(spaced), rows))]
 
 

@@ -10,7 +10,7 @@ from gsbench.measure.record import Record, TimeScreen
 from gsbench.report.configurations import Group
 from gsbench.report.intervals import Estimate
 from gsbench.report.on_demand import DEGREES, REMOVED, Decided, decided
-from gsbench.report.page import charts, gallery, words
+from gsbench.report.page import charts, gallery, messages
 from gsbench.report.page.content import Canvas, Column, Drawing, Image, Section, Swatch, Tab, Table, Value
 from gsbench.report.page.palette import CLASS_LIKE, MODELS
 from gsbench.report.page.svg import LINE, model_colour, stage_colour
@@ -66,11 +66,14 @@ def _screen_words(runs: list[Record]) -> str:
     if not screens:
         return ""
     first = screens[0]
-    text = words.cut(f"{of_decision(first)}, as {first.reason}", LONGEST_REASON)
+    text = messages.shorten(f"{of_decision(first)}, as {first.reason}", LONGEST_REASON)
     others = Counter(screen.decision for screen in screens if screen.decision != first.decision)
     if others:
-        parts = [f"{words.cut(decision, 20)} with {words.count(n, 'seed')}" for decision, n in sorted(others.items())]
-        text += f"; {words.listing(parts)}"
+        parts = [
+            f"{messages.shorten(decision, 20)} with {messages.count(n, 'seed')}"
+            for decision, n in sorted(others.items())
+        ]
+        text += f"; {messages.listing(parts)}"
     elif len(screens) > 1:
         text += f"; the same with all {len(screens)} seeds"
     return f"{text}."
@@ -88,22 +91,22 @@ def _gate_words(one: Decided) -> list[str]:
     share = f" ({100 * one.left / one.before:.0f} %)" if one.before else ""
     where = "" if one.gated == len(one.runs) else f" On {one.gated} of {len(one.runs)} seeds:"
     text = f"{where} Of {one.before:,.0f} Gaussians the gates left {one.left:,.0f}{share}"
-    said = [(f"{text}: {words.listing(kept)}." if kept else f"{text}.").strip()]
+    said = [(f"{text}: {messages.listing(kept)}." if kept else f"{text}.").strip()]
     if one.asleep > 0:
         moves = 100 * (1 - one.asleep)
         said.append(f"At any one time AGR moves {moves:.0f} % of its Gaussians; the others cannot be seen then.")
     if one.psnr.scenes:
-        text = f"The gate at the end changed PSNR on {words.cut(one.views, 40)} by {_change(one.psnr, 'dB', 3)}"
+        text = f"The gate at the end changed PSNR on {messages.shorten(one.views, 40)} by {_change(one.psnr, 'dB', 3)}"
         if one.ms.scenes:
-            text += f" and a frame of {words.plain(one.ms_before)} ms by {_change(one.ms, 'ms', 2)}"
-        said.append(f"{text}." if one.psnr.over else f"{text}; {words.NO_SPREAD}.")
+            text += f" and a frame of {messages.plain(one.ms_before)} ms by {_change(one.ms, 'ms', 2)}"
+        said.append(f"{text}." if one.psnr.over else f"{text}; {messages.NO_SPREAD}.")
     return said
 
 
 def _change(of: Estimate, unit: str, digits: int) -> str:
     """Write a change with its interval, where there is one."""
-    interval = f" ({words.interval(of, digits, sign=True)})" if of.over else ""
-    return f"{words.signed(of.mean, digits)} {unit}{interval}"
+    interval = f" ({messages.interval(of, digits, sign=True)})" if of.over else ""
+    return f"{messages.signed(of.mean, digits)} {unit}{interval}"
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
@@ -112,10 +115,10 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
     for one in found:
         for run in one.runs:
             for note in run.on_demand.notes if run.on_demand else []:
-                named.setdefault(f"{one.scene}, {one.name}, §: {words.cut(note)}", []).append(run.seed)
+                named.setdefault(f"{one.scene}, {one.name}, §: {messages.shorten(note)}", []).append(run.seed)
     notes = []
     for text, seeds in named.items():
-        which = f"seed{'' if len(seeds) == 1 else 's'} {words.listing([str(seed) for seed in seeds[:5]])}"
+        which = f"seed{'' if len(seeds) == 1 else 's'} {messages.listing([str(seed) for seed in seeds[:5]])}"
         notes.append(text.replace("§", which, 1))
     more = [f"and {len(notes) - MOST_NOTES} more notes."] if len(notes) > MOST_NOTES else []
     if gated > MOST_BARS:
@@ -131,14 +134,14 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
 
 def _drawings(gated: list[Decided], canvas: Canvas) -> list[Drawing]:
     """Draw a bar of classes and a bar of degrees for each scene and model."""
-    label = lambda one: words.middle(f"{one.scene}, {one.name}", LONGEST_LABEL, LABEL_END)  # noqa: E731
+    label = lambda one: messages.shorten_middle(f"{one.scene}, {one.name}", LONGEST_LABEL, LABEL_END)  # noqa: E731
     classes = [
         charts.Bar(label(one), _shares([one.rows[name] for name in NAMES]), f"{one.left:,.0f} of {one.before:,.0f}")
         for one in gated
     ]
     degrees = [charts.Bar(label(one), _shares(one.degrees), f"mean degree {_mean_degree(one)}") for one in gated]
     colours = [model_colour(MODELS.index(CLASS_LIKE[name])) for name in CLASSES]
-    whose = words.listing([bar.label for bar in classes])
+    whose = messages.listing([bar.label for bar in classes])
     drawn = (
         ("Gaussians by class, of those before the gates", "k", classes, [*colours, LINE]),
         ("Harmonics by degree, of the Gaussians left", "d", degrees, [stage_colour(_stage(i)) for i in range(DEGREES)]),
@@ -162,7 +165,7 @@ def _shares(values: list[float]) -> list[float]:
 
 def _mean_degree(one: Decided) -> str:
     total = sum(one.degrees)
-    return words.plain(sum(i * n for i, n in enumerate(one.degrees)) / total if total else math.nan, 1)
+    return messages.plain(sum(i * n for i, n in enumerate(one.degrees)) / total if total else math.nan, 1)
 
 
 def _swatches() -> list[Swatch]:

@@ -5,7 +5,7 @@ from statistics import fmean
 
 from gsbench.report import frontier as f
 from gsbench.report.configurations import Configuration, Group
-from gsbench.report.page import charts, events, words
+from gsbench.report.page import charts, events, messages
 from gsbench.report.page.content import Canvas, Column, Drawing, Section, Tab, Table, Value
 
 
@@ -18,7 +18,7 @@ def quality_section(group: Group, canvas: Canvas) -> Section:
     ratios = f.profile(targets)
     problems = len(next(iter(ratios.values()), []))
     panel = charts.profile({m: (canvas.look[m], list(values)) for m, values in ratios.items()}, problems)
-    alt = f"Performance profile of {words.listing(list(ratios))} over {problems} targets"
+    alt = f"Performance profile of {messages.listing(list(ratios))} over {problems} targets"
     models = [m for m in canvas.look if any(m in t.seconds for t in targets)]
     columns = [Column("scene"), Column("target"), Column("PSNR dB", 2), *(Column(f"{m} s", 1) for m in models)]
     rows: list[list[Value]] = [[t.scene, t.rule, t.psnr, *(t.seconds.get(m) for m in models)] for t in targets]
@@ -47,10 +47,12 @@ def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
     quick = [m for m in models if fastest[m] == max(fastest.values())]
     alone = sum(sum(map(math.isfinite, t.seconds.values())) == 1 < len(t.seconds) for t in targets)
     verb = "reaches" if len(most) == 1 else "reach"
-    text = f"{words.listing(most)} {verb} most targets ({reached[most[0]]} of {len(targets)}). By mean seconds "
-    text += f"{words.listing(quick)} {'is' if len(quick) == 1 else 'are'} first most often ({fastest[quick[0]]} times)."
+    text = f"{messages.listing(most)} {verb} most targets ({reached[most[0]]} of {len(targets)}). By mean seconds "
+    text += (
+        f"{messages.listing(quick)} {'is' if len(quick) == 1 else 'are'} first most often ({fastest[quick[0]]} times)."
+    )
     if alone:
-        text += f" {words.count(alone, 'target')} {'is' if alone == 1 else 'are'} reached by one model only."
+        text += f" {messages.count(alone, 'target')} {'is' if alone == 1 else 'are'} reached by one model only."
     return [text]
 
 
@@ -120,7 +122,7 @@ def _anytime_words(tails: dict[str, list[float]]) -> list[str]:
     if not lost:
         return ["Every model ends within 0.05 dB of the best it had on val: none overfits visibly by its last step."]
     worst = sorted(lost, key=lambda m: -lost[m])
-    parts = [f"{m} by {words.plain(lost[m])} dB" for m in worst]
+    parts = [f"{m} by {messages.plain(lost[m])} dB" for m in worst]
     rest = [m for m in tails if m not in lost]
-    text = f"On the mean of the scenes these end below the best they had on val: {words.listing(parts)}"
-    return [f"{text}; {words.listing(rest)} within 0.05 dB." if rest else f"{text}."]
+    text = f"On the mean of the scenes these end below the best they had on val: {messages.listing(parts)}"
+    return [f"{text}; {messages.listing(rest)} within 0.05 dB." if rest else f"{text}."]

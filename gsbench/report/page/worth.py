@@ -8,7 +8,7 @@ from gsbench.report import compare
 from gsbench.report.compare import Cube, Pair, Price
 from gsbench.report.configurations import Group
 from gsbench.report.family import Family
-from gsbench.report.page import charts, words
+from gsbench.report.page import charts, messages
 from gsbench.report.page.content import Canvas, Column, Drawing, Section, Swatch, Tab, Table, Value
 
 UNITS = (("psnr", "dB", 2), ("seconds", "training s", 1), ("ms", "ms a frame", 2), ("mb", "MB", 2))
@@ -28,11 +28,13 @@ def effects_section(group: Group, family: Family, canvas: Canvas) -> Section:
     cube = compare.cube(group, family)
     notes = []
     if cube.missing:
-        notes.append(f"Not run, so not priced: models with {words.listing(cube.missing, 'or')}.")
+        notes.append(f"Not run, so not priced: models with {messages.listing(cube.missing, 'or')}.")
     if cube.left_out:
-        notes.append(f"Left out, as another model has the same effects: {words.listing(cube.left_out)}.")
+        notes.append(f"Left out, as another model has the same effects: {messages.listing(cube.left_out)}.")
     if cube.on_demand:
-        notes.append(f"Left out, as their Gaussians keep only the effects that pay: {words.listing(cube.on_demand)}.")
+        notes.append(
+            f"Left out, as their Gaussians keep only the effects that pay: {messages.listing(cube.on_demand)}."
+        )
     if {"4dgs", "7dgs_noagr"} <= {c.model for c in cube.cells.values()}:
         notes.append(f"{PARAMETRISATION} {NESTED if cube.nested else NOT_NESTED}")
     if not cube.prices:
@@ -43,7 +45,7 @@ def effects_section(group: Group, family: Family, canvas: Canvas) -> Section:
     for unit, title, digits in UNITS:
         rows = [_row(price, unit, digits) for price in shown if price.costs[unit].scenes]
         if rows:
-            alt = f"Change in {title} of {words.listing([row.label for row in rows])}"
+            alt = f"Change in {title} of {messages.listing([row.label for row in rows])}"
             drawings.append(Drawing(f"in {title}", charts.differences(rows, title).svg(f"{canvas.name}e{unit}", alt)))
     columns = [Column("effect"), Column("computed from")]
     for _, title, digits in UNITS:
@@ -55,7 +57,7 @@ def effects_section(group: Group, family: Family, canvas: Canvas) -> Section:
             p.name,
             p.models,
             *(v for unit, _, _ in UNITS for v in _cells(p, unit)),
-            words.over(p.costs["psnr"]),
+            messages.over(p.costs["psnr"]),
         ]
         for p in shown
     ]
@@ -67,7 +69,7 @@ def effects_section(group: Group, family: Family, canvas: Canvas) -> Section:
 
 def _row(price: Price, unit: str, digits: int) -> charts.Row:
     of = price.costs[unit]
-    return charts.Row(price.name, of.mean, of.low, of.high, price.told[unit], words.signed(of.mean, digits))
+    return charts.Row(price.name, of.mean, of.low, of.high, price.told[unit], messages.signed(of.mean, digits))
 
 
 def _cells(price: Price, unit: str) -> tuple[Value, ...]:
@@ -80,10 +82,10 @@ def _scope(cube: Cube, family: Family) -> list[str]:
     """Say over what the intervals of prices are, and among how many comparisons a price is told from nothing."""
     fewest = min((price.costs["psnr"] for price in cube.prices), key=lambda of: of.scenes)
     if not family.size():
-        return [words.scope(fewest)]
-    many = words.count(family.size(), "comparison")
+        return [messages.scope(fewest)]
+    many = messages.count(family.size(), "comparison")
     return [
-        words.scope(fewest),
+        messages.scope(fewest),
         f"Filled points are told from nothing after Holm's correction, in dB for all {many} on this page. An interval "
         "is of its price alone, so one that leaves out zero may still be chance among so many.",
     ]
@@ -94,23 +96,27 @@ def _effect_words(cube: Cube) -> list[str]:
     single = [p for p in cube.prices if compare.is_single(p.name)]
     best = max(single, key=lambda p: p.costs["psnr"].mean)
     gain, seconds = best.costs["psnr"], best.costs["seconds"]
-    text = f"Worth most: {best.name}, {words.signed(gain.mean)} dB ({words.interval(gain, sign=True)})"
-    text += f", for {words.signed(seconds.mean, 1)} s of training." if seconds.scenes else "."
+    text = f"Worth most: {best.name}, {messages.signed(gain.mean)} dB ({messages.interval(gain, sign=True)})"
+    text += f", for {messages.signed(seconds.mean, 1)} s of training." if seconds.scenes else "."
     if gain.mean <= 0:
-        text = f"No effect raises PSNR here; {best.name} lowers it least: {words.signed(gain.mean)} dB."
+        text = f"No effect raises PSNR here; {best.name} lowers it least: {messages.signed(gain.mean)} dB."
     unclear = [p.name for p in single if p.costs["psnr"].over and not p.told["psnr"]]
     said = [text, f"Not told from nothing in dB: {'; '.join(unclear)}." if unclear else ""]
     for price in cube.nested:
         if price.name.startswith("direction"):
             of = price.costs["psnr"]
             told = f", {'' if price.told['psnr'] else 'not '}told from nothing" if of.over else ""
-            said.append(f"{words.sentence(price.name)}, within one parametrisation: {words.signed(of.mean)} dB "
-                        f"({words.interval(of, sign=True)}){told}.")  # fmt: skip
+            said.append(f"{messages.sentence(price.name)}, within one parametrisation: {messages.signed(of.mean)} dB "
+                        f"({messages.interval(of, sign=True)}){told}.")  # fmt: skip
     for price in cube.prices:
         of = price.costs["psnr"]
         if price.order == 2 and price.told["psnr"]:
-            side = f"{words.plain(abs(of.mean))} dB {'less' if of.mean < 0 else 'more'} than the sum of each by itself"
-            said.append(f"{words.sentence(price.name)}: together they bring {side} ({words.interval(of, sign=True)}).")
+            side = (
+                f"{messages.plain(abs(of.mean))} dB {'less' if of.mean < 0 else 'more'} than the sum of each by itself"
+            )
+            said.append(
+                f"{messages.sentence(price.name)}: together they bring {side} ({messages.interval(of, sign=True)})."
+            )
     return [s for s in said[:5] if s]
 
 
@@ -122,7 +128,7 @@ def stages_section(group: Group, canvas: Canvas) -> Section:
     every = {name for stages in parts.values() for name in stages}
     names = [name for name in (*STAGES, REST) if name in every]
     panel = charts.stages(list(parts.items()), names, [_colour(name) for name in names])
-    alt = f"Seconds of training by stage for {words.listing(list(parts))}"
+    alt = f"Seconds of training by stage for {messages.listing(list(parts))}"
     rows: list[list[Value]] = [
         [m, *(stages.get(s, 0.0) for s in names), sum(stages.values())] for m, stages in parts.items()
     ]
@@ -187,25 +193,25 @@ def pairs_section(group: Group, family: Family, canvas: Canvas) -> Section:
     rows = [
         charts.Row(
             _pair_name(group, p), p.difference.mean, p.difference.low, p.difference.high,
-            p.differs, words.signed(p.difference.mean),
+            p.differs, messages.signed(p.difference.mean),
         )
         for p in found[:MOST_PAIRS]
     ]  # fmt: skip
-    alt = f"Differences in PSNR of {words.count(len(rows), 'pair')} of models with 95 % intervals"
+    alt = f"Differences in PSNR of {messages.count(len(rows), 'pair')} of models with 95 % intervals"
     columns = [Column("pair"), Column("dB", 2), Column("95 % low", 2), Column("95 % high", 2)]
     columns += [Column("ahead on % of views", 0), Column("p, Holm"), Column("told apart")]
     table = Table("pairs.csv", columns, [_pair_row(group, p) for p in found])
     drawing = Drawing("Difference in PSNR", charts.differences(rows, "dB").svg(f"{canvas.name}p", alt))
     first = found[0].difference
     notes = [
-        f"Paired over the seeds and views that both have; each interval, over {words.over(first)}, is of its pair "
-        f"alone. p is adjusted after Holm for all {words.count(family.size(), 'comparison')} of this page (pairs, "
+        f"Paired over the seeds and views that both have; each interval, over {messages.over(first)}, is of its pair "
+        f"alone. p is adjusted after Holm for all {messages.count(family.size(), 'comparison')} of this page (pairs, "
         "prices, answers to budgets); filled points are told apart, which is p below 5 %. Ahead: how likely a run of "
         "the first beats one of the second on a view."
         if first.over
-        else f"{words.NO_SPREAD.capitalize()}: no interval and no p-value is given."
+        else f"{messages.NO_SPREAD.capitalize()}: no interval and no p-value is given."
     ]
-    said = [*([words.scope(first)] if first.over else []), *_pair_words(group, found)]
+    said = [*([messages.scope(first)] if first.over else []), *_pair_words(group, found)]
     return Section("pairs", "Is it a difference?", said, [Tab("", [drawing])], table, beside=True, notes=notes)
 
 
@@ -222,7 +228,7 @@ def _pair_row(group: Group, pair: Pair) -> list[Value]:
         d.low,
         d.high,
         100 * pair.improvement,
-        words.probability(pair.p_holm),
+        messages.probability(pair.p_holm),
         told,
     ]
 
@@ -231,9 +237,9 @@ def _pair_words(group: Group, found: list[Pair]) -> list[str]:
     """Say how many pairs are told apart, and name those that are not."""
     if all(math.isnan(p.p_holm) for p in found):
         first = found[0]
-        by = f"by {words.plain(first.difference.mean)} dB"
+        by = f"by {messages.plain(first.difference.mean)} dB"
         ahead = f"{group.label(first.better)} is ahead of {group.label(first.other)} {by}"
-        return [f"{words.NO_SPREAD.capitalize()}. The largest difference: {ahead}."]
+        return [f"{messages.NO_SPREAD.capitalize()}. The largest difference: {ahead}."]
     level = [
         f"{group.label(p.better)} from {group.label(p.other)}"
         for p in found
@@ -248,6 +254,6 @@ def _pair_words(group: Group, found: list[Pair]) -> list[str]:
         ]
     if tested == 1:
         return ["The pair is not told apart at 95 %."]
-    named = words.listing(level[:4]) + (f" and {len(level) - 4} more" if len(level) > 4 else "")
-    told = f"{tested - len(level)} of {words.count(tested, 'pair')} are told apart at 95 %, after Holm"
+    named = messages.listing(level[:4]) + (f" and {len(level) - 4} more" if len(level) > 4 else "")
+    told = f"{tested - len(level)} of {messages.count(tested, 'pair')} are told apart at 95 %, after Holm"
     return [f"{told}. Not told apart: {named}."]

@@ -11,15 +11,15 @@ NO_SPREAD = "no spread is known from one seed"
 LONGEST = 300  # characters of a text from a record
 
 
-def cut(text: object, longest: int = LONGEST) -> str:
+def shorten(text: object, longest: int = LONGEST) -> str:
     """Put a text from a record on one line of at most `longest` characters."""
     line = printable(str(text)[: 4 * longest])
     return line if len(line) <= longest else f"{line[: longest - 1]}…"
 
 
-def middle(text: str, longest: int, tail: int) -> str:
+def shorten_middle(text: str, longest: int, tail: int) -> str:
     """Shorten a text to `longest` characters by leaving out its middle, so that `tail` characters of its end stay."""
-    line = cut(text)
+    line = shorten(text)
     return line if len(line) <= longest else f"{line[: longest - tail - 1].rstrip()}…{line[-tail:]}"
 
 
@@ -107,4 +107,4 @@ def command(records: list[Record]) -> str:
         words = ["-m", *rest.pop(), f"seed={','.join(str(r.seed) for r in records)}"]
     else:
         words = list(records[0].overrides)
-    return f"python -m gsbench {' '.join(shlex.quote(cut(word)) for word in words)}"
+    return f"python -m gsbench {' '.join(shlex.quote(shorten(word)) for word in words)}"
