@@ -172,7 +172,8 @@ def _frontier_tab(group: Group, canvas: Canvas, key: str, label: str, scenes: li
         ]
         drawn = [c for c in curves if c.best]
         if drawn:
-            alt = f"PSNR in dB against {title} of {messages.listing([p.configuration.name for p in points][:20])}, {label}"
+            named = messages.listing([p.configuration.name for p in points][:20])
+            alt = f"PSNR in dB against {title} of {named}, {label}"
             drawings.append(
                 Drawing(f"PSNR against {title}", charts.frontier(drawn, title).svg(canvas.name + key + cost, alt))
             )

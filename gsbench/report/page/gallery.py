@@ -1,4 +1,4 @@
-"""StripRow the image strips beside the records into images small enough to be part of the page."""
+"""Cut the image strips beside the records into images small enough to be part of the page."""
 
 import base64
 from dataclasses import dataclass
@@ -87,7 +87,7 @@ def _image(caption: str, image: Pixels, quality: int) -> Image:
 
 
 def cut_strip(path: Path) -> list[StripRow]:
-    """StripRow a strip into its rows of (render, truth, error), enlarged pixels made single again; nothing if it is none."""
+    """Cut a strip into rows of (render, truth, error) at their own resolution; return nothing where it is no strip."""
     data = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if data is None:
         return []
