@@ -65,7 +65,7 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Row:
+class ComparedRuns:
     """A model with its variant on a scene, in both folders."""
 
     experiment: str
@@ -83,11 +83,11 @@ class Comparison:
 
     ours: str  # the folder
     theirs: str
-    rows: list[Row]
+    rows: list[ComparedRuns]
     only_ours: list[str]  # models on scenes that the other folder lacks
     only_theirs: list[str]
 
-    def of(self, quantity: str, verdict: str) -> list[Row]:
+    def of(self, quantity: str, verdict: str) -> list[ComparedRuns]:
         """List the rows whose quantity is judged so."""
         return [row for row in self.rows if row.judged[quantity].verdict == verdict]
 
@@ -138,7 +138,7 @@ def compare(ours: Sequence[Record], theirs: Sequence[Record], names: tuple[str, 
     here, there = _by_configuration(ours), _by_configuration(theirs)
     rows = [_row(here[key], there[key]) for key in sorted(here.keys() & there.keys())]
     for quantity, limit in LIMITS.items():
-        experiments: dict[tuple[str, str], list[Row]] = {}
+        experiments: dict[tuple[str, str], list[ComparedRuns]] = {}
         for row in rows:
             if not row.judged[quantity].reason:
                 experiments.setdefault((row.experiment, row.dataset), []).append(row)
@@ -166,7 +166,7 @@ def _missing(of: RunsByConfiguration, other: RunsByConfiguration) -> list[str]:
     return [f"{model} {variant}".rstrip() + f" on {scene}" for _, _, scene, model, variant in sorted(of.keys() - other)]
 
 
-def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> Row:
+def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> ComparedRuns:
     """Put the runs of a model on a scene side by side, with each quantity's difference or why there is none."""
     first = next(iter(ours.values()))
     mine, other = ([r for r in runs.values() if r.status == "ok"] for runs in (ours, theirs))
@@ -179,7 +179,7 @@ def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> Row:
             reason = f"{'here' if not known[0] else 'there'} it was not measured"
         judged[quantity] = Judged(known[0], known[1], reason)
     label = f"{first.model} {first.variant}".rstrip()
-    return Row(first.experiment, first.dataset, first.scene, label, ours, theirs, judged)
+    return ComparedRuns(first.experiment, first.dataset, first.scene, label, ours, theirs, judged)
 
 
 def value(record: Record, quantity: str) -> float:
@@ -262,7 +262,7 @@ def _judge(found: Judged, limit: Limit, p: float) -> Judged:
     return replace(found, verdict=AGREES, p_holm=p)
 
 
-def _places(rows: list[Row]) -> str:
+def _places(rows: list[ComparedRuns]) -> str:
     """Name models on scenes, the first few."""
     named = [f"{printable(row.model)} on {printable(row.scene)}" for row in rows[:3]]
     return ", ".join(named) + (f" and {len(rows) - 3} more" if len(rows) > 3 else "")

@@ -7,17 +7,16 @@ from typing import Any
 
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
-from gsbench.report.against import LIMITS, RULE, Comparison, Judged, Row, value
+from gsbench.report.against import LIMITS, RULE, ComparedRuns, Comparison, Judged, value
 from gsbench.report.conditions import printable
-from gsbench.report.layout import EMPTY, Column, Section, Table
-from gsbench.report.layout import Row as Line
+from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
 
 COLUMNS = [
-    Column("psnr", "PSNR dB", 2),
-    Column("seconds", "training s", 1),
-    Column("ms", "ms a frame", 2),
-    Column("gaussians", "Gaussians", 0),
-    Column("mb", "MB", 2),
+    QuantityColumn("psnr", "PSNR dB", 2),
+    QuantityColumn("seconds", "training s", 1),
+    QuantityColumn("ms", "ms a frame", 2),
+    QuantityColumn("gaussians", "Gaussians", 0),
+    QuantityColumn("mb", "MB", 2),
 ]
 
 
@@ -37,23 +36,23 @@ def tables(of: Comparison) -> list[Table]:
     return [Table(f"{of.ours} / {of.theirs}", COLUMNS, sections, [], footnotes)]
 
 
-def lines(row: Row) -> list[Line]:
+def lines(row: ComparedRuns) -> list[Row]:
     """Make the lines of a model on a scene: its seeds, the differences with their intervals, the verdicts."""
     made = []
     for seed in sorted(row.ours.keys() | row.theirs.keys()):
         pair = row.ours.get(seed), row.theirs.get(seed)
         cells = {c.key: " / ".join(_shown(record, c) for record in pair) for c in COLUMNS}
-        made.append(Line(f"{printable(row.model)} seed {seed}", cells))
-    made.append(Line(f"{printable(row.model)} difference", {c.key: _difference(row.judged[c.key], c) for c in COLUMNS}))
-    made.append(Line(f"{printable(row.model)} verdict", {c.key: row.judged[c.key].verdict for c in COLUMNS}))
+        made.append(Row(f"{printable(row.model)} seed {seed}", cells))
+    made.append(Row(f"{printable(row.model)} difference", {c.key: _difference(row.judged[c.key], c) for c in COLUMNS}))
+    made.append(Row(f"{printable(row.model)} verdict", {c.key: row.judged[c.key].verdict for c in COLUMNS}))
     return made
 
 
-def _shown(record: Record | None, column: Column) -> str:
+def _shown(record: Record | None, column: QuantityColumn) -> str:
     return EMPTY if record is None or record.status != "ok" else column.show(value(record, column.key))
 
 
-def _difference(found: Judged, column: Column) -> str:
+def _difference(found: Judged, column: QuantityColumn) -> str:
     """Show a difference with half its interval."""
     mean, half = found.difference.mean, found.difference.half
     if math.isnan(mean):
@@ -62,7 +61,7 @@ def _difference(found: Judged, column: Column) -> str:
     return f"{mean:+.{column.digits}f}{width}"
 
 
-def _reasons(rows: list[Row]) -> list[str]:
+def _reasons(rows: list[ComparedRuns]) -> list[str]:
     """Say why something cannot be told; equal reasons once."""
     titles = {c.key: c.title for c in COLUMNS}
     why: dict[str, dict[str, list[str]]] = {}
@@ -93,7 +92,7 @@ def write_json(of: Comparison, path: Path) -> None:
     write_atomically(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
-def _plain(row: Row) -> dict[str, Any]:
+def _plain(row: ComparedRuns) -> dict[str, Any]:
     named = {name: getattr(row, name) for name in ("experiment", "dataset", "scene", "model")}
     runs = [
         {"seed": seed, "ours": _run(row.ours.get(seed)), "theirs": _run(row.theirs.get(seed))}

@@ -18,7 +18,7 @@ FEWEST_TARGETS = 3  # of a scene
 
 
 @dataclass(frozen=True)
-class Point:
+class FrontierPoint:
     """A configuration on a scene, or on the mean of scenes: what it costs and what it reaches."""
 
     configuration: Configuration
@@ -32,7 +32,7 @@ class Point:
         return self.configuration.series
 
 
-def points(group: Group, scenes: list[str]) -> list[Point]:
+def points(group: Group, scenes: list[str]) -> list[FrontierPoint]:
     """Return a point for every configuration that has finished all of `scenes`, averaged over them."""
     found = []
     for configuration in group.configurations:
@@ -40,70 +40,70 @@ def points(group: Group, scenes: list[str]) -> list[Point]:
         if scenes and all(map(len, psnr)):
             cost = {name: _mean([group.sample(configuration, s, name) for s in scenes]) for name in COSTS}
             val = _mean([group.sample(configuration, s, "psnr_val") for s in scenes])
-            found.append(Point(configuration, estimate(psnr, generalise=False), val, cost))
+            found.append(FrontierPoint(configuration, estimate(psnr, generalise=False), val, cost))
     return found
 
 
-def frontier(of: Sequence[Point], cost: str) -> list[Point]:
+def frontier(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
     """Return the points that no cheaper one equals, by rising cost: each reaches more than all before it."""
-    best: list[Point] = []
+    best: list[FrontierPoint] = []
     for point in sorted(of, key=lambda p: (p.cost[cost], -p.psnr.mean)):
         if not math.isnan(point.cost[cost]) and (not best or point.psnr.mean > best[-1].psnr.mean):
             best.append(point)
     return best
 
 
-def beaten(of: Sequence[Point], cost: str) -> list[Point]:
+def beaten(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
     """Return the points beside which another is at least as good and as cheap, and better in one, by their means."""
     known = [p for p in of if not math.isnan(p.cost[cost])]
     return [p for p in known if any(beats(q, p, cost) for q in known)]
 
 
-def beats(q: Point, p: Point, cost: str) -> bool:
+def beats(q: FrontierPoint, p: FrontierPoint, cost: str) -> bool:
     """Tell whether the means of `q` are at least as good and as cheap as those of `p`, and better in one of the two."""
     as_good = q.psnr.mean >= p.psnr.mean and q.cost[cost] <= p.cost[cost]
     return as_good and (q.psnr.mean > p.psnr.mean or q.cost[cost] < p.cost[cost])
 
 
 @dataclass(frozen=True)
-class Choice:
+class BudgetChoice:
     """The point that a budget buys, and how the best of each other model compares with it on the evaluated split."""
 
-    point: Point
+    point: FrontierPoint
     on_val: bool  # whether it was chosen on val; otherwise on what is shown, as some runs have no PSNR on val
-    ahead: list[Point]  # those that it is told to be ahead of
-    level: list[Point]  # those that it is not told apart from
-    behind: list[Point]  # those that it is told to be behind
-    unknown: list[Point]  # those of which no spread is known
+    ahead: list[FrontierPoint]  # those that it is told to be ahead of
+    level: list[FrontierPoint]  # those that it is not told apart from
+    behind: list[FrontierPoint]  # those that it is told to be behind
+    unknown: list[FrontierPoint]  # those of which no spread is known
 
 
-def has_val(of: Sequence[Point]) -> bool:
+def has_val(of: Sequence[FrontierPoint]) -> bool:
     """Tell whether every point has PSNR on val, so that one may be chosen there and shown on the evaluated split."""
     return bool(of) and not any(math.isnan(p.val) for p in of)
 
 
-def ranked(of: Sequence[Point]) -> list[Point]:
+def ranked(of: Sequence[FrontierPoint]) -> list[FrontierPoint]:
     """Return points by falling PSNR on val; by that on the evaluated split where `has_val` is not so."""
     on_val = has_val(of)
     return sorted(of, key=lambda p: -(p.val if on_val else p.psnr.mean))
 
 
-def contest(of: Sequence[Point], cost: str, budget: float) -> list[Point]:
+def contest(of: Sequence[FrontierPoint], cost: str, budget: float) -> list[FrontierPoint]:
     """Return the best point of each model among those that cost at most `budget`, the best of all first."""
-    best: dict[str, Point] = {}
+    best: dict[str, FrontierPoint] = {}
     for point in ranked(of):
         if point.cost[cost] <= budget:
             best.setdefault(point.series, point)
     return list(best.values())
 
 
-def contested(of: Sequence[Point]) -> list[Weights]:
+def contested(of: Sequence[FrontierPoint]) -> list[Weights]:
     """Return the differences that `choose` asks for, of all BUDGETS."""
     contests = [contest(of, *budget) for budget in BUDGETS]
     return [[(1.0, found[0].configuration), (-1.0, other.configuration)] for found in contests for other in found[1:]]
 
 
-def choose(of: Sequence[Point], cost: str, budget: float, family: Family) -> Choice | None:
+def choose(of: Sequence[FrontierPoint], cost: str, budget: float, family: Family) -> BudgetChoice | None:
     """Choose the best point that costs at most `budget`; None where there is none.
 
     The best point of each other model within the budget is compared with it, paired over seeds and views.
@@ -119,7 +119,7 @@ def choose(of: Sequence[Point], cost: str, budget: float, family: Family) -> Cho
         return None
     first, *others = found
     tested = [(p, family.of([(1.0, first.configuration), (-1.0, p.configuration)])) for p in others]
-    return Choice(
+    return BudgetChoice(
         first,
         has_val(of),
         [p for p, t in tested if t.told and t.difference.mean > 0],

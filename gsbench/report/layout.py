@@ -10,7 +10,7 @@ EMPTY = "–"
 
 
 @dataclass(frozen=True)
-class Column:
+class QuantityColumn:
     """A quantity of the table and how it is shown."""
 
     key: str
@@ -31,7 +31,7 @@ class Row:
     """One line: a model's mean over its seeds, a run that did not finish, or the numbers of the paper."""
 
     label: str
-    cells: dict[str, str]  # by Column.key
+    cells: dict[str, str]  # by QuantityColumn.key
     seeds: str = ""  # how many
     best: bool = False  # whether its first column is the best that was measured
 
@@ -50,7 +50,7 @@ class Table:
     """The table of one experiment on one data set."""
 
     title: str
-    columns: list[Column]
+    columns: list[QuantityColumn]
     sections: list[Section]
     marks: list[str]  # the meaning of (1), (2), ... in the cells
     footnotes: list[str]  # the conditions under which the numbers hold
@@ -111,7 +111,7 @@ def _titles(table: Table) -> list[str]:
     return ["model", *(c.title for c in table.columns), "seeds"]
 
 
-def _texts(row: Row, columns: list[Column], star: str = "") -> list[str]:
+def _texts(row: Row, columns: list[QuantityColumn], star: str = "") -> list[str]:
     """Return the texts of a row from left to right, with a `star` at the best PSNR."""
     first, *rest = (row.cells.get(c.key, "") for c in columns)
     return [row.label, first + star * row.best, *rest, row.seeds]

@@ -8,12 +8,12 @@ from gsbench.measure.record import Record
 from gsbench.report import paper, tables
 from gsbench.report.conditions import conditions, printable
 from gsbench.report.configurations import Group
-from gsbench.report.layout import EMPTY, Column, Row, Section, Table
+from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
 from gsbench.report.paper_protocol import MODELS, ModelRecipe, Sorted, departure, finished, model_recipe, model_recipes
 from gsbench.report.seed_means import SPREAD, mean
 from gsbench.report.tables import LEAKS, OF_THE_MACHINE, of_one_machine
 
-COLUMNS = [*tables.COLUMNS[:1], Column(LEAKS, LEAKS, 2, "psnr"), *tables.COLUMNS[1:]]
+COLUMNS = [*tables.COLUMNS[:1], QuantityColumn(LEAKS, LEAKS, 2, "psnr"), *tables.COLUMNS[1:]]
 SEEDS = 3  # the fewest for an interval that holds
 
 PAPER = (
@@ -31,7 +31,7 @@ def build(found: Sorted) -> tuple[list[Table], list[Line]]:
     made: list[Table] = []
     lines: list[Line] = []
     for dataset, records in found.paper.items():
-        table = _Builder(dataset, records, lines, "paper")
+        table = _Table1Builder(dataset, records, lines, "paper")
         notes = [missing(dataset, records), *_left_out(found.left_out[dataset])]
         made.append(
             table.make(f"Table 1, {dataset}, at the paper's protocol", list(paper.PROTOCOLS[dataset].scenes), notes)
@@ -39,7 +39,7 @@ def build(found: Sorted) -> tuple[list[Table], list[Line]]:
     for kind, pools in (("other protocol", found.other_protocol), ("other data", found.other_data)):
         for pool in pools:
             scenes = sorted({r.scene for r in pool.runs})
-            table = _Builder(pool.dataset, pool.runs, lines, kind)
+            table = _Table1Builder(pool.dataset, pool.runs, lines, kind)
             note = OTHER_DATA if kind == "other data" else _other_protocol(pool.runs)
             made.append(table.make(f"{kind.upper()}, {printable(pool.heading)}", scenes, [note]))
     return made, lines
@@ -76,7 +76,7 @@ def _left_out(pools: list[str]) -> list[str]:
     return [f"Left out, at another protocol than the paper's: {shown}."]
 
 
-class _Builder:
+class _Table1Builder:
     """Makes the table of one data set, and adds its numbers to the lines of the CSV."""
 
     def __init__(self, dataset: str, records: list[Record], lines: list[Line], kind: str) -> None:
@@ -165,7 +165,7 @@ class _Builder:
         return f"({self.marks.index(text) + 1})"
 
 
-def _signed(column: Column, difference: float) -> str:
+def _signed(column: QuantityColumn, difference: float) -> str:
     """Format a difference with its sign, as many digits as its column has."""
     if math.isnan(difference):
         return EMPTY

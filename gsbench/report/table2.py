@@ -6,17 +6,17 @@ from typing import Any
 from gsbench.measure.record import Record
 from gsbench.report import paper
 from gsbench.report.conditions import conditions, printable
-from gsbench.report.layout import EMPTY, Column, Row, Section, Table
+from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
 from gsbench.report.paper_protocol import MODELS, ModelRecipe, Sorted, finished, model_recipes
 from gsbench.report.seed_means import SPREAD, mean
 from gsbench.report.table1 import missing
 from gsbench.report.tables import LEAKS
 
 COLUMNS = [
-    Column("psnr", "PSNR", 2),
-    Column(LEAKS, LEAKS, 2),
-    Column("ssim", "SSIM", 3),
-    Column("lpips_alex", "LPIPS-Alex", 3),
+    QuantityColumn("psnr", "PSNR", 2),
+    QuantityColumn(LEAKS, LEAKS, 2),
+    QuantityColumn("ssim", "SSIM", 3),
+    QuantityColumn("lpips_alex", "LPIPS-Alex", 3),
 ]
 SOURCES = {
     "quoted": "quoted by the 7DGS paper (Table 2) from the method's own publication",

@@ -17,21 +17,21 @@ from gsbench.report.cells import cell
 from gsbench.report.conditions import conditions, printable
 from gsbench.report.configurations import groups
 from gsbench.report.intervals import over_seeds
-from gsbench.report.layout import EMPTY, Column, Row, Section, Table
+from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
 
 LEAKS = "psnr_best_on_test (leaks)"  # its title always says that it leaks
 COLUMNS = (  # their keys are columns of `tidy`
-    Column("psnr", "PSNR", 2, "psnr"),
-    Column("ssim", "SSIM", 3, "ssim"),
-    Column("lpips_alex", "LPIPS-Alex", 3, "lpips"),
-    Column("train_min", "train min", None, "train_min"),
-    Column("fps", "FPS", None, "fps"),
-    Column("num_gaussians", "#Gaussians", 0, "num_gaussians"),
+    QuantityColumn("psnr", "PSNR", 2, "psnr"),
+    QuantityColumn("ssim", "SSIM", 3, "ssim"),
+    QuantityColumn("lpips_alex", "LPIPS-Alex", 3, "lpips"),
+    QuantityColumn("train_min", "train min", None, "train_min"),
+    QuantityColumn("fps", "FPS", None, "fps"),
+    QuantityColumn("num_gaussians", "#Gaussians", 0, "num_gaussians"),
 )
 OF_THE_MACHINE = ("train_min", "fps")  # columns that compare only between runs of one machine
 COSTS = ("fps", "num_gaussians", "bytes", "peak_memory", "train_cpu_s", "load")  # of a record, as it has them
-TRAIN = Column("psnr_train", "PSNR train", 2)  # shown on request
-EXTRA_COLUMNS = (Column("lpips_vgg", "LPIPS-VGG", 3), Column(LEAKS, LEAKS, 2))  # where a run has them
+TRAIN = QuantityColumn("psnr_train", "PSNR train", 2)  # shown on request
+EXTRA_COLUMNS = (QuantityColumn("lpips_vgg", "LPIPS-VGG", 3), QuantityColumn(LEAKS, LEAKS, 2))  # where a run has them
 
 PAPER = (
     "Table 1 of the 7DGS paper (ICCV 2025): 30,000 iterations at half resolution (Technicolor: full), PSNR is the best "
@@ -105,7 +105,7 @@ def build(records: list[Record], *, train: bool = False, machine: str | None = N
         train: also show `psnr_train`.
         machine: whose seconds and FPS are shown, by `Provenance.machine`; None: in each table that of most runs.
     """
-    return [_Builder(group.records, train, machine or group.machine).table() for group in groups(records)]
+    return [_TableBuilder(group.records, train, machine or group.machine).table() for group in groups(records)]
 
 
 def of_one_machine(records: list[Record], machine: str) -> list[str]:
@@ -125,7 +125,7 @@ def of_one_machine(records: list[Record], machine: str) -> list[str]:
     ]
 
 
-class _Builder:
+class _TableBuilder:
     """Makes the table of one experiment on one data set, and collects the footnotes of its cells."""
 
     def __init__(self, records: list[Record], train: bool, machine: str) -> None:
@@ -147,7 +147,7 @@ class _Builder:
         }
         self.marks: list[str] = []
 
-    def _values(self, column: Column, seeds: list[dict[str, Any]]) -> list[float]:
+    def _values(self, column: QuantityColumn, seeds: list[dict[str, Any]]) -> list[float]:
         """Return a column's value of each run; of seconds those of the table's machine, NaN where it has none."""
         counted = [q for q in seeds if column.key not in OF_THE_MACHINE or q["machine"] == self.machine]
         return [math.nan if q[column.key] is None else float(q[column.key]) for q in counted] or [math.nan]
@@ -199,7 +199,7 @@ class _Builder:
                 rows += self._paper_row([scene], model)
         return Section(scene, rows, notes)
 
-    def _cell(self, column: Column, finished: list[Record]) -> str:
+    def _cell(self, column: QuantityColumn, finished: list[Record]) -> str:
         """Show the mean and the spread over the seeds, or the reason why a seed lacks the number."""
         values = self.values[finished[0].scene, self._name(finished[0])][column.key]
         if not math.isnan(fmean(values)):

@@ -24,7 +24,7 @@ from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import groups
 from gsbench.report.frontier import choose, points
 from gsbench.report.page import build, cost, evidence, gallery, messages, palette, time_to_quality, worth
-from gsbench.report.page.content import Canvas, Column, Runs, Table
+from gsbench.report.page.content import Canvas, Column, DataTable, Runs
 from gsbench.report.page.events import of as events_of
 from gsbench.report.page.palette import DARK, LIGHT, MARKERS, styles
 from gsbench.schedule import Schedule
@@ -475,7 +475,7 @@ def test_a_lambda_that_is_fixed_is_not_said_to_be_learned():
 
 def test_a_table_shows_its_first_rows_and_links_all():
     """Catches a page that grows with every run, and a file that is cut like the page."""
-    table = Table("t.csv", [Column("a", 1), Column("b")], [[i / 3, f"run {i}"] for i in range(500)])
+    table = DataTable("t.csv", [Column("a", 1), Column("b")], [[i / 3, f"run {i}"] for i in range(500)])
     assert len(table.shown) == 60
     assert table.hidden == 440
     assert len(base64.b64decode(table.href.partition(",")[2]).decode().splitlines()) == 501

@@ -12,8 +12,7 @@ from make_golden import GOLDEN, GOLDEN_TERMINAL, make, records
 from gsbench.measure import record as files
 from gsbench.report import layout, tables
 from gsbench.report.__main__ import main
-from gsbench.report.page.content import Column as PageColumn
-from gsbench.report.page.content import Table
+from gsbench.report.page.content import Column, DataTable
 
 
 def page(*of: files.Record) -> str:
@@ -303,7 +302,7 @@ def test_a_cell_of_csv_is_no_formula(tmp_path):
     lost, kept = frame[frame.status == "failed"].iloc[0], frame[frame.status == "ok"].iloc[0]
     assert (lost.reason, lost.protocol_name, lost.protocol_frames) == ("'=1+1", "'@SUM(A1)", "'-2+3")
     assert kept.psnr == -1.5
-    linked = Table("t.csv", [PageColumn("=a"), PageColumn("b", 1)], [["+cmd|' /C calc'!A0", -1.5]])
+    linked = DataTable("t.csv", [Column("=a"), Column("b", 1)], [["+cmd|' /C calc'!A0", -1.5]])
     assert base64.b64decode(linked.href.partition(",")[2]).decode() == "'=a,b\n'+cmd|' /C calc'!A0,-1.5\n"
 
 

@@ -4,12 +4,12 @@ from gsbench.report.against import AGREES, DIFFERS, RULE, UNTOLD, Comparison
 from gsbench.report.against_table import COLUMNS, lines
 from gsbench.report.configurations import Group
 from gsbench.report.page import messages
-from gsbench.report.page.content import Column, Section, Table, Value
+from gsbench.report.page.content import Column, DataTable, PageSection, Value
 
 LONGEST = 400  # characters of the line
 
 
-def against_section(comparison: Comparison, group: Group) -> Section:
+def against_section(comparison: Comparison, group: Group) -> PageSection:
     """Show the seeds of each model and scene of a group side by side, ours / theirs, with differences and verdicts."""
     own = [row for row in comparison.rows if (row.experiment, row.dataset) == (group.experiment, group.dataset)]
     columns = [Column("scene"), Column("run"), *(Column(c.title) for c in COLUMNS)]
@@ -21,6 +21,10 @@ def against_section(comparison: Comparison, group: Group) -> Section:
     if own:
         counts = [f"{v} in {sum(r.judged['psnr'].verdict == v for r in own)}" for v in (AGREES, DIFFERS, UNTOLD)]
         said.append(f"PSNR {', '.join(counts)} of {messages.count(len(own), 'row')} here. Cells are {ours} / {theirs}.")
-    return Section(
-        "against", f"Against {theirs}", said, table=Table("against.csv", columns, rows) if own else None, notes=[RULE]
+    return PageSection(
+        "against",
+        f"Against {theirs}",
+        said,
+        table=DataTable("against.csv", columns, rows) if own else None,
+        notes=[RULE],
     )

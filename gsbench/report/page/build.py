@@ -17,8 +17,8 @@ from gsbench.report.configurations import Group, groups
 from gsbench.report.family import Family
 from gsbench.report.page import against as other
 from gsbench.report.page import cost, evidence, messages, on_demand, time_to_quality, worth
-from gsbench.report.page.content import Canvas, Runs, Section, Table
-from gsbench.report.page.gallery import View, gallery
+from gsbench.report.page.content import Canvas, DataTable, PageSection, Runs
+from gsbench.report.page.gallery import GalleryView, gallery
 from gsbench.report.page.palette import DARK, LIGHT, STAGES_DARK, STAGES_LIGHT, Style, styles
 from gsbench.report.page.svg import marker
 
@@ -34,12 +34,12 @@ class Chapter:
     key: str
     title: str
     summary: str
-    answers: list[cost.Answer]
+    answers: list[cost.BudgetAnswer]
     basis: str
-    sections: list[Section]
-    views: list[View]
+    sections: list[PageSection]
+    views: list[GalleryView]
     tables: list[layout.Table]
-    failures: Table | None
+    failures: DataTable | None
     legend: list[tuple[str, Style]]
 
 
@@ -135,7 +135,7 @@ def _chapter(group: Group, folder: Path, canvas: Canvas) -> Chapter:
     )
 
 
-def _sections(group: Group, family: Family, folder: Path, canvas: Canvas) -> list[Section]:
+def _sections(group: Group, family: Family, folder: Path, canvas: Canvas) -> list[PageSection]:
     chosen = on_demand.on_demand_section(group, canvas, folder)
     return [
         cost.frontier_section(group, canvas),

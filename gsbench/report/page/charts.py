@@ -27,7 +27,7 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Curve:
+class FrontierCurve:
     """What a figure shows of one model."""
 
     style: Style
@@ -37,7 +37,7 @@ class Curve:
     paper: Sequence[Mark] = ()  # the paper's own numbers, on other hardware
 
 
-def frontier(curves: list[Curve], x: str, y: str = "PSNR, dB") -> Panel:
+def frontier(curves: list[FrontierCurve], x: str, y: str = "PSNR, dB") -> Panel:
     """Draw quality against a cost: means with intervals, joined along each model's frontier, single runs pale."""
     panel = Panel(270)
     axes = panel.axes
@@ -128,7 +128,7 @@ def profile(ratios: dict[str, tuple[Style, Sequence[float]]], problems: int) -> 
 
 
 @dataclass(frozen=True)
-class Row:
+class Difference:
     """A difference with its interval, and how it is named."""
 
     label: str
@@ -139,7 +139,7 @@ class Row:
     note: str = ""
 
 
-def differences(rows: list[Row], x: str) -> Panel:
+def differences(rows: list[Difference], x: str) -> Panel:
     """Draw differences with their intervals about zero, the name of each above it."""
     panel = Panel(66 + ROW * len(rows), left=2, top=4)
     axes = panel.axes

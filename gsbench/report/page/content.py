@@ -24,7 +24,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Table:
+class DataTable:
     """Numbers behind a figure, on the page and as a file."""
 
     name: str  # of the file
@@ -68,7 +68,7 @@ def show(value: Value, column: Column) -> str:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class PageFigure:
     """A panel with its caption."""
 
     caption: str
@@ -80,7 +80,7 @@ class Tab:
     """Drawings that are shown together."""
 
     label: str
-    drawings: list[Drawing]
+    drawings: list[PageFigure]
 
 
 @dataclass(frozen=True)
@@ -102,14 +102,14 @@ class Image:
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """A figure of the page with what it says in words."""
 
     key: str
     title: str
     sentences: list[str]
     tabs: list[Tab] = field(default_factory=list)
-    table: Table | None = None
+    table: DataTable | None = None
     beside: bool = False  # the table stands open beside the drawings
     legend: bool = False
     notes: list[str] = field(default_factory=list)

@@ -8,9 +8,9 @@ from gsbench.report import frontier as f
 from gsbench.report import paper
 from gsbench.report.configurations import Configuration, Group, without
 from gsbench.report.family import Family
-from gsbench.report.frontier import Point
+from gsbench.report.frontier import FrontierPoint
 from gsbench.report.page import charts, messages
-from gsbench.report.page.content import Canvas, Column, Drawing, Runs, Section, Tab, Table, Value
+from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, PageSection, Runs, Tab, Value
 from gsbench.report.page.palette import Style
 
 AXES = (("seconds", "training seconds"), ("ms", "ms a frame"), ("mb", "MB of the model"))
@@ -23,7 +23,7 @@ INTERVALS = (
 
 
 @dataclass(frozen=True)
-class Answer:
+class BudgetAnswer:
     """Which model to use for a budget."""
 
     budget: str
@@ -33,7 +33,7 @@ class Answer:
     detail: str
 
 
-def answers(group: Group, family: Family) -> list[Answer]:
+def answers(group: Group, family: Family) -> list[BudgetAnswer]:
     """Answer which model to use for each budget of training, and for 60 frames a second; `family`: the comparisons."""
     points = f.points(group, group.basis)
     return [_answer(points, family, cost, budget) for cost, budget in f.BUDGETS]
@@ -63,24 +63,26 @@ def _split(group: Group) -> str:
     return messages.shorten(group.finished[0].protocol.get("eval_split", "evaluated"), 20)
 
 
-def _answer(points: list[Point], family: Family, cost: str, budget: float) -> Answer:
+def _answer(points: list[FrontierPoint], family: Family, cost: str, budget: float) -> BudgetAnswer:
     timed = cost == "seconds"
     title = f"{messages.budget(budget)} of training" if timed else f"{1000 / budget:g} frames a second"
     known = [p.cost[cost] for p in points if not math.isnan(p.cost[cost])]
     if not known:
-        return Answer(title, "", "not measured", "", "No finished run tells.")
+        return BudgetAnswer(title, "", "not measured", "", "No finished run tells.")
     write = messages.duration if timed else lambda ms: f"{messages.plain(ms)} ms a frame"
     choice = f.choose(points, cost, budget, family)
     if choice is None:
-        return Answer(title, "", "none fits", "", f"The quickest took {write(min(known))}.")
+        return BudgetAnswer(title, "", "none fits", "", f"The quickest took {write(min(known))}.")
     point = choice.point
     detail = f"{_told(point.configuration)}{write(point.cost[cost])}. {_compared(choice)}"
     if timed and budget > 2 * max(known):
         detail += f" No run here trained longer than {write(max(known))}."
-    return Answer(title, point.series, f"{messages.plain(point.psnr.mean)} dB", messages.interval(point.psnr), detail)
+    return BudgetAnswer(
+        title, point.series, f"{messages.plain(point.psnr.mean)} dB", messages.interval(point.psnr), detail
+    )
 
 
-def _compared(choice: f.Choice) -> str:
+def _compared(choice: f.BudgetChoice) -> str:
     """Say which models that fit the chosen one is ahead of, which it is not told apart from, and which are ahead."""
     others = len(choice.ahead) + len(choice.level) + len(choice.behind) + len(choice.unknown)
     if not others:
@@ -96,7 +98,7 @@ def _compared(choice: f.Choice) -> str:
     return " ".join(said)
 
 
-def _named(points: list[Point]) -> str:
+def _named(points: list[FrontierPoint]) -> str:
     names = [p.series for p in points]
     more = [f"{len(names) - MOST_NAMED} more"] if len(names) > MOST_NAMED else []
     return messages.listing(names[:MOST_NAMED] + more)
@@ -111,7 +113,7 @@ def _told(configuration: Configuration) -> str:
     return length + (f"{rest.replace(',', ', ')}, " if rest else "")
 
 
-def frontier_section(group: Group, canvas: Canvas) -> Section:
+def frontier_section(group: Group, canvas: Canvas) -> PageSection:
     """Draw quality against seconds, milliseconds and megabytes, for the mean of scenes and for each scene."""
     scenes = group.basis
     points = f.points(group, scenes)
@@ -123,13 +125,13 @@ def frontier_section(group: Group, canvas: Canvas) -> Section:
     columns += [Column("95 % low", 2), Column("95 % high", 2), Column("PSNR val dB", 2), Column("training s", 1)]
     columns += [Column("ms a frame", 2), Column("MB", 2), Column("beaten in seconds")]
     rows = [row for where in [scenes, *([s] for s in single)] for row in _rows(group, where)]
-    table = Table("frontier.csv", columns, rows) if rows else None
+    table = DataTable("frontier.csv", columns, rows) if rows else None
     theirs = any(_paper(r, "ms") for r in group.finished)
     notes = [INTERVALS] if any(p.psnr.over for p in points) else []
     notes += ["×: the paper's own number, which was measured on other hardware by another protocol."] if theirs else []
     if len(drawn) < len(single):
         notes.append(f"Of {len(single)} scenes {len(drawn) or 'none'} are drawn singly; the table has all.")
-    return Section(
+    return PageSection(
         "frontier", "What accuracy costs", _frontier_words(group, points), tabs, table, legend=bool(tabs), notes=notes
     )
 
@@ -175,12 +177,14 @@ def _frontier_tab(group: Group, canvas: Canvas, key: str, label: str, scenes: li
             named = messages.listing([p.configuration.name for p in points][:20])
             alt = f"PSNR in dB against {title} of {named}, {label}"
             drawings.append(
-                Drawing(f"PSNR against {title}", charts.frontier(drawn, title).svg(canvas.name + key + cost, alt))
+                PageFigure(f"PSNR against {title}", charts.frontier(drawn, title).svg(canvas.name + key + cost, alt))
             )
     return Tab(label, drawings)
 
 
-def _curve(group: Group, runs: Runs, style: Style, points: list[Point], cost: str, scenes: list[str]) -> charts.Curve:
+def _curve(
+    group: Group, runs: Runs, style: Style, points: list[FrontierPoint], cost: str, scenes: list[str]
+) -> charts.FrontierCurve:
     """Gather what a panel shows of one model."""
     best = f.frontier(points, cost)
     beaten = [p for p in points if p not in best and not math.isnan(p.cost[cost])]
@@ -195,7 +199,7 @@ def _curve(group: Group, runs: Runs, style: Style, points: list[Point], cost: st
             pairs = [(group.value(r, cost), group.value(r, "psnr"), runs.of_record(group, r)) for r in own]
             single = [charts.Mark(x, y, run) for x, y, run in pairs if not math.isnan(x + y)]
         theirs = [charts.Mark(*at, runs.of_paper(r)) for r in own[:1] if not gated and (at := _paper(r, cost))]
-    return charts.Curve(style, [mark(p) for p in best], [mark(p) for p in beaten], single, theirs)
+    return charts.FrontierCurve(style, [mark(p) for p in best], [mark(p) for p in beaten], single, theirs)
 
 
 def _paper(record: Record, cost: str) -> tuple[float, float] | None:
@@ -208,7 +212,7 @@ def _paper(record: Record, cost: str) -> tuple[float, float] | None:
     return (1000 / row.fps, row.psnr) if cost == "ms" else None
 
 
-def _frontier_words(group: Group, points: list[Point]) -> list[str]:
+def _frontier_words(group: Group, points: list[FrontierPoint]) -> list[str]:
     """Say which point is chosen, which are beaten by their means, and what the points are from."""
     if not points:
         return ["No run has finished, so there is nothing to compare."]
@@ -225,7 +229,7 @@ def _frontier_words(group: Group, points: list[Point]) -> list[str]:
     return [text, _lengths(points)]
 
 
-def _beaten_words(points: list[Point]) -> str:
+def _beaten_words(points: list[FrontierPoint]) -> str:
     """Say how many points another one beats; this is of means, so that it claims no difference."""
     timed = [p for p in points if not math.isnan(p.cost["seconds"])]
     beaten = f.beaten(timed, "seconds")
@@ -248,7 +252,7 @@ def _beaten_words(points: list[Point]) -> str:
     )
 
 
-def _lengths(points: list[Point]) -> str:
+def _lengths(points: list[FrontierPoint]) -> str:
     """Say of which lengths of training the points are."""
     lengths = sorted({n for p in points if (n := p.configuration.iterations)})
     if len(lengths) > 1:

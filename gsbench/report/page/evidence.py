@@ -5,7 +5,7 @@ from gsbench.report import layout, tables
 from gsbench.report.conditions import conditions
 from gsbench.report.configurations import Group, iterations
 from gsbench.report.page import messages
-from gsbench.report.page.content import Column, Section, Table, Value
+from gsbench.report.page.content import Column, DataTable, PageSection, Value
 
 LONGEST_NOTE = 700
 
@@ -20,7 +20,7 @@ def _compared(group: Group) -> list[Record]:
     return [r for r in group.records if r.variant == group.variant] or group.records
 
 
-def protocol_section(group: Group) -> Section:
+def protocol_section(group: Group) -> PageSection:
     """List protocol, data, machine, commit, versions and seeds, warnings first, and every run."""
     columns = [Column("run"), Column("status"), Column("PSNR dB", 2), Column("training s", 1), Column("CPU s", 1)]
     columns += [Column("load", 1), Column("ms a frame", 2), Column("MB", 2), Column("iterations"), Column("machine")]
@@ -46,12 +46,14 @@ def protocol_section(group: Group) -> Section:
     ended = messages.count(len(group.finished), "run")
     lost = len(group.records) - len(group.finished)
     said = [f"{ended} finished, {messages.count(lost, 'run')} did not (below)." if lost else f"All {ended} finished."]
-    return Section("protocol", "Protocol, machine, seeds", said, table=Table("runs.csv", columns, rows), notes=notes)
+    return PageSection(
+        "protocol", "Protocol, machine, seeds", said, table=DataTable("runs.csv", columns, rows), notes=notes
+    )
 
 
-def failures(group: Group) -> Table | None:
+def failures(group: Group) -> DataTable | None:
     """List the runs that did not finish and why."""
     lost = [r for r in group.records if r.status != "ok"]
     columns = [Column("run"), Column("status"), Column("reason")]
     rows: list[list[Value]] = [[messages.run_name(r), r.status, messages.shorten(r.reason, 2000)] for r in lost]
-    return Table("not_finished.csv", columns, rows) if lost else None
+    return DataTable("not_finished.csv", columns, rows) if lost else None

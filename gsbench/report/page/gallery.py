@@ -20,7 +20,7 @@ STEPS = ((400, 92, 3), (400, 85, 3), (320, 80, 3), (256, 75, 3), (256, 75, 1), (
 
 
 @dataclass(frozen=True)
-class View:
+class GalleryView:
     """The images of one view of a scene: the ground truth, and render and error by model, as data addresses."""
 
     scene: str
@@ -35,7 +35,7 @@ class View:
 StripRow = tuple[Pixels, Pixels, Pixels]  # render, truth, error
 
 
-def gallery(records: list[Record], folder: Path) -> list[View]:
+def gallery(records: list[Record], folder: Path) -> list[GalleryView]:
     """Return the views of which there are images, of the first seed of each model, in less than BUDGET bytes.
 
     Images that do not fit are first compressed more, then made smaller, then left out: all views but one a scene.
@@ -128,7 +128,7 @@ def _blocks(image: Pixels, factor: int) -> bool:
 
 def _views(
     scene: str, models: dict[str, tuple[Record, list[StripRow]]], side: int, quality: int, most: int
-) -> list[View]:
+) -> list[GalleryView]:
     """Encode the views that every model's strip has."""
     shown = []
     shared = min(len(rows) for _, rows in models.values())
@@ -141,7 +141,7 @@ def _views(
         }
         render, error = ({m: pair[k] for m, pair in encoded.items()} for k in (0, 1))
         height, width = truth.shape[:2]
-        shown.append(View(scene, names[i], _encode(truth, side, quality), render, error, width, height))
+        shown.append(GalleryView(scene, names[i], _encode(truth, side, quality), render, error, width, height))
     return shown
 
 
@@ -162,5 +162,5 @@ def _encode(image: Pixels, side: int, quality: int) -> str:
     return f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
-def _size(view: View) -> int:
+def _size(view: GalleryView) -> int:
     return len(view.truth) + sum(map(len, (*view.render.values(), *view.error.values())))

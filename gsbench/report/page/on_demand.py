@@ -11,7 +11,7 @@ from gsbench.report.configurations import Group
 from gsbench.report.intervals import Estimate
 from gsbench.report.on_demand import DEGREES, REMOVED, Decided, decided
 from gsbench.report.page import charts, gallery, messages
-from gsbench.report.page.content import Canvas, Column, Drawing, Image, Section, Swatch, Tab, Table, Value
+from gsbench.report.page.content import Canvas, Column, DataTable, Image, PageFigure, PageSection, Swatch, Tab, Value
 from gsbench.report.page.palette import CLASS_LIKE, MODELS
 from gsbench.report.page.svg import LINE, model_colour, stage_colour
 
@@ -29,7 +29,7 @@ IN_TRAINING = (
 NAMES = CLASSES | {REMOVED: "removed"}
 
 
-def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> Section | None:
+def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection | None:
     """Say what was decided, and draw the classes and the harmonics of the Gaussians; None where nothing was."""
     found = decided(group)
     if not found:
@@ -39,7 +39,7 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> Section | N
     if len(found) > len(said):
         said.append(f"These are {len(said)} of {len(found)} scenes and runs; the table has all of them.")
     gated = [one for one in found if one.gated]
-    return Section(
+    return PageSection(
         "on-demand",
         "Effects on demand",
         said,
@@ -132,7 +132,7 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
 # ---- figures
 
 
-def _drawings(gated: list[Decided], canvas: Canvas) -> list[Drawing]:
+def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
     """Draw a bar of classes and a bar of degrees for each scene and model."""
     label = lambda one: messages.shorten_middle(f"{one.scene}, {one.name}", LONGEST_LABEL, LABEL_END)  # noqa: E731
     classes = [
@@ -147,7 +147,7 @@ def _drawings(gated: list[Decided], canvas: Canvas) -> list[Drawing]:
         ("Harmonics by degree, of the Gaussians left", "d", degrees, [stage_colour(_stage(i)) for i in range(DEGREES)]),
     )
     return [
-        Drawing(title, charts.bars(bars, hues, "%").svg(f"{canvas.name}o{key}", f"{title}: {whose}"))
+        PageFigure(title, charts.bars(bars, hues, "%").svg(f"{canvas.name}o{key}", f"{title}: {whose}"))
         for title, key, bars, hues in drawn
     ]
 
@@ -186,7 +186,7 @@ def _images(found: list[Decided], folder: Path) -> list[Image]:
 # ---- numbers
 
 
-def _table(found: list[Decided], machine: str) -> Table:
+def _table(found: list[Decided], machine: str) -> DataTable:
     columns = [Column("scene"), Column("model"), Column("variant"), Column("seeds"), Column("time")]
     columns += [Column("largest p", 3), Column("% free of the camera", 0), Column("screen s", 1), Column("seeds gated")]
     columns += [Column("Gaussians before", 0), *(Column(said, 0) for said in NAMES.values())]
@@ -194,7 +194,7 @@ def _table(found: list[Decided], machine: str) -> Table:
     columns += [Column("predicted dB", 3), Column("PSNR measured on"), Column("PSNR dB", 3), Column("95 % low", 3)]
     columns += [Column("95 % high", 3), Column("ms a frame before", 2), Column("change in ms", 2), Column("low", 2)]
     columns += [Column("high", 2), Column("MB before", 2), Column("MB", 2)]
-    return Table("effects_on_demand.csv", columns, [_row(one, machine) for one in found])
+    return DataTable("effects_on_demand.csv", columns, [_row(one, machine) for one in found])
 
 
 def _row(one: Decided, machine: str) -> list[Value]:

@@ -6,15 +6,15 @@ from statistics import fmean
 from gsbench.report import frontier as f
 from gsbench.report.configurations import Configuration, Group
 from gsbench.report.page import charts, events, messages
-from gsbench.report.page.content import Canvas, Column, Drawing, Section, Tab, Table, Value
+from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, PageSection, Tab, Value
 
 
-def quality_section(group: Group, canvas: Canvas) -> Section:
+def quality_section(group: Group, canvas: Canvas) -> PageSection:
     """Say how long each model needs for the targets, and draw the performance profile."""
     targets = f.targets(group)
     if not targets:
         text = "No target: no finished run has PSNR on val and training seconds, or all reach the same."
-        return Section("quality", "Time to quality", [text])
+        return PageSection("quality", "Time to quality", [text])
     ratios = f.profile(targets)
     problems = len(next(iter(ratios.values()), []))
     panel = charts.profile({m: (canvas.look[m], list(values)) for m, values in ratios.items()}, problems)
@@ -22,12 +22,12 @@ def quality_section(group: Group, canvas: Canvas) -> Section:
     models = [m for m in canvas.look if any(m in t.seconds for t in targets)]
     columns = [Column("scene"), Column("target"), Column("PSNR dB", 2), *(Column(f"{m} s", 1) for m in models)]
     rows: list[list[Value]] = [[t.scene, t.rule, t.psnr, *(t.seconds.get(m) for m in models)] for t in targets]
-    return Section(
+    return PageSection(
         "quality",
         "Time to quality",
         _quality_words(targets, models),
-        [Tab("", [Drawing("Targets reached within a factor of the fastest", panel.svg(f"{canvas.name}q", alt))])],
-        Table("time_to_quality.csv", columns, rows),
+        [Tab("", [PageFigure("Targets reached within a factor of the fastest", panel.svg(f"{canvas.name}q", alt))])],
+        DataTable("time_to_quality.csv", columns, rows),
         beside=True,
         legend=True,
         notes=[
@@ -56,9 +56,9 @@ def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
     return [text]
 
 
-def anytime_section(group: Group, canvas: Canvas) -> Section:
+def anytime_section(group: Group, canvas: Canvas) -> PageSection:
     """Draw PSNR on val while training, for each scene, at the common variant."""
-    drawings: list[Drawing] = []
+    drawings: list[PageFigure] = []
     rows: list[list[Value]] = []
     tails: dict[str, list[float]] = {}
     seen: set[str] = set()
@@ -76,17 +76,17 @@ def anytime_section(group: Group, canvas: Canvas) -> Section:
                 tails.setdefault(configuration.model, []).append(max(psnr) - psnr[-1])
         if curves and i < max(1, canvas.scenes):
             alt = f"PSNR on val against training seconds on {scene}, one curve for each of {len(curves)} models"
-            drawings.append(Drawing(scene, charts.anytime(curves).svg(f"{canvas.name}a{i}", alt)))
+            drawings.append(PageFigure(scene, charts.anytime(curves).svg(f"{canvas.name}a{i}", alt)))
     if not rows:
-        return Section("anytime", "While training", ["No finished run has a curve of PSNR on val."])
+        return PageSection("anytime", "While training", ["No finished run has a curve of PSNR on val."])
     columns = [Column("scene"), Column("model"), Column("iteration"), Column("seconds", 2), Column("PSNR val dB", 2)]
     letters = [f"{letter}: {events.MEANING[letter]}" for letter in events.MEANING if letter in seen]
     notes = [
         "This is the course of runs of this length, not what shorter runs would give: rates and densification scale."
     ]
     notes += [f"Events in mean seconds: {'; '.join(letters)}."] if letters else []
-    table = Table("anytime.csv", columns, rows)
-    return Section(
+    table = DataTable("anytime.csv", columns, rows)
+    return PageSection(
         "anytime", "While training", _anytime_words(tails), [Tab("", drawings)], table, legend=True, notes=notes
     )
 

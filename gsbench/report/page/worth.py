@@ -9,7 +9,7 @@ from gsbench.report.compare import Cube, Pair, Price
 from gsbench.report.configurations import Group
 from gsbench.report.family import Family
 from gsbench.report.page import charts, messages
-from gsbench.report.page.content import Canvas, Column, Drawing, Section, Swatch, Tab, Table, Value
+from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, PageSection, Swatch, Tab, Value
 
 UNITS = (("psnr", "dB", 2), ("seconds", "training s", 1), ("ms", "ms a frame", 2), ("mb", "MB", 2))
 STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer", "screen", "gate")  # each has a colour
@@ -23,7 +23,7 @@ NOT_NESTED = "The nested comparison, with model=7dgs_nodir, needs runs that are 
 NESTED = "Nested: 7dgs_nodir, which is 7dgs less direction and nothing else, in the place of 4dgs."
 
 
-def effects_section(group: Group, family: Family, canvas: Canvas) -> Section:
+def effects_section(group: Group, family: Family, canvas: Canvas) -> PageSection:
     """Price time, direction, AGR and their interactions in every unit, as far as the cells were run."""
     cube = compare.cube(group, family)
     notes = []
@@ -39,14 +39,16 @@ def effects_section(group: Group, family: Family, canvas: Canvas) -> Section:
         notes.append(f"{PARAMETRISATION} {NESTED if cube.nested else NOT_NESTED}")
     if not cube.prices:
         text = "No two finished models differ in one effect alone, so no effect can be priced."
-        return Section("effects", "The price of each effect", [text], notes=notes)
+        return PageSection("effects", "The price of each effect", [text], notes=notes)
     shown = cube.prices + [replace(price, name=f"{price.name}, nested") for price in cube.nested]
     drawings = []
     for unit, title, digits in UNITS:
         rows = [_row(price, unit, digits) for price in shown if price.costs[unit].scenes]
         if rows:
             alt = f"Change in {title} of {messages.listing([row.label for row in rows])}"
-            drawings.append(Drawing(f"in {title}", charts.differences(rows, title).svg(f"{canvas.name}e{unit}", alt)))
+            drawings.append(
+                PageFigure(f"in {title}", charts.differences(rows, title).svg(f"{canvas.name}e{unit}", alt))
+            )
     columns = [Column("effect"), Column("computed from")]
     for _, title, digits in UNITS:
         columns += [Column(title, digits), Column(f"{title}: 95 % low", digits), Column(f"{title}: high", digits)]
@@ -61,15 +63,15 @@ def effects_section(group: Group, family: Family, canvas: Canvas) -> Section:
         ]
         for p in shown
     ]
-    table = Table("effects.csv", columns, priced)
+    table = DataTable("effects.csv", columns, priced)
     first, *rule = _scope(cube, family)
     said = [first, *_effect_words(cube)]
-    return Section("effects", "The price of each effect", said, [Tab("", drawings)], table, notes=[*rule, *notes])
+    return PageSection("effects", "The price of each effect", said, [Tab("", drawings)], table, notes=[*rule, *notes])
 
 
-def _row(price: Price, unit: str, digits: int) -> charts.Row:
+def _row(price: Price, unit: str, digits: int) -> charts.Difference:
     of = price.costs[unit]
-    return charts.Row(price.name, of.mean, of.low, of.high, price.told[unit], messages.signed(of.mean, digits))
+    return charts.Difference(price.name, of.mean, of.low, of.high, price.told[unit], messages.signed(of.mean, digits))
 
 
 def _cells(price: Price, unit: str) -> tuple[Value, ...]:
@@ -120,11 +122,11 @@ def _effect_words(cube: Cube) -> list[str]:
     return [s for s in said[:5] if s]
 
 
-def stages_section(group: Group, canvas: Canvas) -> Section:
+def stages_section(group: Group, canvas: Canvas) -> PageSection:
     """Draw where the seconds of training go, by stage."""
     parts = {c.model: found for c in group.main_configurations if (found := _stage_seconds(group, c.model))}
     if not parts:
-        return Section("stages", "Where the seconds go", ["No finished run tells its seconds by stage."])
+        return PageSection("stages", "Where the seconds go", ["No finished run tells its seconds by stage."])
     every = {name for stages in parts.values() for name in stages}
     names = [name for name in (*STAGES, REST) if name in every]
     panel = charts.stages(list(parts.items()), names, [_colour(name) for name in names])
@@ -138,9 +140,9 @@ def stages_section(group: Group, canvas: Canvas) -> Section:
     text = f"The largest share of training, on the mean of the models, is {first} with {100 * share[first]:.0f} %"
     text += f", then {others[0]} with {100 * share[others[0]]:.0f} %." if others else "."
     text += _slowest_words(parts, names)
-    table = Table("stages.csv", columns, rows)
-    drawing = Drawing("Seconds of training by stage", panel.svg(f"{canvas.name}s", alt))
-    return Section(
+    table = DataTable("stages.csv", columns, rows)
+    drawing = PageFigure("Seconds of training by stage", panel.svg(f"{canvas.name}s", alt))
+    return PageSection(
         "stages",
         "Where the seconds go",
         [text],
@@ -184,14 +186,14 @@ def _stage_seconds(group: Group, model: str) -> dict[str, float]:
     return found | ({REST: rest} if rest > 0.005 * total else {}) if total > 0 else {}
 
 
-def pairs_section(group: Group, family: Family, canvas: Canvas) -> Section:
+def pairs_section(group: Group, family: Family, canvas: Canvas) -> PageSection:
     """Draw the difference of every two models with its interval."""
     found = compare.pairs(group, family)
     if not found:
         text = "Fewer than two models have finished the same scene, so there is no pair to compare."
-        return Section("pairs", "Is it a difference?", [text])
+        return PageSection("pairs", "Is it a difference?", [text])
     rows = [
-        charts.Row(
+        charts.Difference(
             _pair_name(group, p), p.difference.mean, p.difference.low, p.difference.high,
             p.differs, messages.signed(p.difference.mean),
         )
@@ -200,8 +202,8 @@ def pairs_section(group: Group, family: Family, canvas: Canvas) -> Section:
     alt = f"Differences in PSNR of {messages.count(len(rows), 'pair')} of models with 95 % intervals"
     columns = [Column("pair"), Column("dB", 2), Column("95 % low", 2), Column("95 % high", 2)]
     columns += [Column("ahead on % of views", 0), Column("p, Holm"), Column("told apart")]
-    table = Table("pairs.csv", columns, [_pair_row(group, p) for p in found])
-    drawing = Drawing("Difference in PSNR", charts.differences(rows, "dB").svg(f"{canvas.name}p", alt))
+    table = DataTable("pairs.csv", columns, [_pair_row(group, p) for p in found])
+    drawing = PageFigure("Difference in PSNR", charts.differences(rows, "dB").svg(f"{canvas.name}p", alt))
     first = found[0].difference
     notes = [
         f"Paired over the seeds and views that both have; each interval, over {messages.over(first)}, is of its pair "
@@ -212,7 +214,7 @@ def pairs_section(group: Group, family: Family, canvas: Canvas) -> Section:
         else f"{messages.NO_SPREAD.capitalize()}: no interval and no p-value is given."
     ]
     said = [*([messages.scope(first)] if first.over else []), *_pair_words(group, found)]
-    return Section("pairs", "Is it a difference?", said, [Tab("", [drawing])], table, beside=True, notes=notes)
+    return PageSection("pairs", "Is it a difference?", said, [Tab("", [drawing])], table, beside=True, notes=notes)
 
 
 def _pair_name(group: Group, pair: Pair) -> str:
