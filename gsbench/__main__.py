@@ -16,9 +16,9 @@ from gsbench.config import CONF, HERE, register_schema
 from gsbench.errors import InputError, one_line, printable
 from gsbench.run.stop import Stopped, stop_at_once
 from gsbench.sweep.axes import expand
+from gsbench.sweep.callbacks import started
 from gsbench.sweep.explain import explain, raised_by_hydra
 from gsbench.sweep.finish import see_through
-from gsbench.sweep.hooks import started
 from gsbench.sweep.task import Problem, do
 
 BAD_INPUT, FAILED = 2, 1  # exit statuses: nothing could be run as asked; a run did not end well

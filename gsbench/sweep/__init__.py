@@ -1,5 +1,5 @@
-"""Do many runs: plan a grid, see what became of each of its runs, put back those that did not end.
+"""Do many runs: plan a grid of runs, show the state of each run, and launch again the runs that did not finish.
 
-The state of a sweep is what lies in its results folder and what Slurm says; there is no daemon and no database.
-No module here imports torch, so that the status of a sweep is there at once.
+The state of a sweep is its results folder and Slurm's queue; there is no daemon and no database. No module here
+imports torch, so the status of a sweep is shown without delay.
 """

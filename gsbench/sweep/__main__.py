@@ -1,4 +1,4 @@
-"""Show how far the runs of an experiment are, or put back those that did not end.
+"""Show the state of an experiment's runs, or launch again the runs that did not finish.
 
 python -m gsbench.sweep status results/EXP [--watch] [--json]
 python -m gsbench.sweep retry results/EXP [launch.memory=16G ...]
@@ -14,40 +14,42 @@ from pathlib import Path
 
 from gsbench.errors import InputError, printable
 from gsbench.sweep.show import lines
-from gsbench.sweep.status import BROKEN, GOING, Run, read, status
+from gsbench.sweep.status import BROKEN, GOING, RunStatus, read, status
 
 WATCH_SECONDS = 10.0
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Return 0 if no run failed or is lost, else 1; 2 if there is nothing to look at."""
+    """Return 0 if no run failed or is lost, 1 if one did, and 2 if the folder is no experiment."""
     parser = argparse.ArgumentParser(prog="python -m gsbench.sweep", description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    shown = commands.add_parser("status", help="what is done, running, queued, planned, failed, lost")
+    shown = commands.add_parser("status", help="show which runs are done, running, queued, planned, failed or lost")
     shown.add_argument("experiment", type=Path, metavar="results/EXP")
-    shown.add_argument("--watch", action="store_true", help="again and again until nothing is running or waits")
-    shown.add_argument("--json", action="store_true", help="every run, the ones that are done too, as JSON")
-    again = commands.add_parser("retry", help="put back what failed, was lost or never started")
+    shown.add_argument("--watch", action="store_true", help="repeat until no run is running or waiting")
+    shown.add_argument("--json", action="store_true", help="print all runs as JSON, also those that are done")
+    again = commands.add_parser("retry", help="launch again the runs that failed, are lost or never started")
     again.add_argument("experiment", type=Path, metavar="results/EXP")
-    again.add_argument("launch", nargs="*", metavar="launch.KEY=VALUE", help="other settings than it had")
-    asked = parser.parse_args(arguments)
+    again.add_argument("launch", nargs="*", metavar="launch.KEY=VALUE", help="launch settings to change")
+    options = parser.parse_args(arguments)
     try:
-        if not asked.experiment.is_dir():
-            raise InputError(f"{asked.experiment}: expected the folder of an experiment, such as results/mini")
-        if asked.command == "retry":
-            return _retry(asked.experiment, asked.launch)
-        return _watch(asked.experiment, asked.json) if asked.watch else _verdict(_show(asked.experiment, asked.json))
+        if not options.experiment.is_dir():
+            raise InputError(f"{options.experiment}: expected the folder of an experiment, such as results/mini")
+        if options.command == "retry":
+            return _retry(options.experiment, options.launch)
+        if options.watch:
+            return _watch(options.experiment, options.json)
+        return _verdict(_show(options.experiment, options.json))
     except InputError as error:
         print(f"gsbench.sweep: {printable(str(error))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # who read it has seen enough, as `head` does
+    except BrokenPipeError:  # the reader has closed the pipe, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
 
 
-def _show(folder: Path, as_json: bool) -> list[Run]:
+def _show(folder: Path, as_json: bool) -> list[RunStatus]:
     experiment = read(folder)
     runs = status(experiment)
     if as_json:
@@ -67,7 +69,7 @@ def _watch(folder: Path, as_json: bool) -> int:
         time.sleep(WATCH_SECONDS)
 
 
-def _verdict(runs: list[Run]) -> int:
+def _verdict(runs: list[RunStatus]) -> int:
     return 1 if any(run.state in BROKEN for run in runs) else 0
 
 
@@ -78,7 +80,7 @@ def _retry(folder: Path, launch: list[str]) -> int:
     folder = folder.resolve()  # runs are launched from the folder that the first command was given in
     count = retry(read(folder), launch, do)
     if not count:
-        print(f"{folder}: nothing failed, is lost or was never started", file=sys.stderr)
+        print(f"{folder}: no run failed, is lost or never started", file=sys.stderr)
     return _verdict(_show(folder, False))
 
 

@@ -1,4 +1,4 @@
-"""Expand a command line before Hydra reads it: scene=all becomes an axis of the sweep, one run for each scene."""
+"""Expand a command line before Hydra reads it: scene=all becomes an axis of the sweep with one run for each scene."""
 
 import re
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ def expand(words: Sequence[str]) -> list[str]:
 
 
 def _check_group(name: str, choices: str) -> None:
-    """Raise InputError for a group's choice that is a number or the like: Hydra would raise an error of its insides."""
+    """Raise InputError for a group's choice that is no name, such as a number; Hydra's own error explains nothing."""
     if not name or not (CONF / name).is_dir():
         return
     for choice in choices.split(","):
@@ -56,7 +56,7 @@ def _check_group(name: str, choices: str) -> None:
 
 
 def scenes_of(overrides: list[str]) -> list[str] | None:
-    """Return the scenes of an experiment, each of them then a choice of the group `scene`; None where Hydra fails."""
+    """Return the scenes of an experiment and make each one a choice of the group `scene`; None where Hydra fails."""
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             scenes: list[str] = list(compose("config", overrides).data.scenes)

@@ -26,6 +26,6 @@ def explain(error: Exception) -> str:
 
 
 def raised_by_hydra(error: Exception) -> bool:
-    """Tell whether an error comes from the insides of Hydra: it takes some words for what they cannot be."""
+    """Tell whether Hydra's own code raised an error, as it does for words that it misreads."""
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
     return str(frame.f_globals.get("__name__")).partition(".")[0] in ("hydra", "omegaconf", "antlr4")

@@ -1,6 +1,7 @@
-"""See a launched sweep to its end: a job or a process that died stops no other, and what broke is known at the end.
+"""Wait for the last job of a launched sweep, and list the runs that broke.
 
-Hydra's launchers for Slurm and for several processes end with the first job or process that died, while others go on.
+Hydra's launchers for Slurm and for several processes stop waiting when the first job or process dies, while others
+still run.
 """
 
 import time
@@ -11,18 +12,18 @@ from typing import Any
 from gsbench.errors import InputError
 from gsbench.sweep import plan
 from gsbench.sweep.plan import identity
-from gsbench.sweep.status import BROKEN, GOING, Run, read, status
+from gsbench.sweep.status import BROKEN, GOING, RunStatus, read, status
 
-LIBRARIES = ("submitit", "joblib")  # what Hydra's launchers are made of
+LIBRARIES = ("submitit", "joblib")  # that Hydra's launchers use
 POLL = 10.0  # seconds between two looks at Slurm's queue
 
 
-def see_through(launch: Callable[[], Any], started: Sequence[Path]) -> list[Run]:
+def see_through(launch: Callable[[], Any], started: Sequence[Path]) -> list[RunStatus]:
     """Launch a sweep, wait for its last job, and return those of its runs that broke.
 
     Args:
-        launch: starts the runs and waits for them; may stop waiting by an error of its library.
-        started: when it is done, the folders of the plans that it wrote; none where nothing was swept.
+        launch: starts the runs and waits for them; an error of its library may end the wait.
+        started: the folders of the plans that `launch` wrote, read after it returns; empty where nothing was swept.
 
     Raises:
         InputError: not one job could be submitted.
@@ -37,12 +38,12 @@ def see_through(launch: Callable[[], Any], started: Sequence[Path]) -> list[Run]
     return [run for folder in started for run in _ended(folder) if run.state in (*BROKEN, "planned")]
 
 
-def _ended(folder: Path) -> list[Run]:
+def _ended(folder: Path) -> list[RunStatus]:
     """Wait until no run of a plan has a job that goes on, and return the status of its runs."""
     while True:
         whole = plan.read(folder / plan.FILE_NAME)
-        asked = {identity(run) for run in whole.runs}
-        runs = [run for run in status(read(folder.parents[1])) if identity(run.overrides) in asked]
+        requested = {identity(run) for run in whole.runs}
+        runs = [run for run in status(read(folder.parents[1])) if identity(run.overrides) in requested]
         if not _is_of_slurm(folder) or not any(run.state in GOING for run in runs):
             return runs
         time.sleep(POLL)

@@ -1,7 +1,7 @@
-"""Write down which runs a sweep asks for, in `results/<experiment>/.sweep/<time>/plan.json`, and find such plans.
+"""Write the runs that a sweep requests to `results/<experiment>/.sweep/<time>/plan.json`, and find such plans.
 
-A run is known by its overrides, less those that change none of its numbers (`identity`). What a run leaves (record,
-progress) has the same overrides in it, so that the two are matched without composing a config, which takes 0.1 s.
+A run is identified by those of its overrides that decide its numbers (`identity`). Its record and its progress file
+hold the same overrides. So they are matched without composing a config, which takes 0.1 s.
 """
 
 import json
@@ -21,7 +21,7 @@ Identity = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Plan:
-    """The runs that one command asked for, and who launches them."""
+    """The runs that one command requested, and the process that launches them."""
 
     launcher: str  # of Hydra: basic, joblib or submitit_slurm
     runs: list[list[str]]  # the overrides of each run, in the order of the tasks of a job array
@@ -35,10 +35,10 @@ class Plan:
 
 @dataclass(frozen=True)
 class Ended:
-    """What became of one run of a plan, as the process that did it left it."""
+    """The outcome of one run of a plan, written by the process that did the run."""
 
-    record: str | None  # the path of its record from the folder of all results; None where there is none
-    reason: str | None  # why there is none
+    record: str | None  # path of its record, relative to the folder of all results; None where it has no record
+    reason: str | None  # why it has no record
 
 
 def identity(overrides: Sequence[str]) -> Identity:
@@ -64,12 +64,12 @@ def find(experiment: Path) -> list[Path]:
 
 
 def write_ended(folder: Path, number: int, ended: Ended) -> None:
-    """Write down what became of run `number` of the plan in `folder`."""
+    """Write the outcome of run `number` of the plan in `folder`."""
     write_atomically(folder / ENDED / f"{number}.json", json.dumps(asdict(ended)).encode())
 
 
 def read_ended(folder: Path) -> dict[int, Ended]:
-    """Read what became of the runs of the plan in `folder`, by their numbers; a damaged file says nothing."""
+    """Read the outcomes of the runs of the plan in `folder`, by number; damaged files are skipped."""
     found = {}
     for path in (folder / ENDED).glob("*.json"):
         try:
@@ -80,9 +80,9 @@ def read_ended(folder: Path) -> dict[int, Ended]:
 
 
 def jobs(folder: Path) -> dict[int, str]:
-    """List the Slurm jobs of the plan in `folder` by the numbers of their runs: submitit makes a folder for each.
+    """List the Slurm jobs of the plan in `folder` by the numbers of their runs; submitit makes a folder for each job.
 
-    An array has a folder of its own, `<array>`, beside those of its tasks, `<array>_<task>`; a single run has no array.
+    A job array has a folder `<array>` and one folder `<array>_<task>` for each task. A single run has no array.
     """
     names = [path.name for path in (folder / JOBS).glob("[0-9]*")]
     tasks = {int(name.partition("_")[2]): name for name in names if re.fullmatch(r"\d+_\d+", name)}

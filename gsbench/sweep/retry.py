@@ -1,4 +1,4 @@
-"""Put the runs of an experiment back that failed, were lost or never started, by the launcher they had."""
+"""Launch the runs of an experiment again that failed, were lost or never started, by the launcher they had."""
 
 import os
 import sys
@@ -21,31 +21,31 @@ from gsbench.errors import InputError, printable
 from gsbench.run.overrides import launches
 from gsbench.sweep import plan
 from gsbench.sweep.axes import SCENES_DEPEND_ON, scenes_of
+from gsbench.sweep.callbacks import plan_of
 from gsbench.sweep.explain import explain
 from gsbench.sweep.finish import see_through
-from gsbench.sweep.hooks import plan_of
 from gsbench.sweep.plan import identity
-from gsbench.sweep.status import BROKEN, Asked, Experiment, status
+from gsbench.sweep.status import BROKEN, Experiment, RequestedRun, status
 
 CONFIG_NAME = "config"
 
 
-def broken(experiment: Experiment) -> list[Asked]:
-    """List the runs that a sweep asked for and that have ended without a result."""
+def broken(experiment: Experiment) -> list[RequestedRun]:
+    """List the requested runs that ended without a result."""
     states = {identity(run.overrides): run.state for run in status(experiment)}
-    return [asked for one, asked in experiment.asked.items() if states[one] in BROKEN]
+    return [run for one, run in experiment.requested.items() if states[one] in BROKEN]
 
 
 def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfig], Any]) -> int:
-    """Launch the runs that are `broken` again and wait for them, as the first command did; return how many they were.
+    """Launch the `broken` runs again, wait for them as the first command did, and return how many there were.
 
     Args:
         experiment: as it was read just now.
         more: overrides of `launch`, such as more memory.
         task: does a run of a composed config.
 
-    A group of runs that cannot be launched is told on stderr, and the others are: the folder where its command was
-    given may be gone, and its words may no longer be known.
+    A group of runs that cannot be launched is reported on stderr, and the other groups are launched. The folder in
+    which its command was given may be gone, or an override may no longer be known.
 
     Raises:
         InputError: `more` would change what is run, or is not known.
@@ -59,9 +59,9 @@ def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfi
             compose(CONFIG_NAME, list(more))
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError(f"retry: {explain(error)}") from None
-    groups: dict[tuple[str, ...], list[Asked]] = defaultdict(list)
-    for asked in broken(experiment):
-        groups[(asked.plan.cwd, *_launch(asked), *asked.plan.hydra)].append(asked)
+    groups: dict[tuple[str, ...], list[RequestedRun]] = defaultdict(list)
+    for requested in broken(experiment):
+        groups[(requested.plan.cwd, *_launch(requested), *requested.plan.hydra)].append(requested)
     for group in groups.values():
         try:
             _relaunch(experiment, group, more, task)
@@ -72,15 +72,15 @@ def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfi
     return sum(map(len, groups.values()))
 
 
-def _launch(asked: Asked) -> list[str]:
-    """The overrides of a run that say how it is launched."""
-    return [one for one in asked.overrides if launches(one)]
+def _launch(requested: RequestedRun) -> list[str]:
+    """Return the overrides of a run that say how it is launched."""
+    return [one for one in requested.overrides if launches(one)]
 
 
 def _relaunch(
-    experiment: Experiment, group: list[Asked], more: Sequence[str], task: Callable[[DictConfig], Any]
+    experiment: Experiment, group: list[RequestedRun], more: Sequence[str], task: Callable[[DictConfig], Any]
 ) -> None:
-    """Launch runs that one command asked for: their lists are no grid, so the launcher is called without a sweeper."""
+    """Launch runs that one command requested; they form no grid, so the launcher is called without a sweeper."""
     first = group[0]
     results = str(experiment.folder.parent.resolve())
     try:
@@ -90,8 +90,8 @@ def _relaunch(
                          f"{getattr(error, 'strerror', error)}") from None  # fmt: skip
     # Scenes that have no file in conf/ become choices of the group `scene`, as when the command was given.
     scenes_of([one for one in first.overrides if one.partition("=")[0].lstrip("+") in SCENES_DEPEND_ON])
-    runs = [[*(one for one in asked.overrides if not one.startswith("results=")), f"results={results}", *more]
-            for asked in group]  # fmt: skip
+    runs = [[*(one for one in requested.overrides if not one.startswith("results=")), f"results={results}", *more]
+            for requested in group]  # fmt: skip
     with initialize_config_dir(str(CONF), job_name="gsbench", version_base="1.3"):
         config = compose(CONFIG_NAME, [*first.plan.hydra, *_common(runs)], return_hydra_config=True)
         with open_dict(config):
@@ -106,5 +106,5 @@ def _relaunch(
 
 
 def _common(runs: list[list[str]]) -> list[str]:
-    """The overrides that all runs have, in their order: what the config of the whole is composed of."""
+    """Return the overrides that all runs share, in their order, from which the launch's config is composed."""
     return [one for one in runs[0] if all(one in run for run in runs)]

@@ -1,20 +1,20 @@
-"""Show the status of an experiment as lines of text: how many runs are in which state, and each that is not done."""
+"""Show the status of an experiment as lines of text: the number of runs in each state, and each run not yet done."""
 
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.errors import printable
-from gsbench.sweep.status import STATES, Run
+from gsbench.sweep.status import STATES, RunStatus
 
 
-def lines(experiment: Path, runs: Sequence[Run], silent: str | None = None) -> list[str]:
+def lines(experiment: Path, runs: Sequence[RunStatus], silent: str | None = None) -> list[str]:
     """Show the runs of an experiment; `silent` says why Slurm did not answer."""
     counts = Counter(run.state for run in runs)
     summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
     shown = [f"{experiment}: {len(runs)} runs: {summary}" if runs else f"{experiment}: no run was asked for"]
     if silent:
-        shown.append(f"Slurm did not answer ({silent}): who wrote in the last 10 minutes is taken as running")
+        shown.append(f"Slurm did not answer ({silent}): a run that reported in the last 10 minutes counts as running")
     common = set.intersection(*(set(run.overrides) for run in runs)) if len(runs) > 1 else set()
     named = [(run, " ".join(one for one in run.overrides if one not in common)) for run in runs]
     width = max((len(name) for run, name in named if run.state != "done"), default=0)
@@ -23,7 +23,7 @@ def lines(experiment: Path, runs: Sequence[Run], silent: str | None = None) -> l
     return list(map(printable, shown))
 
 
-def _details(run: Run) -> str:
+def _details(run: RunStatus) -> str:
     parts = []
     if run.state in ("running", "queued"):
         if run.step is not None:

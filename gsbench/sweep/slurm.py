@@ -1,4 +1,4 @@
-"""Ask Slurm about jobs: what is in its queue, and how jobs ended that are no longer in it."""
+"""Ask Slurm for the state of jobs in its queue, and how jobs ended that have left the queue."""
 
 import shutil
 import subprocess
@@ -7,19 +7,19 @@ from dataclasses import dataclass
 
 from gsbench.errors import one_line
 
-SECONDS = 30  # a Slurm that does not answer within them is down
+SECONDS = 30  # for an answer; after that Slurm counts as down
 
 
 @dataclass(frozen=True)
 class Queue:
     """The jobs that Slurm has queued or runs, by `<array>_<task>` or `<job>`; `silent` says why it did not answer."""
 
-    states: dict[str, str]  # state and, for a job that waits, what for
+    states: dict[str, str]  # the state and, for a pending job, the reason
     silent: str | None = None
 
 
 def queue(jobs: Iterable[str]) -> Queue:
-    """Ask squeue once for the queue's part of `jobs`; for no jobs Slurm is not asked."""
+    """Ask squeue once for the states of `jobs`; without jobs Slurm is not asked."""
     arrays = sorted({job.partition("_")[0] for job in jobs})
     if not arrays:
         return Queue({})
@@ -54,7 +54,7 @@ def endings(jobs: Iterable[str]) -> dict[str, str]:
 
 
 def _ask(*command: str) -> subprocess.CompletedProcess[str] | str:
-    """Run a command of Slurm; a string says why there is no answer."""
+    """Run a Slurm command; return its result, or a string that says why there is none."""
     if shutil.which(command[0]) is None:
         return f"{command[0]} is not on this machine"
     try:

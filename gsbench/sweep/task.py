@@ -1,4 +1,4 @@
-"""Do the run of a config that a sweep composed, in whatever process or job the sweep put it."""
+"""Do the run of a config that a sweep composed, in the process or job that the sweep chose."""
 
 import sys
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ class Problem:
     """Why a run did not end well."""
 
     reason: str
-    is_refused: bool  # what was asked for cannot be a run, so that nothing was run and nothing recorded
+    is_refused: bool  # whether the request cannot be run, so that nothing was run and nothing recorded
 
 
 def do(composed: DictConfig) -> Problem | None:
-    """Do a run; return why it did not end well, which is on stderr too, or None."""
+    """Do a run; return None, or why it did not end well, which is also printed on stderr."""
     chosen = HydraConfig.get()
     try:
         from gsbench.run.run import UnrecordedError, run  # imports torch

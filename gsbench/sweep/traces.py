@@ -1,4 +1,4 @@
-"""Read the traces that runs left in a folder, records and progress files, without composing a config."""
+"""Read the records and progress files that runs left in a folder, without composing a config."""
 
 import json
 import os
@@ -18,7 +18,7 @@ from gsbench.sweep.plan import Identity, identity
 
 @dataclass(frozen=True)
 class Outcome:
-    """The end of a run, by its record."""
+    """How a run ended, by its record."""
 
     path: Path
     status: str  # as in the record; `failed` where the record is damaged
@@ -37,7 +37,7 @@ class Traces:
 
 
 def read(folders: list[Path]) -> Traces:
-    """Read every record and every progress file in some folders; of two for one run, the newer one counts."""
+    """Read every record and progress file in some folders; where a run has two, the newer one counts."""
     found = Traces()
     for path in _files(folders):
         if path.name == RECORD:
@@ -50,7 +50,7 @@ def read(folders: list[Path]) -> Traces:
             try:
                 one = progress.read(path)
             except InputError:
-                continue  # it was removed just now, for the run has ended; or it is damaged, and the run looks lost
+                continue  # the run has ended and removed it just now, or it is damaged and the run looks lost
             of = identity(one.overrides)
             if of not in found.progress or found.progress[of][1].updated < one.updated:
                 found.progress[of] = path, one
@@ -58,18 +58,18 @@ def read(folders: list[Path]) -> Traces:
 
 
 def _files(folders: list[Path]) -> Iterator[Path]:
-    """Find the records and progress files; hidden folders hold those of sweeps, and published ones are of no sweep."""
+    """Find the records and progress files, except in hidden folders and in those of published records."""
     for folder in folders:
         for at, below, names in os.walk(folder):
             below[:] = sorted(name for name in below if not name.startswith(".") and name != PUBLISHED)
             for name in (RECORD, progress.FILE_NAME):
                 path = Path(at, name)
-                if name in names and path.is_file():  # a pipe would keep its reader waiting
+                if name in names and path.is_file():  # reading a pipe would block
                     yield path
 
 
 def _outcome(path: Path) -> tuple[list[str], Outcome]:
-    """Read what a status needs of a record, which is much faster than to validate all of it."""
+    """Read only what a status needs of a record, which is much faster than validating all of it."""
     written = path.stat().st_mtime
     try:
         plain: Any = json.loads(read_file(path, str(path), MAX_JSON))

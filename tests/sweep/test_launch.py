@@ -19,7 +19,7 @@ from tiny_run import ROOT, environment, gsbench, overrides, write_moving_square
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
 from gsbench.measure.settings import flat
-from gsbench.sweep import hooks, plan, status
+from gsbench.sweep import callbacks, plan, status
 from gsbench.sweep.__main__ import main as sweep_main
 from gsbench.sweep.plan import Plan, identity
 from gsbench.sweep.retry import retry
@@ -88,7 +88,10 @@ def test_the_ablation_sweeps_over_all_ablations_by_itself() -> None:
     loader = GlobalHydra.instance().config_loader()
     config = loader.load_configuration("config", ["+exp=ablation", "scene=a,b"], run_mode=RunMode.MULTIRUN)
     asked = [
-        word.removeprefix("+ablation=") for run in hooks.expand(config) for word in run if word.startswith("+ablation=")
+        word.removeprefix("+ablation=")
+        for run in callbacks.expand(config)
+        for word in run
+        if word.startswith("+ablation=")
     ]
     assert sorted(asked) == sorted([*ABLATIONS, *ABLATIONS])
     assert {path.stem for path in (CONF / "ablation").glob("*.yaml")} == set(ABLATIONS)
@@ -160,7 +163,7 @@ def test_retry_does_what_is_missing_and_repeats_nothing(square: Path, tmp_path: 
     assert states(experiment) == ["done", "done"]
     assert kept.stat().st_mtime_ns == before[0]
     assert json.loads(lost.read_text())["metrics"] == json.loads(before[1])["metrics"]
-    assert "nothing failed" in sweep("retry", str(experiment)).stderr
+    assert "no run failed" in sweep("retry", str(experiment)).stderr
 
 
 @pytest.mark.slow

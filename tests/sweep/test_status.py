@@ -19,7 +19,7 @@ from gsbench.sweep import plan, show, status
 from gsbench.sweep.__main__ import main
 from gsbench.sweep.plan import Ended, Plan
 from gsbench.sweep.slurm import Queue
-from gsbench.sweep.status import Run
+from gsbench.sweep.status import RunStatus
 
 RUN = ("7dgs", "lego", 0)
 WORDS = crowd.overrides(*RUN)
@@ -53,7 +53,7 @@ def trains(experiment: Path, **of: object) -> None:
     progress.write(run_folder(experiment), dataclasses.replace(at, **of))  # type: ignore[arg-type]
 
 
-def only(experiment: Path, queue: Queue | None = None) -> Run:
+def only(experiment: Path, queue: Queue | None = None) -> RunStatus:
     """The status of the only run there is, with Slurm's queue as given."""
     read = status.read(experiment)
     if queue:
@@ -297,7 +297,7 @@ def test_old_records_are_done(tmp_path: Path) -> None:
 
 def test_only_what_differs_names_a_run() -> None:
     """Catches a status that repeats what all runs have in common, or hides which run failed."""
-    runs = [Run(crowd.overrides("7dgs", "lego", seed), state, "why" if state == "failed" else None)
+    runs = [RunStatus(crowd.overrides("7dgs", "lego", seed), state, "why" if state == "failed" else None)
             for seed, state in enumerate(["done", "failed", "done"])]  # fmt: skip
     assert show.lines(Path("results/crowd"), runs) == [
         "results/crowd: 3 runs: 2 done, 1 failed", "  failed   seed=1  why",

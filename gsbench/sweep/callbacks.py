@@ -1,6 +1,6 @@
-"""Take notes while Hydra sweeps: the plan when it starts, and what became of each run when that ends.
+"""Write the plan when Hydra starts a sweep, and the outcome of each run when the run ends.
 
-Hydra calls `Note` (conf/config.yaml: hydra.callbacks); on Slurm and with joblib it is pickled into every job.
+Hydra calls `WritePlan` (conf/config.yaml: hydra.callbacks). On Slurm and with joblib it is pickled into every job.
 """
 
 import copy
@@ -28,20 +28,22 @@ from gsbench.sweep.plan import Ended, Plan
 started: list[Path] = []  # the folders of the plans of this process
 
 
-class Note(Callback):
-    """Write plan.json when a multirun starts, and `ended/<number>.json` beside it as each of its runs ends."""
+class WritePlan(Callback):
+    """Write plan.json when a multirun starts, and `ended/<number>.json` beside it when a run ends."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the plan and say where it is."""
-        asked = plan_of(expand(config), config)
+        planned = plan_of(expand(config), config)
         folder = Path(config.hydra.sweep.dir)
-        plan.write(asked, folder)
+        plan.write(planned, folder)
         started.append(folder)
         experiment = folder.parents[1]
-        print(f"{len(asked.runs)} runs; how far they are: python -m gsbench.sweep status {experiment}", file=sys.stderr)
+        print(
+            f"{len(planned.runs)} runs; how far they are: python -m gsbench.sweep status {experiment}", file=sys.stderr
+        )
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
-        """Write down which record the run has; two commands may ask for one run in other words."""
+        """Write the path of the run's record, as two commands may ask for one run by different overrides."""
         if config.hydra.mode == RunMode.MULTIRUN:
             folder = Path(config.hydra.sweep.dir)
             plan.write_ended(folder, config.hydra.job.num, ended(config, folder.parents[2]))
