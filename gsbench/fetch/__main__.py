@@ -9,25 +9,25 @@ from gsbench.fetch.sources import Source, find, sources
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Fetch what is asked for, one after the other; return 0, or 2 with a line on stderr for each that failed."""
+    """Fetch the named sources in turn; return 0, or 2 with a line on stderr for each that failed."""
     made = argparse.ArgumentParser(prog="python -m gsbench.fetch", description=__doc__)
     made.add_argument("names", nargs="*", metavar="NAME", help="dnerf, pbr, lpips-alex or lpips-vgg")
     made.add_argument("--list", action="store_true", help="print what can be fetched, and what is there")
     made.add_argument("--dry-run", action="store_true", help="print what would be fetched, from where and to where")
     made.add_argument("--to", type=Path, default=Path("data"), metavar="FOLDER", help="of data sets (data)")
-    asked = made.parse_args(arguments)
-    if not asked.names and not asked.list:
+    options = made.parse_args(arguments)
+    if not options.names and not options.list:
         made.error("expected a NAME, or --list")
     try:
-        known = sources(folder_of(asked.to))
+        known = sources(folder_of(options.to))
     except InputError as error:
         print(f"gsbench.fetch: {one_line(error)}", file=sys.stderr)
         return 2
     failed = 0
-    for name in list(known) if asked.list else asked.names:
+    for name in list(known) if options.list else options.names:
         try:
             source = find(name, known)
-            print(line_of(source) if asked.list else plan_of(source) if asked.dry_run else fetch(source))
+            print(line_of(source) if options.list else plan_of(source) if options.dry_run else fetch(source))
         except (InputError, OSError) as error:
             print(f"gsbench.fetch: {one_line(error)}", file=sys.stderr)
             failed = 2

@@ -29,31 +29,31 @@ def main(arguments: list[str] | None = None) -> int:
     either.add_argument("--publish", type=Path, metavar="DIR", help="copy the records to DIR, and write its table anew")
     parser.add_argument("--against", type=Path, metavar="DIR", help="compare with the records in DIR; 1 if they differ")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the comparison to FILE")
-    asked = parser.parse_args(arguments)
-    folder = asked.results
-    if asked.json and not asked.against:
+    options = parser.parse_args(arguments)
+    folder = options.results
+    if options.json and not options.against:
         parser.error("--json: expected --against beside it")
-    if asked.against and (asked.live or asked.tables or asked.publish):
+    if options.against and (options.live or options.tables or options.publish):
         parser.error("--against: expected none of --live, --tables and --publish beside it")
-    if asked.live:
-        return live.watch(folder, train=asked.train)
+    if options.live:
+        return live.watch(folder, train=options.train)
     differs = False
     try:
         records, faults = tables.load(folder)
-        if asked.publish:
-            print(publish(folder, asked.publish))
-        elif records and asked.tables:
+        if options.publish:
+            print(publish(folder, options.publish))
+        elif records and options.tables:
             print(layout.terminal(paper_tables.write(records, folder)))
             print(f"Written: {', '.join(str(folder / name) for name in paper_tables.NAMES)}")
         elif records:
-            print(layout.terminal(tables.write(records, folder, train=asked.train)))
-            compared = _compared(records, folder, asked.against) if asked.against else None
+            print(layout.terminal(tables.write(records, folder, train=options.train)))
+            compared = _compared(records, folder, options.against) if options.against else None
             page = build.write(records, folder, faults, against=compared)
             print(f"Written: {folder / 'table.md'}, {folder / 'table.csv'}, {page}")
             if compared:
                 differs = compared.verdict == DIFFERS
-                if asked.json:
-                    against_table.write_json(compared, asked.json)
+                if options.json:
+                    against_table.write_json(compared, options.json)
                 print(f"\n{layout.terminal(against_table.tables(compared))}\n{compared.line}")
     except (InputError, OSError) as error:
         print(f"gsbench.report: {one_line(error)}", file=sys.stderr)

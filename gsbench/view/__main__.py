@@ -23,9 +23,9 @@ def main(arguments: list[str] | None = None) -> int:
         help="that registers the run's model",
     )
     made.add_argument("--device", default="cpu", help="cpu or cuda")
-    asked = made.parse_args(arguments)
+    options = made.parse_args(arguments)
     try:
-        serve(asked)
+        serve(options)
     except (InputError, OSError) as error:
         print(f"gsbench.view: {one_line(error)}", file=sys.stderr)
         return 2
@@ -34,7 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def serve(asked: argparse.Namespace) -> None:
+def serve(options: argparse.Namespace) -> None:
     """Load the runs and serve them.
 
     Raises:
@@ -43,22 +43,23 @@ def serve(asked: argparse.Namespace) -> None:
     """
     if importlib.util.find_spec("viser") is None:
         raise InputError("the viewer needs viser: pip install 'gsbench[view]'")
-    if not 0 < asked.port < 65536:
-        raise InputError(f"--port: expected 1 to 65535, got {asked.port}")
+    if not 0 < options.port < 65536:
+        raise InputError(f"--port: expected 1 to 65535, got {options.port}")
     from gsbench.models.registry import import_models
     from gsbench.run.checks import check_device
     from gsbench.run.load import load_run
     from gsbench.view.viewer import Viewer
 
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # viser's, when a browser leaves
-    check_device(asked.device)
-    import_models(asked.model_module)
-    viewer = Viewer([load_run(run, asked.device) for run in asked.runs], asked.host, asked.port, asked.data_root)
+    check_device(options.device)
+    import_models(options.model_module)
+    runs = [load_run(run, options.device) for run in options.runs]
+    viewer = Viewer(runs, options.host, options.port, options.data_root)
     for painter in viewer.painters:
         print(f"{painter.run.folder}: {len(painter.run.model)} Gaussians")
     if isinstance(viewer.scene, str):
         print(f"no training cameras: {viewer.scene}")
-    host = f"[{asked.host}]" if ":" in asked.host else asked.host
+    host = f"[{options.host}]" if ":" in options.host else options.host
     print(f"Open http://{host}:{viewer.server.get_port()} in a browser; Ctrl-C ends it.", flush=True)
     try:
         while True:

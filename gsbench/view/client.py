@@ -69,7 +69,7 @@ class Client:
             if moving:
                 self.rests = False
             self.changed.clear()
-            if self.left:  # asked once the event is clear: what `leave` sets from now on ends the next wait
+            if self.left:  # tested after the event is cleared: a later `leave` ends the next wait
                 return
             self.controls.advance()
             try:
@@ -96,7 +96,7 @@ class Client:
         """Render one image or two as the controls say."""
         shown, mode = self.controls.shown(), self.controls.layout
         camera = self._camera(max(1, width // 2) if mode == SIDE else width, height)
-        first, *others = [painter.paint(camera, self.controls.asked(colours)) for painter, colours in shown]
+        first, *others = [painter.paint(camera, self.controls.request(colours)) for painter, colours in shown]
         if not others:
             return first
         return beside(first, others[0]) if mode == SIDE else wiped(first, others[0], self.controls.wiped)
@@ -106,9 +106,9 @@ class Client:
         if self._views is None or not self.controls.compare.value:
             return
         nearest = self._views.nearest(self._camera(1, 1), self.controls.now)
-        asked = self.controls.asked_of(nearest.view)
+        request = self.controls.request_of(nearest.view)
         painters = dict.fromkeys(painter for painter, _ in self.controls.shown())
-        compared = [compare(painter, nearest.view, asked) for painter in painters]
+        compared = [compare(painter, nearest.view, request) for painter in painters]
         self.controls.comparison.content = comparison(nearest, compared)
 
     def _camera(self, width: int, height: int) -> Camera:

@@ -12,7 +12,7 @@ import torch
 import viser
 
 from gsbench.scenes import Scene, View
-from gsbench.view.frame import CLASS, COLOURS, IMAGE, Asked, Painter
+from gsbench.view.frame import CLASS, COLOURS, IMAGE, FrameRequest, Painter
 from gsbench.view.frusta import Frusta
 
 PLAYED_S = 4.0  # a clip takes that long
@@ -21,7 +21,7 @@ NEAREST = "nearest training view"
 PANEL = {"x": 15.0, "y": -15.0, "width": 400.0}  # pixels: where it floats, from the left and from the bottom
 
 
-class Shown(NamedTuple):
+class ShownImage(NamedTuple):
     """One of the images that are shown."""
 
     painter: Painter  # of the model
@@ -173,27 +173,27 @@ class Controls:
         """How many images are shown, and how: ONE, SIDE or WIPE."""
         return self.mode.value if self.mode.value in (SIDE, WIPE) else ONE
 
-    def shown(self) -> list[Shown]:
+    def shown(self) -> list[ShownImage]:
         """Return the one or two images that are shown."""
         choices = self._choices[:1] if self.layout == ONE else self._choices
         first = next(iter(self._painters.values()))
-        return [Shown(self._painters.get(model.value, first), colours.value if colours.value in COLOURS else IMAGE)
+        return [ShownImage(self._painters.get(model.value, first), colours.value if colours.value in COLOURS else IMAGE)
                 for model, colours in choices]  # fmt: skip
 
-    def asked(self, colours: str) -> Asked:
+    def request(self, colours: str) -> FrameRequest:
         """Return what is asked of a model now, in some colours."""
-        return self._asked_at(self.now, colours)
+        return self._request_at(self.now, colours)
 
-    def asked_of(self, view: View) -> Asked:
+    def request_of(self, view: View) -> FrameRequest:
         """Return what is asked of a model at a training view: the same effects in the view's own time."""
-        return self._asked_at(view.time, IMAGE)
+        return self._request_at(view.time, IMAGE)
 
-    def _asked_at(self, time: float | None, colours: str) -> Asked:
+    def _request_at(self, time: float | None, colours: str) -> FrameRequest:
         if not self._has_time:
             time = None
         elif self._held is not None:
             time = self._held
-        return Asked(time, self._frozen, self.agr.value, max(0, self.degree.value), colours)
+        return FrameRequest(time, self._frozen, self.agr.value, max(0, self.degree.value), colours)
 
 
 def _within(value: float, low: float, high: float) -> float:

@@ -21,7 +21,7 @@ IMAGE, CLASS, COST = COLOURS = ("image", "class", "cost")  # what the colours of
 EVERY_DEGREE = 3  # of the harmonics
 
 
-class Asked(NamedTuple):
+class FrameRequest(NamedTuple):
     """What a model is asked for, besides the camera that sees it."""
 
     time: float | None  # in [0, 1]; None where the scene has none
@@ -31,7 +31,7 @@ class Asked(NamedTuple):
     colours: str = IMAGE
 
 
-class Cost(NamedTuple):
+class FrameCost(NamedTuple):
     """What a frame of one model took."""
 
     name: str  # of the model
@@ -46,7 +46,7 @@ class Frame(NamedTuple):
     """A rendered image and what it cost."""
 
     image: Pixels  # [H, W, 3] RGB
-    costs: tuple[Cost, ...]  # of each model in it
+    costs: tuple[FrameCost, ...]  # of each model in it
 
     def ms(self, part: str) -> float:
         """Return the milliseconds of the slices or of the rasters."""
@@ -73,38 +73,38 @@ class Painter:
         self._colors = {CLASS: class_colors(run.model), COST: cost_colors(run.model, most_cost)}
         self._lock = threading.Lock()
 
-    def paint(self, camera: Camera, asked: Asked) -> Frame:
+    def paint(self, camera: Camera, request: FrameRequest) -> Frame:
         """Render what a camera sees; raises InputError where it cannot be one."""
-        image, ms = self._render(camera, asked)
-        shown = inferno(image[..., 0].cpu().numpy()) if asked.colours == COST else to_bytes(image.cpu().numpy())
-        return Frame(shown, (Cost(self.name, ms),))
+        image, ms = self._render(camera, request)
+        shown = inferno(image[..., 0].cpu().numpy()) if request.colours == COST else to_bytes(image.cpu().numpy())
+        return Frame(shown, (FrameCost(self.name, ms),))
 
-    def image(self, camera: Camera, asked: Asked) -> torch.Tensor:
+    def image(self, camera: Camera, request: FrameRequest) -> torch.Tensor:
         """Render what a camera sees as floats, [H, W, 3], to be measured."""
-        return self._render(camera, asked)[0].cpu()
+        return self._render(camera, request)[0].cpu()
 
-    def _render(self, camera: Camera, asked: Asked) -> tuple[torch.Tensor, dict[str, float]]:
+    def _render(self, camera: Camera, request: FrameRequest) -> tuple[torch.Tensor, dict[str, float]]:
         """Render an image; return it with the milliseconds by stage."""
         run, device = self.run, self.run.config.device
         camera = camera.to(device)
-        center = camera.center if asked.center is None else asked.center.to(device)
-        query = Query.at(center, asked.time)
+        center = camera.center if request.center is None else request.center.to(device)
+        query = Query.at(center, request.time)
         with self._lock, torch.inference_mode(), StageWatch(device) as watch:
-            run.model.phase = self._phase(asked)
+            run.model.phase = self._phase(request)
             gaussians = run.model.slice(query)
             watch.end(SLICE)
-            if asked.colours in self._colors:
-                gaussians = gaussians._replace(colors=self._colors[asked.colours])
-            background = self._backgrounds[asked.colours]
+            if request.colours in self._colors:
+                gaussians = gaussians._replace(colors=self._colors[request.colours])
+            background = self._backgrounds[request.colours]
             image = rasterize_slice(gaussians, camera, background, run.model.backend, run.config.raster.antialias).image
             watch.end(RASTER)
             return image[0], watch.ms
 
-    def _phase(self, asked: Asked) -> Phase:
+    def _phase(self, request: FrameRequest) -> Phase:
         """Return the phase of the training's end, less what is switched off."""
         trained = self.trained_phase
-        degree = min(asked.sh_degree, trained.sh_degree)
-        return replace(trained, refine=asked.agr and trained.refine, sh_degree=degree)
+        degree = min(request.sh_degree, trained.sh_degree)
+        return replace(trained, refine=request.agr and trained.refine, sh_degree=degree)
 
 
 def beside(left: Frame, right: Frame) -> Frame:

@@ -10,7 +10,7 @@ import torch
 from gsbench.measure.images import Pixels, error_image, to_bytes
 from gsbench.measure.quality import psnr, quantise
 from gsbench.scenes import Camera, Scene, View
-from gsbench.view.frame import Asked, Painter
+from gsbench.view.frame import FrameRequest, Painter
 
 SAME = 1e-3  # extents and radians: views that are nearer to one another than that differ in their times only
 MOST_WIDTH = 480  # pixels of an image that is shown; larger ones are made smaller
@@ -24,7 +24,7 @@ class Nearest(NamedTuple):
     degrees: float  # between the directions in which the two look
 
 
-class Compared(NamedTuple):
+class ViewComparison(NamedTuple):
     """What a model makes of a training view."""
 
     name: str  # of the model
@@ -60,19 +60,19 @@ class TrainingViews:
         return Nearest(self._views[best], float(distances[best]), math.degrees(angles[best]))
 
 
-def compare(painter: Painter, view: View, asked: Asked) -> Compared:
+def compare(painter: Painter, view: View, request: FrameRequest) -> ViewComparison:
     """Render what a view's camera sees and measure it as the run was measured.
 
     Args:
         painter: of the model.
         view: to be compared with.
-        asked: the query and the effects.
+        request: the query and the effects.
     """
     view = view.to("cpu")
-    image = painter.image(view.camera, asked)
+    image = painter.image(view.camera, request)
     shown = quantise(image) if painter.run.config.protocol.quantise else image
     error = error_image(shown.numpy(), view.image.numpy())
-    return Compared(
+    return ViewComparison(
         painter.name,
         _small(to_bytes(view.image.cpu().numpy())),
         _small(to_bytes(shown.cpu().numpy())),

@@ -11,9 +11,9 @@ import numpy.typing as npt
 from gsbench.effects.picture import COLOURS
 from gsbench.effects.words import CLASSES
 from gsbench.measure.images import ERROR_SCALE, inferno
-from gsbench.view.controls import Shown
-from gsbench.view.frame import CLASS, COST, Cost
-from gsbench.view.nearest import Compared, Nearest
+from gsbench.view.controls import ShownImage
+from gsbench.view.frame import CLASS, COST, FrameCost
+from gsbench.view.nearest import Nearest, ViewComparison
 from gsbench.view.stages import STAGES
 
 STOPS = 9  # of a gradient
@@ -23,7 +23,7 @@ _SWATCH = "display:inline-block;width:0.8em;height:0.8em"
 _BOX = "margin:0 1em 0.5em;font-size:0.75em;line-height:1.35;overflow-wrap:anywhere"
 
 
-def cost_table(costs: Sequence[Cost], width: int, height: int) -> str:
+def cost_table(costs: Sequence[FrameCost], width: int, height: int) -> str:
     """Write the milliseconds of a frame: a column for each model, a row for each stage, and frames a second."""
     rows = [_row("ms", [cost.name for cost in costs], bold=True)]
     for part, stages in STAGES.items():
@@ -34,7 +34,7 @@ def cost_table(costs: Sequence[Cost], width: int, height: int) -> str:
     return _box(_table(rows) + f"<div>at {width} x {height}</div>")
 
 
-def legend(shown: Sequence[Shown], most_cost: float) -> str:
+def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
     """Say what the colours of the Gaussians mean where they are not the models' own.
 
     Args:
@@ -56,7 +56,7 @@ def legend(shown: Sequence[Shown], most_cost: float) -> str:
     return text
 
 
-def comparison(nearest: Nearest, compared: Sequence[Compared]) -> str:
+def comparison(nearest: Nearest, compared: Sequence[ViewComparison]) -> str:
     """Show a training view beside what models make of it, and where they differ."""
     view = nearest.view
     when = "" if view.time is None else f", time {view.time:.2f}"
@@ -70,7 +70,7 @@ def comparison(nearest: Nearest, compared: Sequence[Compared]) -> str:
     return _box(f"{text}<div>absolute error, mean of RGB</div>{_gradient('0', f'{ERROR_SCALE} or more')}")
 
 
-def _ms(cost: Cost, stage: str) -> str:
+def _ms(cost: FrameCost, stage: str) -> str:
     return f"{cost.ms[stage]:.1f}" if stage in cost.ms else ""
 
 

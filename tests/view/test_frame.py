@@ -24,7 +24,7 @@ from gsbench.schedule import Phase
 from gsbench.view import paths
 from gsbench.view.__main__ import main
 from gsbench.view.client import camera_at
-from gsbench.view.frame import CLASS, COST, Asked, Cost, Frame, Painter, beside, wiped
+from gsbench.view.frame import CLASS, COST, Frame, FrameCost, FrameRequest, Painter, beside, wiped
 from gsbench.view.resolution import LEAST_PIXELS, MOST_PIXELS, MOVING_MS, Resolution
 from gsbench.view.stages import RASTER, SLICE, STAGES
 
@@ -59,7 +59,7 @@ def seen_from(azimuth: float, one: Painter) -> Camera:
 def test_a_frame_is_the_models_image(one: Painter) -> None:
     """Catches a viewer that shows another picture than the one that is measured, and times of zero."""
     camera = seen_from(0.5, one)
-    frame = one.paint(camera, Asked(0.4))
+    frame = one.paint(camera, FrameRequest(0.4))
     assert (frame.image == to_bytes(render(one.run.model, camera, 0.4, torch.zeros(3)).cpu().numpy())).all()
     assert frame.image.max() > 30
     assert frame.ms(SLICE) > 0
@@ -69,36 +69,36 @@ def test_a_frame_is_the_models_image(one: Painter) -> None:
 def test_a_frozen_direction_slices_from_there_and_draws_from_here(one: Painter) -> None:
     """Catches a frozen slice that is also drawn from its old place, or that is not frozen."""
     here, there = seen_from(0.5, one), seen_from(2.0, one)
-    frozen = one.paint(here, Asked(0.4, there.center)).image
+    frozen = one.paint(here, FrameRequest(0.4, there.center)).image
     gaussians = one.run.model.slice(Query.at(there.center, 0.4))
     expected = to_bytes(rasterize_slice(gaussians, here, torch.zeros(3), AUTO).image[0].cpu().numpy())
     assert (frozen == expected).all()
-    assert (frozen != one.paint(here, Asked(0.4)).image).any()
+    assert (frozen != one.paint(here, FrameRequest(0.4)).image).any()
 
 
 def test_agr_is_switched_for_one_frame(one: Painter) -> None:
     """Catches a client that switches AGR off for all others, or on where the training had not yet."""
     camera = seen_from(0.5, one)
-    on, off, again = (one.paint(camera, Asked(0.4, agr=agr)).image for agr in (True, False, True))
+    on, off, again = (one.paint(camera, FrameRequest(0.4, agr=agr)).image for agr in (True, False, True))
     assert (on != off).any()
     assert (on == again).all()
     early = painter()
     early.trained_phase = replace(early.trained_phase, refine=False)
-    assert (early.paint(camera, Asked(0.4)).image == off).all()
+    assert (early.paint(camera, FrameRequest(0.4)).image == off).all()
 
 
 def test_harmonics_are_cut_for_one_frame(one: Painter) -> None:
     """Catches colours that still change with the direction at degree 0, and a cut that the next frame still has."""
     camera = seen_from(0.5, one)
-    images = [one.paint(camera, Asked(0.4, sh_degree=degree)).image for degree in (0, 1, 3)]
-    assert (one.paint(camera, Asked(0.4)).image == images[2]).all()
+    images = [one.paint(camera, FrameRequest(0.4, sh_degree=degree)).image for degree in (0, 1, 3)]
+    assert (one.paint(camera, FrameRequest(0.4)).image == images[2]).all()
     flat = lively("7dgs_agr", count=80).float()
     flat.splats["shN"].data.zero_()
     assert (to_bytes(render(flat.requires_grad_(False), camera, 0.4, torch.zeros(3)).cpu().numpy()) == images[0]).all()
     assert len({image.tobytes() for image in images}) == 3
     early = painter()
     early.trained_phase = replace(early.trained_phase, sh_degree=1)
-    assert (early.paint(camera, Asked(0.4)).image == images[1]).all()
+    assert (early.paint(camera, FrameRequest(0.4)).image == images[1]).all()
 
 
 @pytest.mark.parametrize("classes", [None, of_every_class()], ids=["without classes", "with classes"])
@@ -111,7 +111,7 @@ def test_colours_are_those_of_the_picture_of_classes(classes: Classes | None) ->
     step = factor * SIZE + picture.GAP
     for i, colours in enumerate(("image", CLASS, COST)):
         panel = panels[: factor * SIZE : factor, i * step :][:, : factor * SIZE : factor]
-        assert (made.paint(camera, Asked(0.4, colours=colours)).image == panel).all()
+        assert (made.paint(camera, FrameRequest(0.4, colours=colours)).image == panel).all()
     assert made.counts == made.run.model.count_classes()
     assert all(made.counts[name] == 16 for name in NAMES) == (classes is not None)
 
@@ -138,7 +138,7 @@ def test_a_kernels_time_is_its_stages(one: Painter, kernel: str, stage: str, mon
         run(library, name, *values)
 
     monkeypatch.setattr(Library, "_run", run_slowly)
-    (cost,) = one.paint(seen_from(0.5, one), Asked(0.4)).costs
+    (cost,) = one.paint(seen_from(0.5, one), FrameRequest(0.4)).costs
     assert tuple(cost.ms) == (*STAGES[SLICE], *STAGES[RASTER])
     assert max(cost.ms, key=lambda name: cost.ms[name]) == stage
     assert cost.ms[stage] >= 1000 * slow
@@ -147,18 +147,18 @@ def test_a_kernels_time_is_its_stages(one: Painter, kernel: str, stage: str, mon
 def test_what_torch_computes_alone_is_not_divided() -> None:
     """Catches stages of zero milliseconds, and time that is not counted, without kernels."""
     made = painter(REFERENCE)
-    (cost,) = made.paint(seen_from(0.5, made), Asked(0.4)).costs
+    (cost,) = made.paint(seen_from(0.5, made), FrameRequest(0.4)).costs
     assert list(cost.ms) == [SLICE, RASTER]
     assert cost.of(SLICE) == cost.ms[SLICE] > 0
     assert cost.of(RASTER) == cost.ms[RASTER] > 0
-    (without_agr,) = painter().paint(seen_from(0.5, made), Asked(0.4, agr=False)).costs
+    (without_agr,) = painter().paint(seen_from(0.5, made), FrameRequest(0.4, agr=False)).costs
     assert "AGR" not in without_agr.ms
 
 
 def test_two_models_share_an_image() -> None:
     """Catches swapped sides, an edge at the wrong place and costs that are not added."""
     ms = {"AGR": 0.25, "conditioning": 0.75, "blending": 2.0}
-    left, right = (Frame(np.full((4, 8, 3), value, np.uint8), (Cost(str(value), ms),)) for value in (10, 20))
+    left, right = (Frame(np.full((4, 8, 3), value, np.uint8), (FrameCost(str(value), ms),)) for value in (10, 20))
     both = beside(left, right)
     assert both.image.shape == (4, 16, 3)
     assert (both.image[:, :7] == 10).all()

@@ -12,12 +12,12 @@ from gsbench.effects.picture import COLOURS
 from gsbench.effects.words import CLASSES
 from gsbench.models.classes import NAMES
 from gsbench.scenes import Camera, View
-from gsbench.view.frame import CLASS, COST, IMAGE, Cost
-from gsbench.view.nearest import Compared, Nearest
+from gsbench.view.frame import CLASS, COST, IMAGE, FrameCost
+from gsbench.view.nearest import Nearest, ViewComparison
 from gsbench.view.panel import comparison, cost_table, legend
 
-SEVEN = Cost("7dgs seed0", {"AGR": 2.0, "conditioning": 1.0, "colours": 0.5, "projection": 0.5, "blending": 4.0})
-THREE = Cost("3dgs seed0", {"conditioning": 0.25, "raster": 3.75})
+SEVEN = FrameCost("7dgs seed0", {"AGR": 2.0, "conditioning": 1.0, "colours": 0.5, "projection": 0.5, "blending": 4.0})
+THREE = FrameCost("3dgs seed0", {"conditioning": 0.25, "raster": 3.75})
 
 
 def rows(text: str) -> dict[str, list[str]]:
@@ -68,7 +68,7 @@ def test_a_comparison_says_with_what_and_how_far(time: float | None) -> None:
     """Catches a number without its model, and a view of a static scene that has no time to print."""
     view = View("train/r_7", Camera(torch.eye(4), torch.eye(3), 4, 4), time, torch.zeros(4, 4, 3))
     image = np.zeros((4, 4, 3), np.uint8)
-    text = comparison(Nearest(view, 0.5, 12.3), [Compared("a", image, image, image, 31.256)])
+    text = comparison(Nearest(view, 0.5, 12.3), [ViewComparison("a", image, image, image, 31.256)])
     for said in ("train/r_7", "0.50", "12°", "31.26 dB", "0.2 or more"):
         assert said in text
     assert ("time 0.50" in text) == (time is not None)
@@ -81,8 +81,8 @@ def test_names_of_folders_are_text() -> None:
     image = np.zeros((2, 2, 3), np.uint8)
     view = View(bad, Camera(torch.eye(4), torch.eye(3), 2, 2), None, torch.zeros(2, 2, 3))
     texts = (
-        cost_table([Cost(bad, {"AGR": 1.0})], 1, 1),
+        cost_table([FrameCost(bad, {"AGR": 1.0})], 1, 1),
         legend([shown(CLASS, bad, 1, 0, 0, 0, 0)], 1.0),
-        comparison(Nearest(view, 0.0, 0.0), [Compared(bad, image, image, image, 1.0)]),
+        comparison(Nearest(view, 0.0, 0.0), [ViewComparison(bad, image, image, image, 1.0)]),
     )
     assert not any("<script" in text for text in texts)
