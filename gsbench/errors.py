@@ -25,8 +25,9 @@ def one_line(error: BaseException) -> str:
     return printable((str(error) or type(error).__name__).splitlines()[0])
 
 
-def printable(text: str) -> str:
-    """Return a text with its control characters, and others that a terminal would obey, written as escapes."""
+def printable(value: object) -> str:
+    """Return a value as text on one line; characters that a terminal would obey are written as escapes."""
+    text = str(value)
     if text.isprintable():
         return text
     return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)

@@ -5,10 +5,10 @@ import math
 from pathlib import Path
 from typing import Any
 
+from gsbench.errors import printable
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
 from gsbench.report.against import LIMITS, RULE, ComparedRuns, Comparison, Judged, value
-from gsbench.report.conditions import printable
 from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
 
 COLUMNS = [

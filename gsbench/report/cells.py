@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from gsbench.report.conditions import printable
+from gsbench.errors import printable
 
 _FORMULA = "=+-@"  # a spreadsheet computes a text that begins with one of these
 

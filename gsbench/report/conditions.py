@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable
 from functools import partial
 
+from gsbench.errors import printable
 from gsbench.measure.record import Record
 from gsbench.report.configurations import without
 
@@ -19,11 +20,6 @@ DEFINITIONS = (
 )
 
 Get = Callable[[Record], str]
-
-
-def printable(text: object) -> str:
-    """Put text from a record on one line, without control characters that a terminal would obey."""
-    return "".join(c if c.isprintable() else "?" for c in " ".join(str(text).split()))
 
 
 def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:

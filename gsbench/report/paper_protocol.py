@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from gsbench.errors import printable
 from gsbench.measure.record import Record
-from gsbench.report.conditions import printable
 from gsbench.report.configurations import iterations, without
 from gsbench.report.paper import PROTOCOLS
 

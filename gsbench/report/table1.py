@@ -4,9 +4,10 @@ import math
 from statistics import fmean
 from typing import Any
 
+from gsbench.errors import printable
 from gsbench.measure.record import Record
 from gsbench.report import paper, tables
-from gsbench.report.conditions import conditions, printable
+from gsbench.report.conditions import conditions
 from gsbench.report.configurations import Group
 from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
 from gsbench.report.paper_protocol import MODELS, ModelRecipe, Sorted, departure, finished, model_recipe, model_recipes

@@ -3,9 +3,10 @@
 import math
 from typing import Any
 
+from gsbench.errors import printable
 from gsbench.measure.record import Record
 from gsbench.report import paper
-from gsbench.report.conditions import conditions, printable
+from gsbench.report.conditions import conditions
 from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
 from gsbench.report.paper_protocol import MODELS, ModelRecipe, Sorted, finished, model_recipes
 from gsbench.report.seed_means import SPREAD, mean

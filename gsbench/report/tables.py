@@ -8,13 +8,13 @@ from typing import Any
 
 import pandas as pd
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, printable
 from gsbench.measure import record as files
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import METRICS, Record
 from gsbench.report import layout, paper
 from gsbench.report.cells import cell
-from gsbench.report.conditions import conditions, printable
+from gsbench.report.conditions import conditions
 from gsbench.report.configurations import groups
 from gsbench.report.intervals import over_seeds
 from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table

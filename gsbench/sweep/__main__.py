@@ -40,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
             return _watch(options.experiment, options.json)
         return _verdict(_show(options.experiment, options.json))
     except InputError as error:
-        print(f"gsbench.sweep: {printable(str(error))}", file=sys.stderr)
+        print(f"gsbench.sweep: {printable(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

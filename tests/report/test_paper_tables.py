@@ -172,7 +172,7 @@ def test_hostile_names_stay_text(tmp_path):
     assert "\\[a\\](" in text
     assert all("|" not in line.replace("\\|", "") for line in text.splitlines() if "head" in line)
     cells = pd.read_csv(tmp_path / "table1.csv")["dataset"].tolist()
-    assert cells == ["'=1+1|x # head <script>alert(1)</script> [a](http://b)"]
+    assert cells == ["'=1+1|x\\n# head <script>alert(1)</script> [a](http://b)"]
 
 
 def test_the_command_writes_four_files(tmp_path, capsys):

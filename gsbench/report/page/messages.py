@@ -3,8 +3,8 @@
 import math
 import shlex
 
+from gsbench.errors import printable
 from gsbench.measure.record import Record
-from gsbench.report.conditions import printable
 from gsbench.report.intervals import Estimate
 
 NO_SPREAD = "no spread is known from one seed"
