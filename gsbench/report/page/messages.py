@@ -45,7 +45,7 @@ def plain(value: float, digits: int = 2) -> str:
 
 def probability(p: float) -> str:
     """Write a p-value; one too small for three digits as a bound."""
-    return "<\u00a00.001" if p < 0.001 else plain(p, 3)
+    return "< 0.001" if p < 0.001 else plain(p, 3)
 
 
 def signed(value: float, digits: int = 2) -> str:
