@@ -131,8 +131,8 @@ class GatedModel(GaussianModel):
 def as_gated(model: GaussianModel) -> GatedModel:
     """Return the model as one that gates can simplify; raises InputError where it is none."""
     if not isinstance(model, GatedModel):
-        raise InputError(f"effects.gate: expected a model that gates can simplify, a GatedModel, "
-                         f"{type(model).__name__} is none: use effects.gate=off")  # fmt: skip
+        raise InputError(f"effects.gate: expected a model that gates can simplify, {type(model).__name__} is no "
+                         f"GatedModel: make it one (docs/adding_a_model.md), or use effects.gate=off")  # fmt: skip
     return model
 
 

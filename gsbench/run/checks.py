@@ -17,7 +17,7 @@ from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import MAX_POINTS
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
-from gsbench.models.gated import GatedModel
+from gsbench.models.gated import as_gated
 from gsbench.run.identity import hash_of
 from gsbench.scenes import Scene, View
 from gsbench.scenes.trained import TrainedGaussians, read_trained
@@ -207,10 +207,8 @@ def data_root(root: str) -> Path:
 
 def check_gates(model: GaussianModel, config: Config) -> None:
     """Raise InputError where the config asks for gates and the model cannot be gated."""
-    if config.effects.gate != "off" and not isinstance(model, GatedModel):
-        raise InputError(f"effects.gate={config.effects.gate}: expected a model that gates can simplify, "
-                         f"{config.model.name} is no GatedModel: make it one (docs/adding_a_model.md), or leave "
-                         f"effects.gate=off")  # fmt: skip
+    if config.effects.gate != "off":
+        as_gated(model)
 
 
 def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:

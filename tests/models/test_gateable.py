@@ -50,7 +50,7 @@ def made(kind: type[GaussianModel]) -> GaussianModel:
 def test_models_that_can_be_gated() -> None:
     """Catches a model of ours whose gates are refused, and one without the methods whose gates are not."""
     assert all(issubclass(models.find(name), GatedModel) for name in ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_nodir"))
-    with pytest.raises(InputError, match="a GatedModel, Balls is none"):
+    with pytest.raises(InputError, match="Balls is no GatedModel"):
         as_gated(made(Balls))
 
 
