@@ -1,4 +1,4 @@
-"""Attempt a run: prepare it and refuse what can be refused, fit the model, measure it, describe how it went."""
+"""Attempt a run: check its config and data, fit the model, measure it, and describe the result in a record."""
 
 import signal
 import sys
@@ -42,12 +42,12 @@ from gsbench.train.watch import DivergedError
 
 
 class Attempt:
-    """One attempt at a run. What it has come to, it can describe in a record, whatever stopped it."""
+    """One attempt at a run. It can describe its state in a record, also where an error stopped it."""
 
     def __init__(self, this: Run) -> None:
-        """Attempt a run that has a name and a folder; nothing is read or checked yet."""
+        """Take a run that has a name and a folder; nothing is read or checked yet."""
         self.this = this
-        # What can be refused of model=auto is, by the candidate that asks for more; `fit` chooses.
+        # model=auto is checked by its candidate with more effects; `fit` chooses the candidate.
         self.config = with_candidate(this.config, "moving") if is_auto(this.config) else this.config
         self.screen: TimeScreen | None = None
         self._screening = Effort()
@@ -58,7 +58,7 @@ class Attempt:
         self._classes: Pixels | None = None
 
     def prepare(self) -> tuple[GaussianModel, Scene]:
-        """Check everything that can be refused before step 0, build the model and load the scene.
+        """Check the config, build the model and load the scene, so that faults are refused before step 0.
 
         Raises:
             InputError: the config, the device or the data has a fault.
@@ -76,7 +76,7 @@ class Attempt:
         return self.model, scene
 
     def fit(self, model: GaussianModel, scene: Scene) -> Trainer:
-        """Train to the end, from the checkpoint in the run's folder if there is one of this training.
+        """Train to the end, starting from this training's checkpoint where the run's folder has one.
 
         Raises:
             InputError: a training image or the checkpoint is damaged, or a parameter has no learning rate.
@@ -112,7 +112,7 @@ class Attempt:
                     request.hand_on(request.signal)
                 raise stop.Stopped(request.signal, f"{this.name}: stopped at step {trainer.step}, saved in {path}: "
                                                    f"the same command goes on from there")  # fmt: skip
-        for name, parameter in trainer.model.named_parameters():  # a colour of -inf is drawn as black, and not noticed
+        for name, parameter in trainer.model.named_parameters():  # no image shows a colour of -inf: it is black
             if not parameter.isfinite().all():
                 raise DivergedError(f"step {trainer.step}: '{name}' has values that are not finite")
         if not len(trainer.model):
@@ -121,7 +121,7 @@ class Attempt:
         return trainer
 
     def trainer(self, model: GaussianModel, scene: Scene) -> Trainer:
-        """Initialise a model, at the scene's points or as trained Gaussians are, and prepare its training."""
+        """Initialise a model from the scene's points or from trained Gaussians, and prepare its training."""
         random = generator(self.config.seed)
         if self.start is not None:
             start_from(model, self.start, scene.extent, random)
@@ -132,13 +132,13 @@ class Attempt:
         return Trainer(model, scene, evaluated_views(scene, self.config.scene.eval_split), self.config)
 
     def plain(self) -> dict[str, Any]:
-        """Return the config that was trained by in plain values: for model=auto with the model that was chosen."""
+        """Return the training's config in plain values; for model=auto it holds the chosen model."""
         if not is_auto(self.this.config):
             return self.this.plain
         return self.this.plain | {"model": plain_model(self.config), "agr": self.config.agr}
 
     def _choose(self, scene: Scene) -> GaussianModel:
-        """Choose the model of model=auto, and say why."""
+        """Choose the model of model=auto, and print the reason."""
         import_compiler()
         with self._screening:
             self.config, self.screen = resolve(self.this.config, scene)
@@ -197,16 +197,16 @@ class Attempt:
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:
-        """Say which effects were chosen; None where none were to be."""
+        """Return which effects were chosen; None where the config chooses none."""
         if self.screen is None and self.config.effects.gate == "off":
             return None
         gating = trainer.gating
         return OnDemand(self.screen, gating.gates, gating.notes, gating.direction)
 
     def draw(self) -> None:
-        """Write pictures.png of what was measured, and classes.png of a model whose effects were chosen.
+        """Write pictures.png of the measured views, and classes.png of a model whose effects were chosen.
 
-        A disk that is full then costs the pictures and not the record.
+        It is called after the record is written, so a full disk costs the pictures and not the record.
         """
         if not self._shown:
             return
@@ -221,7 +221,7 @@ class Attempt:
                 print(f"{self.this.name}: no pictures: {path}: {error.strerror}", file=sys.stderr)
 
     def describe(self, status: str, reason: str | None) -> Record:
-        """Describe the run in a record without measurements: what was run, where, and how it ended.
+        """Describe the run in a record without measurements: its config, its machine and how it ended.
 
         Args:
             status: ok, failed or diverged.
@@ -263,7 +263,7 @@ class Attempt:
 
 
 def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:
-    """Draw the points to start from, where the data set gives none: in a cube, or in what all cameras see."""
+    """Sample points to start from where the data set has none: in a cube, or in the frusta of all cameras."""
     if data.initial_half_width is not None:
         return random_points(data.initial_points, data.initial_half_width, random)
     cameras = [view.to("cpu").camera for view in scene.train]
@@ -271,23 +271,23 @@ def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> P
 
 
 def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dict[str, str]]:
-    """Choose the function that FPS is measured on, and say for the record how it makes frames on a GPU.
+    """Choose the function whose FPS is measured, and the record's protocol entry on how it makes frames on a GPU.
 
-    Frames are `replayed` from a CUDA graph where CUDA can record the model, and otherwise `launched` anew each time.
+    Frames are `replayed` from a CUDA graph where CUDA can record the model. Otherwise each frame is `launched` anew.
     """
     if trainer.model.backend.name != "cuda":
         return trainer.render, {}
     replay = Replay(trainer.model, trainer.renderer.background, trainer.renderer.antialias)
     try:
         replay(first.camera, first.time)
-    except RuntimeError as error:  # an operation that waits for the device, in a model or a scheme written in torch
+    except RuntimeError as error:  # an operation waits for the device, in a model or a scheme written in torch
         print(f"FPS is that of launched frames: CUDA cannot record this model: {one_line(error)}", file=sys.stderr)
         return trainer.render, {"frames": "launched"}
     return lambda view: replay(view.camera, view.time), {"frames": "replayed"}
 
 
 def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[str, float | None], dict[str, str]]:
-    """Add to the metrics of the last iteration those that the evaluated split had at the best iterations."""
+    """Add the metrics of the evaluated split at the best iterations to those of the last iteration."""
     metrics, missing = dict(quality.metrics), dict(quality.missing)
     metrics["psnr_best_on_val"] = trainer.best.eval_at_best_val
     if config.scene.eval_split == "val":

@@ -1,4 +1,4 @@
-"""Choose the model of model=auto for a scene: one that observes time, or one that does not."""
+"""Choose the model of model=auto for a scene: a model with time or a model without it."""
 
 from dataclasses import replace
 from typing import Any
@@ -27,7 +27,7 @@ def with_candidate(config: Config, name: str) -> Config:
     AGR moves Gaussians with time, so the static candidate has none.
 
     Raises:
-        InputError: the config lacks the candidate, or it is none.
+        InputError: the config lacks the candidate, or the candidate is no model config.
     """
     chosen = config.model.candidates.get(name)
     try:
@@ -39,9 +39,10 @@ def with_candidate(config: Config, name: str) -> Config:
 
 
 def resolve(config: Config, scene: Scene) -> tuple[Config, TimeScreen]:
-    """Choose a candidate by looking at the training views of a scene.
+    """Choose a candidate by the training views of a scene.
 
-    What is undecided is simulated: 7DGS on a static scene costs time, 6DGS on a moving one costs the motion.
+    Where the test of time is undecided, time is simulated: 7DGS on a static scene costs seconds, but 6DGS on a moving
+    scene loses the motion.
 
     Raises:
         InputError: as `with_candidate`.

@@ -1,4 +1,4 @@
-"""Refuse a faulty config, data set, device or folder before the first training step."""
+"""Check the config, the data set, the device and the folder of a run before the first training step."""
 
 import dataclasses
 import importlib.resources
@@ -27,8 +27,8 @@ from gsbench.train.optim import OPTIMIZERS
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 PACKAGE = "pkg://"  # in front of the module whose files data.root names
 SPLITS = ("test", "val")
-LEAST_GAUSSIANS = 4  # to start from: sizes are those of three neighbours until they are known
-ENDLESS = 10**9  # more than any machine will do
+LEAST_GAUSSIANS = 4  # to start from: initial scales come from three neighbours
+ENDLESS = 10**9  # more than any machine can do
 RANGES = {  # of numbers that the schema types but does not bound, both ends included
     "train.iterations": (1, ENDLESS),
     "train.recipe_iterations": (1, ENDLESS),
@@ -89,7 +89,7 @@ def trained_start(config: Config) -> TrainedGaussians | None:
     """Read the trained Gaussians that a training starts from; None where it starts from points.
 
     Raises:
-        InputError: the file is not such a PLY, holds fewer than four Gaussians, or is not the one that is asked for.
+        InputError: the file is no PLY of Gaussians, holds fewer than four, or has another SHA-256 than the config says.
     """
     if config.init.ply is None:
         if config.init.ply_sha256 is not None:
@@ -113,7 +113,7 @@ def lpips_weights(config: Config) -> dict[str, Path]:
 
 
 def check_keys(value: Any, kind: Any, place: str) -> None:
-    """Raise InputError for a key that the schema lacks: Hydra's `+key=` adds it, and nothing would read it."""
+    """Raise InputError for a key that the schema lacks: Hydra's `+key=` adds it, but no code reads it."""
     if isinstance(value, dict):
         for name, one in value.items():
             check_keys(one, type(one), f"{place}.{name}")
@@ -137,14 +137,14 @@ def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
 
 
 def _check_rate(key: str, rate: LearningRate) -> None:
-    """Raise InputError for a rate that is negative, or falls log-linearly from or to zero."""
+    """Raise InputError for a rate that is negative, or that starts or ends a log-linear decay at zero."""
     if rate.start < 0 or (rate.end is not None and (rate.end <= 0 or rate.start == 0)):
         raise InputError(f"{key}: expected start >= 0, and start > 0 with end > 0 or null, "
                          f"got start {rate.start}, end {rate.end}")  # fmt: skip
 
 
 def check_folder(folder: Path) -> None:
-    """Raise InputError unless files can be written in a run's folder, which is made where it is missing."""
+    """Raise InputError unless files can be written in a run's folder; a missing folder is made."""
     probe = folder / ".probe"
     try:
         write_atomically(probe, b"")
@@ -170,10 +170,10 @@ def check_device(name: str) -> None:
 
 
 def scene_folder(config: Config) -> Path:
-    """Find the folder of the config's scene: by its name, else by the name that the published release gives it.
+    """Find the folder of the config's scene by its name, else by its name in the published release.
 
     Raises:
-        InputError: there is none in data.root; the message has all names that were looked for.
+        InputError: data.root has no such folder; the message lists the names that were tried.
     """
     data, scene = config.data, config.scene
     names = [scene.name, *([scene.released_as] if scene.released_as else [])]
@@ -190,7 +190,7 @@ def scene_folder(config: Config) -> Path:
 
 
 def data_root(root: str) -> Path:
-    """Return the folder that data.root names: a path, or pkg://module for data inside a package.
+    """Return the folder that data.root names, as a path or as pkg://module for data inside a package.
 
     Raises:
         InputError: there is no such module, or the path cannot be one.
@@ -212,7 +212,7 @@ def check_gates(model: GaussianModel, config: Config) -> None:
 
 
 def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
-    """Raise InputError where the scene cannot teach the model: no times, or all cameras in one place."""
+    """Raise InputError where the scene cannot train the model: it has no times, or all cameras are at one place."""
     if ("time" in model.observes or config.agr) and not scene.has_time:
         what = "agr=true" if config.agr else config.model.name
         raise InputError(f"{what}: expected a scene with times, {scene.name} has none: use 3dgs or 6dgs, agr=false")

@@ -1,8 +1,8 @@
-"""Claim a run for this process before anything heavy is loaded, so that of equal commands one trains. Needs no torch.
+"""Claim a run for this process before anything heavy is loaded, so that only one of equal commands trains.
 
-The claim is the run's progress.json, made by a hard link, which of several processes on several hosts succeeds for one.
-A claim whose process is gone is taken over; while one process does that, a lock of the system keeps the others of a
-file system with locks out. The system drops the lock of a process that is killed, so nothing is left to clear away.
+The claim is the run's progress.json. It is created by a hard link, which succeeds for only one of several processes,
+also across hosts. A claim whose process is gone is taken over. During that a system lock keeps other processes out,
+where the file system has locks; the system drops the lock of a killed process. The module needs no torch.
 """
 
 import fcntl
@@ -19,16 +19,16 @@ from gsbench.run import progress
 from gsbench.run.progress import Progress
 
 LOCK = ".claim"
-PATIENCE = 5.0  # seconds: who holds the lock for longer is suspended, and the link alone decides
+PATIENCE = 5.0  # seconds to wait for the lock; a process that holds it longer is suspended, and the link decides
 ATTEMPTS = 100
-NOTHING, DAMAGED = "nothing", "damaged"  # what may lie where a claim was looked for
+NOTHING, DAMAGED = "nothing", "damaged"  # results of reading a claim that is no progress file
 
 
 def take(folder: Path, mine: Progress) -> Progress | None:
-    """Claim the run in `folder`, which exists; return None, or the progress of the living process that has it.
+    """Claim the run in the existing `folder`; return None, or the progress of the live process that has the claim.
 
     Raises:
-        InputError: other processes claim and leave the run without end.
+        InputError: other processes claim and release the run again and again.
         OSError: the claim cannot be written.
     """
     path = folder / progress.FILE_NAME
@@ -41,11 +41,11 @@ def take(folder: Path, mine: Progress) -> Progress | None:
                 path.unlink(missing_ok=True)  # a dead process left it, or it is damaged and says nothing
             if create_atomically(path, progress.encode(mine)):
                 return None
-    raise InputError(f"{path}: expected to claim the run, other processes do again and again: try later")
+    raise InputError(f"{path}: expected to claim the run, other processes claim it again and again: try later")
 
 
 def release(folder: Path, mine: Progress) -> None:
-    """Say that nobody is at the run in `folder` any more, unless another process has it now."""
+    """Remove the claim of this process on the run in `folder`; a claim of another process stays."""
     path = folder / progress.FILE_NAME
     try:
         with _alone(folder):
@@ -57,9 +57,9 @@ def release(folder: Path, mine: Progress) -> None:
 
 
 def _read(path: Path) -> Progress | str:
-    """Read a claim; NOTHING where there is none, DAMAGED where it cannot be read again and again.
+    """Read a claim; return NOTHING where there is none, DAMAGED where three attempts to read it fail.
 
-    Without locks one may be made just after it was looked for, which is no damage.
+    Without locks another process may create the claim during the first attempt, which is no damage.
     """
     for _ in range(3):
         try:
@@ -75,9 +75,9 @@ def _is_one(other: Progress, mine: Progress) -> bool:
 
 
 def _may_be_taken(other: Progress, mine: Progress) -> bool:
-    """Tell whether the process of a claim is this one, is gone, or was put back into Slurm's queue when its node fell.
+    """Tell whether the process of a claim is this one, is gone, or was requeued by Slurm after its node failed.
 
-    A job that runs two equal commands on one node has two living processes, of which one is not the other's.
+    A Slurm job that runs two equal commands on one node has two live processes; each respects the other's claim.
     """
     requeued = other.job is not None and other.job == mine.job and other.host != mine.host
     return _is_one(other, mine) or requeued or not progress.is_alive(other)
@@ -85,7 +85,7 @@ def _may_be_taken(other: Progress, mine: Progress) -> bool:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Keep other processes out of a claim while this one is read and replaced, where the file system has locks."""
+    """Lock a claim against other processes while the block reads and replaces it, where the file system has locks."""
     path = folder / LOCK
     until = time.monotonic() + PATIENCE
     file: IO[bytes] | None = None
@@ -105,7 +105,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _locked(path: Path) -> IO[bytes] | None:
-    """Open and lock `path`; None where its last holder has removed it meanwhile, so that others lock another file.
+    """Open and lock `path`; return None where its last holder has removed it meanwhile, as others lock another file.
 
     Raises:
         BlockingIOError: another process holds it.

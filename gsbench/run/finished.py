@@ -1,4 +1,4 @@
-"""Find the record of a run that finished before, and say why it is kept, measured again or trained again."""
+"""Find the record of a run that finished earlier, and decide whether it is kept, measured again or trained again."""
 
 import sys
 from pathlib import Path
@@ -21,10 +21,10 @@ STALE = "record.stale.json"  # that of a finished run, kept beside the record of
 
 
 def finished(this: Run, scene: Scene) -> Record | None:
-    """Read the record of this run, if it ended well before, with the same training, measuring and data.
+    """Read the record of this run if it ended well with the same training, measuring and data; None otherwise.
 
-    Where one ended well otherwise, the reason why it does not count is said. LPIPS weights that are new here have the
-    run measured again from its checkpoint; where that is gone, the record is kept without them.
+    Where a record differs, the reason is printed. Where LPIPS weights are new on this machine, the run is measured
+    again from its checkpoint; where the checkpoint is gone, the record is kept without LPIPS.
     """
     if not this.config.resume:
         return None
@@ -48,7 +48,7 @@ def finished(this: Run, scene: Scene) -> Record | None:
 
 
 def where(this: Run, record: Record) -> str:
-    """Say when and on which machine the record of a run was measured."""
+    """Return when and on which machine the record of a run was measured."""
     here, device = hardware(kernels.instruction_set()), this.config.device
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else here.processor
     theirs = record.provenance.machine
@@ -57,7 +57,7 @@ def where(this: Run, record: Record) -> str:
 
 
 def _outdated(this: Run, scene: Scene, record: Record) -> str:
-    """Say why the record of a finished run is not that of this one; "" where it is."""
+    """Return why the record of a finished run does not match this run; "" where it matches."""
     theirs = record.provenance
     training = training_differences(theirs.config, this.plain)
     if training:
@@ -72,7 +72,7 @@ def _outdated(this: Run, scene: Scene, record: Record) -> str:
 
 
 def _lacks_lpips(this: Run, scene: Scene, record: Record) -> str:
-    """Say why a record is measured again for LPIPS weights that were not there; "" where it is kept."""
+    """Return why new LPIPS weights make a run be measured again; "" where its record is kept."""
     camera, given = evaluated_views(scene, this.config.scene.eval_split)[0].camera, lpips_weights(this.config)
     new = [name for name, known in perceptual.BACKBONES.items()
            if (record.metrics or {}).get(f"lpips_{name}") is None and perceptual.is_here(name, given.get(name))
@@ -87,7 +87,7 @@ def _lacks_lpips(this: Run, scene: Scene, record: Record) -> str:
 
 
 def _is_trained(this: Run, scene: Scene) -> bool:
-    """Tell whether the checkpoint of this run is there and holds all of its training."""
+    """Tell whether this run has a checkpoint of its finished training."""
     path: Path = this.folder / checkpoint.FILE_NAME
     try:
         state = checkpoint.load(path, training_hash(this.plain), scene.fingerprint, "cpu")

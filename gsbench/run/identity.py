@@ -1,4 +1,4 @@
-"""Identify a run by what its training reads: its label, its variant, its folder and the hash of its training."""
+"""Identify a run by the settings that its training reads: give it a label, a variant and a folder."""
 
 import hashlib
 import json
@@ -34,8 +34,8 @@ class Run:
     plain: Plain  # the config as recorded
     folder: Path  # where the record, the checkpoint and the images go
     label: str  # the model's name, with _agr or _noagr where it is not as published
-    variant: str = ""  # what its training reads that differs from the experiment's own, such as "iterations=10"
-    overrides: list[str] = field(default_factory=list)  # what `python -m gsbench` needs to repeat it
+    variant: str = ""  # settings of its training that differ from the experiment's, such as "iterations=10"
+    overrides: list[str] = field(default_factory=list)  # arguments of `python -m gsbench` that repeat it
 
     @property
     def name(self) -> str:
@@ -49,8 +49,8 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
 
     Args:
         composed: the config of one scene, as Hydra composed it.
-        choices: what was chosen of each config group (HydraConfig.runtime.choices); None for a run without variant.
-        overrides: the words of the command line that made it (HydraConfig.overrides.task).
+        choices: the choice of each config group (HydraConfig.runtime.choices); None for a run without variant.
+        overrides: the overrides of its command line (HydraConfig.overrides.task).
 
     Raises:
         InputError: a name cannot be that of a folder, or there is no file to start from. Hydra has already refused
@@ -86,10 +86,10 @@ def hash_of(ply: str) -> str:
 
 
 def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
-    """Name in a few words what a training reads beyond its experiment, model, scene and seed; "" for nothing.
+    """Name the settings that a training reads beyond its experiment, model, scene and seed; "" for none.
 
-    Groups are named by their choice (`recipe=paper`); keys by their value, where it differs from that of the config
-    which the same choices give alone. A long name is cut at a whole word and ends in a hash of the rest.
+    A group is named with its choice (`recipe=paper`). A key is named with its value where that differs from the config
+    that the choices alone compose. A long name is shortened at a whole word and ends in a hash.
     """
     groups = {
         group: choice
@@ -110,7 +110,7 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
 
 
 def _storable(value: Any) -> Any:
-    """Put what a record cannot hold, such as NaN, as text: the run is refused, and its row says why."""
+    """Convert values that a record cannot hold, such as NaN, to text; the run is refused, and its row says why."""
     if isinstance(value, dict):
         return {key: _storable(one) for key, one in value.items()}
     if isinstance(value, float):
@@ -119,9 +119,9 @@ def _storable(value: Any) -> Any:
 
 
 def _printed(value: Any) -> str:
-    """Print a value for the name of a folder; as a hash where it has characters that a folder should not have.
+    """Format a value for the name of a folder; return a hash where it has characters that are unsafe there.
 
-    A SHA-256 is cut to its first eight digits.
+    A SHA-256 is shortened to its first eight digits.
     """
     text = value if isinstance(value, str) else json.dumps(value)
     if re.fullmatch("[0-9a-f]{64}", text):
@@ -131,7 +131,7 @@ def _printed(value: Any) -> str:
 
 
 def _cut(words: list[str]) -> str:
-    """Join words by commas; where that is too long, keep the first ones and a hash of all."""
+    """Join words by commas; where the result is too long, keep the first words and a hash of all."""
     whole = ",".join(words)
     if len(whole) <= LONGEST_VARIANT:
         return whole

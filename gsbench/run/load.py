@@ -1,4 +1,4 @@
-"""Load the model of a finished or broken run back from its folder, and the scene that it was trained on."""
+"""Load the model of a finished or interrupted run from its folder, and the scene that it was trained on."""
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,7 +28,7 @@ LARGEST_EXTENT = 1e18  # world units: squares stay finite in single precision
 
 @dataclass(frozen=True)
 class SceneDescription:
-    """What is to be known of a scene to render a model of it, without its images."""
+    """The facts about a scene that rendering a model of it needs, without images."""
 
     name: str
     fingerprint: str  # Scene.fingerprint of the data that the model was trained on
@@ -48,19 +48,19 @@ class SceneDescription:
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A trained model, ready to render, with the config and the scene that it was trained by."""
+    """A trained model, ready to render, with the config and the scene of its training."""
 
     model: GaussianModel
     config: Config
     scene: SceneDescription
-    step: int  # finished steps; below config.train.iterations where the run was broken off
+    step: int  # finished steps; below config.train.iterations where the run was interrupted
     folder: Path
 
 
 def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> LoadedRun:
     """Load the model, the config and a description of the scene from the folder of a run.
 
-    Only the checkpoint is read. It is untrusted: nothing in it is executed, and its config and tensors are checked.
+    Only the checkpoint is read. It is not trusted: nothing in it is executed, and its config and tensors are checked.
 
     Args:
         folder: of the run, such as results/mini/suzanne/7dgs/seed0.
@@ -92,7 +92,7 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     scene = parse(SceneDescription, found.scene, str(path))
     _check_scene(scene, path)
     model = build(config)
-    points = torch.eye(4, 3)  # as few as there can be; `load_state` replaces them
+    points = torch.eye(4, 3)  # the fewest allowed; `load_state` replaces them
     model.initialise(Points(points, points), scene.extent, generator(config.seed))
     model.to(device)
     try:
@@ -112,10 +112,10 @@ def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
 
     Args:
         run: whose config names the scene.
-        data_root: the folder of its data set, where it is no longer the one in the config.
+        data_root: the folder of its data set, where it differs from the one in the config.
 
     Raises:
-        InputError: the data are gone, have a fault, or are others than those of the training.
+        InputError: the data are gone, have a fault, or differ from those of the training.
     """
     root = data_root or own_root(run.config.data.root, run.folder)
     config = replace(run.config, data=replace(run.config.data, root=root))
@@ -130,10 +130,10 @@ def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
 
 
 def own_root(root: str, where: Path) -> str:
-    """Return the data.root that a checkpoint names, where no one else names one.
+    """Return the data.root that a checkpoint names, for use where the user names none.
 
     Raises:
-        InputError: it is a package other than that of the embedded scenes: to look for its files would import it.
+        InputError: it is a package other than that of the embedded scenes; finding its files would import it.
     """
     if root.startswith(PACKAGE) and root != EMBEDDED:
         raise InputError(f"{where}: expected data in a folder or in {EMBEDDED}, its checkpoint names {root!r:.80}, "
@@ -142,7 +142,7 @@ def own_root(root: str, where: Path) -> str:
 
 
 def _check_scene(scene: SceneDescription, path: Path) -> None:
-    """Raise InputError unless a description is of a scene that can be rendered."""
+    """Raise InputError unless a scene description has values that can be rendered."""
     sizes = 0 < scene.width <= MOST_PIXELS and 0 < scene.height <= MOST_PIXELS
     if not sizes or not 0 < scene.extent < LARGEST_EXTENT:
         raise InputError(f"{path}: scene: expected 1 to {MOST_PIXELS} pixels a side and a positive extent, got "
@@ -159,12 +159,12 @@ def plain_description(scene: Scene) -> dict[str, Any]:
 
 
 def typed_config(plain: dict[str, Any], path: Path) -> Config:
-    """Type the plain config of a checkpoint.
+    """Convert the plain config of a checkpoint to a typed one.
 
-    A checkpoint is untrusted, so that the module it names for its model is never imported: the user does it.
+    A checkpoint is not trusted, so the module that it names for its model is not imported here; the user imports it.
 
     Raises:
-        InputError: it is none, has a value that no run has, or a name that could lead out of the folder of the data.
+        InputError: it is no config, has a value that no run has, or a name that leads out of the folder of the data.
     """
     try:
         typed = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.create(_without_interpolations(plain)))
@@ -187,7 +187,7 @@ def typed_config(plain: dict[str, Any], path: Path) -> Config:
 
 
 def _without_interpolations(value: Any) -> Any:
-    """Refuse text that OmegaConf would resolve: `${oc.env:NAME}` reads the environment of whoever loads it."""
+    """Return plain values, and refuse text that OmegaConf would resolve: `${oc.env:NAME}` reads the environment."""
     if isinstance(value, str) and "${" in value:
         raise ValueError(f"expected resolved values, got {value!r:.80}")
     for key, one in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():

@@ -1,4 +1,4 @@
-"""Tell the overrides that decide a run's numbers from those that say where its results lie and who runs it."""
+"""Separate the overrides that decide a run's numbers from those that set its results folder or its launcher."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Tell other processes how far a run is: progress.json lies in its folder while it runs. Needs no torch."""
+"""Report the progress of a run to other processes by a progress.json in its folder. The module needs no torch."""
 
 import dataclasses
 import json
@@ -16,12 +16,12 @@ from gsbench.reading import parse_json, read_file
 FILE_NAME = "progress.json"
 EVERY = 5.0  # seconds between two writes
 LARGEST = 1 << 20  # bytes
-SILENT = 600.0  # seconds after which a run that nobody can be asked about counts as lost
+SILENT = 600.0  # seconds without a report after which a run on an unreachable host counts as lost
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is, and the process that does it."""
+    """The progress of a run, and the process that does it."""
 
     overrides: list[str]  # of the run, as in its record
     host: str = field(default_factory=socket.gethostname)
@@ -42,7 +42,7 @@ def write(folder: Path, progress: Progress) -> None:
 
 
 def encode(progress: Progress) -> bytes:
-    """Return what is written of a progress."""
+    """Encode a progress as the JSON of its file."""
     return json.dumps(dataclasses.asdict(progress), indent=1, allow_nan=False).encode()
 
 
@@ -50,14 +50,14 @@ class Reporter:
     """Writes the progress of a run from inside its training, when it is due."""
 
     def __init__(self, folder: Path, overrides: list[str], steps: int) -> None:
-        """Say at once that the run in `folder`, of so many steps, has started."""
+        """Report at once that the run in `folder`, which has `steps` steps, has started."""
         self.folder = folder
         self.progress = Progress(overrides, steps=steps)
         write(folder, self.progress)
         self._written = time.monotonic()
 
     def is_due(self) -> bool:
-        """Tell whether the last report is EVERY seconds old; what is reported may cost a wait for the GPU."""
+        """Tell whether the last report is EVERY seconds old; computing a report may wait for the GPU."""
         return time.monotonic() - self._written >= EVERY
 
     def __call__(self, step: int, seconds: float, last: Point | None) -> None:
@@ -69,11 +69,11 @@ class Reporter:
         self._written = time.monotonic()
         try:
             write(self.folder, self.progress)
-        except OSError:  # a full disk ends the run where something is lost by it: at its checkpoint or its record
+        except OSError:  # a full disk ends the run at its checkpoint or its record, not here
             return
 
     def end(self) -> None:
-        """Say that nobody is at this run any more."""
+        """Remove the report of this run, as its process leaves it."""
         (self.folder / FILE_NAME).unlink(missing_ok=True)
 
 
@@ -83,16 +83,16 @@ def read(path: Path) -> Progress:
 
 
 def is_alive(progress: Progress) -> bool:
-    """Tell whether the process that wrote a progress still runs; on another host, whether it wrote lately."""
+    """Tell whether the process of a progress still runs; on another host, whether its last report is recent."""
     if progress.host == socket.gethostname():
         return progress.born is not None and born(progress.pid) == progress.born
     return time.time() - progress.updated < SILENT
 
 
 def born(pid: int) -> int | None:
-    """Return when a process of this machine started, in clock ticks after the machine did; None where there is none.
+    """Return when a process of this machine started, in clock ticks since boot; None where there is no such process.
 
-    With it a process is told from a later one that was given the same number.
+    It distinguishes a process from a later one with the same process id.
     """
     try:
         after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

@@ -1,4 +1,4 @@
-"""Gate the model of a finished run, and write it as a run of its own beside the old one."""
+"""Gate the model of a finished run, and write the result as a separate run beside the old one."""
 
 import copy
 from pathlib import Path
@@ -25,7 +25,7 @@ def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tu
         data_root: where the data set is now; where it was for the run by default.
 
     Raises:
-        InputError: there is no finished run, it is gated at its end already, or the data are gone or others.
+        InputError: there is no finished run, it was already gated at its end, or the data are gone or have changed.
     """
     path = folder / checkpoint.FILE_NAME
     if not path.exists():

@@ -1,4 +1,4 @@
-"""Do one run from its config to its record, which is on disk at the end, however the run ended."""
+"""Do one run from its config to its record, which is written however the run ends."""
 
 import gc
 import sys
@@ -25,7 +25,7 @@ from gsbench.train.diagnosis import explain
 from gsbench.train.watch import DivergedError
 
 TRACEBACK = "traceback.txt"
-SPARE = 1 << 25  # bytes set aside, and never touched, for the record of a run that ends without memory
+SPARE = 1 << 25  # bytes reserved, so that a run which ends without memory can still write its record
 
 
 class UnrecordedError(InputError):
@@ -33,15 +33,15 @@ class UnrecordedError(InputError):
 
 
 def run(composed: DictConfig, choices: Mapping[str, str] | None = None, overrides: Sequence[str] = ()) -> Record | None:
-    """Do the run of a composed config of one scene, or keep the one that finished before.
+    """Do the run of a composed config of one scene, or keep its earlier result.
 
     Args:
         composed: the config.
-        choices: what was chosen of each config group, for the run's name; see `identify`.
-        overrides: the words of the command line that made it, for the record.
+        choices: the choice of each config group, for the run's name; see `identify`.
+        overrides: the overrides of its command line, for the record.
 
     Returns:
-        The record, which is on disk whatever its status is; None where another process is at this run.
+        The record, which is on disk whatever its status is; None where another process does this run.
 
     Raises:
         InputError: the run has no name that can be a folder, or its folder cannot be written.
@@ -61,7 +61,7 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
 
 
 def _is_claimed(this: Run, mine: Progress) -> bool:
-    """Claim a run for this process; where another is at it, say so and return False.
+    """Claim a run for this process; where another process does it, print that and return False.
 
     Raises:
         InputError: the claim cannot be written.
@@ -77,7 +77,7 @@ def _is_claimed(this: Run, mine: Progress) -> bool:
 
 
 def _done(attempt: Attempt) -> Record:
-    """Do a run that this process has claimed, or keep the one that finished before; see `run`."""
+    """Do a run that this process has claimed, or keep its earlier result; see `run`."""
     this, spare = attempt.this, [bytearray(SPARE)]
     try:
         model, scene = attempt.prepare()
@@ -108,7 +108,7 @@ def _ended_badly(attempt: Attempt, error: Exception) -> Record:
     """Describe a run that an error has ended.
 
     Raises:
-        InputError: the model is unknown, so that the run has no row in a table.
+        InputError: the model is unknown, so the run has no row in a table.
     """
     is_diverged = isinstance(error, DivergedError)
     if is_out_of_memory(error):
@@ -124,7 +124,7 @@ def _ended_badly(attempt: Attempt, error: Exception) -> Record:
 
 
 def reason_of(error: Exception, folder: Path) -> str:
-    """Say in one line why a run failed. The stack of an error that nobody foresaw goes into TRACEBACK in `folder`."""
+    """Say in one line why a run failed; the stack trace of an unexpected error goes to TRACEBACK in `folder`."""
     text = one_line(error)
     if is_out_of_memory(error):
         return f"out of memory: {text}"
@@ -138,7 +138,7 @@ def reason_of(error: Exception, folder: Path) -> str:
 
 
 def write(record: Record, folder: Path) -> None:
-    """Write the record of a run; the one of an earlier run that ended well is kept as STALE if this one did not."""
+    """Write the record of a run; where it did not end well, an earlier record that did is kept as STALE."""
     path, stale = folder / records.FILE_NAME, folder / STALE
     if record.status == "ok":
         records.write(record, path)
@@ -155,7 +155,7 @@ def write(record: Record, folder: Path) -> None:
 
 
 def summary(record: Record) -> str:
-    """Sum up a record in a few words: the quality, the size and the speed, or why there are none."""
+    """Summarise a record in one line: its quality, size and speed, or why it has none."""
     if record.metrics is None or record.cost is None:
         return f"{record.status}: {record.reason}"
     psnr = record.metrics["psnr"]

@@ -1,4 +1,4 @@
-"""End a run at the end of its step when the process is told to: SIGINT, SIGTERM, and Slurm's SIGUSR2."""
+"""Stop a run at the end of its step when the process gets a signal: SIGINT, SIGTERM or Slurm's SIGUSR2."""
 
 import signal
 import threading
@@ -11,7 +11,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
 
 
 class Stopped(BaseException):  # like KeyboardInterrupt: not an error, and no handler of errors takes it
-    """The process was told to end, and the run has saved what it had."""
+    """The process got a signal to end, and the run has saved its state."""
 
     def __init__(self, number: int, message: str) -> None:
         super().__init__(message)
@@ -24,19 +24,19 @@ def stop_at_once(number: int, _: FrameType | None) -> None:
 
 
 class Request:
-    """Whether a signal has asked the run to end, and which."""
+    """The signal that asks the run to end, if there was one."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
         self._before: dict[int, Any] = {}
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
-        if self.signal is not None:  # asked for the second time: what was there before decides, mostly to end at once
+        if self.signal is not None:  # at the second signal the earlier handler acts, which mostly ends the process
             self.hand_on(number, frame)
         self.signal = number
 
     def hand_on(self, number: int, frame: FrameType | None = None) -> None:
-        """Let the handler that was there before act: submitit's puts a job back into Slurm's queue at SIGUSR2."""
+        """Call the handler that was installed before; that of submitit requeues a Slurm job at SIGUSR2."""
         before = self._before.get(number)
         if callable(before):
             before(number, frame)
@@ -47,9 +47,9 @@ class Request:
 
 @contextmanager
 def requested() -> Iterator[Request]:
-    """Note signals while the block runs, which looks at the request between two steps; then as before.
+    """Record signals while the block runs, which reads the request between two steps; then restore the handlers.
 
-    Only the main thread of a process may set handlers; elsewhere nothing is ever requested.
+    Only the main thread of a process may set handlers; in other threads no signal is recorded.
     """
     request = Request()
     if threading.current_thread() is not threading.main_thread():
