@@ -1,1 +1,1 @@
-"""Fetch data sets and weights that are published elsewhere, and put them where gsbench looks for them."""
+"""Download data sets and weights that others publish, and put them where gsbench finds them."""

@@ -1,4 +1,4 @@
-"""Fetch data sets and weights (``python -m gsbench.fetch dnerf|pbr|lpips-alex|lpips-vgg|--list``)."""
+"""Download data sets and weights (``python -m gsbench.fetch dnerf|pbr|lpips-alex|lpips-vgg|--list``)."""
 
 import argparse
 import sys
@@ -35,11 +35,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def folder_of(path: Path) -> Path:
-    """Return a folder by the name that a user gave it; raises InputError where it can be none's."""
+    """Return the folder that a user named; raises InputError where no folder can have that name."""
     try:
         if "\0" not in str(path):
             return path.expanduser()
-    except RuntimeError:  # a home of nobody
+    except RuntimeError:  # `~` of an unknown user
         pass
     raise InputError(f"--to: expected a folder, got {str(path)!a:.200}")
 
@@ -50,7 +50,7 @@ def line_of(source: Source) -> str:
 
 
 def plan_of(source: Source) -> str:
-    """Say what would be fetched, from where, to where, and what is checked."""
+    """Describe what would be downloaded, from where, to where, and how it is checked."""
     if source.target.exists():
         return f"{source.name}: {source.target} is there: nothing would be fetched"
     checked = f"its SHA-256 must begin with {source.sha256}" if source.sha256 else "no SHA-256 of it is published"
@@ -58,10 +58,10 @@ def plan_of(source: Source) -> str:
 
 
 def fetch(source: Source) -> str:
-    """Fetch a source and say where it lies.
+    """Download a source and return a line on where it is.
 
     Raises:
-        InputError: it cannot be fetched, or is not what it should be.
+        InputError: the download fails, or the file is not the expected one.
     """
     from gsbench.fetch.download import check, download, sha256_of
     from gsbench.fetch.unpack import scenes_in, unpack
@@ -79,13 +79,13 @@ def fetch(source: Source) -> str:
     try:
         unpack(archive, source.folder)
     finally:
-        archive.unlink()  # a damaged one would be in the way of the next attempt
+        archive.unlink()  # a damaged archive would block the next attempt
     return (f"{source.name}: unpacked into {source.folder}; SHA-256 of the archive, to compare with others: {digest}; "
             f"{scenes(scenes_in(source.folder))}")  # fmt: skip
 
 
 def scenes(found: dict[Path, list[str]]) -> str:
-    """Say which data.root to name."""
+    """Describe which data.root to use for which scenes."""
     if not found:
         return "no scene with a transforms_train.json is in it"
     return printable("; ".join(f"data.root={root} has {', '.join(names)}" for root, names in found.items()))

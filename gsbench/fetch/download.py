@@ -1,4 +1,4 @@
-"""Download a file by pooch: whole and as it should be, or not at all, with every failure told in one line."""
+"""Download a file by pooch and check it; a failed download leaves no file and raises an error of one line."""
 
 import hashlib
 import logging
@@ -22,8 +22,8 @@ def download(source: Source, folder: Path) -> Path:
     anew the next time.
 
     Raises:
-        InputError: the server cannot be reached, has no such file, breaks off, or sends other bytes than expected or
-            what is no answer.
+        InputError: the server cannot be reached, has no such file, breaks off, sends other bytes than expected, or
+            sends no valid answer.
     """
     url, path = source.address(), folder / source.file
     if path.is_file():
@@ -53,12 +53,12 @@ def download(source: Source, folder: Path) -> Path:
 
 
 def by_hand(source: Source, path: Path) -> str:
-    """Say how to do without this download."""
+    """Describe how to download the file by hand."""
     return f"take it from {source.url or source.published} by hand to {path} and repeat this"
 
 
 def check(path: Path, source: Source, advice: str) -> None:
-    """Raise InputError unless the SHA-256 of a file begins as that of the source, where one is known."""
+    """Raise InputError where the source has a SHA-256 and that of the file begins otherwise."""
     found = sha256_of(path)
     if source.sha256 and not found.startswith(source.sha256):
         raise InputError(f"{source.name}: expected {source.file} with SHA-256 {source.sha256}.., got {found[:8]}..: "

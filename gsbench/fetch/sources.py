@@ -1,4 +1,4 @@
-"""List what can be fetched: where it is published, what its bytes must be, and where it goes."""
+"""List the sources that can be downloaded: their address, their SHA-256 and their folder."""
 
 import os
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ MIRROR = "GSBENCH_MIRROR"  # an address; every file is then fetched from it, by 
 
 @dataclass(frozen=True)
 class Source:
-    """Something that is published elsewhere."""
+    """A data set or a file of weights that others publish."""
 
     name: str
     what: str
     file: str  # its name on a mirror, and on this machine while it is fetched
     folder: Path  # where it goes; an archive is unpacked into it
-    url: str | None  # None: it is published in a way that only a browser can follow
-    sha256: str | None = None  # the first digits that are known; None: its authors publish none
+    url: str | None  # None: only a browser can download it
+    sha256: str | None = None  # its known first digits; None: its authors publish none
     published: str = ""  # where, in words
 
     @property
@@ -32,11 +32,11 @@ class Source:
 
     @property
     def target(self) -> Path:
-        """The file, or the folder of an archive, that is there once it is fetched."""
+        """The file that exists after the download, or the folder of an archive."""
         return self.folder if self.is_archive else self.folder / self.file
 
     def address(self) -> str:
-        """Return the URL that is asked: that of the mirror where there is one.
+        """Return the URL of the download, on the mirror where one is set.
 
         Raises:
             InputError: there is none, or the mirror's is not one.
@@ -54,7 +54,7 @@ class Source:
 
 
 def sources(data: Path) -> dict[str, Source]:
-    """Return everything that can be fetched, by name; data sets go into folders of `data`."""
+    """Return all sources by name; data sets go into folders of `data`."""
     known = [
         Source(
             name="dnerf",
@@ -86,7 +86,7 @@ def find(name: str, known: dict[str, Source]) -> Source:
 
 
 def _is_address(text: str) -> bool:
-    """Whether a text is an address that a program can ask: http or https, with a host and perhaps a port."""
+    """Tell whether a text is an http or https address with a host and perhaps a port."""
     try:
         parts = urlsplit(text)
         (parts.hostname or "").encode("idna")  # raises ValueError, as `port` does
@@ -96,12 +96,12 @@ def _is_address(text: str) -> bool:
 
 
 def _published(experiment: str) -> str:
-    """Read from an experiment's config where its data are published."""
+    """Return where an experiment's config says that its data are published."""
     return str(OmegaConf.load(CONF / "exp" / f"{experiment}.yaml").data.published)
 
 
 def _trunk(backbone: str) -> Source:
-    """Return a trunk of LPIPS, which gsbench.measure looks for in torch's own folder."""
+    """Return the source of an LPIPS trunk, which gsbench.measure reads from torch's own folder."""
     import torch  # it takes two seconds to load
 
     from gsbench.measure.perceptual import BACKBONES

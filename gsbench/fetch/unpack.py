@@ -1,4 +1,4 @@
-"""Unpack a zip that was fetched, into one folder and nowhere else."""
+"""Unpack a downloaded zip into one folder, and refuse members that would lie elsewhere."""
 
 import lzma
 import secrets
@@ -18,7 +18,7 @@ DAMAGED = (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, zlib
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpack a zip into a new folder, which appears when it is complete.
+    """Unpack a zip into a new folder, which appears only when it is complete.
 
     Raises:
         InputError: it is no zip, it is damaged, a name in it leads out of the folder, or the disk is too small for it.
@@ -44,7 +44,7 @@ def unpack(archive: Path, folder: Path) -> None:
 
 
 def check(member: zipfile.ZipInfo, archive: Path) -> None:
-    """Raise InputError where a file of a zip has no name, would lie outside of its folder, or is a link or a device."""
+    """Raise InputError where a member of a zip has no name, would lie outside the folder, or is a link or a device."""
     name = member.filename
     path = PurePosixPath(name.replace("\\", "/"))
     if path.is_absolute() or ".." in path.parts or ":" in name or not name.isprintable():

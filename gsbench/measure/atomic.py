@@ -1,4 +1,4 @@
-"""Write files atomically, so that every file which a killed run leaves behind can be read."""
+"""Write files atomically, so that a killed run leaves no half-written file."""
 
 import errno
 import os
@@ -12,10 +12,10 @@ HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
 
 
 def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
-    """Write `data` to `path` through a temporary name in the same folder, which is then renamed.
+    """Write `data` to a temporary file in the folder of `path`, then rename the file to `path`.
 
-    The folder is made where it is missing. A reader of `path` sees the old file or the new one, never a part. What is
-    `lasting` is flushed to the disk before it is renamed, and survives a power cut.
+    A missing folder is made. A reader of `path` sees the old file or the new one, never a part. A `lasting` file is
+    flushed to the disk before it is renamed, so it survives a power cut.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)
@@ -28,7 +28,7 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
         temporary.replace(path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        # A disk that is full names no file, and a temporary name says nothing.
+        # The error of a full disk names no file, and the temporary name tells a user nothing.
         if isinstance(error, OSError) and error.errno:
             error.filename, error.filename2 = str(path), None
         raise
@@ -42,9 +42,10 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
 
 
 def create_atomically(path: Path, data: bytes) -> bool:
-    """Make the file `path` with all of `data` in it; return False where it is there already. Its folder exists.
+    """Create the file `path` with all of `data`, in an existing folder; return False where the file exists already.
 
-    Of several processes, on several hosts too, that make one file, one does: a hard link to an existing name fails.
+    Where several processes create one file, also across hosts, only one succeeds: a hard link to an existing name
+    fails.
     """
     temporary = _beside(path)
     try:
@@ -63,7 +64,7 @@ def create_atomically(path: Path, data: bytes) -> bool:
 
 
 def _create_here(path: Path, data: bytes) -> bool:
-    """Make a file on a file system without hard links, such as FAT; a reader may see its first part."""
+    """Create a file on a file system without hard links, such as FAT; a reader may see a part of it."""
     try:
         with path.open("xb") as file:
             file.write(data)

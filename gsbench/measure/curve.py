@@ -1,4 +1,4 @@
-"""Keep the curve of a run: PSNR on the val split over iterations and seconds, and the time to reach a PSNR."""
+"""Keep the training curve of a run: PSNR on the val split over iterations and seconds."""
 
 import math
 from dataclasses import dataclass, field
@@ -43,7 +43,7 @@ class Curve:
 
     @property
     def progress(self) -> str:
-        """The latest point in words, with the change since the one before: "12 s of training, val 24.40 dB (+0.31)"."""
+        """The latest point as text, with its change since the previous: "12 s of training, val 24.40 dB (+0.31)"."""
         if not self.points:
             return "val not measured yet"
         before, now = (self.points[-2] if len(self.points) > 1 else None), self.points[-1]

@@ -1,7 +1,7 @@
-"""Describe the machine that a run was measured on, as far as seconds depend on it: processor, cores, memory.
+"""Describe the machine of a run by what its seconds depend on: processor, cores and memory.
 
 The name "AMD EPYC" of a rented machine stands for several generations of processors; family, model and stepping
-tell them apart. Needs no torch.
+distinguish them. The module needs no torch.
 """
 
 import math
@@ -22,11 +22,11 @@ _KEYS = {
 
 @dataclass(frozen=True)
 class Hardware:
-    """The processor and the memory of a machine; what the system does not tell is None."""
+    """The processor and the memory of a machine; a fact that the system does not report is None."""
 
     processor: str  # by name
-    cores: int | None  # that the system has, whether this run may use them or not
-    memory_gib: int | None  # rounded up, so that what the system keeps for itself at a boot changes nothing
+    cores: int | None  # of the system, whether this run may use them or not
+    memory_gib: int | None  # rounded up, so that memory which the system reserves at boot does not change it
     family: str | None = None
     model: str | None = None
     stepping: str | None = None
@@ -42,12 +42,12 @@ class Hardware:
 
 
 def named(device: str, threads: int, hardware: Hardware | None) -> str:
-    """Name a machine in words that tell it from others: of two runs with equal names the seconds compare.
+    """Name a machine so that the seconds of two runs are comparable where their names are equal.
 
     Args:
         device: the processor or GPU by name.
         threads: of torch and of the kernels.
-        hardware: None for older records, which do not say more.
+        hardware: None for older records, which lack it.
     """
     where = "" if hardware is None or device == hardware.processor else f"{device} in "
     return f"{where}{hardware or device}, {threads} thread{'' if threads == 1 else 's'}"

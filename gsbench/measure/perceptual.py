@@ -1,4 +1,4 @@
-"""Compute LPIPS 0.1, the distance of two images in the features of a trained network (Zhang et al. 2018).
+"""Compute LPIPS 0.1, the distance between the features of two images in a trained network (Zhang et al. 2018).
 
 Results are bit-equal to those of the lpips package on the same trunk. The package is not imported, because it imports
 torchvision, whose wheel fails on CPU builds of torch, and does not check weights. Its linear weights are read from its

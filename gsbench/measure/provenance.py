@@ -24,7 +24,7 @@ def provenance(
     device: str | None = None,
     instruction_set: str | None = None,
 ) -> Provenance:
-    """Describe the provenance of a run that ends now; this imports none of the packages whose versions it notes.
+    """Describe the provenance of a run that ends now; the packages whose versions it records are not imported.
 
     Args:
         config: the whole resolved config, plain JSON.
@@ -70,8 +70,8 @@ NO_CODE = ("results", "docs", "*.md")
 def git_commit() -> str | None:
     """Return the commit of the checkout that this file belongs to, with "-dirty" if tracked code differs from it.
 
-    Results and texts make no numbers, so a sweep that writes over landed records stays clean. None if git does not
-    track this file, as in a wheel that is installed inside another repository.
+    Changed results and texts do not count, as they change no number. The commit is None where git does not track this
+    file, as in a wheel that is installed inside another repository.
     """
     here = Path(__file__)
     if _git(here.parent, "ls-files", "--error-unmatch", here.name) is None:

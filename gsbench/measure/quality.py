@@ -1,7 +1,7 @@
 """Measure the quality of images by one protocol: PSNR, SSIM and LPIPS, and their means over the views of a split.
 
-Images are [H, W, 3] tensors of floats and are clamped to [0, 1]. A pixel that is NaN makes the result NaN. Where
-published code differs in a definition, the function states which one is used.
+Images are [H, W, 3] tensors of floats and are clamped to [0, 1]. A NaN pixel makes the result NaN. Where published
+code uses several definitions of a metric, the function states which definition it uses.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -28,7 +28,7 @@ SSIM_LEAST_SIDE = 11  # pixels: the width of a Gaussian window of sigma 1.5, cut
 
 
 def evenly(items: Sequence[T], count: int) -> list[T]:
-    """Choose at most `count` items, evenly spaced from the first on: a fixed subset of the views of a split."""
+    """Choose at most `count` items at even spacing, beginning with the first: a fixed subset of a split's views."""
     count = min(count, len(items))
     return [items[i * len(items) // count] for i in range(count)]
 
@@ -56,7 +56,7 @@ def psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
 
 
 def psnr_channel_mean(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
-    """Compute the mean of the channels' PSNR in dB, as some codes report it; it is never below `psnr` (Jensen)."""
+    """Compute the mean of the channels' PSNR in dB, as some codes report it; by Jensen it is at least `psnr`."""
     return fmean(_decibels(error) for error in _squared_error(a, b).mean((0, 1)))
 
 
@@ -96,9 +96,9 @@ def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
 
 @torch.no_grad()
 def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = None) -> float:  # [H, W, 3], each
-    """Compute LPIPS 0.1, the distance of two images in the features of a trained network (Zhang et al. 2018).
+    """Compute LPIPS 0.1, the distance between the features of two images in a trained network (Zhang et al. 2018).
 
-    No package ships the weights of the network's trunk: `python -m gsbench.fetch lpips-alex` fetches them.
+    No package ships the weights of the network's trunk; `python -m gsbench.fetch lpips-alex` downloads them.
 
     Args:
         a: an image [H, W, 3] of floats, clamped to [0, 1] and scaled to [-1, 1], of at least 31 pixels a side for

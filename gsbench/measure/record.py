@@ -1,7 +1,7 @@
 """Declare the schema of record.json, the record of one run, write it atomically and validate it when it is read.
 
-A record says what was run (model, scene, seed, effects), by which protocol, with which results (metrics, cost, curve)
-and where the numbers come from (provenance). A missing number is null, and `missing` says why. Needs no torch.
+A record holds the run (model, scene, seed, effects), the protocol, the results (metrics, cost, curve) and the
+provenance of the numbers. A missing number is null, and `missing` gives the reason. The module needs no torch.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from gsbench.reading import MAX_JSON, parse_json, read_file
 VERSION = 1
 MAX_POINTS = 10_000  # of a curve: more than a figure shows, and as many as a page draws in a moment
 FILE_NAME = "record.json"
-PUBLISHED = "published"  # the folder of records that came with the code: who is not told to read them passes it by
+PUBLISHED = "published"  # the folder of records that ship with the code; it is read only where it is named
 STATUSES = ("ok", "failed", "diverged")
 METRICS = (
     "psnr",  # dB, joint over H x W x 3, final iteration, mean over the views of the evaluated split
@@ -77,7 +77,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class TimeScreen:
-    """What a test before the training said about time in the scene: gsbench.effects.choose.screen."""
+    """The result of the test for time dependence of a scene before the training: gsbench.effects.choose.screen."""
 
     decision: str  # on, off or undecided
     reason: str
@@ -89,7 +89,7 @@ class TimeScreen:
 
 @dataclass(frozen=True)
 class Gate:
-    """What a gate decided, by gsbench.effects."""
+    """The decision of one gate, by gsbench.effects."""
 
     share: float  # of the squared error, the budget of the prediction
     predicted_db: float
@@ -109,7 +109,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class Direction:
-    """What direction is worth to a model: it cannot be detected, only priced."""
+    """What direction is worth to a model in dB and ms; no test on a scene detects it."""
 
     kept: float  # share of the Gaussians whose slices change with the direction of view
     loss_db: float  # PSNR lost on the evaluated split if direction were frozen in all of them
@@ -129,7 +129,7 @@ class OnDemand:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where the numbers come from; `gsbench.measure.provenance.provenance` fills it in."""
+    """The provenance of the numbers; `gsbench.measure.provenance.provenance` fills it in."""
 
     git_commit: str | None  # "-dirty" at the end where tracked files were changed; None outside a git checkout
     versions: dict[str, str]  # python and the packages that the numbers depend on
@@ -143,7 +143,7 @@ class Provenance:
 
     @property
     def machine(self) -> str:
-        """The machine and the threads in words, by which machines are told apart: seconds compare only on one."""
+        """The machine and the threads as text; seconds are comparable only where it is equal."""
         return named(self.device, self.threads, self.hardware)
 
 
@@ -167,8 +167,8 @@ class Record:
     cost: Cost | None = None  # None only where the run is not ok
     curve: list[Point] = field(default_factory=list)
     version: int = VERSION
-    variant: str = ""  # what its training read that differs from the experiment's own, such as "iterations=10"
-    overrides: list[str] = field(default_factory=list)  # `python -m gsbench` and these words repeat the run
+    variant: str = ""  # settings of its training that differ from the experiment's, such as "iterations=10"
+    overrides: list[str] = field(default_factory=list)  # `python -m gsbench` with these arguments repeats the run
     on_demand: OnDemand | None = None  # None: every Gaussian paid for every effect of the model
 
     @property
@@ -213,7 +213,7 @@ def _validated(plain: Any, path: Path) -> Record:
 
 
 def find(root: Path) -> list[Path]:
-    """List the paths of all records under `root`, sorted, but for those below it in a folder named PUBLISHED."""
+    """List the paths of all records under `root`, sorted, except those in a folder PUBLISHED below it."""
     found = []
     for folder, folders, names in os.walk(root):
         if FILE_NAME in names or FILE_NAME in folders:  # a broken link counts, as what it should show is missing
@@ -231,7 +231,7 @@ def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, 
         scene: its name.
         model: the label of the run, the model's name with _agr or _noagr where it is not as published.
         seed: at least 0 and below 2^63.
-        variant: what differs from the experiment's own config; "" for nothing.
+        variant: the settings that differ from the experiment's; "" for none.
 
     Raises:
         InputError: a name could leave its folder, or the seed is out of its range.
@@ -242,12 +242,12 @@ def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, 
 
 
 def model_folder(model: str, variant: str) -> str:
-    """Name the folder of all seeds of a model and a variant of it, which may be ""."""
+    """Name the folder that holds all seeds of a model at a variant, which may be ""."""
     return f"{model},{variant}" if variant else model
 
 
 def _check_names(experiment: str, scene: str, model: str, variant: str, where: str) -> None:
-    """Refuse a name that, as that of a folder, could leave its parent."""
+    """Raise InputError for a name that, as a folder's name, could lead out of its parent."""
     for what, name in (("experiment", experiment), ("scene", scene), ("model", model)):
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}", name):
             raise InputError(f"{where}{what}: expected a name of letters, digits and _ . + -, got {name!r:.80}")
@@ -261,7 +261,7 @@ def _check_seed(seed: int, where: str) -> None:
 
 
 def check(record: Record, file: str) -> None:
-    """Check what the types do not express; raises InputError that names `file` and the field."""
+    """Check the rules that types do not express; raises InputError that names `file` and the field."""
     if record.status not in STATUSES:
         raise InputError(f"{file}: status: got {record.status!r:.80}. {did_you_mean(record.status, STATUSES)}")
     _check_names(record.experiment, record.scene, record.model, record.variant, f"{file}: ")

@@ -63,7 +63,7 @@ def _parse_fields(kind: Any, value: Any, file: str, field: str) -> Any:
     for name in value:
         if name not in kinds:
             raise InputError(f"{file}: {prefix}{name[:80]!a}: unknown key. {did_you_mean(name, kinds)}")
-    for one in dataclasses.fields(kind):  # what a later gsbench added has a default, so that older files stay readable
+    for one in dataclasses.fields(kind):  # a field added later has a default, so older files stay readable
         if one.name not in value and one.default is one.default_factory is dataclasses.MISSING:
             raise InputError(f"{file}: {prefix}{one.name}: expected a value, the key is missing")
     return kind(**{name: _parse(kinds[name], given, file, prefix + name) for name, given in value.items()})

@@ -1,6 +1,6 @@
-"""Tell which settings of a config a training reads and which only its measuring, and in which two configs differ.
+"""Separate the settings that a training reads from those that only its measuring reads, and compare two configs.
 
-Needs no torch.
+The module needs no torch.
 """
 
 from collections.abc import Collection, Iterator
@@ -10,14 +10,14 @@ from gsbench.measure.provenance import config_hash
 
 Plain = dict[str, Any]  # a resolved config in plain JSON
 
-# What is measured after a training, and where data and results lie, changes no training. `best_on_test` and
-# `eval_split` are not here: the best iteration is looked for while the model trains.
+# Settings of measuring, and the places of data and results, change no training. `best_on_test` and `eval_split` are
+# not here: the best iteration is found while the model trains.
 MEASURING = (
     "experiment", "results", "resume", "launch", "data.dataset", "data.paper_dataset", "data.published", "data.root",
     "data.scenes", "init.ply", "scene.released_as", "train.checkpoint_minutes", "protocol.name", "protocol.quantise",
     "protocol.lpips_alex", "protocol.lpips_vgg", "protocol.renders", "protocol.pictures",
 )  # fmt: skip
-# Of these, where things lie: no number of a record depends on it, for LPIPS weights are checked by their hash.
+# The places among them: no number of a record depends on them, as LPIPS weights are checked by their hash.
 PLACES = (
     "results", "resume", "launch", "data.root", "data.published", "data.scenes", "init.ply", "scene.released_as",
     "train.checkpoint_minutes", "protocol.lpips_alex", "protocol.lpips_vgg",
@@ -42,12 +42,12 @@ def training_part(plain: Plain) -> Plain:
 
 
 def training_hash(plain: Plain) -> str:
-    """Compute the SHA-256 of what a training reads: equal for two runs whose checkpoints can be exchanged."""
+    """Compute the SHA-256 of the settings that a training reads; runs with equal hashes can exchange checkpoints."""
     return config_hash(given(training_part(plain)))
 
 
 def given(plain: Plain) -> Plain:
-    """Flatten a config; a key that is null counts as absent, so that a new one changes no older run."""
+    """Flatten a config; a null key counts as absent, so a new key changes no older run."""
     return {key: value for key, value in flat(plain) if value is not None}
 
 
@@ -61,12 +61,12 @@ def flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def training_differences(theirs: Plain, mine: Plain) -> list[str]:
-    """Name the settings that a training reads and in which two configs differ; none for one training."""
+    """List the settings that a training reads and in which two configs differ; the list is empty for one training."""
     return _differences(given(training_part(theirs)), given(training_part(mine)))
 
 
 def measuring_differences(theirs: Plain, mine: Plain) -> list[str]:
-    """Name the settings that change only what is measured of a training, and in which two configs differ."""
+    """List the settings that only measuring reads and in which two configs differ."""
     read = [given(training_part(config)).keys() for config in (theirs, mine)]
     return _differences(*(
         {key: value for key, value in given(config).items() if key not in keys and not _is_of(key, PLACES)
@@ -75,7 +75,7 @@ def measuring_differences(theirs: Plain, mine: Plain) -> list[str]:
 
 
 def listed(differences: list[str]) -> str:
-    """Join differences in a line, the first few by name."""
+    """Join differences in a line that names the first few."""
     more = len(differences) - _MOST_NAMED
     return "; ".join(differences[:_MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
 

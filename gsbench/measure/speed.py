@@ -1,6 +1,6 @@
 """Measure speed and memory: FPS, seconds by stage of training, CPU-seconds, the load of the machine, peak bytes.
 
-torch is imported only for a GPU, so that records and tables of records do not need it.
+torch is imported only for a GPU, so records and their tables do not need it.
 """
 
 import ctypes
@@ -36,7 +36,7 @@ class RenderTimes:
 
 
 def nothing_to_wait_for() -> None:
-    """Synchronise on the CPU, where work is done when the call returns."""
+    """Return at once: on the CPU a call returns when its work is done."""
 
 
 def synchroniser(device: str) -> Callable[[], None]:
@@ -57,7 +57,7 @@ def time_renders(
     """Time `render(i)`, i = 0..count-1, after `warmup` untimed calls.
 
     FPS in gsbench is 1000 / the median of these milliseconds. A call renders an image on the device from the model,
-    with slicing and AGR, and caches nothing for the next call; it is timed from an idle device to an idle device.
+    with slicing and AGR, and caches nothing for the next call. The device is idle at both ends of a timing.
 
     Args:
         render: renders frame i.
@@ -66,7 +66,7 @@ def time_renders(
         synchronise: waits for the device.
 
     Raises:
-        InputError: fewer than 30 renders, whose percentiles would mean little.
+        InputError: `count` is below 30, where percentiles mean little.
     """
     if count < LEAST_RENDERS:
         raise InputError(f"time_renders: expected count >= {LEAST_RENDERS}, got {count}")
@@ -88,7 +88,7 @@ def time_in_turns(
     count: int = LEAST_RENDERS,
     synchronise: Callable[[], None] = nothing_to_wait_for,
 ) -> list[RenderTimes]:
-    """Time several functions frame by frame in turns, so that what else the machine does meets all alike.
+    """Time several functions frame by frame in turns, so that other load on the machine affects all equally.
 
     Args:
         renders: each renders frame i, as in `time_renders`.
@@ -111,8 +111,8 @@ def time_in_turns(
 class StageClock:
     """Sums the seconds of each stage of training: ``with stages("slice"): ...`` adds to the sum of that stage.
 
-    On a GPU both ends of a stage are events in its queue of work. So nothing waits for it before the sums are read, and
-    work counts for the stage that caused it.
+    On a GPU both ends of a stage are events in its stream. So nothing waits for the GPU before the sums are read, and
+    work counts for the stage that launched it.
     """
 
     def __init__(self, device: str = "cpu") -> None:
@@ -123,7 +123,7 @@ class StageClock:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Time the block inside; raises InputError inside another stage, because its seconds would count twice."""
+        """Time the block; raises InputError inside another stage, as the seconds would count twice."""
         if self._current is not None:
             raise InputError(f"stages: '{name}' was opened inside '{self._current}'; close that one first")
         self._current = name
@@ -137,7 +137,7 @@ class StageClock:
                 self._add_one()
 
     def share(self, workers: list[dict[str, float]], wall: float) -> None:
-        """Add `wall` seconds of workers side by side; stages get them in proportion to the workers' own seconds."""
+        """Add `wall` seconds of parallel workers, split over stages in proportion to the workers' own seconds."""
         total = sum(sum(seconds.values()) for seconds in workers) or 1.0
         for seconds in workers:
             for name, own in seconds.items():
@@ -169,9 +169,9 @@ class StageClock:
 
 
 class Laps:
-    """Divides one stretch of work into stages, each of which begins where the one before it ended.
+    """Splits a block of work into stages; each stage begins where the previous one ended.
 
-    Ends are marked as those of `StageClock`, so nothing waits for a GPU before the seconds are read.
+    The ends are marked as in `StageClock`, so nothing waits for a GPU before the seconds are read.
     """
 
     def __init__(self, device: str = "cpu") -> None:
@@ -181,7 +181,7 @@ class Laps:
         self._ended: list[tuple[str, Any, Any]] = []  # name, start and end
 
     def end(self, name: str) -> None:
-        """End a stage, whose name is known only now; a name that comes again adds to its stage."""
+        """End the current stage and name it; the seconds of equal names add up."""
         end = self._clock.mark()
         self._ended.append((name, self._last, end))
         self._last = end
@@ -202,8 +202,8 @@ class Laps:
 class Effort:
     """Sums the CPU-seconds of this process over blocks, ``with effort: ...``, and averages the load of the machine.
 
-    Beside the seconds of a training they say what else the machine did: the load counts all processes that ran or
-    waited, and CPU-seconds do not grow while another process runs. What is not known is None.
+    Beside the seconds of a training they show other work of the machine: the load counts all processes that ran or
+    waited, and CPU-seconds do not grow while another process runs. An unknown value is None.
     """
 
     def __init__(self) -> None:
@@ -221,7 +221,7 @@ class Effort:
         self._load_s += load() * seconds
 
     def add(self, other: "Effort") -> None:
-        """Add the seconds of another one."""
+        """Add the seconds of another `Effort`."""
         self._seconds += other._seconds
         self._cpu_s += other._cpu_s
         self._load_s += other._load_s
@@ -242,13 +242,13 @@ class Effort:
         return {"seconds": self._seconds, "cpu_s": self._cpu_s, "load_s": self._load_s}
 
     def load_state_dict(self, state: dict[str, float] | None) -> None:
-        """Continue from the sums of a checkpoint; without any, as in older ones, nothing is known from here on."""
+        """Continue from the sums of a checkpoint; where an older checkpoint has none, both values become unknown."""
         state = state or dict.fromkeys(("seconds", "cpu_s", "load_s"), math.nan)
         self._seconds, self._cpu_s, self._load_s = (float(state[name]) for name in ("seconds", "cpu_s", "load_s"))
 
 
 def load() -> float:
-    """Return the mean number of processes that ran or waited to in the last minute; NaN where no one counts them."""
+    """Return the load average: processes that ran or waited in the last minute; NaN where the system has none."""
     try:
         return os.getloadavg()[0]
     except (AttributeError, OSError):  # Windows; a container without /proc
@@ -300,7 +300,7 @@ def _clock_of(device: str) -> _Clock:
 
 
 def reset_peak_memory(device: str = "cpu") -> None:
-    """Start a new peak, so that a run does not report the peak of an earlier run in the same process (multirun)."""
+    """Reset the peak, so that a run does not report the peak of an earlier run in the same process (multirun)."""
     if device.startswith("cuda"):
         import torch
 

@@ -1,1 +1,1 @@
-"""Say what this process may use of its machine: threads, workers and memory. Only workers need torch."""
+"""Configure the threads, workers and memory that this process uses. Only `workers` needs torch."""

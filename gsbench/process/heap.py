@@ -1,11 +1,11 @@
-"""Keep freed memory in the process: what is given back to the system is mapped anew, page by page, in the next step."""
+"""Keep freed memory in the process: memory returned to the system must be mapped again, page by page, in each step."""
 
 import ctypes
 import os
 import sys
 
 KEPT = 1 << 30  # bytes of a block, and of the free end of the heap
-# What glibc's malloc is told (mallopt(3)), by the variable of the environment that would tell it otherwise.
+# Options of glibc's malloc (mallopt(3)) by the environment variable that overrides each.
 OPTIONS = {
     "MALLOC_TRIM_THRESHOLD_": (-1, KEPT),  # M_TRIM_THRESHOLD
     "MALLOC_MMAP_THRESHOLD_": (-3, KEPT),  # M_MMAP_THRESHOLD
@@ -14,12 +14,12 @@ OPTIONS = {
 
 
 def keep_freed_memory() -> None:
-    """Keep large blocks when they are freed, on all threads; before there are any, as each keeps the heap it has.
+    """Keep large blocks when they are freed, on all threads. Call it before threads start: each keeps its heap.
 
-    A step frees some hundred megabytes of gradients and asks for them again, which took a quarter of a step of 4DGS at
-    150,000 Gaussians. The heap ("arena") of another thread than the first gives blocks beyond 64 MB back whatever the
-    thresholds are, so all workers share the first one's (docs/cpu.md has
-    what that is worth). Where there is no glibc, nothing is done.
+    A step frees some hundred megabytes of gradients and allocates them again, which took a quarter of a step of 4DGS at
+    150,000 Gaussians. The heap ("arena") of any thread but the first returns blocks beyond 64 MB to the system whatever
+    the thresholds are. So all workers share the arena of the first thread; docs/cpu.md has the gain. Without glibc
+    nothing is done.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None  # musl has none
     if mallopt is None:

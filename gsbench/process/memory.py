@@ -1,6 +1,6 @@
-"""Ask whether a request fits into memory before it is made: the system kills a process that takes too much in silence.
+"""Check that a request fits into memory before it is made, as the system kills a process that takes too much.
 
-Needs no torch.
+The module needs no torch.
 """
 
 import errno
@@ -9,9 +9,9 @@ from pathlib import Path
 
 from gsbench.errors import TooLargeError
 
-# What the loader of libraries, torch, C++, the system's threads and OpenCV say where there is no memory.
+# Messages of the library loader, torch, C++, the system's threads and OpenCV where memory runs out.
 WITHOUT_MEMORY = re.compile(r"memory|bad_alloc|bad alloc|failed to map segment|can't start new thread", re.IGNORECASE)
-SMALL = 1 << 26  # bytes not worth asking the system about
+SMALL = 1 << 26  # bytes; smaller requests are not checked
 
 
 def require(size: int, what: str, instead: str) -> None:
@@ -19,8 +19,8 @@ def require(size: int, what: str, instead: str) -> None:
 
     Args:
         size: bytes.
-        what: needs them, in the plural.
-        instead: what to do, for the message.
+        what: the objects that need them, in the plural.
+        instead: the advice in the message.
     """
     if size < SMALL:
         return
@@ -31,7 +31,7 @@ def require(size: int, what: str, instead: str) -> None:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Tell whether an error says that there is no memory: few of the libraries below raise a MemoryError."""
+    """Tell whether an error means that memory ran out; few libraries raise a MemoryError."""
     if isinstance(error, OSError):
         return error.errno == errno.ENOMEM
     told = isinstance(error, RuntimeError | ImportError | SystemError) and WITHOUT_MEMORY.search(str(error)) is not None
@@ -39,7 +39,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def available() -> int | None:
-    """Bytes this process can still get, by the system and by its control group; None where neither says."""
+    """Return the bytes that the system and the control group leave to this process; None where neither is known."""
     limits = [x for x in (_system(), _control_group()) if x is not None]
     return min(limits, default=None)
 

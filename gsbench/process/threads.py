@@ -1,8 +1,7 @@
-"""Let idle OpenMP threads sleep instead of spinning, whichever library has loaded their runtime.
+"""Let idle OpenMP threads sleep instead of spin, whichever library has loaded their runtime.
 
-Spinning threads of torch take the cores from those of the kernels, and both take them from other programs. libgomp, the
-runtime of torch's wheels and of the kernels, is told by OMP_WAIT_POLICY, which it reads once, as it is loaded; no call
-changes it later.
+Spinning threads of torch take cores from the kernels, and both take cores from other programs. libgomp is the runtime
+of torch's wheels and of the kernels. It reads OMP_WAIT_POLICY once, when it is loaded; no call changes it later.
 """
 
 import ctypes
@@ -14,11 +13,11 @@ RUNTIME = "libgomp.so.1"
 
 
 def sleep_when_idle() -> None:
-    """Ask for sleeping threads, unless the environment asks for something; before torch is imported or after.
+    """Make idle threads sleep, before or after torch is imported, unless the environment sets a policy.
 
-    A runtime that is already loaded waits for 300,000 rounds before it sleeps, but for only 100 while there are more
-    OpenMP threads than processors (manual of libgomp, GOMP_SPINCOUNT). There it is given that many, which do nothing.
-    Another library's own copy of the runtime, under another name, is not reached.
+    A runtime that is already loaded spins for 300,000 rounds before it sleeps, but for only 100 while there are more
+    OpenMP threads than processors (manual of libgomp, GOMP_SPINCOUNT). So such a runtime gets that many threads, which
+    do nothing. A copy of the runtime that another library brings under another name is not reached.
     """
     if "OMP_WAIT_POLICY" in os.environ or "GOMP_SPINCOUNT" in os.environ:
         return
@@ -35,7 +34,7 @@ def sleep_when_idle() -> None:
 
 
 def _crowd(runtime: ctypes.CDLL, made: threading.Event) -> None:
-    """Make one OpenMP thread more than there are processors, and keep them all: they belong to this thread."""
+    """Start one OpenMP thread more than there are processors, and keep them: they end with this thread."""
     nothing = ctypes.CDLL(None).sched_yield  # each of them runs it once; it takes no argument
     runtime.GOMP_parallel(nothing, None, runtime.omp_get_num_procs() + 1, 0)
     made.set()

@@ -1,4 +1,4 @@
-"""Run independent pieces of work side by side, each on a thread of Python with its share of the kernels' threads."""
+"""Run independent tasks in parallel, each on a Python thread with its share of the kernels' threads."""
 
 import functools
 import time
@@ -13,13 +13,13 @@ Result = TypeVar("Result")
 
 
 def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[Result]:
-    """Yield what `work` makes of each item, in the order of the items, with `workers` of them at work at a time.
+    """Yield the result of `work` for each item, in the order of the items, with `workers` items in parallel.
 
     Kernels give the same bits for any number of threads, so the results do not depend on `workers`.
 
     Args:
-        work: must not write to what another item reads. Gradients are on or off as for the caller.
-        items: are all begun as soon as a worker is free, however slowly the results are taken.
+        work: must not write to data that another item reads. Gradients are enabled as for the caller.
+        items: each starts as soon as a worker is free, however slowly the results are taken.
         workers: see `gsbench.kernels.backends.Backend.workers`.
     """
     workers = min(workers, len(items))

@@ -263,7 +263,7 @@ class Attempt:
 
 
 def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:
-    """Sample points to start from where the data set has none: in a cube, or in the frusta of all cameras."""
+    """Sample points to start from where the data set has none: in a cube, or in the frustum that all cameras share."""
     if data.initial_half_width is not None:
         return random_points(data.initial_points, data.initial_half_width, random)
     cameras = [view.to("cpu").camera for view in scene.train]

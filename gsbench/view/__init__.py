@@ -1,1 +1,1 @@
-"""Look at a model: as a film, as files that other programs open, and in a browser."""
+"""Show a model as a film, as files for other programs, and in a browser."""

@@ -1,4 +1,4 @@
-"""Look at trained models in a browser (``python -m gsbench.view RUN_FOLDER [RUN_FOLDER ...]``)."""
+"""Show trained models in a browser (``python -m gsbench.view RUN_FOLDER [RUN_FOLDER ...]``)."""
 
 import argparse
 import importlib.util
@@ -38,8 +38,8 @@ def serve(options: argparse.Namespace) -> None:
     """Load the runs and serve them.
 
     Raises:
-        InputError: viser is not installed, a folder has no checkpoint, or runs do not belong together.
-        KeyboardInterrupt: it is told to end.
+        InputError: viser is not installed, a folder has no checkpoint, or the runs are of different scenes.
+        KeyboardInterrupt: the user ends it.
     """
     if importlib.util.find_spec("viser") is None:
         raise InputError("the viewer needs viser: pip install 'gsbench[view]'")
@@ -63,7 +63,7 @@ def serve(options: argparse.Namespace) -> None:
     print(f"Open http://{host}:{viewer.server.get_port()} in a browser; Ctrl-C ends it.", flush=True)
     try:
         while True:
-            time.sleep(1)  # not for ever: Ctrl-C may reach another thread, and is heard when this one wakes up
+            time.sleep(1)  # not longer: Ctrl-C may reach another thread, and acts when this one wakes up
     finally:
         viewer.stop()
 

@@ -1,4 +1,4 @@
-"""Serve one browser of the viewer: the thread that renders for it whatever it has chosen, until it leaves."""
+"""Serve one browser of the viewer by a thread that renders its choices until it disconnects."""
 
 import html
 import math
@@ -25,7 +25,7 @@ QUALITY = {True: 75, False: 95}  # of the JPEG while something moves, and at res
 
 
 class Client:
-    """One browser. Everything that it chooses is its own; the models are shared."""
+    """One browser. It has its own choices; the models are shared."""
 
     def __init__(
         self, client: viser.ClientHandle, painters: Sequence[Painter], scene: Scene | str, most_cost: float
@@ -36,7 +36,7 @@ class Client:
             client: the browser, as viser has it.
             painters: of the models that can be shown, one or more of one scene.
             scene: with the training views; or why there are none.
-            most_cost: nanoseconds of a Gaussian that are shown brightest.
+            most_cost: nanoseconds of a Gaussian that have the brightest colour.
         """
         self.client = client
         self.controls = Controls(client, painters, scene)
@@ -52,7 +52,7 @@ class Client:
         self.changed.set()
 
     async def _move(self, _: viser.CameraHandle) -> None:
-        """Take note of a camera in viser's own thread; for another function it would begin one."""
+        """Record a camera's move, in viser's own thread; for a plain function viser would start another thread."""
         self.changed.set()
 
     def leave(self) -> None:
@@ -81,7 +81,7 @@ class Client:
             self.rests = not moving
 
     def _show(self, moving: bool) -> None:
-        """Render a frame and send it to the browser, with what it cost and what its colours mean."""
+        """Render a frame and send it to the browser with its cost and the legend of its colours."""
         camera, controls = self.client.camera, self.controls
         width, height = self.resolution.size(max(1, camera.image_width), max(1, camera.image_height), moving)
         frame = self._frame(width, height)
@@ -93,7 +93,7 @@ class Client:
             controls.legend.content = said
 
     def _frame(self, width: int, height: int) -> Frame:
-        """Render one image or two as the controls say."""
+        """Render the one or two images that the controls request."""
         shown, mode = self.controls.shown(), self.controls.layout
         camera = self._camera(max(1, width // 2) if mode == SIDE else width, height)
         first, *others = [painter.paint(camera, self.controls.request(colours)) for painter, colours in shown]
@@ -102,7 +102,7 @@ class Client:
         return beside(first, others[0]) if mode == SIDE else wiped(first, others[0], self.controls.wiped)
 
     def _compare(self) -> None:
-        """Show the training view nearest to the camera beside what the models make of it, where that is asked for."""
+        """Show the training view nearest to the camera beside the models' renders of it, if the browser requests it."""
         if self._views is None or not self.controls.compare.value:
             return
         nearest = self._views.nearest(self._camera(1, 1), self.controls.now)
@@ -112,13 +112,13 @@ class Client:
         self.controls.comparison.content = comparison(nearest, compared)
 
     def _camera(self, width: int, height: int) -> Camera:
-        """Return the browser's camera for an image of that size; its field of view is the vertical one."""
+        """Return the browser's camera for an image of that size; the field of view is vertical."""
         seen = self.client.camera
         return camera_at(np.asarray(seen.position), np.asarray(seen.wxyz), seen.fov, width, height)
 
 
 def camera_at(position: np.ndarray, wxyz: np.ndarray, fov: float, width: int, height: int) -> Camera:
-    """Return the camera of a pose as viser has it.
+    """Return the camera of a pose in viser's convention.
 
     Args:
         position: [3], world units.

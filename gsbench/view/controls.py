@@ -1,4 +1,4 @@
-"""Offer the controls of one browser of the viewer, and say what they ask of a model."""
+"""Show the controls of one browser of the viewer, and turn them into requests for frames."""
 
 import math
 import threading
@@ -22,14 +22,14 @@ PANEL = {"x": 15.0, "y": -15.0, "width": 400.0}  # pixels: where it floats, from
 
 
 class ShownImage(NamedTuple):
-    """One of the images that are shown."""
+    """One of the images on the screen."""
 
     painter: Painter  # of the model
-    colours: str  # what those of its Gaussians say
+    colours: str  # the meaning of its Gaussians' colours
 
 
 class Controls:
-    """What one browser has chosen. The event `changed` is set whenever that is something else."""
+    """The choices of one browser. The event `changed` is set whenever a choice changes."""
 
     def __init__(self, client: viser.ClientHandle, painters: Sequence[Painter], scene: Scene | str) -> None:
         """Show the controls.
@@ -61,7 +61,7 @@ class Controls:
         self.play.on_update(self._start_clock)
 
     def _add_effects(self) -> None:
-        """Add what switches the effects of the models off, one by one."""
+        """Add the controls that switch the effects of the models off, one by one."""
         gui, painters = self.client.gui, self._painters.values()
         degree = max(painter.trained_phase.sh_degree for painter in painters)
         with gui.add_folder("effects"):
@@ -76,7 +76,7 @@ class Controls:
         freeze.on_update(lambda _: self._freeze(freeze.value))
 
     def _add_images(self) -> None:
-        """Add what chooses the models, and what the colours of their Gaussians say."""
+        """Add the controls that choose the models, and the meaning of their Gaussians' colours."""
         gui, names = self.client.gui, list(self._painters)
         several = len(names) > 1
         self.mode = gui.add_dropdown("show", (ONE, SIDE, WIPE))
@@ -99,7 +99,7 @@ class Controls:
             control.on_update(self._change)
 
     def _add_views(self, scene: Scene | str) -> None:
-        """Add what shows the training views, where they are there."""
+        """Add the controls that show the training views, where the data set is present."""
         gui, why = self.client.gui, scene if isinstance(scene, str) else None
         frusta = gui.add_checkbox("training cameras", False, disabled=why is not None,
                                   hint=why or "click on one to stand there")  # fmt: skip
@@ -126,12 +126,12 @@ class Controls:
         self.changed.set()
 
     def _hold(self, on: bool) -> None:
-        """Keep the time that slices are of, or let it be the slider's again."""
+        """Hold the time of the slices, or release it to the slider."""
         self._held = self.now if on else None
         self.changed.set()
 
     def _freeze(self, on: bool) -> None:
-        """Keep the place from which slices are seen, or let it be the camera's again."""
+        """Hold the viewpoint of the slices, or release it to the camera."""
         position = torch.tensor(np.asarray(self.client.camera.position), dtype=torch.float32)
         self._frozen = position if on else None
         self.changed.set()
@@ -141,7 +141,7 @@ class Controls:
         self.changed.set()
 
     def _go_to(self, position: npt.NDArray[np.float64], wxyz: npt.NDArray[np.float64], time: float | None) -> None:
-        """Stand where a training camera stood, at its time."""
+        """Move to the pose and the time of a training camera."""
         with self.client.atomic():
             self.client.camera.position, self.client.camera.wxyz = position, wxyz
         if time is not None:
@@ -149,14 +149,14 @@ class Controls:
         self.changed.set()
 
     def advance(self) -> None:
-        """Move the slider of time on while a clip is played."""
+        """Advance the time slider while a clip is played."""
         now = time.monotonic()
         if self.play.value:
             on = (now - self._played_at) / PLAYED_S
             self.time.value = (self.now + on) % 1.0  # type: ignore[misc]  # as above
         self._played_at = now
 
-    # ---- what that asks for; a browser may say any value
+    # ---- the requests; a browser may send any value
 
     @property
     def now(self) -> float:
@@ -170,7 +170,7 @@ class Controls:
 
     @property
     def layout(self) -> str:
-        """How many images are shown, and how: ONE, SIDE or WIPE."""
+        """The arrangement of the images: ONE, SIDE or WIPE."""
         return self.mode.value if self.mode.value in (SIDE, WIPE) else ONE
 
     def shown(self) -> list[ShownImage]:
@@ -181,11 +181,11 @@ class Controls:
                 for model, colours in choices]  # fmt: skip
 
     def request(self, colours: str) -> FrameRequest:
-        """Return what is asked of a model now, in some colours."""
+        """Return the request for a frame now, in some colours."""
         return self._request_at(self.now, colours)
 
     def request_of(self, view: View) -> FrameRequest:
-        """Return what is asked of a model at a training view: the same effects in the view's own time."""
+        """Return the request for a frame at a training view: the same effects at the view's own time."""
         return self._request_at(view.time, IMAGE)
 
     def _request_at(self, time: float | None, colours: str) -> FrameRequest:

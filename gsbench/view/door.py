@@ -1,6 +1,6 @@
-"""Guard the port of the viewer: refuse pages of other sites, and drop every message that the viewer's page never sends.
+"""Guard the viewer's port: refuse requests from other sites, and drop messages that the viewer's page never sends.
 
-viser listens by `websockets`, whose options for all of this it does not pass on. `Door.guard` puts them in.
+viser listens by `websockets` but does not pass on the options that this needs. `Door.guard` sets them.
 """
 
 import asyncio
@@ -37,7 +37,7 @@ Answer = Response | None | Awaitable[Response | None]
 
 
 class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
-    """Where a browser looks from, as viser's page says it."""
+    """The pose of a browser's camera, as viser's page sends it."""
 
     wxyz: tuple[float, float, float, float]
     position: Three
@@ -61,19 +61,19 @@ class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
 
 
 class Values(msgspec.Struct, forbid_unknown_fields=True):
-    """What a control may be changed in: its value."""
+    """The only property of a control that a browser may change: its value."""
 
     value: bool | int | float | str
 
 
 class GuiUpdateMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
-    """A control that is moved. What it may be moved to is for `gsbench.view.controls` to say."""
+    """A change of a control. `gsbench.view.controls` decides which values it may have."""
 
     uuid: str
     updates: Values
 
     def is_usable(self) -> bool:
-        """Whether it is a value at all; NaN is none."""
+        """Whether the value is text or a finite number."""
         return isinstance(self.updates.value, str) or math.isfinite(self.updates.value)
 
 
@@ -89,7 +89,7 @@ class SceneNodeClickMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True
     owner: str = ""
 
     def is_usable(self) -> bool:
-        """Whether it can be worked with; nothing but the name is."""
+        """Whether it can be used: it always can, as only its name is read."""
         return True
 
 
@@ -97,7 +97,7 @@ KNOWN = msgspec.msgpack.Decoder(ViewerCameraMessage | GuiUpdateMessage | SceneNo
 
 
 def is_known(message: object) -> bool:
-    """Whether a message is one that the viewer's page sends, with values that can be worked with."""
+    """Whether a message is one that the viewer's page sends, with usable values."""
     if not isinstance(message, bytes):
         return False
     try:
@@ -107,7 +107,7 @@ def is_known(message: object) -> bool:
 
 
 class Connection(ServerConnection):
-    """A browser's connection, over which nothing but known messages arrives. viser stops or grows by others."""
+    """A browser's connection that passes only known messages; others can stop viser or fill its memory."""
 
     async def recv(self, decode: bool | None = None) -> Any:
         """Wait for the next known message."""
@@ -117,7 +117,7 @@ class Connection(ServerConnection):
 
 
 class Door:
-    """A port to listen on, and the names by which a browser may ask for it."""
+    """A port to listen on, and the host names that a browser may use for it."""
 
     def __init__(self, host: str, port: int) -> None:
         """Find a free port.
@@ -127,25 +127,25 @@ class Door:
             port: the first to be tried.
 
         Raises:
-            InputError: nobody can listen there.
+            InputError: the host cannot be listened on, or no port is free.
         """
         with ThreadPoolExecutor(1) as pool:  # in a notebook this thread has a loop of its own
             addresses, self.port = pool.submit(asyncio.run, _free(host, port)).result()
         self._hosts = {host.lower(), *addresses}
         self._is_open = any(ipaddress.ip_address(address).is_unspecified for address in addresses)
-        if self._is_open:  # to all who reach this machine, by any of its addresses
+        if self._is_open:  # every machine on the network can connect, by any address of this machine
             self._hosts.add(socket.gethostname().lower())
         self._guards = False
 
     @contextmanager
     def guard(self) -> Iterator[None]:
-        """Let a server of viser that is begun in here listen behind this door.
+        """Guard a viser server that is started in this block.
 
-        viser's thread looks `websockets.asyncio.server.serve` up while its constructor waits for it, and there is no
-        other way in: so that name stands for ours meanwhile. The one place where gsbench changes a library.
+        viser's thread looks up `websockets.asyncio.server.serve` while its constructor waits for it, and viser has no
+        option for it. So the name is replaced in this block. It is the only place where gsbench changes a library.
 
         Raises:
-            InputError: this version of viser listens in another way; it would be open to every page.
+            InputError: this version of viser listens in another way, so it would accept requests of every page.
         """
         original = websockets_server.serve
 
@@ -170,8 +170,8 @@ class Door:
     def admits(self, headers: Headers) -> bool:
         """Whether a request is for this server and from its own page.
 
-        A page of another site has another `Origin`. One whose name its owner has made to stand for this machine's
-        address ("DNS rebinding") has that name as `Host`.
+        A page of another site has another `Origin`. A page whose host name resolves to this machine's address ("DNS
+        rebinding") has that name as `Host`.
         """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
@@ -195,7 +195,7 @@ class Door:
         return address.is_loopback or self._is_open or name in self._hosts
 
     def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request that is refused; None: it is not."""
+        """Return the response to a refused request; None where the request is admitted."""
         if not self.admits(request.headers):
             return _answer(HTTPStatus.FORBIDDEN, "a viewer of gsbench answers its own page alone: see --host")
         if request.headers.get_all("Upgrade") and len(connection.server.connections) >= MOST_BROWSERS:
@@ -204,7 +204,7 @@ class Door:
 
 
 async def _free(host: str, port: int) -> tuple[list[str], int]:
-    """Return the addresses that a host stands for here, and the first port that is free on all."""
+    """Return the addresses of a host name here, and the first port that is free on all of them."""
     asked = f"--host: expected an address or a name of this machine, such as localhost, got {host[:100]!a}"
     if not host or "\0" in host:
         raise InputError(asked)
@@ -229,7 +229,7 @@ def _answer(status: HTTPStatus, text: str) -> Response:
 
 
 def _silent() -> logging.Logger:
-    """Return a logger for `websockets`, which would write a stack trace for every peer that speaks no HTTP."""
+    """Return a silent logger for `websockets`, which else writes a stack trace for every peer without HTTP."""
     logger = logging.getLogger("gsbench.view.door")
     logger.propagate = False
     logger.addHandler(logging.NullHandler())
@@ -237,7 +237,7 @@ def _silent() -> logging.Logger:
 
 
 def _say(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Tell in one line what goes wrong in viser's thread: a value that a control cannot have, or no free files."""
+    """Print an error of viser's thread in one line: a value that a control cannot have, or no free file handle."""
     error = context.get("exception")
     said = f"{type(error).__name__}: {one_line(error)}" if error else context["message"]
     print(f"gsbench.view: a browser's message or connection was dropped: {said}", file=sys.stderr)

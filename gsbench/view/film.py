@@ -1,4 +1,4 @@
-"""Write what a model looks like along a path of cameras, as a video or as one PNG a frame."""
+"""Write the renders of a model along a path of cameras as a video, or as a PNG for each frame."""
 
 import os
 import secrets
@@ -28,7 +28,7 @@ def frames(run: LoadedRun, shots: list[Shot]) -> Generator[Pixels, None, None]:
 
 
 def write_video(images: Iterable[Pixels], path: Path, fps: float) -> None:
-    """Write images of one size as a video; `path` is the whole video or, after an error, what it was before.
+    """Write images of one size as a video; after an error, `path` is unchanged.
 
     Raises:
         InputError: the folder is not there, or OpenCV cannot write such a file.
@@ -52,10 +52,10 @@ def write_video(images: Iterable[Pixels], path: Path, fps: float) -> None:
 
 
 def write_images(images: Iterable[Pixels], folder: Path) -> None:
-    """Write images as 0000.png, 0001.png, .. into a folder, which is made where only it is missing.
+    """Write images as 0000.png, 0001.png, .. into a folder, which is made if its parent exists.
 
     Raises:
-        InputError: the folder's own folder is not there.
+        InputError: the parent folder does not exist.
     """
     check_parent(folder)
     folder.mkdir(exist_ok=True)
@@ -64,7 +64,7 @@ def write_images(images: Iterable[Pixels], folder: Path) -> None:
 
 
 def check_parent(path: Path) -> None:
-    """Raise InputError unless `path` can be a file's name and the folder that is to hold it is there."""
+    """Raise InputError unless `path` is a valid file name and its parent folder exists."""
     if not path.name or "\0" in str(path):
         raise InputError(f"expected the name of a file or a folder to write, got {str(path)!a:.200}")
     if not path.parent.is_dir():

@@ -1,4 +1,4 @@
-"""Render one frame of the viewer: a model as a browser's controls ask for it, timed; or two models in one image."""
+"""Render and time one frame of the viewer: one model as a browser's controls request it, or two models in one image."""
 
 import threading
 from dataclasses import replace
@@ -17,22 +17,22 @@ from gsbench.schedule import Phase
 from gsbench.view.stages import RASTER, SLICE, StageWatch, part_of
 
 DIVIDER = (255, 255, 255)  # RGB of the line between two models
-IMAGE, CLASS, COST = COLOURS = ("image", "class", "cost")  # what the colours of the Gaussians may say
+IMAGE, CLASS, COST = COLOURS = ("image", "class", "cost")  # meanings of the Gaussians' colours
 EVERY_DEGREE = 3  # of the harmonics
 
 
 class FrameRequest(NamedTuple):
-    """What a model is asked for, besides the camera that sees it."""
+    """The request for a frame of a model, without its camera."""
 
     time: float | None  # in [0, 1]; None where the scene has none
-    center: torch.Tensor | None = None  # [3] where the slice is seen from; None: from the camera
+    center: torch.Tensor | None = None  # [3] the viewpoint of the slice; None: that of the camera
     agr: bool = True  # whether AGR acts, in a model that has it
     sh_degree: int = EVERY_DEGREE  # of the harmonics, at most
     colours: str = IMAGE
 
 
 class FrameCost(NamedTuple):
-    """What a frame of one model took."""
+    """The milliseconds of a frame of one model."""
 
     name: str  # of the model
     ms: dict[str, float]  # by stage, in their order
@@ -43,7 +43,7 @@ class FrameCost(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A rendered image and what it cost."""
+    """A rendered image and its cost."""
 
     image: Pixels  # [H, W, 3] RGB
     costs: tuple[FrameCost, ...]  # of each model in it
@@ -54,14 +54,14 @@ class Frame(NamedTuple):
 
 
 class Painter:
-    """Renders the frames of one run. Its model is switched for each frame, so it does one at a time for all clients."""
+    """Renders the frames of one run. It sets the model's effects for each frame, so it renders one frame at a time."""
 
     def __init__(self, run: LoadedRun, most_cost: float) -> None:
         """Take a run; nothing is rendered yet.
 
         Args:
             run: with the model.
-            most_cost: nanoseconds of a Gaussian that are shown brightest, the same for all models to be compared.
+            most_cost: nanoseconds of a Gaussian that have the brightest colour, the same for all compared models.
         """
         self.run = run
         self.name = f"{run.folder.parent.name} {run.folder.name}"  # such as "7dgs seed0"
@@ -74,13 +74,13 @@ class Painter:
         self._lock = threading.Lock()
 
     def paint(self, camera: Camera, request: FrameRequest) -> Frame:
-        """Render what a camera sees; raises InputError where it cannot be one."""
+        """Render the image of a camera; raises InputError for an invalid camera."""
         image, ms = self._render(camera, request)
         shown = inferno(image[..., 0].cpu().numpy()) if request.colours == COST else to_bytes(image.cpu().numpy())
         return Frame(shown, (FrameCost(self.name, ms),))
 
     def image(self, camera: Camera, request: FrameRequest) -> torch.Tensor:
-        """Render what a camera sees as floats, [H, W, 3], to be measured."""
+        """Render the image of a camera as floats, [H, W, 3], to be measured."""
         return self._render(camera, request)[0].cpu()
 
     def _render(self, camera: Camera, request: FrameRequest) -> tuple[torch.Tensor, dict[str, float]]:

@@ -1,4 +1,4 @@
-"""Turn a model at a query into trained 3D Gaussians as 3DGS stores them."""
+"""Convert the slice of a model at a query to trained 3D Gaussians as 3DGS stores them."""
 
 import math
 
@@ -19,17 +19,17 @@ LARGEST_OPACITY = 1 - 2**-24  # the largest float32 below 1, whose logit is fini
 
 
 def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = False) -> TrainedGaussians:
-    """Slice a model and return what is drawn of the slice, without the Gaussians that are culled by their opacity.
+    """Slice a model and return the Gaussians that are drawn: those that are not culled by their opacity.
 
     Args:
         model: initialised.
-        query: the slice's place and time.
-        keep_harmonics: whether colours stay harmonics of the direction; else they are those seen from the query's
-            place, as harmonics of degree 0.
+        query: the viewpoint and the time of the slice.
+        keep_harmonics: whether colours stay harmonics of the direction; else each is the colour seen from the query's
+            viewpoint, as a harmonic of degree 0.
 
     Raises:
-        InputError: the model's geometry or its colours are known from one place only, and harmonics are asked for; or
-            no Gaussian is left, or one is not finite.
+        InputError: harmonics are requested but the model's geometry or colours depend on the viewpoint; or no Gaussian
+            is left, or one is not finite.
     """
     if keep_harmonics and not has_harmonics(model):
         raise InputError(f"expected --camera I or --direction X,Y,Z: a slice of {type(model).__name__} depends on it")
@@ -49,7 +49,7 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
 def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:
     """Decompose covariances F F^T = R S^2 R^T: ln S [N, 3] and the quaternions wxyz [N, 4] of the rotations R.
 
-    The left singular vectors of F are the axes; one of them is turned round where they are left-handed.
+    The left singular vectors of F are the axes; where they are left-handed, one is negated.
     """
     axes, sizes, _ = torch.linalg.svd(factors.double())
     axes[:, :, 2] *= torch.where(torch.linalg.det(axes) < 0, -1.0, 1.0)[:, None]
@@ -58,7 +58,7 @@ def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def has_harmonics(model: GaussianModel) -> bool:
-    """Tell whether a slice of the model is the same from everywhere, and its colours are known harmonics."""
+    """Tell whether a slice of the model is the same from every viewpoint, and its colours are known harmonics."""
     own = type(model).paint in (GaussianModel.paint, Gaussians4DModel.paint)
     return own and "direction" not in model.observes
 

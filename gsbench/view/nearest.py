@@ -1,4 +1,4 @@
-"""Compare models with the training view nearest to a camera: its image, what they make of it, and the error."""
+"""Compare the renders of models with the training view nearest to a camera, and show the errors."""
 
 import math
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from gsbench.measure.quality import psnr, quantise
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view.frame import FrameRequest, Painter
 
-SAME = 1e-3  # extents and radians: views that are nearer to one another than that differ in their times only
+SAME = 1e-3  # extents and radians: views nearer to each other than this differ only in time
 MOST_WIDTH = 480  # pixels of an image that is shown; larger ones are made smaller
 
 
@@ -25,7 +25,7 @@ class Nearest(NamedTuple):
 
 
 class ViewComparison(NamedTuple):
-    """What a model makes of a training view."""
+    """A training view, a model's render of it, and the error."""
 
     name: str  # of the model
     truth: Pixels  # [H, W, 3] RGB, as the others
@@ -35,7 +35,7 @@ class ViewComparison(NamedTuple):
 
 
 class TrainingViews:
-    """The training views of a scene, by where they stand and where they look."""
+    """The training views of a scene, indexed by position and direction."""
 
     def __init__(self, scene: Scene) -> None:
         """Take a scene; no image is read."""
@@ -61,7 +61,7 @@ class TrainingViews:
 
 
 def compare(painter: Painter, view: View, request: FrameRequest) -> ViewComparison:
-    """Render what a view's camera sees and measure it as the run was measured.
+    """Render a view's camera and measure the image as the run was measured.
 
     Args:
         painter: of the model.
@@ -82,7 +82,7 @@ def compare(painter: Painter, view: View, request: FrameRequest) -> ViewComparis
 
 
 def _small(image: Pixels) -> Pixels:
-    """Make an image smaller that is wider than it is shown."""
+    """Shrink an image that is wider than MOST_WIDTH."""
     height, width = image.shape[:2]
     if width <= MOST_WIDTH:
         return image

@@ -1,4 +1,4 @@
-"""Write what the viewer's panel says: a frame's milliseconds by stage, the legend of colours, errors against a view."""
+"""Write the HTML of the viewer's panel: a frame's milliseconds by stage, the legend, the errors against a view."""
 
 import base64
 import html
@@ -35,11 +35,11 @@ def cost_table(costs: Sequence[FrameCost], width: int, height: int) -> str:
 
 
 def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
-    """Say what the colours of the Gaussians mean where they are not the models' own.
+    """Write the legend of the Gaussians' colours where they are not the models' own.
 
     Args:
         shown: the images.
-        most_cost: nanoseconds that are shown brightest.
+        most_cost: nanoseconds that have the brightest colour.
     """
     text = ""
     if by_class := {painter.name: painter.counts for painter, colours in shown if colours == CLASS}:
@@ -57,7 +57,7 @@ def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
 
 
 def comparison(nearest: Nearest, compared: Sequence[ViewComparison]) -> str:
-    """Show a training view beside what models make of it, and where they differ."""
+    """Show a training view beside the models' renders of it, and their errors."""
     view = nearest.view
     when = "" if view.time is None else f", time {view.time:.2f}"
     away = f"{nearest.distance:.2f} world units and {nearest.degrees:.0f}° from here"
@@ -98,7 +98,7 @@ def _gradient(low: str, high: str) -> str:
 
 
 def _image(image: npt.NDArray[np.uint8]) -> str:
-    """Embed an image as PNG, as wide as there is room; pixels that are enlarged stay sharp."""
+    """Embed an image as PNG at the full width of the panel; enlarged pixels stay sharp."""
     data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
     source = f"data:image/png;base64,{base64.b64encode(data).decode()}"
     return f'<img src="{source}" style="width:100%;display:block;image-rendering:pixelated">'

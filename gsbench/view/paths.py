@@ -1,6 +1,6 @@
-"""Lay out the cameras of a film around a model: an orbit or a spiral about its middle, as large as its scene.
+"""Compute the cameras of a film around a model: an orbit or a spiral about its middle, as large as its scene.
 
-A checkpoint holds no cameras. What it tells of them is the extent, which is about their distance, and the images' size.
+A checkpoint holds no cameras. It holds the extent, which is about their distance, and the size of the images.
 """
 
 import math
@@ -23,7 +23,7 @@ Shot = tuple[Camera, float | None]  # a frame of a film: its camera and its time
 
 
 def middle(model: GaussianModel) -> Tensor:
-    """Return where most of a model is, [3]: the median of its means, a mean counting by its opacity."""
+    """Return the middle of a model, [3]: the median of its means, weighted by opacity."""
     means = model.splats["means"].detach().cpu()
     order = means.argsort(0)
     weights = torch.sigmoid(model.splats["opacities"].detach().cpu())[order].cumsum(0)  # [N, 3]
@@ -32,7 +32,7 @@ def middle(model: GaussianModel) -> Tensor:
 
 
 def look_at(eye: Tensor, target: Tensor) -> Tensor:
-    """Return the viewmat [4, 4] of a camera at `eye` [3] that looks at `target` [3] with the sky above."""
+    """Return the viewmat [4, 4] of an upright camera at `eye` [3] that looks at `target` [3]."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     up = torch.tensor(UP).to(eye)
     if torch.linalg.cross(forward, up).norm() < 1e-3:  # straight up or down
@@ -66,16 +66,16 @@ def around(run: LoadedRun, azimuth: float, elevation: float) -> Camera:
 
 
 def orbit(run: LoadedRun, frames: int) -> list[Camera]:
-    """Return cameras that go once around a model; the last one is before the first one again."""
+    """Return cameras that go once around a model; the last one does not repeat the first."""
     return [around(run, 2 * math.pi * i / frames, ELEVATION) for i in range(frames)]
 
 
 def spiral(run: LoadedRun, frames: int) -> list[Camera]:
-    """Return cameras that go twice around a model and rise from the horizon as they do."""
+    """Return cameras that go twice around a model and rise from the horizon."""
     parts = [i / max(1, frames - 1) for i in range(frames)]
     return [around(run, 2 * math.pi * TURNS * part, HIGHEST * part) for part in parts]
 
 
 def far_along(run: LoadedRun, direction: Tensor) -> Tensor:
-    """Return a place [3] so far away that all of a model is seen from it along `direction` [3]."""
+    """Return a viewpoint [3] so far away that all of a model is seen along `direction` [3]."""
     return middle(run.model) - FAR_AWAY * run.scene.extent * torch.nn.functional.normalize(direction, dim=0)

@@ -1,4 +1,4 @@
-"""Choose how many pixels a frame of the viewer has: few while the camera moves, all when it rests."""
+"""Choose the resolution of a frame of the viewer: low while the camera moves, full when it rests."""
 
 import math
 
@@ -8,10 +8,10 @@ MOST_PIXELS = 1280 * 960  # of a frame at rest; a larger window shows it enlarge
 
 
 class Resolution:
-    """The resolution of one client's frames, which follows from what the last ones took."""
+    """The resolution of one client's frames, chosen by the milliseconds of the previous frame."""
 
     def __init__(self) -> None:
-        """Begin as if a frame of 96 x 96 took all the time there is."""
+        """Assume at first that a frame of 96 x 96 takes MOVING_MS."""
         self._ms_per_pixel = MOVING_MS / LEAST_PIXELS
         self._slice_ms = 0.0
 

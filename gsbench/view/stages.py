@@ -10,7 +10,7 @@ from gsbench.measure.speed import Laps
 
 SLICE, RASTER = "slice", "raster"
 STAGES = {SLICE: ("AGR", "conditioning", "colours"), RASTER: ("projection", "binning", "blending")}
-# By the name of an operation, the stage that it is the last part of, and the one that has ended when it begins.
+# By the name of an operation: the stage that ends with it, and the stage that ends before it.
 _ENDS = {"refine": "AGR", "show_colors": "colours", "project": "projection", "blend": "blending"}
 _FOLLOWS = {"show_colors": "conditioning", "blend": "binning"}
 
@@ -18,9 +18,9 @@ _FOLLOWS = {"show_colors": "conditioning", "blend": "binning"}
 class StageWatch(Tape):
     """Times the slice and the raster of a frame, each by its stages where kernels compute them.
 
-    ``with StageWatch(device) as watch: ...; watch.end(SLICE); ...; watch.end(RASTER)``. It stands where a tape does, so
-    each operation of the kernels tells when it begins and ends; it notes nothing, and there is no gradient. What torch
-    computes alone is not divided: it is the slice, or the raster.
+    ``with StageWatch(device) as watch: ...; watch.end(SLICE); ...; watch.end(RASTER)``. It takes the place of a tape,
+    so each kernel operation reports its begin and end; it records no operation, and there is no gradient. Work that
+    torch computes alone is one stage: the slice, or the raster.
     """
 
     def __init__(self, device: str) -> None:
@@ -38,7 +38,7 @@ class StageWatch(Tape):
         return outputs
 
     def end(self, part: str) -> None:
-        """End the slice or the raster: what is left of it belongs to its last stage where that has run."""
+        """End the slice or the raster; the rest of its time belongs to its last stage, if that stage has run."""
         last = STAGES[part][-1]
         self._laps.end(last if self._laps.has(last) else part)
 
@@ -49,5 +49,5 @@ class StageWatch(Tape):
 
 
 def part_of(stage: str) -> str:
-    """Return which part of a frame a stage is of, `slice` or `raster`."""
+    """Return the part of a frame that a stage belongs to, `slice` or `raster`."""
     return SLICE if stage == SLICE or stage in STAGES[SLICE] else RASTER

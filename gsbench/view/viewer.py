@@ -1,4 +1,4 @@
-"""Serve the viewer: browsers come and go, each with controls of its own."""
+"""Serve the viewer to browsers, each with its own controls."""
 
 import asyncio
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ class Viewer:
     """A server with the models of one scene."""
 
     def __init__(self, runs: Sequence[LoadedRun], host: str, port: int, data_root: str | None = None) -> None:
-        """Begin to serve.
+        """Start the server.
 
         Args:
             runs: one or more, of one scene.
@@ -31,7 +31,7 @@ class Viewer:
             data_root: the folder of the data set, where it has moved.
 
         Raises:
-            InputError: the runs are of different scenes, or nobody can listen on that host.
+            InputError: the runs are of different scenes, or the host cannot be listened on.
         """
         door, first = Door(host, port), runs[0]
         for run in runs:
@@ -45,7 +45,7 @@ class Viewer:
             painter.name = str(painter.run.folder)
         self.scene = scene_or_reason(first, data_root)
         self.clients: dict[int, Client] = {}
-        self._porter = ThreadPoolExecutor(1)  # browsers come and go one after the other; viser would take 32 threads
+        self._porter = ThreadPoolExecutor(1)  # connects and disconnects browsers in turn; viser would use 32 threads
         with door.guard():
             self.server = viser.ViserServer(host, door.port, label=f"gsbench: {first.scene.name}", verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -55,14 +55,14 @@ class Viewer:
         self.server.on_client_connect(self._in_turn(self._welcome))
 
     def stop(self) -> None:
-        """End the server and all that render for it."""
+        """Stop the server and the threads that render for it."""
         for client in list(self.clients.values()):
             client.leave()
         self.server.stop()
         self._porter.shutdown(wait=False)
 
     def _stand(self, run: LoadedRun) -> None:
-        """Let every browser begin where an orbit begins."""
+        """Place the first camera of every browser where an orbit starts."""
         camera = paths.around(run, 0.0, paths.ELEVATION)
         self.server.scene.set_up_direction(paths.UP)
         start = self.server.initial_camera
@@ -72,7 +72,7 @@ class Viewer:
         start.fov = 2 * float(np.arctan(camera.height / 2 / float(camera.K[1, 1])))
 
     def _in_turn(self, callback: Callable[[viser.ClientHandle], None]) -> Callable[[viser.ClientHandle], Any]:
-        """Let a callback wait for those before it, so that no browser leaves before its controls are there."""
+        """Run callbacks one after the other, so that no browser is removed before its controls exist."""
 
         async def waits(client: viser.ClientHandle) -> None:
             await asyncio.get_running_loop().run_in_executor(self._porter, callback, client)
@@ -89,7 +89,7 @@ class Viewer:
 
 
 def scene_or_reason(run: LoadedRun, data_root: str | None) -> Scene | str:
-    """Load the scene of a run, or say why it cannot be had; the model is looked at all the same."""
+    """Load the scene of a run, or return why it cannot be loaded; the model is shown in both cases."""
     try:
         return scene_of(run, data_root)
     except InputError as error:
