@@ -15,10 +15,10 @@ from gsbench.report.publish import publish
 def main(arguments: list[str] | None = None) -> int:
     """Print and write the tables and ``report.html``.
 
-    A record that is damaged, or that of a run which has another record, is left out and named with the reason.
+    A record that is damaged, or the second record of a run, is left out and reported with the reason.
 
     Returns:
-        1 if a record is left out or differs from those that it is held against, 2 if there is none.
+        1 if a record is left out or the verdict of --against is that PSNR differs, 2 if there is no record.
     """
     parser = argparse.ArgumentParser(prog="python -m gsbench.report", description=__doc__)
     parser.add_argument("results", type=Path, metavar="RESULTS_DIR", help="a folder with records, at any depth")
@@ -64,7 +64,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _compared(records: list[Record], folder: Path, other: Path) -> Comparison:
-    """Compare with the records of another folder; one that cannot be read is named."""
+    """Compare with the records of another folder; records that cannot be read are reported."""
     theirs, faults = tables.load(other)
     for fault in faults:
         print(f"gsbench.report: left out: {fault}", file=sys.stderr)

@@ -1,10 +1,10 @@
 """Compare the runs of two folders of records, such as this machine's with published ones, and judge each quantity.
 
 Runs are compared where model, variant, scene, data, training and measuring are equal. Another machine or instruction
-set rounds otherwise, and a training that rounds otherwise ends as one of another seed would: so the runs of a model on
-a scene are taken for draws of two samples, and their means for equal as far as the spread over seeds allows (Student's
-t, Holm over all rows). A few seeds say little of their own spread: it is pooled over the models and scenes of an
-experiment, and that of the row itself counts where it is larger. So one run can be held against three.
+set rounds differently, and a training with other rounding ends like a training with another seed. So the runs of a
+model on a scene are two samples, and their means are compared by the spread over seeds (Student's t, Holm over all
+rows). A few seeds do not give a reliable spread. So it is pooled over the models and scenes of an experiment, and the
+row's own spread counts where it is larger. Thus one run can be compared with three.
 """
 
 import math
@@ -25,7 +25,10 @@ SAME_LOAD = 0.5  # mean loads further apart than this make seconds of two runs i
 
 @dataclass(frozen=True)
 class Limit:
-    """How near two means are equal, and how wide an interval still tells that they are; of theirs where relative."""
+    """The difference up to which two means are equal, and the widest interval that shows that they are.
+
+    Both are parts of the other folder's mean where the limit is relative.
+    """
 
     equal: float
     widest: float
@@ -54,7 +57,7 @@ NONE = Estimate(math.nan, 0, 0, "")
 
 @dataclass(frozen=True)
 class Judged:
-    """A quantity of a model on a scene: the difference of the means, ours less theirs, and what it comes to."""
+    """A quantity of a model on a scene: the difference of the means, ours less theirs, and the verdict."""
 
     ours: list[float]  # by run
     theirs: list[float]
@@ -79,7 +82,7 @@ class ComparedRuns:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two folders side by side."""
+    """The comparison of two folders."""
 
     ours: str  # the folder
     theirs: str
@@ -88,7 +91,7 @@ class Comparison:
     only_theirs: list[str]
 
     def of(self, quantity: str, verdict: str) -> list[ComparedRuns]:
-        """List the rows whose quantity is judged so."""
+        """List the rows whose quantity has this verdict."""
         return [row for row in self.rows if row.judged[quantity].verdict == verdict]
 
     @property
@@ -100,7 +103,7 @@ class Comparison:
 
     @property
     def line(self) -> str:
-        """Say in one line what the comparison comes to."""
+        """The result of the comparison in one line."""
         head = f"{self.ours} against {self.theirs}: {self.verdict}."
         if not self.rows:
             return f"{head} No model and scene is in both."
@@ -131,9 +134,9 @@ def compare(ours: Sequence[Record], theirs: Sequence[Record], names: tuple[str, 
     """Compare the runs of two folders.
 
     Args:
-        ours: records of the one.
-        theirs: records of the other.
-        names: of the two folders.
+        ours: records of the first folder.
+        theirs: records of the second folder.
+        names: the names of the two folders.
     """
     here, there = _by_configuration(ours), _by_configuration(theirs)
     rows = [_row(here[key], there[key]) for key in sorted(here.keys() & there.keys())]
@@ -162,12 +165,12 @@ def _by_configuration(records: Sequence[Record]) -> RunsByConfiguration:
 
 
 def _missing(of: RunsByConfiguration, other: RunsByConfiguration) -> list[str]:
-    """Name the models on scenes that only one folder has."""
+    """List the models on scenes that only the first folder has."""
     return [f"{model} {variant}".rstrip() + f" on {scene}" for _, _, scene, model, variant in sorted(of.keys() - other)]
 
 
 def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> ComparedRuns:
-    """Put the runs of a model on a scene side by side, with each quantity's difference or why there is none."""
+    """Pair the runs of a model on a scene in both folders, with each quantity's values or why it does not compare."""
     first = next(iter(ours.values()))
     mine, other = ([r for r in runs.values() if r.status == "ok"] for runs in (ours, theirs))
     why = _incomparable(mine, other)
@@ -190,7 +193,7 @@ def value(record: Record, quantity: str) -> float:
 
 
 def differences(rows: list[Judged], limit: Limit) -> list[Estimate]:
-    """Estimate the difference of the means in each of some rows, with the spread over seeds that they share."""
+    """Estimate the difference of the means in each row, with the spread over seeds pooled over the rows."""
     units = [abs(fmean(row.theirs)) if limit.relative else 1.0 for row in rows]
     samples = [[[v / (unit or 1.0) for v in runs] for runs in (row.ours, row.theirs)]
                for row, unit in zip(rows, units, strict=True)]  # fmt: skip
@@ -207,13 +210,13 @@ def differences(rows: list[Judged], limit: Limit) -> list[Estimate]:
 
 
 def _squares(*samples: list[float]) -> tuple[float, int]:
-    """Sum the squares about the means of some samples, and count their degrees of freedom."""
+    """Return the sum of squares about the means of some samples, and its degrees of freedom."""
     squares = sum(variance(sample) * (len(sample) - 1) for sample in samples if len(sample) > 1)
     return squares, sum(len(sample) - 1 for sample in samples)
 
 
 def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
-    """Say why no quantity of two samples of runs compares; "" where all do."""
+    """Return why no quantity of two samples of runs compares; "" where all compare."""
     if not ours or not theirs:
         return f"no run finished {'here' if not ours else 'there'}"
     first = theirs[0]
@@ -232,7 +235,7 @@ def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
 
 
 def _other_machine(ours: list[Record], theirs: list[Record]) -> str:
-    """Say why seconds do not compare; "" where all were measured on one machine under one load."""
+    """Return why seconds do not compare; "" where all were measured on one machine under one load."""
     here, there = ({r.provenance.machine for r in runs} for runs in (ours, theirs))
     if here != there or len(here) > 1:
         named = [printable("; ".join(sorted(machines)))[:200] for machines in (here, there)]
@@ -247,7 +250,7 @@ def _other_machine(ours: list[Record], theirs: list[Record]) -> str:
 
 
 def _judge(found: Judged, limit: Limit, p: float) -> Judged:
-    """Decide by RULE."""
+    """Decide the verdict by RULE."""
     if found.reason:
         return found
     unit = abs(fmean(found.theirs)) if limit.relative else 1.0
@@ -263,6 +266,6 @@ def _judge(found: Judged, limit: Limit, p: float) -> Judged:
 
 
 def _places(rows: list[ComparedRuns]) -> str:
-    """Name models on scenes, the first few."""
+    """Name the first few models on scenes."""
     named = [f"{printable(row.model)} on {printable(row.scene)}" for row in rows[:3]]
     return ", ".join(named) + (f" and {len(rows) - 3} more" if len(rows) > 3 else "")

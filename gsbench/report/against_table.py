@@ -1,4 +1,4 @@
-"""Write a comparison of two folders of records: as a table for the terminal and the page, and as JSON."""
+"""Write a comparison of two folders of records as a table for the terminal and the page, and as JSON."""
 
 import json
 import math
@@ -21,7 +21,7 @@ COLUMNS = [
 
 
 def tables(of: Comparison) -> list[Table]:
-    """Make a table: for each scene and model a line for every seed, ours / theirs, and one for the difference."""
+    """Make a table with a line (ours / theirs) for each scene, model and seed, and the difference for each model."""
     scenes = sorted({(row.experiment, row.dataset, row.scene) for row in of.rows})
     several = len({scene[:2] for scene in scenes}) > 1
     sections = []
@@ -62,7 +62,7 @@ def _difference(found: Judged, column: QuantityColumn) -> str:
 
 
 def _reasons(rows: list[ComparedRuns]) -> list[str]:
-    """Say why something cannot be told; equal reasons once."""
+    """List the reasons for the verdict "cannot be told", equal reasons once."""
     titles = {c.key: c.title for c in COLUMNS}
     why: dict[str, dict[str, list[str]]] = {}
     for row in rows:
@@ -72,13 +72,13 @@ def _reasons(rows: list[ComparedRuns]) -> list[str]:
     said = []
     for reason, of in why.items():
         models = sorted({model for named in of.values() for model in named})
-        who = "" if len(models) == len(rows) else f" of {', '.join(models)}"
-        said.append(f"{', '.join(of)}{who} cannot be told: {reason}")
+        named = "" if len(models) == len(rows) else f" of {', '.join(models)}"
+        said.append(f"{', '.join(of)}{named} cannot be told: {reason}")
     return said
 
 
 def write_json(of: Comparison, path: Path) -> None:
-    """Write a comparison as JSON, atomically; what is not known is null."""
+    """Write a comparison as JSON, atomically; an unknown number is null."""
     content = {
         "ours": of.ours,
         "theirs": of.theirs,

@@ -1,4 +1,4 @@
-"""Make texts from records safe to be cells of CSV, which spreadsheets compute and terminals show."""
+"""Make texts from records safe as cells of CSV: spreadsheets run formulas, and terminals obey control characters."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ _FORMULA = "=+-@"  # a spreadsheet computes a text that begins with one of these
 
 
 def cell(value: Any) -> Any:
-    """Return a value for CSV: a text on one line, without control characters, quoted by ' where it is a formula.
+    """Return a value for CSV: a text is put on one line, escaped, and quoted by ' where it begins like a formula.
 
-    Numbers, which may be negative, and all else stay as they are.
+    Numbers, which may be negative, and other values are unchanged.
     """
     if not isinstance(value, str):
         return value

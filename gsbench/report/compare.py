@@ -31,16 +31,16 @@ class Pair:
 
 
 def paired(group: Group) -> list[Weights]:
-    """Return the differences that `pairs` asks for: of every two models at the common variant, gated ones too.
+    """Return the differences that `pairs` needs: of every two models at the common variant, including gated models.
 
-    Ablations are compared with what they change a part of, not with one another.
+    An ablation is compared with the full models, not with other ablations.
     """
     every = itertools.combinations(group.compared, 2)
     return [[(1.0, a), (-1.0, b)] for a, b in every if not (is_ablated(a.variant) and is_ablated(b.variant))]
 
 
 def pairs(group: Group, family: Family) -> list[Pair]:
-    """Compare the models that share a scene, on what both have finished; the largest difference comes first.
+    """Compare the models that share a scene on the runs that both have finished; the largest difference comes first.
 
     Args:
         group: the records.
@@ -61,8 +61,8 @@ def pairs(group: Group, family: Family) -> list[Pair]:
 def improvement(group: Group, a: Configuration, b: Configuration) -> float:
     """Return the probability that a run of `a` has a higher PSNR than one of `b` on the same view of the same scene.
 
-    Every run of `a` meets every run of `b`; a tie counts half; scenes count equally (Agarwal et al. 2021,
-    arXiv 2108.13264, who compare runs; here views too). NaN where they share no view.
+    Every run of `a` is compared with every run of `b`; a tie counts half; scenes count equally. Agarwal et al. 2021
+    (arXiv 2108.13264) compare runs so; here it is done for each view. NaN where they share no view.
     """
     shares = []
     for scene in sorted(set(a.runs) & set(b.runs)):
@@ -83,7 +83,7 @@ def _views(group: Group, configuration: Configuration, scene: str) -> dict[str, 
 
 @dataclass(frozen=True)
 class Price:
-    """What an effect, or the interaction of several, brings and costs."""
+    """The gain in dB and the cost of an effect, or of the interaction of several."""
 
     name: str
     order: int  # 1: an effect, 2 and 3: an interaction
@@ -105,7 +105,7 @@ class Cube:
 
 
 def priced(group: Group) -> list[Weights]:
-    """Return the contrasts that `cube` asks for, in every one of PRICES."""
+    """Return the contrasts that `cube` needs, in each of PRICES."""
     cells, own, _ = _filled(group)
     return [_sum(of, weights) for _, weights in _contrasts() for of in (cells, own) if weights.keys() <= of.keys()]
 
@@ -113,8 +113,9 @@ def priced(group: Group) -> list[Weights]:
 def cube(group: Group, family: Family) -> Cube:
     """Price every effect whose cells were run at the common variant.
 
-    An effect is priced given that the other two are on or off (12 differences), an interaction is the difference of
-    two such prices (6), that of all three the difference of two interactions; the mean effects need all eight cells.
+    An effect is priced with each of the other two on or off (12 differences). An interaction of two effects is the
+    difference of two such prices (6), and that of three effects is the difference of two interactions. The mean effects
+    need all eight cells.
 
     Args:
         group: the records.
@@ -152,7 +153,7 @@ def _filled(group: Group) -> tuple[dict[Cell, Configuration], dict[Cell, Configu
 
 
 def is_single(name: str) -> bool:
-    """Tell whether a price is that of one effect, given which others are on."""
+    """Tell whether a price is that of one effect, with stated other effects on."""
     return " × " not in name and MEAN not in name
 
 
@@ -162,7 +163,7 @@ def _cell(configuration: Configuration) -> Cell:
 
 
 def _words(cell: Cell) -> str:
-    """Say which effects a cell has."""
+    """Name the effects of a cell."""
     on = [name for name, has in zip(FACTORS, cell, strict=True) if has]
     return " + ".join(on) or "no effect"
 

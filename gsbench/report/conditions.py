@@ -25,12 +25,12 @@ Get = Callable[[Record], str]
 def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:
     """List footnotes on protocol, data, machine, commit, versions and seeds; warnings come first.
 
-    They are those of the runs that finished, as only these have numbers: one that failed may have stopped before it
-    knew its backend or its data. Where none finished there is nothing to compare, so nothing is warned of.
+    They describe the finished runs, as only these have numbers: a failed run may have stopped before it knew its
+    backend or its data. Where no run finished, there is no warning, as nothing is compared.
 
     Args:
         records: of one table.
-        spread: says what stands behind ± in it.
+        spread: the meaning of ± in it.
     """
     finished = [r for r in records if r.status == "ok"]
     notes = _stated(finished or records, spread)
@@ -74,7 +74,7 @@ def _iterations(record: Record) -> str:
 
 
 def _data(record: Record) -> str:
-    """Return the beginning of the fingerprint of the data; the words in its place where it was not computed."""
+    """Return the first digits of the data's fingerprint, or the text that stands for a fingerprint not computed."""
     of = printable(record.provenance.data_hash)
     return of if " " in of else of[:8]
 
@@ -84,7 +84,7 @@ def _machine(record: Record) -> str:
 
 
 def _load(records: list[Record]) -> list[str]:
-    """Say how busy the machine of most runs was, as far as the records do."""
+    """Describe the load of the machine of most runs, where the records have it."""
     machine = Counter(r.provenance.machine for r in records).most_common(1)[0][0]
     costs = [r.cost for r in records if r.cost and r.provenance.machine == machine]
     loads = [cost.load for cost in costs if cost.load is not None]
@@ -113,12 +113,12 @@ def _seeds(records: list[Record], spread: str) -> str:
 
 
 def _goes_with_scene(records: list[Record], get: Get) -> bool:
-    """Tell whether every scene has a single value."""
+    """Tell whether each scene has a single value."""
     return len({(r.scene, get(r)) for r in records}) == len({r.scene for r in records})
 
 
 def _by_scene(records: list[Record], get: Get) -> str:
-    """Show the values of all runs, each with its scenes unless all have it."""
+    """Show the values of all runs, each with its scenes unless all scenes have it."""
     every = {record.scene for record in records}
     scenes: dict[str, set[str]] = {}
     for record in records:

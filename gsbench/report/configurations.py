@@ -21,7 +21,7 @@ Values = npt.NDArray[np.float64]
 def psnr_val(record: Record) -> float:
     """Return the PSNR on val at the end of the run, dB; NaN where it was not measured.
 
-    The curve ends before the gate at the end, whose loss on val is taken off.
+    The curve ends before the gate at the end, so the gate's loss on val is subtracted.
     """
     if record.protocol.get("eval_split") == "val":
         return _number((record.metrics or {}).get("psnr"))
@@ -55,7 +55,7 @@ class Configuration:
 
     @property
     def on_demand(self) -> bool:
-        """Whether effects were chosen for the scenes or the Gaussians, so that not every one is paid for."""
+        """Whether effects were chosen for the scenes or the Gaussians, so that not all Gaussians have all effects."""
         return any(r.on_demand for runs in self.runs.values() for r in runs)
 
     @property
@@ -98,7 +98,7 @@ class Group:
 
     @cached_property
     def configurations(self) -> list[Configuration]:
-        """The models with their variants that finished somewhere, by name; without a variant first."""
+        """The models with their variants that finished on some scene, by name; a model without variant comes first."""
         runs: dict[tuple[str, str], dict[str, list[Record]]] = {}
         for r in self.finished:
             runs.setdefault((r.model, r.variant), {}).setdefault(r.scene, []).append(r)
@@ -109,14 +109,14 @@ class Group:
 
     @cached_property
     def series(self) -> list[str]:
-        """The curves of the frontier, also of runs that failed: the models, those that were gated apart."""
+        """The names of the frontiers, also of runs that failed: one for each model, and one for its gated runs."""
         return sorted({self.series_of(r) for r in self.records})
 
     def series_of(self, record: Record) -> str:
         """Name the frontier that a run belongs to.
 
-        Lengths, capacities and budgets of a model share one, and what is gated has its own. Where all runs were gated
-        alike, the model says enough.
+        The lengths, capacities and budgets of a model share a frontier, and its gated runs have their own. Where all
+        runs were gated alike, the name is that of the model.
         """
         own = gating(record)
         return f"{record.model}, {own}" if own and len(self._gatings) > 1 else record.model
@@ -127,7 +127,7 @@ class Group:
 
     @cached_property
     def variant(self) -> str:
-        """The variant at which models are compared: the one that most of them share, first what is not ablated."""
+        """The variant at which models are compared: the most common one; at a tie, one without ablation."""
         shared = Counter(c.variant for c in self.configurations)
         return min(shared, key=lambda variant: (-shared[variant], is_ablated(variant), variant), default="")
 
@@ -207,7 +207,7 @@ class Group:
         return total
 
     def scores(self, record: Record, quantity: str) -> dict[str, float]:
-        """Return a quantity by view; a single value where it is not one of views."""
+        """Return a quantity by view; a single value where it is not measured by view."""
         if quantity == "psnr" and record.per_view:
             return {v.name: v.psnr for v in record.per_view if v.psnr is not None}
         value = self.value(record, quantity)
@@ -223,7 +223,7 @@ def groups(records: list[Record]) -> list[Group]:
 
 
 def gating(record: Record) -> str:
-    """Say when the Gaussians of a run were gated, in the words of a variant; "" where that is its model's default."""
+    """Return when the Gaussians of a run were gated, as a variant writes it; "" where that is its model's default."""
     config = record.provenance.config
     effects, model = (part if isinstance(part := config.get(name), dict) else {} for name in ("effects", "model"))
     gate = effects.get("gate", "off")
@@ -236,12 +236,12 @@ def is_ablated(variant: str) -> bool:
 
 
 def without(variant: str, *names: str) -> str:
-    """Return a variant without its words on some settings, each named by the last part of its key."""
+    """Return a variant without some settings, each named by the last part of its key."""
     return ",".join(word for word in variant.split(",") if word.partition("=")[0].rpartition(".")[2] not in names)
 
 
 def _common(variant: str) -> str:
-    """Return a variant without its words on gates and ablations."""
+    """Return a variant without its settings of gates and ablations."""
     return without(variant, "gate", "budget_db", "ablation")
 
 

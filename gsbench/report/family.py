@@ -1,4 +1,4 @@
-"""Adjust the p-values of all comparisons of a report together, so that no two places of it disagree about one."""
+"""Adjust the p-values of all comparisons of a report together, so that no two of its sections disagree."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -20,12 +20,12 @@ class Tested:
 
     @property
     def known(self) -> bool:
-        """Whether there is a spread, so that a difference can be told from none at all."""
+        """Whether a spread is known, so that a difference can be tested."""
         return not math.isnan(self.p)
 
     @property
     def told(self) -> bool:
-        """Whether the difference is told from none: the one rule behind "told apart" and "ahead"."""
+        """Whether the difference is significant: the rule behind "told apart" and "ahead"."""
         return self.p < 1 - LEVEL
 
 
@@ -43,7 +43,7 @@ class Family:
         self._found = {quantity: _tested(group, quantity, contrasts) for quantity, contrasts in asked.items()}
 
     def of(self, weights: Weights, quantity: str = "psnr") -> Tested:
-        """Return a contrast that the family was made with, with the sign that is asked for here.
+        """Return a contrast of the family, with the sign of these weights.
 
         Raises:
             KeyError: the family has no such contrast.
@@ -68,7 +68,7 @@ def _tested(group: Group, quantity: str, contrasts: Iterable[Weights]) -> dict[K
 
 
 def _key(weights: Weights) -> tuple[Key, float]:
-    """Name a contrast whatever the order and the sign of its terms, and return its sign."""
+    """Return a key that does not depend on the order and the sign of a contrast's terms, and the sign."""
     terms = sorted((c.model, c.variant, weight) for weight, c in weights)
     sign = math.copysign(1.0, terms[0][2])
     return tuple((model, variant, sign * weight) for model, variant, weight in terms), sign

@@ -19,7 +19,7 @@ FEWEST_TARGETS = 3  # of a scene
 
 @dataclass(frozen=True)
 class FrontierPoint:
-    """A configuration on a scene, or on the mean of scenes: what it costs and what it reaches."""
+    """The cost and the quality of a configuration on a scene, or on the mean of scenes."""
 
     configuration: Configuration
     psnr: Estimate  # dB, the evaluated split; the interval is over seeds, on these scenes and views
@@ -45,7 +45,7 @@ def points(group: Group, scenes: list[str]) -> list[FrontierPoint]:
 
 
 def frontier(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
-    """Return the points that no cheaper one equals, by rising cost: each reaches more than all before it."""
+    """Return the points that beat all cheaper ones in PSNR, by rising cost."""
     best: list[FrontierPoint] = []
     for point in sorted(of, key=lambda p: (p.cost[cost], -p.psnr.mean)):
         if not math.isnan(point.cost[cost]) and (not best or point.psnr.mean > best[-1].psnr.mean):
@@ -54,7 +54,7 @@ def frontier(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
 
 
 def beaten(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
-    """Return the points beside which another is at least as good and as cheap, and better in one, by their means."""
+    """Return the points that another point beats, by their means: see `beats`."""
     known = [p for p in of if not math.isnan(p.cost[cost])]
     return [p for p in known if any(beats(q, p, cost) for q in known)]
 
@@ -67,7 +67,7 @@ def beats(q: FrontierPoint, p: FrontierPoint, cost: str) -> bool:
 
 @dataclass(frozen=True)
 class BudgetChoice:
-    """The point that a budget buys, and how the best of each other model compares with it on the evaluated split."""
+    """The best point within a budget, and how the best of each other model compares with it on the evaluated split."""
 
     point: FrontierPoint
     on_val: bool  # whether it was chosen on val; otherwise on what is shown, as some runs have no PSNR on val
@@ -83,7 +83,7 @@ def has_val(of: Sequence[FrontierPoint]) -> bool:
 
 
 def ranked(of: Sequence[FrontierPoint]) -> list[FrontierPoint]:
-    """Return points by falling PSNR on val; by that on the evaluated split where `has_val` is not so."""
+    """Return points by falling PSNR on val, or by that on the evaluated split where `has_val` is false."""
     on_val = has_val(of)
     return sorted(of, key=lambda p: -(p.val if on_val else p.psnr.mean))
 
@@ -98,7 +98,7 @@ def contest(of: Sequence[FrontierPoint], cost: str, budget: float) -> list[Front
 
 
 def contested(of: Sequence[FrontierPoint]) -> list[Weights]:
-    """Return the differences that `choose` asks for, of all BUDGETS."""
+    """Return the differences that `choose` needs, for all BUDGETS."""
     contests = [contest(of, *budget) for budget in BUDGETS]
     return [[(1.0, found[0].configuration), (-1.0, other.configuration)] for found in contests for other in found[1:]]
 

@@ -1,8 +1,8 @@
-"""Estimate a mean over scenes, seeds and views with a 95 % interval that holds its coverage from three seeds on.
+"""Estimate a mean over scenes, seeds and views with a 95 % interval that keeps its coverage from three seeds on.
 
-With three seeds a percentile bootstrap of any hierarchy covers far less than it says: resampling three values finds two
-thirds of their variance, and its quantiles are those of a normal distribution where Student's t has 4.3 instead of 2.
-So the spread of each level is estimated and given its own quantile of t (docs/statistics.md has the simulations):
+With three seeds a percentile bootstrap of any hierarchy covers far less than it claims: resampling three values finds
+two thirds of their variance, and its quantiles are those of a normal distribution where Student's t has 4.3 instead of
+2. So the spread of each level is estimated and has its own quantile of t (docs/statistics.md has the simulations):
 
 - three scenes and more: the means of the scenes are a sample of scenes like these, and hold the spread of seeds and
   views already; t with (scenes - 1) degrees of freedom is exact for normal means.
@@ -137,7 +137,7 @@ def _without_rest(scene: Values) -> Spread:
 
 
 def holm(p: list[float]) -> list[float]:
-    """Adjust p-values for being shown together, after Holm (1979); NaN is not counted and stays."""
+    """Adjust p-values for multiple comparisons, after Holm (1979); NaN is not counted and stays NaN."""
     adjusted = [math.nan] * len(p)
     tested = sorted((value, i) for i, value in enumerate(p) if not math.isnan(value))
     largest = 0.0

@@ -1,4 +1,4 @@
-"""Lay out tables, as Markdown for files and as plain text for a terminal."""
+"""Format tables as Markdown for files and as plain text for a terminal."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Write table and page of a folder again whenever a record in it arrives or changes."""
+"""Rewrite the table and the page of a folder whenever a record in it is added or changes."""
 
 import time
 from pathlib import Path
@@ -16,8 +16,8 @@ State = frozenset[tuple[Path, int]]
 def watch(folder: Path, *, train: bool = False, every: float = EVERY) -> int:
     """Write ``table.md``, ``table.csv`` and ``report.html`` as records arrive, until Ctrl-C; return the exit code.
 
-    A folder without records, or with a damaged one, is said once and looked at again. The page loads itself again
-    while this runs; the last one that is written does not.
+    A folder without records, or with a damaged record, is reported once and read again later. The page reloads itself
+    while this runs; the last page does not.
 
     Args:
         folder: where records are or will be.
@@ -40,7 +40,7 @@ def watch(folder: Path, *, train: bool = False, every: float = EVERY) -> int:
 
 
 def _state(folder: Path) -> State:
-    """Return the records and when they were written; one that is replaced meanwhile counts as gone."""
+    """Return the records with their times of writing; a record that is replaced meanwhile counts as absent."""
     found = set()
     for path in files.find(folder) if folder.is_dir() else []:
         try:
@@ -51,7 +51,7 @@ def _state(folder: Path) -> State:
 
 
 def _written(folder: Path, train: bool, reload: int) -> str:
-    """Write all files and say what there is; where that cannot be done, say why."""
+    """Write all files and return a line that counts the records; where writing fails, return the reason."""
     try:
         records, faults = tables.load(folder)
         if not records:

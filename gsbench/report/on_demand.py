@@ -1,4 +1,4 @@
-"""Average over the seeds what was decided about the effects of a scene and of its Gaussians."""
+"""Average over the seeds the decisions about the effects of a scene and of its Gaussians."""
 
 import math
 import re
@@ -20,7 +20,7 @@ DEGREES = 4  # of harmonics: 0, 1, 2, 3
 
 @dataclass(frozen=True)
 class Decided:
-    """What was decided on a scene for the runs of a configuration, by means over the seeds."""
+    """The decisions on a scene for the runs of a configuration, averaged over the seeds."""
 
     scene: str
     configuration: Configuration
@@ -50,7 +50,7 @@ class Decided:
 
 
 def decided(group: Group) -> list[Decided]:
-    """Return what was decided, by scene and configuration; nothing where every Gaussian pays for every effect."""
+    """Return the decisions by scene and configuration; none where every Gaussian has every effect."""
     configurations = [c for c in group.configurations if c.on_demand]
     shared = Counter(c.series for c in configurations)
     names = [c.series if shared[c.series] == 1 else c.name for c in configurations]
@@ -105,7 +105,7 @@ def _of_degree(gate: Gate, degree: int) -> int:
 
 
 def _less(before: float | None, after: float | None) -> float:
-    """Return what a value changed by: minus `before`, plus `after`."""
+    """Return the change of a value: `after` minus `before`."""
     return math.nan if before is None or after is None else after - before
 
 

@@ -1,7 +1,7 @@
-"""Provide the numbers of the 7DGS paper, its Tables 1 and 2, and the protocol behind them, for comparison.
+"""Provide the numbers of Tables 1 and 2 of the 7DGS paper and their protocol, for comparison.
 
 Source: Gao et al., "7DGS: Unified Spatial-Temporal-Angular Gaussian Splatting", ICCV 2025. A cell that the paper leaves
-empty is None. Its averages are rows of the scene "avg".
+empty is None. The paper's averages are rows of the scene "avg".
 """
 
 import csv

@@ -1,4 +1,4 @@
-"""Sort records by whether they were measured as the 7DGS paper measured, so that only like stands beside like."""
+"""Sort records by whether they follow the 7DGS paper's protocol, so that only comparable runs share a table."""
 
 import re
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ _NOT_OF_THE_RECIPE = ("iterations", "downscale", "eval_split", "protocol", "best
 
 
 class ModelRecipe(NamedTuple):
-    """What the seeds of a row share beside their scene."""
+    """The model, the experiment and the recipe that the seeds of a table row share."""
 
     model: str
     experiment: str
@@ -55,7 +55,7 @@ class Sorted:
 
 
 def sort(records: list[Record]) -> Sorted:
-    """Sort records of the five models; what stands for no data set of the paper is left out without a word."""
+    """Sort records of the five models; records that stand for no data set of the paper are left out silently."""
     at_paper: dict[str, list[Record]] = {name: [] for name in PROTOCOLS}
     pools: dict[tuple[str, str, str, str, int], Pool] = {}  # images of a data set may differ in size by scene
     for r in records:
@@ -86,7 +86,7 @@ def sort(records: list[Record]) -> Sorted:
 
 
 def departure(record: Record) -> str:
-    """Say in what a run departs from the paper's protocol, "" where it does not."""
+    """Name the settings in which a run departs from the paper's protocol; "" where it follows it."""
     protocol = PROTOCOLS.get(record.dataset)
     if protocol is None or record.protocol.get("paper_dataset") != record.dataset:
         return "data"
@@ -130,12 +130,12 @@ def finished(records: list[Record], one: ModelRecipe, scenes: Sequence[str]) -> 
 
 
 def _size(record: Record) -> str:
-    """Return the size of a run's images as width x height, in text that a record may have made up."""
+    """Return the size of a run's images as width x height; the text of the record is not trusted."""
     return printable(record.protocol.get("resolution", "a size not recorded"))
 
 
 def _pixels(size: str) -> int:
-    """Count the pixels of a size; 0 where it is none."""
+    """Count the pixels of a size; 0 where the text is no size."""
     numbers = size.split("x")
     return int(numbers[0]) * int(numbers[1]) if re.fullmatch(r"[0-9]{1,6}x[0-9]{1,6}", size) else 0
 

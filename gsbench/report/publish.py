@@ -1,4 +1,4 @@
-"""Copy the records of finished runs to the folder of published ones, and write the tables there anew."""
+"""Copy the records of finished runs to the folder of published records, and rewrite the tables there."""
 
 import sys
 from pathlib import Path
@@ -12,10 +12,11 @@ from gsbench.report import tables
 def publish(folder: Path, to: Path) -> str:
     """Copy every record of a folder, such as ``results/mini``, to another one, such as ``results/published/mini``.
 
-    A record of the same run that is there is replaced; others stay. Return a line that says what was done.
+    A published record of the same run is replaced; other records stay. Return a line that describes the result.
 
     Raises:
-        InputError: a record is damaged or twice there, or a run did not finish or is of no commit; nothing is copied.
+        InputError: a record is damaged or a duplicate, or a run did not finish or has no clean commit; nothing is
+            copied.
     """
     records, faults = tables.load(folder)
     for r in records:

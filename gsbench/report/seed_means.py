@@ -1,4 +1,4 @@
-"""Average quantities over seeds and scenes, each with the interval of gsbench's statistics."""
+"""Average quantities over seeds and scenes, each with its interval (gsbench.report.intervals)."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -53,7 +53,7 @@ def _other_protocol(runs: list[Record]) -> str:
 
 
 def missing(dataset: str, records: list[Record]) -> str:
-    """Say in one line which scenes, models and seeds a data set lacks at the paper's protocol."""
+    """List in one line the scenes, models and seeds that a data set lacks at the paper's protocol."""
     own = [r for r in records if r.status == "ok" and not model_recipe(r).recipe]
     scenes = paper.PROTOCOLS[dataset].scenes
     seeds = {(s, m): len({r.seed for r in own if (r.scene, r.model) == (s, m)}) for s in scenes for m in MODELS}
@@ -70,7 +70,7 @@ def missing(dataset: str, records: list[Record]) -> str:
 
 
 def _left_out(pools: list[str]) -> list[str]:
-    """Name what is in none of the tables."""
+    """Name the runs that are in none of the tables."""
     if not pools:
         return []
     shown = "; ".join(map(printable, pools[:5])) + (f"; and {len(pools) - 5} more" if len(pools) > 5 else "")
@@ -156,7 +156,7 @@ class _Table1Builder:
         return {key: math.nan if None in given else fmean(given) for key, given in values.items()}
 
     def _label(self, one: ModelRecipe) -> str:
-        """Name a row: the model, what of its training is not the experiment's own, the experiment where they differ."""
+        """Name a row by its model, its recipe, and its experiment where experiments differ."""
         return " ".join(filter(None, [one.model, one.recipe, f"({one.experiment})" * self.names_experiment]))
 
     def _mark(self, text: str) -> str:

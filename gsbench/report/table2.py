@@ -1,4 +1,4 @@
-"""Make Table 2 of the 7DGS paper from records: averages over a data set beside those of the methods it quotes."""
+"""Make Table 2 of the 7DGS paper from records: averages over a data set beside those of the quoted methods."""
 
 import math
 from typing import Any

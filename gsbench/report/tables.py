@@ -48,7 +48,7 @@ PAPER_LPIPS = (
 
 
 def load(root: Path) -> tuple[list[Record], list[str]]:
-    """Return all records under `root`, and for every one that is damaged or of a run that was read before, why.
+    """Return all records under `root`, and the reasons why others were left out: damaged, or a duplicate of a run.
 
     Raises:
         InputError: there is no record at all.
@@ -109,7 +109,7 @@ def build(records: list[Record], *, train: bool = False, machine: str | None = N
 
 
 def of_one_machine(records: list[Record], machine: str) -> list[str]:
-    """Say whose seconds a table shows, and which runs' it leaves out; nothing where all were on one machine.
+    """Name the machine whose seconds a table shows, and the runs left out; nothing where all were on one machine.
 
     Args:
         records: of the table.
@@ -153,7 +153,7 @@ class _TableBuilder:
         return [math.nan if q[column.key] is None else float(q[column.key]) for q in counted] or [math.nan]
 
     def _name(self, record: Record) -> str:
-        """Name the row of a run: its model, and what of its training is not the experiment's own."""
+        """Name the row of a run by its model, and by its variant where it is not the common one."""
         return f"{record.model} {record.variant}" if record.variant != self.common else record.model
 
     def table(self) -> Table:
@@ -168,7 +168,7 @@ class _TableBuilder:
         return Table(title, self.columns, sections, self.marks, said)
 
     def _no_vgg(self) -> list[str]:
-        """Say why there is no column for LPIPS-VGG, if there is none."""
+        """Return the reason why there is no column for LPIPS-VGG, if there is none."""
         shown = any(c.key == "lpips_vgg" for c in self.columns)
         why = {printable(r.missing["lpips_vgg"]) for r in self.records if "lpips_vgg" in r.missing}
         return [f"LPIPS-VGG has no column: {'; '.join(sorted(why))}."] if why and not shown else []

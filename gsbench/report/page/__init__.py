@@ -1,1 +1,1 @@
-"""Make one self-contained page of a folder of results: text, figures, tables and pictures."""
+"""Make one self-contained HTML page of a folder of results, with text, figures, tables and images."""

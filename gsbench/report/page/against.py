@@ -1,4 +1,4 @@
-"""Write the section that holds the runs of a page against those of another folder, such as published ones."""
+"""Write the section that compares the runs of a page with those of another folder, such as published ones."""
 
 from gsbench.report.against import AGREES, DIFFERS, RULE, UNTOLD, Comparison
 from gsbench.report.against_table import COLUMNS, lines

@@ -29,7 +29,7 @@ MOST_SCENES = 8  # that have drawings of their own, over all experiments of the 
 
 @dataclass(frozen=True)
 class Chapter:
-    """What the page says of one experiment on one data set."""
+    """The part of the page on one experiment and data set."""
 
     key: str
     title: str

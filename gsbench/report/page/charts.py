@@ -1,4 +1,4 @@
-"""Draw the figures of the page: one function for each kind of figure, from numbers to a panel."""
+"""Draw the figures of the page, each kind by a function that takes numbers and returns a panel."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class FrontierCurve:
-    """What a figure shows of one model."""
+    """The marks of one model in a frontier figure."""
 
     style: Style
     best: Sequence[Mark]  # the frontier, joined

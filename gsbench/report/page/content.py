@@ -1,4 +1,4 @@
-"""Define what the page is made of: sections with sentences, panels and tables, and the runs that points name."""
+"""Define the parts of the page: sections with sentences, figures and tables, and the runs that points link to."""
 
 import base64
 import csv
@@ -93,7 +93,7 @@ class Swatch:
 
 @dataclass(frozen=True)
 class Image:
-    """A picture with its caption; the source is a data address."""
+    """An image with its caption; the source is a data URL."""
 
     caption: str
     source: str
@@ -103,7 +103,7 @@ class Image:
 
 @dataclass(frozen=True)
 class PageSection:
-    """A figure of the page with what it says in words."""
+    """A section of the page: sentences, figures and a table."""
 
     key: str
     title: str
@@ -118,7 +118,7 @@ class PageSection:
 
 
 class Runs:
-    """Number the runs and configurations that points stand for, with what is shown when one is pointed at."""
+    """Number the runs and configurations behind the points, with the text that is shown when one is pointed at."""
 
     def __init__(self) -> None:
         self.entries: list[dict[str, str]] = []
@@ -157,7 +157,7 @@ class Runs:
 
 @dataclass(frozen=True)
 class Canvas:
-    """What the drawings of one experiment share."""
+    """The state that the figures of one experiment share."""
 
     name: str  # keeps the ids of its drawings apart from those of others
     runs: Runs
@@ -166,7 +166,7 @@ class Canvas:
 
 
 def _facts(psnr: float, seconds: float, ms: float, mb: float) -> str:
-    """Write what a point has reached and cost, without what is not known."""
+    """Write the quality and the costs of a point, without unknown ones."""
     known = [
         (psnr, f"{messages.plain(psnr)} dB"),
         (seconds, messages.duration(seconds)),

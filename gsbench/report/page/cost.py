@@ -1,4 +1,4 @@
-"""Write what accuracy costs: which model to use for a budget, and the frontier of every model."""
+"""Write the sections on the cost of quality: the model to use for each budget, and the frontier of every model."""
 
 import math
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ INTERVALS = (
 
 @dataclass(frozen=True)
 class BudgetAnswer:
-    """Which model to use for a budget."""
+    """The model to use for a budget."""
 
     budget: str
     model: str  # empty: none fits
@@ -40,7 +40,7 @@ def answers(group: Group, family: Family) -> list[BudgetAnswer]:
 
 
 def basis_words(group: Group, family: Family) -> str:
-    """Say what the answers are from, and by which rule one is chosen and compared."""
+    """Describe the data behind the answers, and the rule by which a model is chosen and compared."""
     scenes = group.basis
     if not scenes:
         return "Nothing has finished yet."
@@ -83,7 +83,7 @@ def _answer(points: list[FrontierPoint], family: Family, cost: str, budget: floa
 
 
 def _compared(choice: f.BudgetChoice) -> str:
-    """Say which models that fit the chosen one is ahead of, which it is not told apart from, and which are ahead."""
+    """Say how the chosen model compares with the others that fit: ahead, not told apart, or behind."""
     others = len(choice.ahead) + len(choice.level) + len(choice.behind) + len(choice.unknown)
     if not others:
         return "No other model fits."
@@ -105,7 +105,7 @@ def _named(points: list[FrontierPoint]) -> str:
 
 
 def _told(configuration: Configuration) -> str:
-    """Say what sets a configuration apart from the others of its series: its length, and the rest of its variant."""
+    """Describe a configuration within its series by its length and the rest of its variant."""
     length = f"{configuration.iterations:,} iterations, " if configuration.iterations else ""
     is_gated = configuration.series != configuration.model
     told = [name for name, known in (("iterations", length), ("gate", is_gated)) if known]
@@ -185,7 +185,7 @@ def _frontier_tab(group: Group, canvas: Canvas, key: str, label: str, scenes: li
 def _curve(
     group: Group, runs: Runs, style: Style, points: list[FrontierPoint], cost: str, scenes: list[str]
 ) -> charts.FrontierCurve:
-    """Gather what a panel shows of one model."""
+    """Gather the marks of one model in a panel."""
     best = f.frontier(points, cost)
     beaten = [p for p in points if p not in best and not math.isnan(p.cost[cost])]
     of = {id(p): runs.of_configuration(group, p.configuration, scenes) for p in points}
@@ -203,7 +203,7 @@ def _curve(
 
 
 def _paper(record: Record, cost: str) -> tuple[float, float] | None:
-    """Return where the paper's row stands, which was measured on other hardware, if the data are the paper's."""
+    """Return the position of the paper's row, which was measured on other hardware, if the data are the paper's."""
     row = paper.paper_row(record.dataset, record.scene, record.model)
     if record.protocol.get("paper_dataset") != record.dataset or row is None:
         return None
@@ -213,7 +213,7 @@ def _paper(record: Record, cost: str) -> tuple[float, float] | None:
 
 
 def _frontier_words(group: Group, points: list[FrontierPoint]) -> list[str]:
-    """Say which point is chosen, which are beaten by their means, and what the points are from."""
+    """Say which point is chosen, which points are beaten by their means, and which lengths of training they have."""
     if not points:
         return ["No run has finished, so there is nothing to compare."]
     best, scenes, split = f.ranked(points)[0], group.basis, _split(group)
@@ -230,7 +230,7 @@ def _frontier_words(group: Group, points: list[FrontierPoint]) -> list[str]:
 
 
 def _beaten_words(points: list[FrontierPoint]) -> str:
-    """Say how many points another one beats; this is of means, so that it claims no difference."""
+    """Say how many points are beaten by another; only means are compared, so no difference is claimed."""
     timed = [p for p in points if not math.isnan(p.cost["seconds"])]
     beaten = f.beaten(timed, "seconds")
     if len(points) == 1:
@@ -253,7 +253,7 @@ def _beaten_words(points: list[FrontierPoint]) -> str:
 
 
 def _lengths(points: list[FrontierPoint]) -> str:
-    """Say of which lengths of training the points are."""
+    """Say which lengths of training the points have."""
     lengths = sorted({n for p in points if (n := p.configuration.iterations)})
     if len(lengths) > 1:
         return f"Each point is a finished run: {len(lengths)} lengths, {lengths[0]:,} to {lengths[-1]:,} iterations."

@@ -1,4 +1,4 @@
-"""Say at which steps of a run its schedule changed something, from the config in its record."""
+"""Compute the steps at which the schedule of a run changed its training, from the config in its record."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ MOST_RESETS = 4  # that are marked
 
 
 def of(record: Record) -> list[tuple[int, str]]:
-    """Return steps and the letters of what happens there, by rising step; nothing where the config does not tell."""
+    """Return steps and the letters of their events, by rising step; nothing where the config cannot be read."""
     try:
         steps = _steps(record)
     except (InputError, KeyError, TypeError, AttributeError, ArithmeticError):

@@ -1,4 +1,4 @@
-"""Write the sections on evidence: the tables, the protocol, what failed, and every run with its command."""
+"""Write the sections on evidence: the tables, the protocol, the failed runs, and every run with its command."""
 
 from gsbench.measure.record import Record
 from gsbench.report import layout, tables

@@ -36,9 +36,10 @@ StripRow = tuple[Pixels, Pixels, Pixels]  # render, truth, error
 
 
 def gallery(records: list[Record], folder: Path) -> list[GalleryView]:
-    """Return the views of which there are images, of the first seed of each model, in less than BUDGET bytes.
+    """Return the views that have images, of the first seed of each model, in less than BUDGET bytes.
 
-    Images that do not fit are first compressed more, then made smaller, then left out: all views but one a scene.
+    Where images do not fit, they are compressed more, then made smaller, then reduced to one view for each scene, and
+    at last left out.
     """
     strips = _strips(records, folder)
     for side, quality, views in STEPS:

@@ -1,4 +1,4 @@
-"""Put numbers and their intervals into words."""
+"""Format numbers, intervals and names for the sentences of the page."""
 
 import math
 import shlex
@@ -39,17 +39,17 @@ def count(number: int, what: str) -> str:
 
 
 def plain(value: float, digits: int = 2) -> str:
-    """Write a number with a true minus sign; a dash where there is none."""
+    """Write a number with a true minus sign; a dash for NaN."""
     return "–" if math.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
 
 
 def probability(p: float) -> str:
-    """Write a p-value; one too small for three digits as a bound."""
+    """Write a p-value, or a bound where it is too small for three digits."""
     return "< 0.001" if p < 0.001 else plain(p, 3)
 
 
 def signed(value: float, digits: int = 2) -> str:
-    """Write a difference with its sign; none where it rounds to zero."""
+    """Write a difference with its sign; a difference that rounds to zero has none."""
     text = plain(value, digits)
     if math.isnan(value) or float(text.replace("−", "-")) == 0:
         return text.removeprefix("−")
@@ -73,7 +73,7 @@ def budget(seconds: float) -> str:
 
 
 def interval(of: Estimate, digits: int = 2, *, sign: bool = False) -> str:
-    """Write the 95 % interval and what it is over, or that no spread is known."""
+    """Write the 95 % interval and what it is over; without an interval, NO_SPREAD."""
     write = signed if sign else plain
     return f"95 % {write(of.low, digits)} to {write(of.high, digits)} over {of.over}" if of.over else NO_SPREAD
 
@@ -84,7 +84,7 @@ def over(of: Estimate) -> str:
 
 
 def scope(of: Estimate) -> str:
-    """Say in a sentence of how many scenes differences are, and what their intervals can and cannot tell."""
+    """Say in a sentence over how many scenes differences are, and what their intervals generalise to."""
     scenes = {1: "One scene", 2: "Two scenes"}.get(of.scenes, count(of.scenes, "scene"))
     if not of.over:
         return f"{scenes}, one seed: no interval is known."

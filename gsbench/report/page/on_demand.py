@@ -1,4 +1,4 @@
-"""Write the section on effects on demand: whether time was simulated and why, and what the gates left of the model."""
+"""Write the section on effects on demand: whether and why time was simulated, and which Gaussians the gates left."""
 
 import math
 from collections import Counter
@@ -30,7 +30,7 @@ NAMES = CLASSES | {REMOVED: "removed"}
 
 
 def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection | None:
-    """Say what was decided, and draw the classes and the harmonics of the Gaussians; None where nothing was."""
+    """Describe the decisions, and draw the classes and the harmonics of the Gaussians; None without decisions."""
     found = decided(group)
     if not found:
         return None
@@ -55,13 +55,13 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection
 
 
 def _sentence(one: Decided) -> str:
-    """Say what was decided on a scene for a model."""
+    """Describe the decisions on a scene for a model."""
     parts = [_screen_words(one.runs), *_gate_words(one)]
     return f"On {one.scene}, {one.name}: {' '.join(part for part in parts if part)}"
 
 
 def _screen_words(runs: list[Record]) -> str:
-    """Say whether time was simulated, why in the first run, and whether other seeds decided otherwise."""
+    """Say whether time was simulated, the reason in the first run, and the decisions of other seeds."""
     screens = _screens(runs)
     if not screens:
         return ""
@@ -84,7 +84,7 @@ def _screens(runs: list[Record]) -> list[TimeScreen]:
 
 
 def _gate_words(one: Decided) -> list[str]:
-    """Say what the gates left, and what the gate at the end changed."""
+    """Say which Gaussians the gates left, and what the gate at the end changed."""
     if not one.gated:
         return ["No gate has changed a Gaussian."]
     kept = [f"{one.rows[name]:,.0f} {said}" for name, said in CLASSES.items() if one.rows[name] >= 0.5]
@@ -110,7 +110,7 @@ def _change(of: Estimate, unit: str, digits: int) -> str:
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
-    """List what could not be decided, once where seeds say the same, and what the numbers do not hold."""
+    """List what could not be decided, equal notes of seeds once, and what the numbers do not contain."""
     named: dict[str, list[int]] = {}
     for one in found:
         for run in one.runs:

@@ -1,7 +1,8 @@
-"""Give every model its colour and its marker, the same in all figures, for eyes of every kind and for both themes.
+"""Give every model a colour and a marker, the same in all figures, for the light and the dark theme.
 
-The first hues are those of Okabe and Ito, which people with the common colour deficiencies tell apart, darkened for a
-white page and lightened for a black one to a contrast of at least 4.5:1. Markers tell the models apart without colour.
+The first hues are those of Okabe and Ito, which readers with the common colour deficiencies can distinguish. They are
+darkened for a white page and lightened for a black one, to a contrast of at least 4.5:1. Markers distinguish the models
+without colour.
 """
 
 from dataclasses import dataclass
@@ -27,14 +28,14 @@ STAGES_DARK = ("#c9e0f5", "#a3c6e6", "#7ba8cf", "#588ab3", "#3f6e95", "#2c5373",
 
 @dataclass(frozen=True)
 class Style:
-    """How a model is drawn: the number of its colour and its marker in matplotlib's letters."""
+    """The style of a model: the number of its colour, and its marker as matplotlib's letter."""
 
     colour: int
     marker: str
 
 
 def styles(models: list[str]) -> dict[str, Style]:
-    """Return the style of each model: a known one always has the same, others take what is left, in turn."""
+    """Return the style of each model; a known model always has the same, other models take the rest in turn."""
     others = sorted(set(models) - set(MODELS))
     spare = range(len(MODELS), len(LIGHT))
     free = [*spare, *(i for i, m in enumerate(MODELS) if m not in models)]

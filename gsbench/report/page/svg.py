@@ -1,6 +1,6 @@
 """Draw matplotlib figures as inline SVG with real text, whose colours are variables of the page's style sheet.
 
-Figures are drawn with stand-in colours, which are then replaced: one drawing serves the light and the dark theme.
+Figures are drawn with placeholder colours, which are then replaced, so one drawing serves both themes.
 """
 
 import io

@@ -1,4 +1,4 @@
-"""Write when a quality is reached: the seconds each model needs for the targets, and the course of training."""
+"""Write the sections on time to quality: the seconds each model needs for the targets, and its training curves."""
 
 import math
 from statistics import fmean

@@ -1,4 +1,4 @@
-"""Write the sections on worth: the price of each effect, where the seconds go, whether differences are real."""
+"""Write the sections on the worth of effects: their prices, the seconds by stage, and the differences of models."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ NESTED = "Nested: 7dgs_nodir, which is 7dgs less direction and nothing else, in 
 
 
 def effects_section(group: Group, family: Family, canvas: Canvas) -> PageSection:
-    """Price time, direction, AGR and their interactions in every unit, as far as the cells were run."""
+    """Price time, direction, AGR and their interactions in every unit, where the cells were run."""
     cube = compare.cube(group, family)
     notes = []
     if cube.missing:
@@ -81,7 +81,7 @@ def _cells(price: Price, unit: str) -> tuple[Value, ...]:
 
 
 def _scope(cube: Cube, family: Family) -> list[str]:
-    """Say over what the intervals of prices are, and among how many comparisons a price is told from nothing."""
+    """Say what the intervals of prices are over, and for how many comparisons the p-values are adjusted."""
     fewest = min((price.costs["psnr"] for price in cube.prices), key=lambda of: of.scenes)
     if not family.size():
         return [messages.scope(fewest)]
@@ -94,7 +94,7 @@ def _scope(cube: Cube, family: Family) -> list[str]:
 
 
 def _effect_words(cube: Cube) -> list[str]:
-    """Say which effect is worth most, what it costs, which are not told from nothing, and how they interact."""
+    """Say which effect is worth most, what it costs, which effects are not significant, and how they interact."""
     single = [p for p in cube.prices if compare.is_single(p.name)]
     best = max(single, key=lambda p: p.costs["psnr"].mean)
     gain, seconds = best.costs["psnr"], best.costs["seconds"]
@@ -123,7 +123,7 @@ def _effect_words(cube: Cube) -> list[str]:
 
 
 def stages_section(group: Group, canvas: Canvas) -> PageSection:
-    """Draw where the seconds of training go, by stage."""
+    """Draw the seconds of training by stage."""
     parts = {c.model: found for c in group.main_configurations if (found := _stage_seconds(group, c.model))}
     if not parts:
         return PageSection("stages", "Where the seconds go", ["No finished run tells its seconds by stage."])
@@ -154,12 +154,12 @@ def stages_section(group: Group, canvas: Canvas) -> PageSection:
 
 
 def _colour(stage: str) -> int:
-    """Return the number of a stage's colour, the same whichever others are there."""
+    """Return the number of a stage's colour, which does not depend on the other stages."""
     return (*STAGES, REST).index(stage)
 
 
 def _slowest_words(parts: dict[str, dict[str, float]], names: list[str]) -> str:
-    """Say how much longer the slowest model takes than the quickest, and which share of that one stage has."""
+    """Say how much longer the slowest model takes than the quickest, and the share of one stage in that."""
     slow, quick = (pick(parts, key=lambda m: sum(parts[m].values())) for pick in (max, min))
     took, least = sum(parts[slow].values()), sum(parts[quick].values())
     if took == least:
