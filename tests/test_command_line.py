@@ -144,7 +144,7 @@ def test_what_is_measured_trains_nothing_again(square: Path, tmp_path: Path) -> 
             "train.checkpoint_minutes=1")  # fmt: skip
     done = gsbench(*arguments, *more)
     assert "measured again" in done.stderr
-    assert "goes on from step 30" in done.stderr
+    assert "continues from step 30" in done.stderr
     assert record.find(tmp_path) == [path]
     after = record.read(path)
     assert after.cost is not None

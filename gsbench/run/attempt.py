@@ -92,7 +92,7 @@ class Attempt:
         state = checkpoint.load(path, *hashes, self.config.device) if self.config.resume else None
         if state is not None:
             trainer.load_state_dict(state)
-            print(f"{this.name}: goes on from step {trainer.step} of {path}", file=sys.stderr)
+            print(f"{this.name}: continues from step {trainer.step} of {path}", file=sys.stderr)
         elif self.screen is not None:
             trainer.stages.add("screen", self.screen.seconds)
             trainer.effort.add(self._screening)
@@ -111,7 +111,7 @@ class Attempt:
                 if request.signal == signal.SIGUSR2:  # submitit's handler puts the job back into the queue, and ends it
                     request.hand_on(request.signal)
                 raise stop.Stopped(request.signal, f"{this.name}: stopped at step {trainer.step}, saved in {path}: "
-                                                   f"the same command goes on from there")  # fmt: skip
+                                                   f"the same command continues from there")  # fmt: skip
         for name, parameter in trainer.model.named_parameters():  # no image shows a colour of -inf: it is black
             if not parameter.isfinite().all():
                 raise DivergedError(f"step {trainer.step}: '{name}' has values that are not finite")

@@ -55,7 +55,7 @@ def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tu
     trainer.load_state_dict(found.state)
     if trainer.step < config.train.iterations:
         raise InputError(f"{folder}: expected a finished run, this one is at step {trainer.step} of "
-                         f"{config.train.iterations}: run it again, it goes on from there")  # fmt: skip
+                         f"{config.train.iterations}: run it again, it continues from there")  # fmt: skip
     trainer.gate_at_end(by_halves=True)
     content = Checkpoint(training_hash(plain), found.data, trainer.state_dict(), plain, found.scene)
     checkpoint.save(new / checkpoint.FILE_NAME, content)

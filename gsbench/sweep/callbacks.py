@@ -38,9 +38,7 @@ class WritePlan(Callback):
         plan.write(planned, folder)
         started.append(folder)
         experiment = folder.parents[1]
-        print(
-            f"{len(planned.runs)} runs; how far they are: python -m gsbench.sweep status {experiment}", file=sys.stderr
-        )
+        print(f"{len(planned.runs)} runs; their status: python -m gsbench.sweep status {experiment}", file=sys.stderr)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Write the path of the run's record, as two commands may ask for one run by different overrides."""

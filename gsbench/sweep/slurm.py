@@ -27,7 +27,7 @@ def queue(jobs: Iterable[str]) -> Queue:
     if isinstance(done, str):
         return Queue({}, done)
     if done.returncode and "Invalid job id" not in done.stderr:  # none of the jobs is known any more
-        return Queue({}, (done.stderr.splitlines() or ["squeue failed without a word"])[-1])
+        return Queue({}, (done.stderr.splitlines() or ["squeue failed without a message"])[-1])
     states = {}
     for line in done.stdout.splitlines():
         job, task, state, reason = line.split(maxsplit=3)

@@ -53,7 +53,7 @@ def test_a_signal_saves_and_ends_in_one_line(number: signal.Signals, code: int, 
     _, said = process.communicate(timeout=60)
     assert process.returncode == code, said
     assert "Traceback" not in said
-    found = re.search(r"stopped at step (\d+), saved in (.*): the same command goes on from there", said)
+    found = re.search(r"stopped at step (\d+), saved in (.*): the same command continues from there", said)
     assert found, said
     assert checkpoint.read(Path(found[2])).state["step"] == int(found[1])
     assert not list(tmp_path.rglob(progress.FILE_NAME))

@@ -193,8 +193,8 @@ def time_limit(check: Check) -> None:
     sweep = check.sweep("limit", *long, "launch.minutes=2", "launch.signal_seconds=60")
     sweep.wait(600)
     log = "".join(path.read_text() for path in sweep.results.rglob("*_log.err"))
-    check.say("time limit", "saved and requeued at Slurm's signal", "goes on from step" in log,
-              f"{log.count('goes on from step')} times", begin)  # fmt: skip
+    check.say("time limit", "saved and requeued at Slurm's signal", "continues from step" in log,
+              f"{log.count('continues from step')} times", begin)  # fmt: skip
     check.completed("time limit", sweep, 1, begin)
 
 

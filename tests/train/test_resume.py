@@ -99,7 +99,7 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, whole:
     assert 0 < killed_at[0] < killed_at[1] < 60
     done = gsbench(*overrides(square, tmp_path / "broken", *RUN))
     assert done.returncode == 0, done.stderr
-    assert "goes on from step" in done.stderr
+    assert "continues from step" in done.stderr
     assert_same_bits(comparable_state(whole), comparable_state(tmp_path / "broken"))
 
     scores = []
@@ -118,7 +118,7 @@ def test_a_reloaded_checkpoint_measures_the_same(square: Path, whole: Path, tmp_
     first = record.read(path)
     path.unlink()
     done = gsbench(*overrides(square, results, *RUN))
-    assert "goes on from step 60" in done.stderr
+    assert "continues from step 60" in done.stderr
     assert record.read(path).metrics == first.metrics
 
 
