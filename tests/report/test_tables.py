@@ -314,7 +314,7 @@ def test_the_terminal_form_fits(width):
     runs += [dataclasses.replace(make(seed=seed), model="a_model_with_a_name_of_forty_letters_____") for seed in (0, 1)]
     text = layout.terminal(tables.build(runs), width)
     assert max(map(len, text.splitlines())) <= width
-    assert "only in the files, as the terminal is too narrow" in text
+    assert "only in the files, for lack of width" in text
     assert "7dgs seed 2" in text
 
 
