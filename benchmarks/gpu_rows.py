@@ -15,9 +15,9 @@ from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.raster import backward_by_splat
 from gsbench.models import GaussianModel, Query
+from gsbench.models.cuda_graph import GraphedFrames
 from gsbench.models.factors import rotation
 from gsbench.models.render import render
-from gsbench.models.replay import Replay
 from gsbench.raster import rasterize
 from gsbench.scenes.scene import Camera
 from gsbench.train.losses import photometric
@@ -126,10 +126,10 @@ def replay_row(place: Place, case: str, name: str, agr: bool, N: int, size: int)
     fitted, background = model(name, N, agr=agr).to(place.device), torch.zeros(3, device=place.device)
     viewmats, Ks = place.put(camera(size))
     seen = Camera(viewmats[0], Ks[0], size, size)
-    replay = Replay(fitted, background)
+    graphed = GraphedFrames(fitted, background)
     with torch.no_grad():
         launched = place.cost(lambda: render(fitted, seen, TIME, background))
-    return compared("replay", case, "forward", place.cost(lambda: replay(seen, TIME)), launched)
+    return compared("replay", case, "forward", place.cost(lambda: graphed(seen, TIME)), launched)
 
 
 def step_rows(place: Place) -> Iterator[Row]:

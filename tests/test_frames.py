@@ -20,7 +20,7 @@ def trainer(backend: Backend) -> Any:
 
 
 class Recorded:
-    """Stands for `Replay`, which needs a GPU."""
+    """Stands for `GraphedFrames`, which needs a GPU."""
 
     def __init__(self, *_: Any) -> None: ...
 
@@ -44,7 +44,7 @@ def test_on_a_gpu_the_record_says_which(
     replay: type[Recorded], made: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches a finished training lost to a model that waits for the device, and an FPS that hides how it was made."""
-    monkeypatch.setattr(attempt, "Replay", replay)
+    monkeypatch.setattr(attempt, "GraphedFrames", replay)
     frame, told = attempt.frames(trainer(CUDA), VIEW)
     assert (frame(VIEW), told) == (made, {"frames": made})
     said = capsys.readouterr().err

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gsbench import scenes
-from gsbench.effects import words
+from gsbench.effects import messages
 from gsbench.effects.choose import screen
 from gsbench.errors import InputError, one_line
 from gsbench.models.registry import import_models
@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (InputError, OSError) as error:
         print(f"gsbench.effects: {one_line(error)}", file=sys.stderr)
         return 2
-    print(json.dumps({"time": asdict(found)}) if asked.json else words.of_screen(found))
+    print(json.dumps({"time": asdict(found)}) if asked.json else messages.of_screen(found))
     return 0
 
 
@@ -74,7 +74,7 @@ def _gate(folder: Path, budget_db: float, data_root: str | None) -> int:
     from gsbench.run.regate import gate_run  # a screen needs no training code
 
     record, new = gate_run(folder, budget_db, data_root)
-    for line in words.lines(record.on_demand) if record.on_demand else []:
+    for line in messages.lines(record.on_demand) if record.on_demand else []:
         print(line)
     print(f"Written: {new}")
     return 0

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsbench.effects.gate import apply, choose
-from gsbench.effects.strength import Strength
+from gsbench.effects.sensitivity import Sensitivity
 from gsbench.measure.record import Gate
 from gsbench.models import GaussianModel
 from gsbench.models.color_order import order_of
@@ -26,12 +26,12 @@ class Gated:
     model: GatedModel
     gate: Gate  # what was decided, for the record
     rows: Tensor  # [M] the place that each Gaussian had before
-    changed: Tensor  # [M] bool: whether it became another cut
+    changed: Tensor  # [M] bool: whether it became another simplification
 
 
 def gate_within(
     model: GatedModel,
-    strength: Strength,
+    sensitivity: Sensitivity,
     budget_db: float,
     measure: Callable[[GaussianModel], float],
     spans: Tensor | None = None,  # [N, 2]
@@ -42,7 +42,7 @@ def gate_within(
 
     Args:
         model: trained, or on its way.
-        strength: of its cuts.
+        sensitivity: of its simplifications.
         budget_db: dB that `measure` may fall by.
         measure: the PSNR of a model, dB, on views that the probe did not look at.
         spans: when each Gaussian can be seen, for AGR to rest at other times.
@@ -52,8 +52,8 @@ def gate_within(
         if 10 * math.log10(1 + share) > MOST_PREDICTED * budget_db:
             continue
         gated = copy.deepcopy(model)
-        choice = choose(strength, gated, share)
-        rows, changed = apply(gated, strength, choice, spans)
+        choice = choose(sensitivity, gated, share)
+        rows, changed = apply(gated, sensitivity, choice, spans)
         loss = before - measure(gated)
         if loss <= budget_db and len(gated):
             gate = Gate(

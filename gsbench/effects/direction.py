@@ -6,12 +6,12 @@ from collections.abc import Sequence
 import torch
 
 from gsbench.effects.gate import classes_of
-from gsbench.effects.strength import MOST_VIEWS
+from gsbench.effects.sensitivity import MOST_VIEWS
 from gsbench.measure.quality import evenly
 from gsbench.models import GaussianModel, Query
-from gsbench.models.classes import DIRECTION
-from gsbench.models.cuts import STILL, shares_of
+from gsbench.models.effect_sets import DIRECTION
 from gsbench.models.gated import GatedModel
+from gsbench.models.simplifications import STILL, shares_of
 from gsbench.scenes import View
 
 

@@ -1,7 +1,7 @@
-"""Keep each effect of each Gaussian only where it pays: choose cuts under a budget of error, and apply them.
+"""Keep each effect of each Gaussian only where it pays: choose simplifications under a budget of error, and apply them.
 
-For every Gaussian the cut is chosen that minimises time + lambda error, its frame time and the error that
-gsbench.effects.strength predicts for it; lambda is such that the errors add up to the budget. One rule decides about
+For every Gaussian the simplification is chosen that minimises time + lambda error, its frame time and the error that
+gsbench.effects.sensitivity predicts for it; lambda is such that the errors add up to the budget. One rule decides about
 time, direction, AGR, harmonics and existence, and its unit is error for milliseconds.
 """
 
@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsbench.effects.strength import Strength
+from gsbench.effects.sensitivity import Sensitivity
 from gsbench.models import GaussianModel
-from gsbench.models.classes import DIRECTION, TIME, Classes
 from gsbench.models.color_order import MOST_PACKED, at_most, order_of
-from gsbench.models.cuts import LIVE, REMOVED, SLICED, STILL
+from gsbench.models.effect_sets import DIRECTION, TIME, Classes
 from gsbench.models.gated import GatedModel
+from gsbench.models.simplifications import LIVE, REMOVED, SLICED, STILL
 
 # Nanoseconds that a Gaussian adds to a frame, as measured on an EPYC Zen 4 (AVX-512, one thread, 5,300 Gaussians at
 # 80 x 80). They are constants, so that the same seed chooses the same Gaussians on every machine.
@@ -30,32 +30,33 @@ BISECTIONS = 32
 
 @dataclass(frozen=True)
 class Choice:
-    """The cut of each Gaussian."""
+    """The simplification of each Gaussian."""
 
-    geometry: dict[str, Tensor]  # [N] bool by the name of a cut: which Gaussians become it
+    geometry: dict[str, Tensor]  # [N] bool by the name of a simplification: which Gaussians become it
     levels: Tensor  # [N] int32 of colours, see Classes.levels
     predicted: float  # error that the choice adds, as a share of the model's own
 
 
-def choose(strength: Strength, model: GaussianModel, budget: float) -> Choice:
-    """Choose the cheapest cuts whose predicted errors add up to at most a share of the model's own error.
+def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Choice:
+    """Choose the cheapest simplifications whose predicted errors add up to at most a share of the model's own error.
 
     Args:
-        strength: of the model's cuts.
+        sensitivity: of the model's simplifications.
         model: whose they are; it may have classes already.
         budget: a share, such as 0.01, which is 0.043 dB.
     """
     now = classes_of(model)
     live = _live_cost(model, now)
     none = torch.zeros_like(live)
-    geometry = {LIVE: none} | {v.name: strength.errors[v.name] for v in strength.cuts if v.level is None}
+    ways, errors = sensitivity.simplifications, sensitivity.errors
+    geometry = {LIVE: none} | {way.name: errors[way.name] for way in ways if way.level is None}
     costs = torch.stack([live if name == LIVE else torch.minimum(live, none + COSTS.get(name, SLICING - LESS_TO_READ))
                          for name in geometry])  # fmt: skip
     forms = torch.stack(list(geometry.values()))
     removes = torch.tensor([name == REMOVED for name in geometry], device=live.device)[:, None]
     assert now.levels is not None
-    levels = torch.stack([now.levels] + [at_most(now.levels, v.level) for v in strength.cuts if v.level is not None])
-    hues = torch.stack([none] + [strength.errors[v.name] for v in strength.cuts if v.level is not None])
+    levels = torch.stack([now.levels] + [at_most(now.levels, way.level) for way in ways if way.level is not None])
+    hues = torch.stack([none] + [errors[way.name] for way in ways if way.level is not None])
     painting = _painting(levels)
 
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -68,11 +69,11 @@ def choose(strength: Strength, model: GaussianModel, budget: float) -> Choice:
     low, high = -60.0, 60.0  # of log2 of the price
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        within = float(decide(2.0**middle)[2].sum()) <= budget * strength.total
+        within = float(decide(2.0**middle)[2].sum()) <= budget * sensitivity.total
         low, high = (low, middle) if within else (middle, high)
     form, hue, error = decide(2.0**high)
     chosen = {name: form == i for i, name in enumerate(geometry)}
-    return Choice(chosen, levels.gather(0, hue[None])[0], float(error.sum()) / max(strength.total, 1e-300))
+    return Choice(chosen, levels.gather(0, hue[None])[0], float(error.sum()) / max(sensitivity.total, 1e-300))
 
 
 def _live_cost(model: GaussianModel, now: Classes) -> Tensor:
@@ -118,15 +119,15 @@ def classes_of(model: GaussianModel) -> Classes:
 @torch.no_grad()
 def apply(
     model: GatedModel,
-    strength: Strength,
+    sensitivity: Sensitivity,
     choice: Choice,
     spans: Tensor | None = None,  # [N, 2]
 ) -> tuple[Tensor, Tensor]:
-    """Turn each Gaussian of a model into its cut, drop the removed ones, sort the others by class.
+    """Turn each Gaussian of a model into its simplification, drop the removed ones, sort the others by class.
 
     Args:
         model: becomes the gated one.
-        strength: of its cuts.
+        sensitivity: of its simplifications.
         choice: one of them for each Gaussian.
         spans: when each Gaussian can be seen, see `Classes.spans`.
 
@@ -136,12 +137,12 @@ def apply(
     now = classes_of(model)
     assert now.levels is not None
     assert now.frozen is not None
-    for cut in strength.cuts:
-        if cut.raw is None:
+    for simplification in sensitivity.simplifications:
+        if simplification.raw is None:
             continue
-        rows = choice.geometry[cut.name] if cut.level is None else (
-            (choice.levels != now.levels) & (choice.levels == at_most(now.levels, cut.level)))  # fmt: skip
-        for key, value in cut.raw.items():
+        rows = choice.geometry[simplification.name] if simplification.level is None else (
+            (choice.levels != now.levels) & (choice.levels == at_most(now.levels, simplification.level)))  # fmt: skip
+        for key, value in simplification.raw.items():
             model.splats[key].data[rows] = value[rows]
     place = torch.arange(len(model), device=now.levels.device)
     refined, still = place < now.refined, place >= now.sliced

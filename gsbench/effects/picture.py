@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from gsbench.effects.gate import classes_of, cost_of, most_cost
-from gsbench.effects.words import CLASSES
+from gsbench.effects.messages import CLASSES
 from gsbench.measure.images import Pixels, inferno, to_bytes
 from gsbench.models import GaussianModel, Query
-from gsbench.models.classes import NAMES
+from gsbench.models.effect_sets import NAMES
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes import Camera
 

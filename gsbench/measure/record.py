@@ -94,7 +94,7 @@ class Gate:
     share: float  # of the squared error, the budget of the prediction
     predicted_db: float
     measured_db: float  # PSNR lost on the views that it was checked on
-    rows: dict[str, int]  # Gaussians by class: gsbench.models.classes.NAMES, and removed
+    rows: dict[str, int]  # Gaussians by class: gsbench.models.effect_sets.NAMES, and removed
     levels: dict[str, int]  # Gaussians by the harmonics of their colours
     bytes_before: int
     bytes: int

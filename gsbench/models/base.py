@@ -14,8 +14,8 @@ from gsbench.errors import InputError
 from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.colors import show_colors
 from gsbench.models.appearance import sh_colors
-from gsbench.models.classes import NAMES, Classes
 from gsbench.models.color_order import ColorOrder
+from gsbench.models.effect_sets import NAMES, Classes
 from gsbench.models.query import Query, unit
 from gsbench.models.refinement import OCTAVES, Refinement
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
@@ -189,7 +189,7 @@ class GaussianModel(nn.Module, ABC):
         return None if self.classes is None else self.classes.levels
 
     def count_classes(self) -> dict[str, int]:
-        """Count the Gaussians of each class, by the names of `gsbench.models.classes.NAMES`."""
+        """Count the Gaussians of each class, by the names of `gsbench.models.effect_sets.NAMES`."""
         N, classes = len(self), self.classes
         if classes is not None:
             return classes.by_name(N)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.models.base import Conditioned, GaussianModel, Raw
-from gsbench.models.classes import DIRECTION, TIME, Classes
 from gsbench.models.color_order import MOST_PACKED, ColorOrder, coefficients_within
+from gsbench.models.effect_sets import DIRECTION, TIME, Classes
 from gsbench.models.query import Query
 
 OPACITY_MARGIN = 1e-6  # between a frozen Gaussian's opacity and 0 or 1, whose logits are infinite

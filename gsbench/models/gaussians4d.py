@@ -13,8 +13,8 @@ from gsbench.kernels.headers import LOG_SIZE_MAX, MAX_WAVES, TIME_GATE_MIN
 from gsbench.kernels.slices import observe_rotated
 from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Conditioned, Raw
-from gsbench.models.classes import Classes
 from gsbench.models.color_order import ColorOrder, coefficients_within, order_of
+from gsbench.models.effect_sets import Classes
 from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
 from gsbench.models.gated import OPACITY_MARGIN, GatedModel
 from gsbench.models.query import Query, unit

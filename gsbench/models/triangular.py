@@ -12,7 +12,7 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.kernels.slices import observe_triangular
 from gsbench.models.base import SHRINK, Conditioned, Raw
-from gsbench.models.classes import DIRECTION, TIME, Classes
+from gsbench.models.effect_sets import DIRECTION, TIME, Classes
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle, rotation, sizes
 from gsbench.models.gated import OPACITY_MARGIN, GatedModel
 from gsbench.models.query import Query, unit

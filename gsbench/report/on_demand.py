@@ -9,7 +9,7 @@ from statistics import fmean
 
 import numpy as np
 
-from gsbench.effects.words import CLASSES
+from gsbench.effects.messages import CLASSES
 from gsbench.measure.record import Gate, Record
 from gsbench.report.configurations import Configuration, Group
 from gsbench.report.intervals import Estimate, estimate

@@ -23,7 +23,7 @@ from gsbench.measure.record import Cost, Effects, OnDemand, Record, TimeScreen
 from gsbench.measure.settings import training_hash
 from gsbench.measure.speed import Effort, peak_memory, reset_peak_memory, synchroniser, time_renders
 from gsbench.models import GaussianModel
-from gsbench.models.replay import Replay
+from gsbench.models.cuda_graph import GraphedFrames
 from gsbench.models.start import start_from
 from gsbench.run import progress, stop
 from gsbench.run.auto import is_auto, plain_model, resolve, with_candidate
@@ -36,9 +36,9 @@ from gsbench.scenes.points import frustum_points, random_points
 from gsbench.scenes.trained import TrainedGaussians
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
-from gsbench.train.draws import generator
+from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer
-from gsbench.train.watch import DivergedError
+from gsbench.train.seeding import generator
 
 
 class Attempt:
@@ -277,13 +277,13 @@ def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dic
     """
     if trainer.model.backend.name != "cuda":
         return trainer.render, {}
-    replay = Replay(trainer.model, trainer.renderer.background, trainer.renderer.antialias)
+    graphed = GraphedFrames(trainer.model, trainer.renderer.background, trainer.renderer.antialias)
     try:
-        replay(first.camera, first.time)
-    except RuntimeError as error:  # an operation waits for the device, in a model or a scheme written in torch
+        graphed(first.camera, first.time)
+    except RuntimeError as error:  # an operation that waits for the device, in a model or a scheme written in torch
         print(f"FPS is that of launched frames: CUDA cannot record this model: {one_line(error)}", file=sys.stderr)
         return trainer.render, {"frames": "launched"}
-    return lambda view: replay(view.camera, view.time), {"frames": "replayed"}
+    return lambda view: graphed(view.camera, view.time), {"frames": "replayed"}
 
 
 def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[str, float | None], dict[str, str]]:

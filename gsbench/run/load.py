@@ -19,7 +19,7 @@ from gsbench.scenes import Scene
 from gsbench.scenes.scene import Points
 from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
-from gsbench.train.draws import generator
+from gsbench.train.seeding import generator
 
 EMBEDDED = f"{PACKAGE}gsbench.scenes.sample"
 MOST_PIXELS = 1 << 16  # a side

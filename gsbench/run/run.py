@@ -9,7 +9,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from gsbench.effects import words
+from gsbench.effects import messages
 from gsbench.errors import InputError, one_line, printable
 from gsbench.measure import record as records
 from gsbench.measure.atomic import remove_leftovers
@@ -22,7 +22,7 @@ from gsbench.run.finished import STALE, finished, where
 from gsbench.run.identity import Run, identify
 from gsbench.run.progress import Progress
 from gsbench.train.diagnosis import explain
-from gsbench.train.watch import DivergedError
+from gsbench.train.finite_check import DivergedError
 
 TRACEBACK = "traceback.txt"
 SPARE = 1 << 25  # bytes reserved, so that a run which ends without memory can still write its record
@@ -94,7 +94,7 @@ def _done(attempt: Attempt) -> Record:
         write(record, this.folder)
     except OSError as error:  # the other runs of the sweep go on; this one's checkpoint is what it was
         raise UnrecordedError(f"{summary(record)}; its record cannot be written: {error.strerror}") from None
-    for line in words.lines(record.on_demand) if record.on_demand else []:
+    for line in messages.lines(record.on_demand) if record.on_demand else []:
         print(f"{this.name}: {line}")
     print(f"{this.name}: {summary(record)}; {this.folder / records.FILE_NAME}")
     try:

@@ -14,7 +14,7 @@ from gsbench.run.setup import load_scene
 from gsbench.scenes.points import random_points
 from gsbench.scenes.scene import Camera, Points, Scene, View
 from gsbench.stability.cases import case
-from gsbench.train.draws import generator
+from gsbench.train.seeding import generator
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs")
 SIZE = 16  # pixels a side

@@ -16,9 +16,9 @@ from gsbench.scenes.scene import Camera, Points, Scene, View
 from gsbench.stability.cases import Case, Cell, device_of
 from gsbench.stability.training_cases import Training
 from gsbench.train.diagnosis import explain
-from gsbench.train.draws import generator
+from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer
-from gsbench.train.watch import DivergedError
+from gsbench.train.seeding import generator
 
 SEEDS = (0, 1, 2)  # of the trainings whose drift is measured
 

@@ -4,7 +4,7 @@ import hashlib
 import io
 import stat
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,13 @@ MAGIC = b"gsbench checkpoint 4\n"  # then the SHA-256 of the rest in hex and a l
 FILE_NAME = "checkpoint.pt"
 DIGEST = 64  # hex digits
 # Keys of a training's state. Every training of a seed ends with the same bits in these, interrupted or not ..
-REPRODUCED = frozenset({"step", "model", "optimizer", "density", "floor", "gating", "best"})
+REPRODUCED = frozenset({"step", "model", "optimizer", "density", "minimum_scale", "gating", "best"})
 # .. and no two have the same seconds: the state without these keys, at any depth, is what can be compared.
 TIMES = frozenset({"stages", "effort", "curve", "seconds", "frame_ms_before", "frame_ms", "frame_ms_without"})
+
+
+# Keys of a training's state in checkpoints of older versions, and their names now.
+RENAMED = {"floor": "minimum_scale"}
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,12 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
         expected = str if name in ("training", "data") else dict
         if not isinstance(value, expected):
             raise _fault(path, f"'{name}' as {type(value).__name__}")
-    return found
+    return replace(found, state=with_present_names(found.state))
+
+
+def with_present_names(state: dict[str, Any]) -> dict[str, Any]:
+    """Return a training's state with the keys that it has now, where an older version wrote it."""
+    return {RENAMED.get(key, key): value for key, value in state.items()}
 
 
 def check_plain(value: object, most: int) -> None:

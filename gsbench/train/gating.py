@@ -11,18 +11,18 @@ from torch import Tensor
 from gsbench.config import Config
 from gsbench.effects.budget import Gated, gate_within
 from gsbench.effects.direction import share_with_direction, without_direction
-from gsbench.effects.strength import MOST_VIEWS, probe
+from gsbench.effects.sensitivity import MOST_VIEWS, probe
 from gsbench.effects.visible import seen_times, share_asleep
 from gsbench.errors import InputError
 from gsbench.measure.record import Direction, Gate
 from gsbench.measure.schema import parse
 from gsbench.measure.speed import synchroniser, time_in_turns
 from gsbench.models import GaussianModel
-from gsbench.models.classes import Classes
+from gsbench.models.effect_sets import Classes
 from gsbench.models.gated import as_gated
 from gsbench.scenes import Scene, View
 from gsbench.train.density import DensityControl
-from gsbench.train.floor import Floor
+from gsbench.train.minimum_scale import MinimumScale
 from gsbench.train.optim import Optimizer
 from gsbench.train.renderer import Renderer
 
@@ -61,16 +61,16 @@ class Gating:
     """The gates of one training."""
 
     def __init__(
-        self, model: GaussianModel, optimizer: Optimizer, density: DensityControl, floor: Floor, scene: Scene,
-        renderer: Renderer, config: Config,
+        self, model: GaussianModel, optimizer: Optimizer, density: DensityControl, minimum_scale: MinimumScale,
+        scene: Scene, renderer: Renderer, config: Config,
     ) -> None:  # fmt: skip
-        """Gate `model`; the moments, the counts and the floor of its Gaussians follow.
+        """Gate `model`; the moments, the counts and the minimum scale of its Gaussians follow.
 
         Args:
             model: of the training.
             optimizer: of the model.
             density: of the model.
-            floor: of the model.
+            minimum_scale: of the model.
             scene: gives the views that are probed and those that the loss is measured on.
             renderer: of the training.
             config: says by which gates, and what they may cost.
@@ -78,7 +78,7 @@ class Gating:
         self.model = model
         self.optimizer = optimizer
         self.density = density
-        self.floor = floor
+        self.minimum_scale = minimum_scale
         self.renderer = renderer
         self.config = config
         self.gates: list[Gate] = []
@@ -149,9 +149,9 @@ class Gating:
         # In training AGR does not rest: when a Gaussian can be seen still changes.
         spans = seen_times(model, self.probed) if at_end else None
         hidden = None if spans is None else spans[:, 0].isinf()
-        strength = probe(model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
+        sensitivity = probe(model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
                          antialias=self.renderer.antialias, by_halves=by_halves, hidden=hidden)  # fmt: skip
-        found = gate_within(model, strength, budget_db, lambda gated: self.renderer.psnr(gated, self.checked), spans)
+        found = gate_within(model, sensitivity, budget_db, lambda gated: self.renderer.psnr(gated, self.checked), spans)
         if found is None:
             self.notes.append(f"{'at the end' if at_end else f'at step {step}'} no simplification cost at most "
                               f"{budget_db} dB on {self.checked_on}")  # fmt: skip
@@ -165,7 +165,7 @@ class Gating:
         become(self.model, shape_of(found.model))
         self.optimizer.follow(self.model, found.rows, found.changed)
         self.density.follow(found.rows)
-        self.floor.update()
+        self.minimum_scale.update()
 
     def state_dict(self) -> dict[str, Any]:
         """Return what was decided, for the checkpoint; the classes are the model's."""

@@ -20,13 +20,13 @@ from gsbench.scenes import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.train.checkpoint import whole_number
 from gsbench.train.density import MOST_GAUSSIANS, DensityControl
-from gsbench.train.draws import batch, generator
-from gsbench.train.floor import Floor
+from gsbench.train.finite_check import DivergedError, FiniteCheck
 from gsbench.train.gating import NO_GATES, Gating
+from gsbench.train.minimum_scale import MinimumScale
 from gsbench.train.optim import Optimizer
 from gsbench.train.renderer import Renderer
+from gsbench.train.seeding import batch, generator
 from gsbench.train.step import Step, fitting_threads
-from gsbench.train.watch import DivergedError, Watch
 
 
 @dataclass
@@ -65,14 +65,14 @@ class Trainer:
         self.schedule = Schedule(train, config.model.sh_degree, config.agr)
         self.optimizer = Optimizer(model, config.model, train, scene.extent, config.optim)
         self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity, len(scene.train))
-        self.floor = Floor(model, [view.camera for view in scene.train])
+        self.minimum_scale = MinimumScale(model, [view.camera for view in scene.train])
         self.stages = StageClock(config.device)
         self.effort = Effort()
         self.gradients = Step(model, self.renderer.background, train.ssim_weight, self.renderer.antialias, self.stages)
-        self.gating = Gating(model, self.optimizer, self.density, self.floor, scene, self.renderer, config)
-        self.watch = Watch(config.device)
+        self.gating = Gating(model, self.optimizer, self.density, self.minimum_scale, scene, self.renderer, config)
+        self.finite_check = FiniteCheck(config.device)
         if config.device.startswith("cuda"):  # a bad step is found some steps later, and must not be applied until then
-            self.optimizer.adam.found_inf = self.watch.skip  # type: ignore[attr-defined]
+            self.optimizer.adam.found_inf = self.finite_check.skip  # type: ignore[attr-defined]
         self.curve = Curve()
         self.best = Best()
         self.step = 0
@@ -111,9 +111,8 @@ class Trainer:
                 self.step += 1
                 bar.update()
                 # Seconds are those of the last point: reading the clock's own would wait for a GPU at every step.
-                bar.set_postfix_str(
-                    f"{self.curve.progress}, loss {self.watch.loss:.4f}, {len(self.model)} Gaussians", refresh=False
-                )
+                loss = f"loss {self.finite_check.loss:.4f}"
+                bar.set_postfix_str(f"{self.curve.progress}, {loss}, {len(self.model)} Gaussians", refresh=False)
                 if not goes_on():
                     break
                 if time.monotonic() - saved >= 60 * train.checkpoint_minutes and self.step < train.iterations:
@@ -149,17 +148,17 @@ class Trainer:
             with stages("density"):
                 for view, one in zip(views, seen, strict=True):
                     self.density.observe(one.radii, one.g_means2d, view.camera.width, view.camera.height, len(views))
-        self.watch.see(step, torch.stack([one.loss for one in seen]).sum(), self.model.groups())
+        self.finite_check.see(step, torch.stack([one.loss for one in seen]).sum(), self.model.groups())
         with stages("optimizer"):
             drawn = torch.cat([one.radii for one in seen]).any(0)
             self.optimizer.step(step, drawn, slowed=self.gating.slows_agr(step))
-            self.floor.hold()
+            self.minimum_scale.hold()
         with stages("density"):
             if self.schedule.densifies(step):
                 refused = self.density.densify(generator(self.config.seed, step), self.schedule.has_reset(step))
                 self._tell_full(refused)
             if (step + 1) % self.schedule.densify_every == 0:
-                self.floor.update()
+                self.minimum_scale.update()
         if self.config.effects.gate == "both" and self.schedule.gates(step):
             with stages("gate"):
                 self.gating.in_training(step + 1)
@@ -200,13 +199,13 @@ class Trainer:
         Raises:
             DivergedError: as `run`.
         """
-        self.watch.look()
+        self.finite_check.look()
         return {
             "step": self.step,
             "model": self.model.pack(),
             "optimizer": self.optimizer.state_dict(),
             "density": self.density.state_dict(),
-            "floor": self.floor.state_dict(),
+            "minimum_scale": self.minimum_scale.state_dict(),
             "gating": self.gating.state_dict(),
             "stages": self.stages.state_dict(),
             "effort": self.effort.state_dict(),
@@ -225,7 +224,7 @@ class Trainer:
             self.model.load_state(state["model"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.density.load_state_dict(state["density"])
-            self.floor.load_state_dict(state["floor"])
+            self.minimum_scale.load_state_dict(state["minimum_scale"])
             self.gating.load_state_dict(state.get("gating", NO_GATES))
             self.stages.load_state_dict(state["stages"])
             self.effort.load_state_dict(state.get("effort"))

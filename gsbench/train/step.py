@@ -19,8 +19,8 @@ from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
+from gsbench.train.finite_check import DivergedError
 from gsbench.train.losses import photometric
-from gsbench.train.watch import DivergedError
 
 Sums = dict[int, Tensor]  # gradients by the id of what they are by
 

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from gsbench.effects.messages import CLASSES
 from gsbench.effects.picture import COLOURS
-from gsbench.effects.words import CLASSES
 from gsbench.measure.images import ERROR_SCALE, inferno
 from gsbench.view.controls import ShownImage
 from gsbench.view.frame import CLASS, COST, FrameCost

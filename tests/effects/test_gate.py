@@ -6,29 +6,29 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_strength import BLACK, OPTIONS, SIZE, N, slice_of, trained_a_little, views_of
+from test_sensitivity import BLACK, OPTIONS, SIZE, N, slice_of, trained_a_little, views_of
 from torch import Tensor
 from worlds import camera
 
 from gsbench.effects.budget import gate_within
 from gsbench.effects.direction import share_with_direction
 from gsbench.effects.gate import apply, choose
-from gsbench.effects.strength import Strength, probe
+from gsbench.effects.sensitivity import Sensitivity, probe
 from gsbench.errors import InputError
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.measure.quality import psnr
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Gaussians3D
-from gsbench.models.classes import DIRECTION, Classes
-from gsbench.models.cuts import cuts_of
+from gsbench.models.effect_sets import DIRECTION, Classes
 from gsbench.models.render import render
+from gsbench.models.simplifications import simplifications_of
 
 VIEWS = 10
 
 
 @functools.cache
-def probed(name: str) -> tuple[GaussianModel, Strength]:
-    """A model and what its cuts would cost; no test may change them."""
+def probed(name: str) -> tuple[GaussianModel, Sensitivity]:
+    """A model and what its simplifications would cost; no test may change them."""
     model = trained_a_little(name, 0)
     return model, probe(model, views_of(model, 1)[:VIEWS], BLACK)
 
@@ -36,9 +36,9 @@ def probed(name: str) -> tuple[GaussianModel, Strength]:
 @functools.cache
 def gated(name: str, share: float) -> tuple[GaussianModel, GaussianModel]:
     """A model before and after a gate; no test may change them."""
-    model, strength = probed(name)
+    model, sensitivity = probed(name)
     after = copy.deepcopy(model)
-    apply(after, strength, choose(strength, after, share))
+    apply(after, sensitivity, choose(sensitivity, after, share))
     return model, after
 
 
@@ -58,13 +58,13 @@ def test_nothing_is_taken_for_nothing(name: str) -> None:
 @pytest.mark.parametrize("name", OPTIONS)
 def test_more_budget_buys_more(name: str) -> None:
     """Catches a price of error with the wrong sign, and a sum of errors that is not held."""
-    model, strength = probed(name)
+    model, sensitivity = probed(name)
     sizes = []
     for share in (0.0, 0.1, 1.0, 10.0):
         after = copy.deepcopy(model)
-        choice = choose(strength, after, share)
+        choice = choose(sensitivity, after, share)
         assert choice.predicted <= share
-        apply(after, strength, choice)
+        apply(after, sensitivity, choice)
         sizes.append(after.stored_bytes())
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] < 0.8 * sizes[0]
@@ -86,14 +86,14 @@ def test_classes_are_as_the_rows(name: str) -> None:
 
 def test_a_frozen_variable_changes_nothing() -> None:
     """Catches a Gaussian that still moves with what was frozen, or that no longer moves with what was not."""
-    model, strength = probed("7dgs")
+    model, sensitivity = probed("7dgs")
     here = Query.at(torch.tensor([0.0, 0.0, -4.0]), 0.2)
     later, beside = Query.at(here.center, 0.9), Query.at(torch.tensor([4.0, 0.0, 0.0]), 0.2)
     for name, same, different in (("time", later, beside), ("direction", beside, later), ("still", later, None)):
         after = copy.deepcopy(model)
-        everything = choose(strength, after, 0.0)
+        everything = choose(sensitivity, after, 0.0)
         all_rows = {key: torch.full((N,), key == name) for key in everything.geometry}
-        apply(after, strength, replace(everything, geometry=all_rows))
+        apply(after, sensitivity, replace(everything, geometry=all_rows))
         assert after.count_classes()[name] == len(after) == N
         for a, b in zip(after.slice(here)[:3], after.slice(same)[:3], strict=True):
             torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
@@ -109,8 +109,8 @@ def test_a_second_gate_takes_no_more_for_nothing(name: str) -> None:
     """Catches a gate that undoes or pays again for what an earlier one did."""
     _, after = gated(name, 3.0)
     again = copy.deepcopy(after)
-    strength = probe(after, views_of(after, 1)[:VIEWS], BLACK)
-    rows, _ = apply(again, strength, choose(strength, again, 0.0))
+    sensitivity = probe(after, views_of(after, 1)[:VIEWS], BLACK)
+    rows, _ = apply(again, sensitivity, choose(sensitivity, again, 0.0))
     assert again.count_classes()["refined"] <= after.count_classes()["refined"]
     assert len(rows) <= len(after)
     for a, b in zip(images(after), images(again), strict=True):
@@ -124,19 +124,19 @@ def _up_to_turns(gaussians: Gaussians3D) -> Gaussians3D:
 
 @pytest.mark.parametrize("name", OPTIONS)
 def test_a_cut_leaves_the_rows_behind_it(name: str) -> None:
-    """Catches a cut of a gated model that changes Gaussians whose errors the probe does not look at."""
+    """Catches a simplification of a gated model that changes Gaussians whose errors the probe does not look at."""
     _, after = gated(name, 3.0)
     views = views_of(after, 1)[:VIEWS]
     queries = [Query.of(view.camera, view.time) for view in views]
     live = [after.slice(query) for query in queries]
     errors = probe(after, views, BLACK).errors
-    for cut in cuts_of(after, queries, live):
+    for simplification in simplifications_of(after, queries, live):
         for query, before in zip(queries, live, strict=True):
-            changed = slice_of(after, cut, before, query)
+            changed = slice_of(after, simplification, before, query)
             for a, b in zip(_up_to_turns(before), _up_to_turns(changed), strict=True):
-                torch.testing.assert_close(a[cut.rows :], b[cut.rows :], atol=1e-5, rtol=1e-5)
-        assert (errors[cut.name][cut.rows :] == 0).all()
-        assert cut.rows == 0 or (errors[cut.name][: cut.rows] > 0).any()
+                torch.testing.assert_close(a[simplification.rows :], b[simplification.rows :], atol=1e-5, rtol=1e-5)
+        assert (errors[simplification.name][simplification.rows :] == 0).all()
+        assert simplification.rows == 0 or (errors[simplification.name][: simplification.rows] > 0).any()
 
 
 @pytest.mark.parametrize("name", OPTIONS)
@@ -196,12 +196,12 @@ def test_the_loss_is_measured_and_not_only_predicted() -> None:
     """Catches a gate that goes by its prediction where the views it is checked on say otherwise."""
     model = trained_a_little("7dgs", 0)
     views = views_of(model, 1)
-    strength = probe(model, views[5:], BLACK)
+    sensitivity = probe(model, views[5:], BLACK)
 
     def measure(one: GaussianModel) -> float:
         return sum(psnr(render(one, view.camera, view.time, BLACK), view.image) for view in views[:5]) / 5
 
-    found = gate_within(model, strength, 0.3, measure)
+    found = gate_within(model, sensitivity, 0.3, measure)
     assert found is not None
     assert found.gate.measured_db <= 0.3
     assert found.gate.measured_db == pytest.approx(measure(model) - measure(found.model), abs=1e-9)
@@ -209,4 +209,4 @@ def test_the_loss_is_measured_and_not_only_predicted() -> None:
     assert found.gate.bytes < found.gate.bytes_before == model.stored_bytes()
     assert model.classes is None
     worse = iter([30.0] + [20.0] * 20)
-    assert gate_within(model, strength, 0.3, lambda _: next(worse)) is None
+    assert gate_within(model, sensitivity, 0.3, lambda _: next(worse)) is None

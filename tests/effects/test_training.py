@@ -10,7 +10,7 @@ from tiny_run import gsbench, overrides, write_moving_square
 
 from gsbench.effects import __main__ as command
 from gsbench.effects.direction import without_direction
-from gsbench.effects.strength import probe
+from gsbench.effects.sensitivity import probe
 from gsbench.measure import record
 from gsbench.measure.record import Gate
 from gsbench.run.load import load_run
@@ -19,10 +19,10 @@ from gsbench.scenes.scene import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train import gating
-from gsbench.train.draws import generator
 from gsbench.train.gating import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating, become
 from gsbench.train.loop import Trainer
 from gsbench.train.renderer import Renderer
+from gsbench.train.seeding import generator
 
 STEPS = 100
 
@@ -44,7 +44,7 @@ def end(one: Trainer) -> dict[str, object]:
     states: list[dict[str, object]] = []
     one.run(lambda state: states.append(copy.deepcopy(state)), "test")
     last = states[-1]
-    return {key: last[key] for key in ("model", "optimizer", "density", "floor")}
+    return {key: last[key] for key in ("model", "optimizer", "density", "minimum_scale")}
 
 
 def assert_same(a: object, b: object) -> None:

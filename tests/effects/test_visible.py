@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_strength import BLACK, N, trained_a_little, views_of
+from test_sensitivity import BLACK, N, trained_a_little, views_of
 
 from gsbench.effects.gate import apply, choose, classes_of
-from gsbench.effects.strength import probe
+from gsbench.effects.sensitivity import probe
 from gsbench.effects.visible import seen_times, share_asleep
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import GaussianModel, Query
@@ -64,11 +64,11 @@ def test_agr_rests_unseen() -> None:
     model = fleeting()
     views = views_of(model, 1)
     spans = seen_times(model, views)
-    strength = probe(model, views, BLACK)
+    sensitivity = probe(model, views, BLACK)
     gated, resting = copy.deepcopy(model), copy.deepcopy(model)
-    choice = choose(strength, model, 0.0)
-    rows, _ = apply(gated, strength, choice)
-    again, _ = apply(resting, strength, choice, spans)
+    choice = choose(sensitivity, model, 0.0)
+    rows, _ = apply(gated, sensitivity, choice)
+    again, _ = apply(resting, sensitivity, choice, spans)
     assert sorted(rows.tolist()) == sorted(again.tolist())
     assert resting.classes is not None
     assert resting.classes.spans is not None
@@ -98,6 +98,6 @@ def test_what_no_view_shows_is_removed(most: int) -> None:
     errors = probe(model, views, BLACK, most=most, hidden=hidden).errors["removed"]
     assert (errors[hidden] == 0).all()
     after = copy.deepcopy(model)
-    strength = probe(model, views, BLACK, most=most, hidden=hidden)
-    rows, _ = apply(after, strength, choose(strength, model, 0.0))
+    sensitivity = probe(model, views, BLACK, most=most, hidden=hidden)
+    rows, _ = apply(after, sensitivity, choose(sensitivity, model, 0.0))
     assert not hidden[rows].any()

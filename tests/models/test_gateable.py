@@ -10,7 +10,7 @@ from gsbench import models
 from gsbench.errors import InputError
 from gsbench.models import registry
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
-from gsbench.models.classes import Classes
+from gsbench.models.effect_sets import Classes
 from gsbench.models.gated import GatedModel, as_gated
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.scenes.scene import Points

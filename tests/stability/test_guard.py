@@ -27,10 +27,10 @@ from gsbench.stability import (
 from gsbench.stability.cases import CASES
 from gsbench.train import checkpoint, diagnosis
 from gsbench.train.checkpoint import Checkpoint
-from gsbench.train.draws import generator
+from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer
+from gsbench.train.seeding import generator
 from gsbench.train.step import Seen
-from gsbench.train.watch import DivergedError
 
 POISONED = 7
 

@@ -222,7 +222,7 @@ def test_sparse_adam_is_adam_where_all_is_drawn_and_rests_elsewhere() -> None:
 
 @pytest.mark.parametrize("kind", ["adam", "sparse_adam"])
 def test_a_bad_step_that_is_found_later_changes_nothing(kind: str) -> None:
-    """Catches an update, or a count of it, where the watch of a GPU has said that a gradient was not finite."""
+    """Catches an update, or a count of it, where the finite check of a GPU has said that a gradient was not finite."""
     model, optimizer = fitted(kind=kind)
     descend(model, optimizer, 0)
     before, moments = copy.deepcopy(model.state_dict()), copy.deepcopy(optimizer.adam.state_dict()["state"])

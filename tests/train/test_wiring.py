@@ -14,9 +14,9 @@ from gsbench.models import Query
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene
 from gsbench.stability.training_cases import compose, moving_square
-from gsbench.train.draws import generator
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import rate_at
+from gsbench.train.seeding import generator
 from gsbench.train.step import Seen
 
 
@@ -41,7 +41,7 @@ def gradient_of_a_step(batch: int) -> tuple[torch.Tensor, torch.Tensor, float]:
     fitted.optimizer.step = lambda *_, **__: seen.append(means.grad)  # type: ignore[method-assign]
     fitted._descend()
     assert means.grad is not None
-    return means.grad.clone(), fitted.density.gradient / fitted.density.seen.clamp(min=1), fitted.watch.loss
+    return means.grad.clone(), fitted.density.gradient / fitted.density.seen.clamp(min=1), fitted.finite_check.loss
 
 
 def test_a_batch_is_a_mean() -> None:
@@ -248,7 +248,7 @@ def test_the_size_of_4dgs_is_its_largest_in_space() -> None:
 
 
 def test_the_floor_is_held_in_training_and_follows_the_rows() -> None:
-    """Catches a floor that is never held, or that is of other Gaussians once rows were moved."""
+    """Catches a minimum scale that is never held, or that is of other Gaussians once rows were moved."""
     fitted = trainer("7dgs", "train.densify.every=1")
     sizes = fitted.model.splats["log_diagonal"]
     for step in (0, 60):
@@ -257,9 +257,9 @@ def test_the_floor_is_held_in_training_and_follows_the_rows() -> None:
         fitted.step = step
         fitted._descend()
         held = fitted.model.splats["log_diagonal"].detach()[:, 4:].amin(1)
-        assert len(held) == len(fitted.floor.least)
+        assert len(held) == len(fitted.minimum_scale.least)
         if step == 0:
-            torch.testing.assert_close(held, fitted.floor.least.log(), rtol=1e-2, atol=0)
+            torch.testing.assert_close(held, fitted.minimum_scale.least.log(), rtol=1e-2, atol=0)
 
 
 def test_the_bar_tells_seconds_and_val_without_reading_the_clock(

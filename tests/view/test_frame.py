@@ -16,7 +16,7 @@ from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.kernels.library import Library
 from gsbench.measure.images import to_bytes
 from gsbench.models import Query
-from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes
+from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, Classes
 from gsbench.models.render import rasterize_slice, render
 from gsbench.run.load import LoadedRun, SceneDescription
 from gsbench.scenes import Camera

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from gsbench.effects.messages import CLASSES
 from gsbench.effects.picture import COLOURS
-from gsbench.effects.words import CLASSES
-from gsbench.models.classes import NAMES
+from gsbench.models.effect_sets import NAMES
 from gsbench.scenes import Camera, View
 from gsbench.view.frame import CLASS, COST, IMAGE, FrameCost
 from gsbench.view.nearest import Nearest, ViewComparison

@@ -5,7 +5,7 @@ from collections import Counter
 from pathlib import Path
 from statistics import fmean
 
-from gsbench.effects.words import CLASSES, of_decision
+from gsbench.effects.messages import CLASSES, of_decision
 from gsbench.measure.record import Record, TimeScreen
 from gsbench.report.configurations import Group
 from gsbench.report.intervals import Estimate

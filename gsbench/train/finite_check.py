@@ -1,4 +1,4 @@
-"""Watch a training for the first loss or gradient that is not finite, without waiting for the GPU at every step."""
+"""Check every loss and gradient of a training for NaN and infinity, without a wait for the GPU at every step."""
 
 import math
 
@@ -12,7 +12,7 @@ class DivergedError(RuntimeError):
     """A loss or a gradient was not finite."""
 
 
-class Watch:
+class FiniteCheck:
     """Checks the loss and the gradients of every step on their device, and raises when the result is read.
 
     On a GPU the result is read some steps later. From the first bad step on, `skip` [] is therefore 1 instead of 0, and
@@ -20,7 +20,7 @@ class Watch:
     """
 
     def __init__(self, device: str) -> None:
-        """Watch a training on `device` ("cpu", "cuda", "cuda:1")."""
+        """Check a training on `device` ("cpu", "cuda", "cuda:1")."""
         self.every = LOOK_EVERY if device.startswith("cuda") else 1
         self.loss = math.nan  # of the last step that was read
         self._names: list[str] = []

@@ -5,11 +5,11 @@ import torch
 from torch import Tensor
 from worlds import camera
 
-from gsbench.effects.strength import probe
+from gsbench.effects.sensitivity import probe
 from gsbench.models import GaussianModel, Query, build
 from gsbench.models.base import Gaussians3D
-from gsbench.models.cuts import Cut, cuts_of
 from gsbench.models.render import rasterize_slice
+from gsbench.models.simplifications import Simplification, simplifications_of
 from gsbench.scenes.scene import Points, View
 from gsbench.schedule import Phase
 
@@ -52,25 +52,25 @@ def views_of(model: GaussianModel, seed: int) -> list[View]:
     return film
 
 
-def slice_of(model: GaussianModel, cut: Cut, live: Gaussians3D, query: Query) -> Gaussians3D:
-    """All Gaussians as the cut has them."""
-    if cut.raw is None:
+def slice_of(model: GaussianModel, simplification: Simplification, live: Gaussians3D, query: Query) -> Gaussians3D:
+    """All Gaussians as the simplification has them."""
+    if simplification.raw is None:
         return live._replace(opacities=torch.zeros_like(live.opacities))
-    if cut.level is not None:
-        raw = model.refined(query) | cut.raw
+    if simplification.level is not None:
+        raw = model.refined(query) | simplification.raw
         return live._replace(colors=model.paint(raw, live.means, live.opacities, query))
-    raw = dict(model.splats.items()) | cut.raw
+    raw = dict(model.splats.items()) | simplification.raw
     means, factors, opacities = model.observe(raw, query)
     return Gaussians3D(means, factors, opacities, model.paint(raw, means, opacities, query))
 
 
-def brute_force(model: GaussianModel, views: list[View], cut: Cut) -> Tensor:
-    """The error that each Gaussian adds when it alone becomes the cut, what improves a view not counted, [N]."""
+def brute_force(model: GaussianModel, views: list[View], simplification: Simplification) -> Tensor:
+    """The error that each Gaussian adds when it alone is simplified, what improves a view not counted, [N]."""
     errors = torch.zeros(len(model))
     for view in views:
         query = Query.of(view.camera, view.time)
         live = model.slice(query)
-        changed = slice_of(model, cut, live, query)
+        changed = slice_of(model, simplification, live, query)
         before = rasterize_slice(live, view.camera, BLACK, model.backend).image[0]
         for i in range(len(model)):
             one = Gaussians3D(*(x.clone() for x in live))
@@ -95,21 +95,21 @@ def test_prediction_against_brute_force(name: str) -> None:
     predicted = probe(model, views, BLACK, draws=4)
     queries = [Query.of(view.camera, view.time) for view in views]
     seen = [model.slice(query) for query in queries]
-    for cut in cuts_of(model, queries, seen):
-        true, guess = brute_force(model, views, cut), predicted.errors[cut.name]
+    for simplification in simplifications_of(model, queries, seen):
+        true, guess = brute_force(model, views, simplification), predicted.errors[simplification.name]
         # The image is linear in opacities and colours, and not in what moves: docs/effects.md has the figures.
-        linear = cut.raw is None or cut.level is not None
+        linear = simplification.raw is None or simplification.level is not None
         # One that changes places in depth with another is predicted at 0.38 of its error.
         least_rank, least_share = (0.98, 0.5) if linear else (0.92 if name == "4dgs" else 0.95, 0.35)
-        assert float(torch.corrcoef(torch.stack([ranks(true), ranks(guess)]))[0, 1]) > least_rank, cut.name
+        assert float(torch.corrcoef(torch.stack([ranks(true), ranks(guess)]))[0, 1]) > least_rank, simplification.name
         worst = true.argsort(descending=True)[: N // 3]
-        assert (guess[worst] > least_share * true[worst]).all(), cut.name
+        assert (guess[worst] > least_share * true[worst]).all(), simplification.name
         if linear:
-            assert float(guess.sum() / true.sum()) == pytest.approx(1, abs=0.15), cut.name
+            assert float(guess.sum() / true.sum()) == pytest.approx(1, abs=0.15), simplification.name
 
 
 def test_an_opaque_gaussian_is_no_harder_to_predict() -> None:
-    """Catches a cut drawn behind or within the opaque Gaussian that it stands for, and so predicted too cheap."""
+    """Catches a simplification drawn behind or within its own opaque Gaussian, and so predicted too cheap."""
     random = torch.Generator().manual_seed(0)
     points = Points(torch.cartesian_prod(torch.tensor([-0.9, 0, 0.9]), torch.tensor([-0.5, 0.5]), torch.zeros(1)),
                     torch.rand(6, 3, generator=random))  # fmt: skip
@@ -123,7 +123,8 @@ def test_an_opaque_gaussian_is_no_harder_to_predict() -> None:
         model.splats["opacities"][:] = logit
         views = views_of(model, 1)
         queries = [Query.of(view.camera, view.time) for view in views]
-        still = next(cut for cut in cuts_of(model, queries, [model.slice(q) for q in queries]) if cut.name == "still")
+        ways = simplifications_of(model, queries, [model.slice(q) for q in queries])
+        still = next(way for way in ways if way.name == "still")
         ratios[name] = probe(model, views, BLACK, draws=8).errors["still"] / brute_force(model, views, still)
     assert ratios["opaque"].mean() / ratios["transparent"].mean() == pytest.approx(1, abs=0.15)
 

@@ -2,7 +2,7 @@
 
 from gsbench.measure.record import Direction, Gate, OnDemand, TimeScreen
 
-CLASSES = {  # of Gaussians: the names of gsbench.models.classes, in its order, and what they are called
+CLASSES = {  # of Gaussians: the names of gsbench.models.effect_sets, in its order, and what they are called
     "refined": "refined by AGR",
     "sliced": "sliced",
     "time": "time frozen",

@@ -1,4 +1,4 @@
-"""What the watch makes of losses and gradients, and that a step found to be bad only later is not applied meanwhile."""
+"""What the finite check makes of losses and gradients; a step found to be bad only later is not applied meanwhile."""
 
 import math
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from gsbench.train.watch import DivergedError, Watch
+from gsbench.train.finite_check import DivergedError, FiniteCheck
 
 
 def parameter(gradient: list[float]) -> nn.Parameter:
@@ -19,24 +19,24 @@ def parameter(gradient: list[float]) -> nn.Parameter:
 def test_the_parameter_is_named_at_its_step(bad: float) -> None:
     """Catches a bad gradient that reaches its parameter, or is blamed on another parameter or step."""
     groups = {"means": [parameter([1.0, 2.0])], "refinement": [parameter([1.0]), parameter([0.0, bad])]}
-    seen = Watch("cpu")
+    seen = FiniteCheck("cpu")
     with pytest.raises(DivergedError, match=r"step 3: the gradient of 'refinement' is not finite \(loss 0.5\)"):
         seen.see(3, torch.tensor(0.5), groups)
     with pytest.raises(DivergedError, match="step 4: the loss is nan"):
-        Watch("cpu").see(4, torch.tensor(math.nan), {"means": [parameter([1.0])]})
+        FiniteCheck("cpu").see(4, torch.tensor(math.nan), {"means": [parameter([1.0])]})
 
 
 def test_finite_values_whose_sum_is_not_are_let_through() -> None:
     """Catches a check of the sum alone, and a parameter without a gradient taken for a fault."""
     unused = nn.Parameter(torch.zeros(1))
-    seen = Watch("cpu")
+    seen = FiniteCheck("cpu")
     seen.see(0, torch.tensor(0.25), {"means": [parameter([3e38, 3e38])], "unused": [unused]})
     assert seen.loss == 0.25
 
 
 def test_a_bad_step_found_later_changes_nothing_meanwhile() -> None:
     """Catches a GPU's training, looked at now and then, that applies a bad gradient, or a good one after it."""
-    seen = Watch("cpu")
+    seen = FiniteCheck("cpu")
     seen.every = 4
     fitted = nn.Parameter(torch.zeros(3))
     adam = torch.optim.Adam([fitted], lr=0.1, fused=True)

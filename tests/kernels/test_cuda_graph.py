@@ -12,9 +12,9 @@ from benchmarks.scene import model
 from gsbench.errors import InputError
 from gsbench.kernels.backends import CUDA, REFERENCE
 from gsbench.kernels.raster import Viewport
-from gsbench.models import GaussianModel, Query, replay
+from gsbench.models import GaussianModel, Query, cuda_graph
+from gsbench.models.cuda_graph import GraphedFrames
 from gsbench.models.render import render
-from gsbench.models.replay import Replay
 from gsbench.raster import EPS2D, FAR, NEAR
 from gsbench.raster.native import draw_within
 from gsbench.scenes.scene import Camera
@@ -29,7 +29,7 @@ def camera(device: str, distance: float = 4.0, size: int = 40) -> Camera:
 
 
 def called_again(call: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
-    """`replay.capture` where there is no GPU: its results are overwritten, as a graph's are."""
+    """`cuda_graph.capture` where there is no GPU: its results are overwritten, as a graph's are."""
     results = call()
 
     def play() -> None:
@@ -43,8 +43,8 @@ def called_again(call: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
 def device(cuda_device: str, monkeypatch: pytest.MonkeyPatch) -> str:
     """Where replays run."""
     if cuda_device == "cpu":
-        monkeypatch.setattr(replay, "capture", called_again)
-        monkeypatch.setattr(replay, "resolve", lambda *_: CUDA)
+        monkeypatch.setattr(cuda_graph, "capture", called_again)
+        monkeypatch.setattr(cuda_graph, "resolve", lambda *_: CUDA)
     return cuda_device
 
 
@@ -53,7 +53,9 @@ def large(name: str, device: str, agr: bool = False) -> GaussianModel:
     return model(name, 300, agr=agr, sigma=0.2).to(device)
 
 
-def both(device: str, name: str, agr: bool = False) -> tuple[GaussianModel, Replay, Callable[[Camera, float], Tensor]]:
+def both(
+    device: str, name: str, agr: bool = False
+) -> tuple[GaussianModel, GraphedFrames, Callable[[Camera, float], Tensor]]:
     """A model, its replay, and its launched render."""
     fitted, background = large(name, device, agr), torch.tensor(BACKGROUND, device=device)
 
@@ -61,7 +63,7 @@ def both(device: str, name: str, agr: bool = False) -> tuple[GaussianModel, Repl
         with torch.no_grad():
             return render(fitted, camera, time, background)
 
-    return fitted, Replay(fitted, background), launched
+    return fitted, GraphedFrames(fitted, background), launched
 
 
 @pytest.mark.parametrize(("name", "agr"), [("3dgs", False), ("4dgs", False), ("6dgs", True), ("7dgs", True)])
@@ -119,4 +121,4 @@ def test_too_little_room_is_told(N: int, room: int, device: str) -> None:
 def test_only_the_cuda_backend_is_replayed() -> None:
     """Catches a graph asked for where nothing records one."""
     with pytest.raises(InputError, match=r"expected raster\.backend=cuda, got 'reference'"):
-        Replay(model("3dgs", 5, backend=REFERENCE), torch.zeros(3))
+        GraphedFrames(model("3dgs", 5, backend=REFERENCE), torch.zeros(3))

@@ -9,7 +9,7 @@ from gsbench.models import GaussianModel, Query, build
 from gsbench.models.render import render
 from gsbench.scenes import Camera
 from gsbench.scenes.points import random_points
-from gsbench.train.floor import LEAST_PIXELS, Floor
+from gsbench.train.minimum_scale import LEAST_PIXELS, MinimumScale
 
 OPTIONS = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_d": 0.05, "lambda_t": 0.05}}
 
@@ -34,8 +34,8 @@ def test_the_floor_is_a_part_of_a_pixel_at_the_nearest_camera() -> None:
     """Catches the farthest camera, a mean over cameras, or a focal length that is left out."""
     model = flat("3dgs")
     model.splats["means"].data.zero_()
-    floor = Floor(model, [camera(4.0), camera(2.0), camera(2.5, focal=100.0)])
-    torch.testing.assert_close(floor.least, torch.full((200,), LEAST_PIXELS * 2.5 / 100))
+    minimum_scale = MinimumScale(model, [camera(4.0), camera(2.0), camera(2.5, focal=100.0)])
+    torch.testing.assert_close(minimum_scale.least, torch.full((200,), LEAST_PIXELS * 2.5 / 100))
 
 
 def test_the_floor_is_of_the_finer_axis_of_the_pixels() -> None:
@@ -45,7 +45,7 @@ def test_the_floor_is_of_the_finer_axis_of_the_pixels() -> None:
     for axis in (0, 1):
         K = wide.K.clone()
         K[axis, axis] = 80.0
-        least = Floor(model, [Camera(wide.viewmat, K, 48, 48)]).least
+        least = MinimumScale(model, [Camera(wide.viewmat, K, 48, 48)]).least
         torch.testing.assert_close(least, torch.full((200,), LEAST_PIXELS * 2.0 / 80))
 
 
@@ -57,25 +57,25 @@ def test_no_camera_sees_the_floor(name: str) -> None:
     before = render(model, eye, 0.5, background)
     others = {n: p.detach().clone() for n, p in model.splats.items() if n not in ("scales", "log_diagonal")}
     durations = model.splats["scales"].detach()[:, 3:].clone() if name == "4dgs" else None
-    floor = Floor(model, [eye])
-    floor.hold()
+    minimum_scale = MinimumScale(model, [eye])
+    minimum_scale.hold()
     after = render(model, eye, 0.5, background)
     assert 0 < (after - before).abs().max() < 1 / 255
     factors = model.slice(Query.at(eye.center, 0.5)).factors
-    assert (torch.linalg.svdvals(factors)[:, 2] >= 0.99 * floor.least).all()
+    assert (torch.linalg.svdvals(factors)[:, 2] >= 0.99 * minimum_scale.least).all()
     assert all(torch.equal(model.splats[n], p) for n, p in others.items())
     assert durations is None or torch.equal(model.splats["scales"][:, 3:], durations)
 
 
 @pytest.mark.parametrize("name", OPTIONS)
 def test_only_sizes_in_space_are_held(name: str) -> None:
-    """Catches a floor that lengthens what is short in time, or widens what is narrow in direction."""
+    """Catches a minimum scale that lengthens what is short in time, or widens what is narrow in direction."""
     model = flat(name)
     space = model.rows["p"] if name in ("6dgs", "7dgs") else [0, 1, 2]
     sizes = model.splats["log_diagonal" if name in ("6dgs", "7dgs") else "scales"].data
     sizes.fill_(math.log(1e-7))
-    floor = Floor(model, [camera(4.0)])
-    floor.hold()
+    minimum_scale = MinimumScale(model, [camera(4.0)])
+    minimum_scale.hold()
     for column in range(sizes.shape[1]):
-        expected = floor.least if column in space else torch.full((200,), 1e-7)
+        expected = minimum_scale.least if column in space else torch.full((200,), 1e-7)
         torch.testing.assert_close(sizes[:, column].exp(), expected, rtol=1e-4, atol=0)

@@ -1,7 +1,7 @@
 """Predict what every simplification of every Gaussian would cost, all of them at once, from a few renders.
 
-A cut of a Gaussian (AGR baked in, time or direction frozen, fewer harmonics, removed) changes its slice in view v
-by delta_v, and the image by x_v. With r the image minus the truth, the squared error of all views grows by
+A simplification of a Gaussian (AGR baked in, time or direction frozen, fewer harmonics, removed) changes its slice in
+view v by delta_v, and the image by x_v. With r the image minus the truth, the squared error of all views grows by
 
     E = sum over v of max(0, 2 <r, x_v>) + <g, x_v>^2,
 
@@ -10,9 +10,9 @@ views is not counted on. Products of r and g with J, the derivative of the image
 all Gaussians at once:
 
 - The image is linear in a Gaussian's colour and in its opacity, so x = J delta for fewer harmonics and for a removal.
-- A cut that moves a Gaussian by less than its size has x = (J + J') delta / 2, with J' at the cut. For that the cuts
-  are drawn beside the model's own Gaussians, so thin that they hide nothing of one another; what the model's own one
-  hides of its cut is added.
+- A simplification that moves a Gaussian by less than its size has x = (J + J') delta / 2, with J' at the
+  simplification. For that the simplifications are drawn beside the model's own Gaussians, so thin that they hide
+  nothing of one another; what the model's own one hides of its simplification is added.
 - One that moves it farther is missed in one place and seen in another: |x|^2 is the sum of both squares.
 
 Two equal Gaussians that are d standard deviations apart overlap by exp(-d^2 / 4); by so much the second case counts,
@@ -32,9 +32,9 @@ from gsbench.kernels.tape import Tape
 from gsbench.measure.quality import evenly
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Gaussians3D
-from gsbench.models.cuts import REMOVED, Cut, cuts_of
 from gsbench.models.gated import GatedModel
 from gsbench.models.render import rasterize_slice
+from gsbench.models.simplifications import REMOVED, Simplification, simplifications_of
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import Camera, View
 
@@ -47,11 +47,11 @@ OPACITY, COLOR = 12, slice(13, 16)  # columns of `_rows_of`
 
 
 @dataclass(frozen=True)
-class Strength:
-    """What each cut of each Gaussian would add to the squared error of the training views."""
+class Sensitivity:
+    """What each simplification of each Gaussian would add to the squared error of the training views."""
 
-    cuts: list[Cut]
-    errors: dict[str, Tensor]  # [N] by the name of the cut, summed over pixels, channels and views
+    simplifications: list[Simplification]
+    errors: dict[str, Tensor]  # [N] by the name of the simplification, summed over pixels, channels and views
     total: float  # the squared error of the model as it is, in the same units
 
 
@@ -67,8 +67,8 @@ def probe(
     antialias: bool = False,
     by_halves: bool = True,
     hidden: Tensor | None = None,  # [N] bool
-) -> Strength:
-    """Predict the error of every cut of every Gaussian.
+) -> Sensitivity:
+    """Predict the error of every simplification of every Gaussian.
 
     Args:
         model: trained, or on its way.
@@ -85,12 +85,12 @@ def probe(
     queries = [Query.of(view.camera, view.time) for view in looked_at]
     workers = model.backend.workers(model.splats["means"])
     seen = list(side_by_side(model.slice, queries, workers))
-    cuts = cuts_of(model, queries, seen, by_halves)
+    simplifications = simplifications_of(model, queries, seen, by_halves)
     random = torch.Generator().manual_seed(seed)
     seeds = torch.randint(2**62, (len(looked_at),), generator=random).tolist()
 
     def errors_in(v: int) -> tuple[float, list[Tensor]]:
-        """Return the squared error of a view as it is, and what each cut would add to it."""
+        """Return the squared error of a view as it is, and what each simplification would add to it."""
         view = looked_at[v]
         drawing = Drawing(model, view.camera, background, antialias)
         here = drawing(seen[v])
@@ -101,17 +101,17 @@ def probe(
         products = here.products(vectors)
         removed = -products[..., OPACITY] * seen[v].opacities
         place = Place(model, queries[v], seen[v], _rows_of(seen[v]), here, products, vectors, removed)
-        return float(residual.square().sum()), [_error(cut, place, drawing) for cut in cuts]
+        return float(residual.square().sum()), [_error(one, place, drawing) for one in simplifications]
 
-    errors, total = {cut.name: torch.zeros_like(seen[0].opacities) for cut in cuts}, 0.0
+    errors, total = {one.name: torch.zeros_like(seen[0].opacities) for one in simplifications}, 0.0
     for squared, added in side_by_side(errors_in, range(len(looked_at)), workers):
         total += squared
-        for cut, error in zip(cuts, added, strict=True):
-            errors[cut.name] += error
+        for simplification, error in zip(simplifications, added, strict=True):
+            errors[simplification.name] += error
     if len(looked_at) < len(views):  # of a Gaussian in none of these views nothing is known, so nothing is taken
         unknown = (errors[REMOVED] == 0) if hidden is None else (errors[REMOVED] == 0) & ~hidden
         errors = {name: torch.where(unknown, math.inf, error) for name, error in errors.items()}
-    return Strength(cuts, errors, total)
+    return Sensitivity(simplifications, errors, total)
 
 
 class Drawn(NamedTuple):
@@ -168,18 +168,18 @@ class Place(NamedTuple):
     removed: Tensor  # [K, N] what each Gaussian's removal changes, times each of the vectors
 
 
-def _error(cut: Cut, here: Place, draw: Drawing) -> Tensor:
-    """Compute E [N] of a cut in one view."""
+def _error(simplification: Simplification, here: Place, draw: Drawing) -> Tensor:
+    """Compute E [N] of a simplification in one view."""
     model, live = here.model, here.live
-    if cut.raw is None:
+    if simplification.raw is None:
         return _grown(here.removed)
-    raw = dict(model.splats.items()) | cut.raw
-    if cut.level is not None:
+    raw = dict(model.splats.items()) | simplification.raw
+    if simplification.level is not None:
         colors = model.paint(raw, live.means, live.opacities, here.query)
         return _grown((here.products[..., COLOR] * (colors - live.colors)).sum(-1))
     means, factors, opacities = model.observe(raw, here.query)
     whole = Gaussians3D(means, factors, opacities, model.paint(raw, means, opacities, here.query))
-    N, n = len(live.means), cut.rows
+    N, n = len(live.means), simplification.rows
     changed = Gaussians3D(*(x[:n] for x in whole))
     thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))
     both = draw(Gaussians3D(*(torch.cat(pair) for pair in zip(live, thin, strict=True))))

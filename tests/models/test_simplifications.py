@@ -1,11 +1,11 @@
-"""What a cut keeps of a Gaussian: the colours that it had on average, and the effect that was not frozen."""
+"""What a simplification keeps of a Gaussian: the colours that it had on average, and the effect that was not frozen."""
 
 import pytest
 import torch
 from small import CAMERA, fresh, lively, seeded
 
 from gsbench.models import Query
-from gsbench.models.cuts import cuts_of, shares_of
+from gsbench.models.simplifications import shares_of, simplifications_of
 
 
 @pytest.mark.parametrize("variant", ["3dgs", "4dgs"])
@@ -22,10 +22,10 @@ def test_fewer_harmonics_have_the_same_colour_on_average(variant: str) -> None:
     seen = [model.slice(query) for query in queries]
     weights = shares_of([one.opacities for one in seen])
     assert min(float(one.colors.amin()) for one in seen) > 0
-    cuts = [cut for cut in cuts_of(model, queries, seen) if cut.level is not None]
-    assert [cut.level for cut in cuts] == model.lower_levels()
-    for cut in cuts:
-        raw = dict(model.splats.items()) | cut.raw
+    simplifications = [one for one in simplifications_of(model, queries, seen) if one.level is not None]
+    assert [simplification.level for simplification in simplifications] == model.lower_levels()
+    for simplification in simplifications:
+        raw = dict(model.splats.items()) | simplification.raw
         colors = torch.stack(
             [model.paint(raw, one.means, one.opacities, q) for q, one in zip(queries, seen, strict=True)]
         )

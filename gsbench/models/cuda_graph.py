@@ -31,7 +31,7 @@ class _Recording(NamedTuple):
     room: int  # for intersections
 
 
-class Replay:
+class GraphedFrames:
     """`render` of a model on a GPU that launches no kernels by itself and waits only at the end of an image.
 
     The first call for an image size records a graph, which fixes the numbers of Gaussians and of pixels. `render` waits
@@ -47,8 +47,8 @@ class Replay:
         """
         backend = resolve(model.backend.name, model.splats["means"].device.type)
         if backend.name != "cuda":
-            raise InputError(f"replay: expected raster.backend=cuda, got '{backend.name}': only a GPU records what it "
-                             "does")  # fmt: skip
+            raise InputError(f"CUDA graph: expected raster.backend=cuda, got '{backend.name}': only a GPU records what "
+                             f"it does")  # fmt: skip
         self.model = model
         self.background = background
         self.antialias = antialias

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsbench.models.base import GaussianModel, Gaussians3D, Raw
-from gsbench.models.classes import Classes
+from gsbench.models.effect_sets import Classes
 from gsbench.models.gated import GatedModel
 from gsbench.models.query import Query
 from gsbench.process.workers import side_by_side
@@ -23,7 +23,7 @@ FEW = 1e-6  # added to weights: a Gaussian that no query sees is averaged over a
 
 
 @dataclass(frozen=True)
-class Cut:
+class Simplification:
     """All Gaussians of a model, simplified in one way."""
 
     name: str
@@ -32,9 +32,9 @@ class Cut:
     level: int | None = None  # of the harmonics that are left (see Classes.levels), where only the colour changes
 
 
-def cuts_of(
+def simplifications_of(
     model: GatedModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], by_halves: bool = True
-) -> list[Cut]:
+) -> list[Simplification]:
     """List the ways to simplify the Gaussians of a model.
 
     Args:
@@ -54,16 +54,16 @@ def cuts_of(
     refined, lost = _averages(model, queries, slices, weights, names if rows["refined"] else (), list(fewer.values()))
     raw = raw | refined
     if rows["refined"]:
-        found.append(Cut(SLICED, refined, rows["refined"]))
+        found.append(Simplification(SLICED, refined, rows["refined"]))
     for name, frozen in model.frozen(raw, queries, weights).items():
         if name != STILL and not by_halves:
             continue
-        found.append(Cut(name, {key: raw[key] for key in names} | frozen, sliced))
-    found.append(Cut(REMOVED, None, len(model)))
-    for (level, cut), missing in zip(fewer.items(), lost, strict=True):
-        constant = cut["sh0"].clone()
+        found.append(Simplification(name, {key: raw[key] for key in names} | frozen, sliced))
+    found.append(Simplification(REMOVED, None, len(model)))
+    for (level, less), missing in zip(fewer.items(), lost, strict=True):
+        constant = less["sh0"].clone()
         constant.flatten(1, -2)[:, 0] += missing / SH_C0
-        found.append(Cut(f"level{level}", {"sh0": constant, "shN": cut["shN"]}, len(model), level))
+        found.append(Simplification(f"level{level}", {"sh0": constant, "shN": less["shN"]}, len(model), level))
     return found
 
 
@@ -80,9 +80,9 @@ def _all(model: GaussianModel, level: int) -> Tensor:
 
 def _averages(
     model: GaussianModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], weights: Tensor,
-    names: Sequence[str], cuts: Sequence[Raw],
+    names: Sequence[str], fewer: Sequence[Raw],
 ) -> tuple[Raw, list[Tensor]]:  # fmt: skip
-    """Average over the queries what AGR makes of the raw parameters, and the colour [N, 3] that each cut loses.
+    """Average over the queries what AGR makes of the raw parameters, and the colour [N, 3] that fewer harmonics lose.
 
     Args:
         model: as it is.
@@ -90,13 +90,13 @@ def _averages(
         slices: at the queries.
         weights: [V, N].
         names: of the raw parameters that AGR moves; none without AGR.
-        cuts: raw parameters with fewer harmonics.
+        fewer: raw parameters with fewer harmonics.
     """
 
     def at(v: int) -> list[Tensor]:
         moved, seen, weight = model.refined(queries[v]), slices[v], weights[v][:, None]
-        colors = [model.paint(moved | {"shN": cut["shN"]}, seen.means, seen.opacities, queries[v]) for cut in cuts]
-        return [weight * moved[name] for name in names] + [weight * (seen.colors - less) for less in colors]
+        colors = [model.paint(moved | {"shN": less["shN"]}, seen.means, seen.opacities, queries[v]) for less in fewer]
+        return [weight * moved[name] for name in names] + [weight * (seen.colors - others) for others in colors]
 
     workers = model.backend.workers(weights)
     total = functools.reduce(_add, side_by_side(at, range(len(queries)), workers))

@@ -11,13 +11,13 @@ from tiny_run import gsbench, overrides, write_moving_square
 from gsbench.effects import picture
 from gsbench.effects.__main__ import main
 from gsbench.effects.gate import COLORING, COSTS, LESS_TO_READ, REFINING, SLICING, cost_of, most_cost
-from gsbench.effects.words import CLASSES
+from gsbench.effects.messages import CLASSES
 from gsbench.measure import record
 from gsbench.measure.images import Pixels
 from gsbench.models import GaussianModel, build
 from gsbench.models.base import Gaussians3D
-from gsbench.models.classes import DIRECTION, NAMES, TIME, Classes
-from gsbench.models.cuts import STILL
+from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, Classes
+from gsbench.models.simplifications import STILL
 from gsbench.report.page.palette import CLASS_LIKE, LIGHT, MODELS
 from gsbench.scenes import Camera, Points
 from gsbench.schedule import Phase

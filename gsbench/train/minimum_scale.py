@@ -13,11 +13,11 @@ from gsbench.train.checkpoint import tensor
 LEAST_PIXELS = 0.05
 
 
-class Floor:
+class MinimumScale:
     """The least size of each Gaussian in space: LEAST_PIXELS in the training camera in which it is largest."""
 
     def __init__(self, model: GaussianModel, cameras: list[Camera]) -> None:
-        """Measure the floor of `model`, which is initialised and on its device, for the training `cameras`."""
+        """Measure the minimum scale of `model`, which is initialised and on its device, for the training `cameras`."""
         self.model = model
         self.centers = torch.stack([camera.center for camera in cameras])  # [C, 3]
         self.focal = torch.stack([camera.K[[0, 1], [0, 1]].amax() for camera in cameras])  # [C] pixels
@@ -25,7 +25,7 @@ class Floor:
 
     @torch.no_grad()
     def update(self) -> None:
-        """Measure the floor again, after Gaussians were moved, added or removed."""
+        """Measure the minimum scale again, after Gaussians were moved, added or removed."""
         means = self.model.splats["means"]
         pixel = means.new_full((len(means),), torch.inf)  # [N] width of a pixel at the Gaussian's distance, world units
         for center, focal in zip(self.centers, self.focal, strict=True):
@@ -34,11 +34,11 @@ class Floor:
 
     @torch.no_grad()
     def hold(self) -> None:
-        """Raise sizes that are below the floor."""
+        """Raise sizes that are below the minimum scale."""
         self.model.hold_sizes(self.least)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the floor, for the checkpoint."""
+        """Return the minimum scale, for the checkpoint."""
         return {"least": self.least}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
