@@ -10,7 +10,7 @@ from gsbench.models import GaussianModel, build
 from gsbench.models.factors import KINDS
 from gsbench.models.triangular import TriangularModel
 from gsbench.scenes.scene import Points
-from gsbench.schedule import Phase
+from gsbench.schedule import ActiveComponents
 
 SIGMA = 0.0083  # median standard deviation along an axis: a mean 3-sigma radius of 5 pixels at 400 x 400
 SPREAD = 0.4  # of its logarithm
@@ -57,5 +57,5 @@ def model(
         logs = made.splats[made.geometry[0]]  # [N, 3 or more], of which those in space are set
         space = made.rows["p"] if isinstance(made, TriangularModel) else [0, 1, 2]
         logs[:, space] = math.log(sigma) + SPREAD * torch.randn(N, 3, generator=g)
-    made.set_phase(Phase(3, refine=agr, tune_modulation=False))
+    made.set_active(ActiveComponents(3, refine=agr, tunes_lambda=False))
     return made

@@ -105,7 +105,7 @@ def write_ply(asked: Asked, path: Path) -> None:
     culled = len(run.model) - len(trained)
     when = "" if query.time is None else f" at time {float(query.time):g}"
     whence = f"camera {options.camera}" if options.camera is not None else f"direction {options.direction}"
-    colours = f"harmonics of degree {run.model.phase.sh_degree}" if keep else f"as seen from {whence}"
+    colours = f"harmonics of degree {run.model.active.sh_degree}" if keep else f"as seen from {whence}"
     print(f"{path}: {len(trained)} Gaussians{when}, colours {colours}; {culled} of {len(run.model)} are left out, as "
           f"their opacity there is below 1/255")  # fmt: skip
 

@@ -21,12 +21,12 @@ STEPS_TO_RECOVER = 300  # .. and so many are left: with 120 left of 300, a gated
 
 
 @dataclass(frozen=True)
-class Phase:
+class ActiveComponents:
     """The parts of a model that are active at a step of the training."""
 
     sh_degree: int
     refine: bool  # AGR moves the parameters and learns
-    tune_modulation: bool  # lambda_t and lambda_d learn
+    tunes_lambda: bool  # lambda_t and lambda_d learn
 
 
 class Schedule:
@@ -50,12 +50,12 @@ class Schedule:
         """Scale a step of the recipe to this run; at least 1."""
         return max(1, round(step * self.config.iterations / self.config.recipe_iterations))
 
-    def phase(self, step: int) -> Phase:
+    def active(self, step: int) -> ActiveComponents:
         """Tell which parts of the model are switched on at a step, counted from 0."""
-        return Phase(
+        return ActiveComponents(
             sh_degree=min(self.sh_degree, step // self.scaled(self.config.sh_every)),
             refine=self.agr and step >= self.scaled(self.config.refine_from),
-            tune_modulation=step >= self.scaled(self.config.modulation_from),
+            tunes_lambda=step >= self.scaled(self.config.modulation_from),
         )
 
     def densifies(self, step: int) -> bool:

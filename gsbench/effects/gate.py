@@ -57,12 +57,12 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     assert now.levels is not None
     levels = torch.stack([now.levels] + [at_most(now.levels, way.level) for way in ways if way.level is not None])
     hues = torch.stack([none] + [errors[way.name] for way in ways if way.level is not None])
-    painting = _painting(levels)
+    shading = _shading(levels)
 
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
         """Choose for a price of error; return both choices, and the error of each Gaussian."""
-        paint, hue = (painting + price * hues).min(0)
-        _, form = (costs + price * forms + torch.where(removes, 0.0, paint)).min(0)  # argmin takes 8 to 30 times longer
+        shade, hue = (shading + price * hues).min(0)
+        _, form = (costs + price * forms + torch.where(removes, 0.0, shade)).min(0)  # argmin takes 8 to 30 times longer
         error = forms.gather(0, form[None])[0] + hues.gather(0, hue[None])[0] * ~removes[form, 0]
         return form, hue, error
 
@@ -91,15 +91,15 @@ def cost_of(model: GaussianModel) -> Tensor:
     """Return the nanoseconds that each Gaussian adds to a frame before it is rasterized, colours counted, [N]."""
     now = classes_of(model)
     assert now.levels is not None
-    return _live_cost(model, now) + _painting(now.levels)
+    return _live_cost(model, now) + _shading(now.levels)
 
 
 def most_cost(model: GaussianModel) -> float:
     """Return the nanoseconds of a Gaussian that pays for everything that this model can have."""
-    return REFINING + SLICING + float(_painting(torch.tensor(model.full_level())))
+    return REFINING + SLICING + float(_shading(torch.tensor(model.full_level())))
 
 
-def _painting(levels: Tensor) -> Tensor:
+def _shading(levels: Tensor) -> Tensor:
     """Return the cost, ns, of evaluating colours of some orders, packed."""
     order = order_of(levels)
     return torch.tensor(COLORING, device=levels.device)[order.degree] * order.waves

@@ -175,10 +175,10 @@ def _error(simplification: Simplification, here: Place, draw: Drawing) -> Tensor
         return _grown(here.removed)
     raw = dict(model.splats.items()) | simplification.raw
     if simplification.level is not None:
-        colors = model.paint(raw, live.means, live.opacities, here.query)
+        colors = model.shade(raw, live.means, live.opacities, here.query)
         return _grown((here.products[..., COLOR] * (colors - live.colors)).sum(-1))
     means, factors, opacities = model.observe(raw, here.query)
-    whole = Gaussians3D(means, factors, opacities, model.paint(raw, means, opacities, here.query))
+    whole = Gaussians3D(means, factors, opacities, model.shade(raw, means, opacities, here.query))
     N, n = len(live.means), simplification.rows
     changed = Gaussians3D(*(x[:n] for x in whole))
     thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))

@@ -21,7 +21,7 @@ from gsbench.models.refinement import OCTAVES, Refinement
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
-from gsbench.schedule import Phase
+from gsbench.schedule import ActiveComponents
 
 Raw = dict[str, Tensor]  # raw parameters by name, N rows each
 CHILDREN = 2  # a split leaves two Gaussians ..
@@ -72,7 +72,7 @@ class GaussianModel(nn.Module, ABC):
         if sh_degree not in range(4):
             raise InputError(f"sh_degree: expected 0, 1, 2 or 3, got {sh_degree}")
         self.splats = nn.ParameterDict()
-        self.log_modulation = nn.ParameterDict()  # ln lambda_t, ln lambda_d of the models that have them
+        self.log_lambda = nn.ParameterDict()  # ln lambda_t, ln lambda_d of the models that have them
         self.refinement: Refinement | None = None
         if not isinstance(agr_octaves, int) or not 0 <= agr_octaves <= 32:
             raise InputError(f"agr_octaves: expected 0, 1, .., 32, got {agr_octaves}")
@@ -82,7 +82,7 @@ class GaussianModel(nn.Module, ABC):
         self.backend = backend
         self.classes: Classes | None = None  # None: every row has every effect; a GatedModel may have them
         self.extent = 1.0  # of the scene, world units
-        self.phase = Phase(sh_degree, agr, False)
+        self.active = ActiveComponents(sh_degree, agr, False)
 
     # ---- what a subclass provides
 
@@ -99,7 +99,7 @@ class GaussianModel(nn.Module, ABC):
         """Return the largest standard deviation of each Gaussian in space, [N], world units."""
 
     @abstractmethod
-    def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
+    def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Return the raw geometry of children; `raw` holds CHILDREN copies of each parent, one after the other."""
 
     def hold_sizes(self, least: Tensor) -> None:
@@ -126,14 +126,14 @@ class GaussianModel(nn.Module, ABC):
 
     def full_level(self) -> int:
         """Return the order of colour in use, packed as by `ColorOrder`."""
-        return ColorOrder(self.phase.sh_degree, 1).packed
+        return ColorOrder(self.active.sh_degree, 1).packed
 
-    def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
+    def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
         """Compute the colours [N, 3] of a slice; a model whose colours are not these harmonics overrides it.
 
         The kernel skips Gaussians that are culled by their opacity.
         """
-        degree = self.phase.sh_degree
+        degree = self.active.sh_degree
         if self.backend.serves(means):
             return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, degree, levels=self.levels)
         return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), unit(means - query.center), degree, self.levels)
@@ -164,7 +164,7 @@ class GaussianModel(nn.Module, ABC):
             size = size_of(points)
             units = torch.cat([torch.full((n,), size if name in self.lengths else 1.0) for name, n in widths.items()])
             self.refinement = Refinement(outputs, generator, self.agr_octaves, units)
-        self.set_phase(self.phase)
+        self.set_active(self.active)
 
     def slice(self, query: Query) -> Gaussians3D:
         """Slice the model at a query: return 3D Gaussians for the rasterizer.
@@ -176,7 +176,7 @@ class GaussianModel(nn.Module, ABC):
             raise InputError(f"{type(self).__name__}: expected a time in [0, 1], got none: this model observes time")
         raw = self.refined(query)
         means, factors, opacities = self.observe(raw, query)
-        return Gaussians3D(means, factors, opacities, self.paint(raw, means, opacities, query))
+        return Gaussians3D(means, factors, opacities, self.shade(raw, means, opacities, query))
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """Compute the means, factors and opacities of a slice; models that have a kernel for it call the kernel."""
@@ -199,14 +199,14 @@ class GaussianModel(nn.Module, ABC):
 
     @property
     def refines(self) -> bool:
-        """Whether AGR is there and acts in this phase."""
-        return self.refinement is not None and self.phase.refine
+        """Whether AGR is there and is active."""
+        return self.refinement is not None and self.active.refine
 
     def refined(self, query: Query) -> Raw:
         """Apply AGR to the raw parameters: raw + phi(f) (7DGS eq. 15), to log-diagonals before the exp."""
         raw: Raw = dict(self.splats.items())
         rows = None if self.classes is None else self.classes.refined
-        if self.refinement is None or not self.phase.refine or query.time is None or rows == 0:
+        if self.refinement is None or not self.active.refine or query.time is None or rows == 0:
             return raw
         names = (*self.centers, *self.geometry)
         by_kernel = self.backend.serves(raw["means"])
@@ -215,7 +215,7 @@ class GaussianModel(nn.Module, ABC):
         moved = self.refinement(values, query.time, by_kernel=by_kernel, rows=rows, spans=spans)
         return raw | dict(zip(names, moved, strict=True))
 
-    def modulate(self, name: str, value: float) -> None:
+    def add_lambda(self, name: str, value: float) -> None:
         """Give the model lambda_t (`time`) or lambda_d (`direction`), initially `value`.
 
         Raises:
@@ -223,27 +223,27 @@ class GaussianModel(nn.Module, ABC):
         """
         if not isinstance(value, int | float) or not 0 < value < math.inf:
             raise InputError(f"lambda_{name[0]}: expected a positive number, got {value}")
-        self.log_modulation[name] = nn.Parameter(torch.tensor(math.log(value)))
+        self.log_lambda[name] = nn.Parameter(torch.tensor(math.log(value)))
 
-    def modulation(self, name: str) -> Tensor:
-        """Return lambda_t or lambda_d, [], positive as the exp of `log_modulation`."""
-        return self.log_modulation[name].exp()
+    def lambda_of(self, name: str) -> Tensor:
+        """Return lambda_t or lambda_d, [], positive as the exp of `log_lambda`."""
+        return self.log_lambda[name].exp()
 
-    def set_phase(self, phase: Phase) -> None:
+    def set_active(self, active: ActiveComponents) -> None:
         """Switch parts of the model on or off; a part that is off neither acts nor learns."""
-        self.phase = phase
-        for parameter in self.log_modulation.parameters():
-            parameter.requires_grad_(phase.tune_modulation)
+        self.active = active
+        for parameter in self.log_lambda.parameters():
+            parameter.requires_grad_(active.tunes_lambda)
         if self.refinement is not None:
-            self.refinement.requires_grad_(phase.refine)
+            self.refinement.requires_grad_(active.refine)
 
     def groups(self) -> dict[str, list[nn.Parameter]]:
         """Return the parameters by group; a group has a name and a learning rate."""
         groups = {name: [parameter] for name, parameter in self.splats.items()}
         if self.refinement is not None:
             groups["refinement"] = list(self.refinement.parameters())
-        if len(self.log_modulation):
-            groups["modulation"] = list(self.log_modulation.parameters())
+        if len(self.log_lambda):
+            groups["modulation"] = list(self.log_lambda.parameters())
         return groups
 
     # ---- density control: keep, copy and split rows
@@ -256,10 +256,10 @@ class GaussianModel(nn.Module, ABC):
             parameter.grad = None
 
     @torch.no_grad()
-    def split(self, rows: Tensor, generator: torch.Generator) -> None:
+    def split_rows(self, rows: Tensor, generator: torch.Generator) -> None:
         """Turn rows [M], CHILDREN copies of each parent one after the other, into its children."""
         raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.geometry)}
-        for name, value in self.divide(raw, generator).items():
+        for name, value in self.split(raw, generator).items():
             self.splats[name].data[rows] = value
 
     @torch.no_grad()

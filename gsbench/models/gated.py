@@ -46,7 +46,7 @@ class GatedModel(GaussianModel):
 
     def lower_levels(self) -> list[int]:
         """List the orders of colour below the one in use, packed."""
-        return [ColorOrder(degree, 1).packed for degree in range(self.phase.sh_degree)]
+        return [ColorOrder(degree, 1).packed for degree in range(self.active.sh_degree)]
 
     def kept(self, classes: Classes) -> dict[str, Tensor]:
         """Tell which entries of the parameters matter to rows of these classes; those not named matter all.

@@ -63,7 +63,7 @@ class Gaussians3DModel(GatedModel):
         """Raise all three scales."""
         self.splats["scales"].data.clamp_(min=least.log()[:, None])
 
-    def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
+    def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Sample children from the parent's distribution, 1.6 times smaller (3DGS, section 5.2)."""
         z = torch.randn(raw["means"].shape, generator=generator).to(raw["means"])
         means = raw["means"] + (self.factors(raw) @ z[..., None])[..., 0]

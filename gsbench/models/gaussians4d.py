@@ -62,7 +62,7 @@ class Gaussians4DModel(GatedModel):
         check_scheme(scheme)
         self.time_degree = time_degree
         self.scheme = scheme
-        self.modulate("time", lambda_t)
+        self.add_lambda("time", lambda_t)
         self.register_buffer("clock", torch.ones(()))
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
@@ -128,11 +128,11 @@ class Gaussians4DModel(GatedModel):
 
     def full_level(self) -> int:
         """The degree in use with all waves."""
-        return ColorOrder(self.phase.sh_degree, self.time_degree + 1).packed
+        return ColorOrder(self.active.sh_degree, self.time_degree + 1).packed
 
     def lower_levels(self) -> list[int]:
         """List every degree up to the one in use, with all waves and with the constant one alone."""
-        degrees = range(self.phase.sh_degree + 1)
+        degrees = range(self.active.sh_degree + 1)
         orders = {ColorOrder(degree, waves).packed for waves in (1, self.time_degree + 1) for degree in degrees}
         return sorted(orders - {self.full_level()})
 
@@ -175,14 +175,14 @@ class Gaussians4DModel(GatedModel):
             raw["opacities"],
             self.clock,
             query.time,
-            self.log_modulation["time"],
+            self.log_lambda["time"],
             sliced=self.sliced,
         )
 
-    def paint(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
+    def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
         """Compute 4DSH, by the kernel where the backend has one for so many waves."""
         assert query.time is not None
-        sh0, degree, waves = raw["sh0"].flatten(1, 2), self.phase.sh_degree, self.time_degree + 1
+        sh0, degree, waves = raw["sh0"].flatten(1, 2), self.active.sh_degree, self.time_degree + 1
         if waves <= MAX_WAVES and self.backend.serves(means):
             return show_colors(sh0, raw["shN"], means, opacities, query.center, degree, raw["times"], query.time, waves,
                                self.levels)  # fmt: skip
@@ -204,7 +204,7 @@ class Gaussians4DModel(GatedModel):
         """Raise the three spatial scales."""
         self.splats["scales"].data[:, :3].clamp_(min=least.log()[:, None])
 
-    def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
+    def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Sample children from the parent's distribution in space and time, with all scales 1.6 times smaller."""
         z = torch.randn(len(raw["means"]), 4, generator=generator).to(raw["means"])
         offset = (self.factors(raw) @ z[..., None])[..., 0]
@@ -216,7 +216,7 @@ class Gaussians4DModel(GatedModel):
 
     def gate(self, factor: Tensor, delta: Tensor) -> Tensor:
         """Compute f_temp [N] of factors [N, 4, 4] at a distance delta [N, 1] in time."""
-        return torch.exp(-0.5 * self.modulation("time") * mahalanobis(factor[:, 3:], delta))
+        return torch.exp(-0.5 * self.lambda_of("time") * mahalanobis(factor[:, 3:], delta))
 
     def factors(self, raw: Raw) -> Tensor:
         """Compute the factors R S with rows (x, y, z, t), t in clips, [N, 4, 4]."""

@@ -95,7 +95,7 @@ def _averages(
 
     def at(v: int) -> list[Tensor]:
         moved, seen, weight = model.refined(queries[v]), slices[v], weights[v][:, None]
-        colors = [model.paint(moved | {"shN": less["shN"]}, seen.means, seen.opacities, queries[v]) for less in fewer]
+        colors = [model.shade(moved | {"shN": less["shN"]}, seen.means, seen.opacities, queries[v]) for less in fewer]
         return [weight * moved[name] for name in names] + [weight * (seen.colors - others) for others in colors]
 
     workers = model.backend.workers(weights)

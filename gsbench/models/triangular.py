@@ -133,8 +133,8 @@ class TriangularModel(GatedModel):
             raw["opacities"],
             query.center,
             query.time,
-            self.log_modulation["direction"] if "direction" in self.observes else None,
-            self.log_modulation["time"] if "time" in self.observes else None,
+            self.log_lambda["direction"] if "direction" in self.observes else None,
+            self.log_lambda["time"] if "time" in self.observes else None,
             conditioned_first=self.factor_order == "conditioned_first",
             form=OFF_DIAGONALS.index(self.triangle.form),
             directional_half=self.directional_half,
@@ -152,7 +152,7 @@ class TriangularModel(GatedModel):
         space = self.rows["p"]
         self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=least.log()[:, None])
 
-    def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
+    def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Sample children along the parent's path where it is long in time, else from its slice.
 
         In the reduced factor [T_qq 0; K T_qq T_pp] a child's shape is T_pp / 1.6 (space), or T_qq with its last row,
@@ -279,10 +279,10 @@ class TriangularModel(GatedModel):
         found = {}
         if "direction" in self.observes:
             half = 0.5 if self.directional_half else 1.0
-            found["direction"] = half * self.modulation("direction") * white[:, :3].square().sum(-1)
+            found["direction"] = half * self.lambda_of("direction") * white[:, :3].square().sum(-1)
         if "time" in self.observes:
             distance = delta[:, -1] / T_qq[:, -1].norm(dim=-1)  # in standard deviations, sqrt(S_t)
-            found["time"] = 0.5 * self.modulation("time") * distance.square()
+            found["time"] = 0.5 * self.lambda_of("time") * distance.square()
         return found
 
     def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
@@ -326,7 +326,7 @@ class TimedModel(TriangularModel):
             InputError: an option is out of its range.
         """
         super().__init__(**options)
-        self.modulate("time", lambda_t)
+        self.add_lambda("time", lambda_t)
 
 
 class DirectionalModel(TriangularModel):
@@ -344,5 +344,5 @@ class DirectionalModel(TriangularModel):
             InputError: an option is out of its range.
         """
         super().__init__(**options)
-        self.modulate("direction", lambda_d)
+        self.add_lambda("direction", lambda_d)
         self.directional_half = directional_half

@@ -103,7 +103,7 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     except Exception as error:  # a part may be of any type
         raise InputError(f"{path}: expected a training's state, it lacks {one_line(error)!s:.200}") from None
     schedule = Schedule(config.train, config.model.sh_degree, config.agr)
-    model.set_phase(schedule.phase(max(0, step - 1)))
+    model.set_active(schedule.active(max(0, step - 1)))
     return LoadedRun(model.requires_grad_(False), config, scene, step, Path(folder))
 
 

@@ -116,6 +116,6 @@ def differentiate(shown: Shown, backend: str, weight: Tensor, copies: int) -> tu
     raw = {"means": means, "times": times, "sh0": sh0, "shN": sh[:, 1:]}
     moment = torch.tensor(shown.time, device=device)
     query = Query(shown.center.to(device), moment)
-    color = model.paint(raw, means, torch.ones_like(means[:, 0]), query).cpu()
+    color = model.shade(raw, means, torch.ones_like(means[:, 0]), query).cpu()
     gradients = torch.autograd.grad(color.double(), inputs, weight.repeat(copies, 1), materialize_grads=True)
     return color.detach().double(), torch.cat([g.flatten(1).double() for g in gradients], 1)

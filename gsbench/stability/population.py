@@ -219,7 +219,7 @@ def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
                   backend=BACKENDS[backend])  # fmt: skip
     assert isinstance(model, TriangularModel)
     for name in ("direction", "time"):
-        model.log_modulation[name] = nn.Parameter(torch.tensor(NEVER))
+        model.log_lambda[name] = nn.Parameter(torch.tensor(NEVER))
     return model.to(device_of(backend))
 
 

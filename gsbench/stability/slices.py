@@ -89,7 +89,7 @@ def load(observed: Observed, scheme: str, backend: str, copies: int = 1) -> tupl
     """Make a model with the Gaussians of a case, `copies` times."""
     model = build(observed.model, scheme=scheme, backend=BACKENDS[backend], **OPTIONS[observed.model])
     for name, value in observed.log_lambda.items():
-        model.log_modulation[name] = nn.Parameter(torch.tensor(value))
+        model.log_lambda[name] = nn.Parameter(torch.tensor(value))
     model.to(device_of(backend))
     rows = torch.arange(COUNT).repeat(copies)
     return model, {name: value[rows].requires_grad_() for name, value in observed.raw.items()}

@@ -23,8 +23,9 @@ REPRODUCED = frozenset({"step", "model", "optimizer", "density", "minimum_scale"
 TIMES = frozenset({"stages", "effort", "curve", "seconds", "frame_ms_before", "frame_ms", "frame_ms_without"})
 
 
-# Keys of a training's state in checkpoints of older versions, and their names now.
+# Keys of a training's state in checkpoints of older versions, and their names now; and how keys of its model began.
 RENAMED = {"floor": "minimum_scale"}
+RENAMED_IN_MODEL = {"log_modulation.": "log_lambda."}
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,18 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
 
 def with_present_names(state: dict[str, Any]) -> dict[str, Any]:
     """Return a training's state with the keys that it has now, where an older version wrote it."""
-    return {RENAMED.get(key, key): value for key, value in state.items()}
+    state = {RENAMED.get(key, key): value for key, value in state.items()}
+    if isinstance(model := state.get("model"), dict):
+        state["model"] = {_in_model(key): value for key, value in model.items()}
+    return state
+
+
+def _in_model(key: Any) -> Any:
+    """Return the name that a key of a model's state has now."""
+    for old, new in RENAMED_IN_MODEL.items():
+        if isinstance(key, str) and key.startswith(old):
+            return new + key.removeprefix(old)
+    return key
 
 
 def check_plain(value: object, most: int) -> None:

@@ -44,7 +44,7 @@ class DensityControl:
         self.seen = torch.zeros_like(like)  # [N] number of views in which the Gaussian was visible
 
     @torch.no_grad()
-    def observe(
+    def accumulate(
         self,
         radii: Tensor,  # [C, N]
         g_means2d: Tensor,  # [C, N, 2] per pixel
@@ -86,7 +86,7 @@ class DensityControl:
         parents = split.nonzero()[:, 0].repeat_interleave(CHILDREN)
         self._select(torch.cat([kept, cloned, parents]), fresh=len(cloned) + len(parents))
         children = torch.arange(len(model) - len(parents), len(model), device=parents.device)
-        model.split(children, generator)
+        model.split_rows(children, generator)
 
         # A Gaussian that no view sees gets no gradient, so it would never come back, and it costs as much as any other.
         keep = (torch.sigmoid(model.splats["opacities"]) >= self.min_opacity) & (self.unseen < self.patience)

@@ -41,7 +41,7 @@ def resembles(model: GaussianModel, index: int) -> str | None:
         return "learning_rates_times_30"  # the previous step was too long
     sizes, in_time = _log_sizes(model, raw, index), _log_size_in_time(model, raw)
     colors = torch.cat([raw[name] for name in ("sh0", "shN") if name in raw])
-    lambdas = [float(value) for value in model.log_modulation.parameters()]
+    lambdas = [float(value) for value in model.log_lambda.parameters()]
     checks = {
         "refinement_pushes_sizes": float(sizes.abs().amax()) > LOG_SIZE_MAX,
         "instant": in_time is not None and in_time < THIN,

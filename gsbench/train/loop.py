@@ -129,7 +129,7 @@ class Trainer:
             by_halves: whether time or direction alone may be frozen: it saves bytes and no time of a frame, and nearly
                 doubles the seconds of the gate (docs/effects.md).
         """
-        self.model.set_phase(self.schedule.phase(self.step - 1))
+        self.model.set_active(self.schedule.active(self.step - 1))
         ungated = self.gating.now()
         with self.effort, self.stages("gate"):
             self.gating.at_end(by_halves)
@@ -138,7 +138,7 @@ class Trainer:
     def _descend(self) -> None:
         """Do one step: the loss is the mean over a batch of views."""
         step, train, stages = self.step, self.config.train, self.stages
-        self.model.set_phase(self.schedule.phase(step))
+        self.model.set_active(self.schedule.active(step))
         views = [self.scene.train[i] for i in batch(step, len(self.scene.train), train.batch_size, self.config.seed)]
         try:
             seen = self.gradients(views)
@@ -147,7 +147,7 @@ class Trainer:
         if step < self.schedule.densify_stop:
             with stages("density"):
                 for view, one in zip(views, seen, strict=True):
-                    self.density.observe(one.radii, one.g_means2d, view.camera.width, view.camera.height, len(views))
+                    self.density.accumulate(one.radii, one.g_means2d, view.camera.width, view.camera.height, len(views))
         self.finite_check.see(step, torch.stack([one.loss for one in seen]).sum(), self.model.groups())
         with stages("optimizer"):
             drawn = torch.cat([one.radii for one in seen]).any(0)
@@ -173,7 +173,7 @@ class Trainer:
 
     def _measure(self) -> None:
         """Add a point to the curve; its seconds belong to no stage and so do not count as training time."""
-        self.model.set_phase(self.schedule.phase(self.step))
+        self.model.set_active(self.schedule.active(self.step))
         val = self.psnr(self.scene.val) if self.scene.val else math.nan
         self.curve.add(self.step + 1, sum(self.stages.seconds.values()), val)
         leak = self.config.protocol.best_on_test
@@ -234,4 +234,4 @@ class Trainer:
             raise
         except Exception as error:  # a part may be of any type
             raise InputError(f"checkpoint: expected the state of this training: {one_line(error)!r:.200}") from None
-        self.model.set_phase(self.schedule.phase(max(0, self.step - 1)))
+        self.model.set_active(self.schedule.active(max(0, self.step - 1)))

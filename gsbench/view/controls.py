@@ -63,7 +63,7 @@ class Controls:
     def _add_effects(self) -> None:
         """Add the controls that switch the effects of the models off, one by one."""
         gui, painters = self.client.gui, self._painters.values()
-        degree = max(painter.trained_phase.sh_degree for painter in painters)
+        degree = max(painter.trained_active.sh_degree for painter in painters)
         with gui.add_folder("effects"):
             self.agr = gui.add_checkbox("AGR", True, disabled=not any(painter.has_agr for painter in painters))
             hold = gui.add_checkbox("freeze time", False, disabled=not self._has_time, hint="slices stay those of now")

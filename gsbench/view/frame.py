@@ -13,7 +13,7 @@ from gsbench.models.query import Query
 from gsbench.models.render import rasterize_slice
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
-from gsbench.schedule import Phase
+from gsbench.schedule import ActiveComponents
 from gsbench.view.stages import RASTER, SLICE, StageWatch, part_of
 
 DIVIDER = (255, 255, 255)  # RGB of the line between two models
@@ -65,7 +65,7 @@ class Painter:
         """
         self.run = run
         self.name = f"{run.folder.parent.name} {run.folder.name}"  # such as "7dgs seed0"
-        self.trained_phase = run.model.phase
+        self.trained_active = run.model.active
         self.has_agr = run.model.refinement is not None
         self.counts = run.model.count_classes()  # of Gaussians, by class
         background = torch.tensor(run.scene.background).to(run.config.device)
@@ -90,7 +90,7 @@ class Painter:
         center = camera.center if request.center is None else request.center.to(device)
         query = Query.at(center, request.time)
         with self._lock, torch.inference_mode(), StageWatch(device) as watch:
-            run.model.phase = self._phase(request)
+            run.model.active = self._active(request)
             gaussians = run.model.slice(query)
             watch.end(SLICE)
             if request.colours in self._colors:
@@ -100,9 +100,9 @@ class Painter:
             watch.end(RASTER)
             return image[0], watch.ms
 
-    def _phase(self, request: FrameRequest) -> Phase:
-        """Return the phase of the training's end, less what is switched off."""
-        trained = self.trained_phase
+    def _active(self, request: FrameRequest) -> ActiveComponents:
+        """Return the active components at the end of the training, less what is switched off."""
+        trained = self.trained_active
         degree = min(request.sh_degree, trained.sh_degree)
         return replace(trained, refine=request.agr and trained.refine, sh_degree=degree)
 

@@ -58,14 +58,14 @@ def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def has_harmonics(model: GaussianModel) -> bool:
-    """Tell whether a slice of the model is the same from every viewpoint, and its colours are known harmonics."""
-    own = type(model).paint in (GaussianModel.paint, Gaussians4DModel.paint)
+    """Tell whether a slice of the model is the same from everywhere, and its colours are known harmonics."""
+    own = type(model).shade in (GaussianModel.shade, Gaussians4DModel.shade)
     return own and "direction" not in model.observes
 
 
 def harmonics_at(model: GaussianModel, query: Query) -> Tensor:
     """Return the harmonics of the colours at a query's time, [N, K, 3]; those not yet in use are left out."""
-    used = (model.phase.sh_degree + 1) ** 2
+    used = (model.active.sh_degree + 1) ** 2
     sh0, shN = model.splats["sh0"], model.splats["shN"]
     if not isinstance(model, Gaussians4DModel):
         return torch.cat([sh0, shN], 1)[:, :used]

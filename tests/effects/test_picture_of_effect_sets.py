@@ -20,7 +20,7 @@ from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, Classes
 from gsbench.models.simplifications import STILL
 from gsbench.report.page.palette import CLASS_LIKE, LIGHT, MODELS
 from gsbench.scenes import Camera, Points
-from gsbench.schedule import Phase
+from gsbench.schedule import ActiveComponents
 
 CAMERA = Camera(torch.eye(4), torch.tensor([[50.0, 0, 50], [0, 50, 10], [0, 0, 1]]), 100, 20)
 CENTRES = (10, 30, 50, 70, 90)  # pixels of five Gaussians, four standard deviations of which are between two
@@ -33,7 +33,7 @@ def five(name: str = "7dgs", *, agr: bool = True, classes: Classes | None = None
     model = build(name, agr=agr, **OPTIONS[name])
     means = torch.tensor([[(x - 50) / 10, 0.0, 5.0] for x in CENTRES])
     model.initialise(Points(means, torch.full((5, 3), 0.5)), 1.0, torch.Generator().manual_seed(0))
-    model.set_phase(Phase(3, agr, True))
+    model.set_active(ActiveComponents(3, agr, True))
     model.classes = classes
     seen = Gaussians3D(means, 0.35 * torch.eye(3).expand(5, 3, 3), torch.full((5,), 0.999), torch.full((5, 3), 0.5))
     model.slice = lambda _: seen  # type: ignore[method-assign]

@@ -11,7 +11,7 @@ from gsbench.models.base import Gaussians3D
 from gsbench.models.render import rasterize_slice
 from gsbench.models.simplifications import Simplification, simplifications_of
 from gsbench.scenes.scene import Points, View
-from gsbench.schedule import Phase
+from gsbench.schedule import ActiveComponents
 
 N, SIZE, VIEWS = 60, 24, 30
 BLACK = torch.zeros(3)
@@ -29,7 +29,7 @@ def trained_a_little(name: str, seed: int) -> GaussianModel:
     random = torch.Generator().manual_seed(seed)
     model = build(name, **OPTIONS[name])
     model.initialise(Points(torch.rand(N, 3, generator=random) * 2 - 1, torch.rand(N, 3, generator=random)), 4, random)
-    model.set_phase(Phase(3, model.agr, False))
+    model.set_active(ActiveComponents(3, model.agr, False))
     with torch.no_grad():
         for key, parameter in model.splats.items():
             size = {"means": 0.02, "motion": 0.15, "opacities": 1.5, "shN": 0.08}.get(key, 0.2)
@@ -58,10 +58,10 @@ def slice_of(model: GaussianModel, simplification: Simplification, live: Gaussia
         return live._replace(opacities=torch.zeros_like(live.opacities))
     if simplification.level is not None:
         raw = model.refined(query) | simplification.raw
-        return live._replace(colors=model.paint(raw, live.means, live.opacities, query))
+        return live._replace(colors=model.shade(raw, live.means, live.opacities, query))
     raw = dict(model.splats.items()) | simplification.raw
     means, factors, opacities = model.observe(raw, query)
-    return Gaussians3D(means, factors, opacities, model.paint(raw, means, opacities, query))
+    return Gaussians3D(means, factors, opacities, model.shade(raw, means, opacities, query))
 
 
 def brute_force(model: GaussianModel, views: list[View], simplification: Simplification) -> Tensor:

@@ -91,7 +91,7 @@ def check(seeds: range, folder: Path) -> int:
         state = replaced(found.state, path, harm(draw))
         try:
             fitted.load_state_dict(state)
-            fitted.model.set_phase(fitted.schedule.phase(5))
+            fitted.model.set_active(fitted.schedule.active(5))
             fitted._descend()  # a tensor of the wrong shape that was accepted would crash here
         except InputError as error:
             refused += "\n" not in str(error)

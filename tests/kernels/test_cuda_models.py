@@ -40,13 +40,13 @@ def assert_slices_agree(exact: GaussianModel, raw: dict[str, Tensor], move: Move
     """The kernels' slice, and its gradients by all parameters, against those of torch in float64."""
     center, time = torch.tensor([0.3, -0.2, -3.0]), torch.tensor(0.4)
     expected = list(exact.observe(raw, Query(center.double(), time.double())))
-    lambdas = list(exact.log_modulation.parameters())
+    lambdas = list(exact.log_lambda.parameters())
     single = {name: move(x) for name, x in raw.items()}
     model = deepcopy(exact).to(single["opacities"])
     model.condition = None  # nothing is left to torch
     actual = list(model.observe(single, Query(move(center), move(time))))
     assert_same(back(actual), expected)
-    inputs = [*single.values(), *model.log_modulation.parameters()]
+    inputs = [*single.values(), *model.log_lambda.parameters()]
     assert_same(back(gradients(actual, inputs)), gradients(expected, [*raw.values(), *lambdas]))
 
 

@@ -62,12 +62,12 @@ def model_and_raw(name: str, options: dict[str, Any], dtype: torch.dtype) -> tup
         del lambdas["lambda_d"], raw["directions"], raw["coupling"]
     model = build(name, **lambdas, **options)
     assert isinstance(model, TriangularModel)
-    model.log_modulation.requires_grad_(True)
+    model.log_lambda.requires_grad_(True)
     return model.to(dtype), {k: v.to(dtype).requires_grad_() for k, v in raw.items()}
 
 
 def lambda_of(model: TriangularModel, variable: str) -> Tensor | None:
-    return model.log_modulation[variable] if variable in model.observes else None
+    return model.log_lambda[variable] if variable in model.observes else None
 
 
 def gradients(outputs: list[Tensor], inputs: list[Tensor]) -> list[Tensor]:
@@ -93,7 +93,7 @@ def test_slice(name: str, options: dict[str, Any]) -> None:
     seen = exact.condition(raw, Query(center.double(), torch.tensor(0.4, dtype=torch.float64)))
     expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
     model, single = model_and_raw(name, options, torch.float32)
-    lambdas = list(model.log_modulation.parameters())
+    lambdas = list(model.log_lambda.parameters())
     actual = list(observe_triangular(
         single["means"], single.get("directions"), single.get("times"), single["log_diagonal"], single["shape"],
         single["motion"], single.get("coupling", torch.empty(37, 0)), single["opacities"], center, torch.tensor(0.4),
@@ -103,7 +103,7 @@ def test_slice(name: str, options: dict[str, Any]) -> None:
     ))  # fmt: skip
     assert_same(actual, expected)
     assert_same(gradients(actual, [*single.values(), *lambdas]),
-                gradients(expected, [*raw.values(), *exact.log_modulation.parameters()]))  # fmt: skip
+                gradients(expected, [*raw.values(), *exact.log_lambda.parameters()]))  # fmt: skip
 
 
 def rotated(dtype: torch.dtype) -> tuple[Gaussians4DModel, dict[str, Tensor]]:
@@ -115,7 +115,7 @@ def rotated(dtype: torch.dtype) -> tuple[Gaussians4DModel, dict[str, Tensor]]:
     raw["scales"][:20] = -3.0  # short in time
     model = Gaussians4DModel(lambda_t=0.7)
     model.clock.fill_(0.8)
-    model.log_modulation.requires_grad_(True)
+    model.log_lambda.requires_grad_(True)
     return model.to(dtype), {k: v.to(dtype).requires_grad_() for k, v in raw.items()}
 
 
@@ -127,10 +127,10 @@ def test_rotated_slice() -> None:
     expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
     assert 0 < (seen.gate == 0).sum() < len(seen.gate)  # some are gated away
     model, single = rotated(torch.float32)
-    actual = list(observe_rotated(*single.values(), model.clock, torch.tensor(0.4), model.log_modulation["time"]))
+    actual = list(observe_rotated(*single.values(), model.clock, torch.tensor(0.4), model.log_lambda["time"]))
     assert_same(actual, expected)
-    assert_same(gradients(actual, [*single.values(), *model.log_modulation.parameters()]),
-                gradients(expected, [*raw.values(), *exact.log_modulation.parameters()]))  # fmt: skip
+    assert_same(gradients(actual, [*single.values(), *model.log_lambda.parameters()]),
+                gradients(expected, [*raw.values(), *exact.log_lambda.parameters()]))  # fmt: skip
 
 
 def still(dtype: torch.dtype) -> dict[str, Tensor]:

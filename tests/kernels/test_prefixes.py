@@ -54,8 +54,8 @@ def assert_still_rows(exact: GaussianModel, raw: Raw, model: GaussianModel, sing
     for x, y in zip(actual, everything, strict=True):
         assert torch.equal(x[:count], y[:count])
     assert count == len(actual[0]) or not torch.equal(actual[0][count:], everything[0][count:])
-    want = gradients(expected, [*raw.values(), *exact.log_modulation.parameters()])
-    got = gradients(actual, [*single.values(), *model.log_modulation.parameters()])
+    want = gradients(expected, [*raw.values(), *exact.log_lambda.parameters()])
+    got = gradients(actual, [*single.values(), *model.log_lambda.parameters()])
     assert_same(actual, expected)
     assert_same(got, want)
     for x, y in zip(got[: len(raw)], want, strict=False):
@@ -193,7 +193,7 @@ def test_rows_that_there_are_not() -> None:
             model.observe(raw, Query(CENTER, TIME))
     rotating, single = rotated(torch.float32)
     with pytest.raises(InputError, match="sliced"):
-        observe_rotated(*single.values(), rotating.clock, TIME, rotating.log_modulation["time"], sliced=46)
+        observe_rotated(*single.values(), rotating.clock, TIME, rotating.log_lambda["time"], sliced=46)
     with pytest.raises(InputError, match="refine: rows"):
         Refinement([3, 4], torch.Generator())([torch.ones(2, 3), torch.ones(2, 4)], TIME, by_kernel=True, rows=3)
     for spans in (torch.ones(3, 2), torch.ones(2, 3), torch.ones(2, 2).double(), torch.empty(0)):

@@ -40,7 +40,7 @@ def fitted(name: str, N: int = 300, *, agr: bool = False, classed: bool = False)
     with torch.no_grad():
         for parameter in made.refinement.parameters() if made.refinement is not None else ():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
-    made.set_phase(replace(made.phase, tune_modulation=True))
+    made.set_active(replace(made.active, tunes_lambda=True))
     if classed:
         levels = torch.randint(0, 12, (N,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
         made.classes = Classes(N // 3, N // 2 + 1, levels)

@@ -10,7 +10,7 @@ from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Classes
 from gsbench.models.factors import rotation, rotation4d, turn_of_space
 from gsbench.models.triangular import TriangularModel
-from gsbench.schedule import Phase
+from gsbench.schedule import ActiveComponents
 
 OBSERVING = [name for name in VARIANTS if not name.startswith("3dgs")]
 QUERY = Query.at(CAMERA, 0.45)
@@ -19,7 +19,7 @@ QUERY = Query.at(CAMERA, 0.45)
 def classed(variant: str, count: int, refined: int, sliced: int, sh_degree: int = 3) -> GaussianModel:
     """A lively model with levels from the constant colour to more than there is."""
     model = lively(variant, count, sh_degree=sh_degree)
-    model.set_phase(Phase(sh_degree, model.agr, True))
+    model.set_active(ActiveComponents(sh_degree, model.agr, True))
     model.classes = Classes(refined, sliced, torch.randint(0, 16, (count,), generator=seeded(3), dtype=torch.int32))
     return model
 
@@ -43,7 +43,7 @@ def test_slice_has_gradients(variant: str) -> None:
 def test_rows_have_the_effects_of_their_class_only(variant: str) -> None:
     """Catches classes cut at another row: what is still is the same everywhere, what AGR leaves is as it was."""
     model, whole = classed(variant, N, 8, 15), lively(variant)
-    whole.set_phase(model.phase)
+    whole.set_active(model.active)
     moved, everything, raw = model.refined(QUERY), whole.refined(QUERY), dict(whole.splats.items())
     for name in (*model.centers, *model.geometry):
         assert torch.equal(moved[name][8:], raw[name][8:])

@@ -48,11 +48,9 @@ def by_hand(model: GaussianModel, order: str, half: float) -> tuple[np.ndarray, 
         covariances.append(S[np.ix_(p, p)] - K @ S[np.ix_(q, p)])
         exponent = 0.0
         if d:
-            exponent = (
-                half * model.modulation("direction").item() * offset_d @ np.linalg.inv(S[np.ix_(d, d)]) @ offset_d
-            )
+            exponent = half * model.lambda_of("direction").item() * offset_d @ np.linalg.inv(S[np.ix_(d, d)]) @ offset_d
         if t:
-            exponent += 0.5 * model.modulation("time").item() * offset_t[0] ** 2 / S[t[0], t[0]]
+            exponent += 0.5 * model.lambda_of("time").item() * offset_t[0] ** 2 / S[t[0], t[0]]
         opacities.append(math.exp(-exponent) / (1 + math.exp(-values["opacities"][i])))
     return np.stack(means), np.stack(covariances), np.array(opacities)
 

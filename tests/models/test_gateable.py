@@ -30,7 +30,7 @@ class Balls(GaussianModel):
     def scales(self) -> Tensor:
         return self.splats["radii"].detach()[:, 0].exp()
 
-    def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
+    def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         return {"means": raw["means"], "radii": raw["radii"] / SHRINK}
 
 

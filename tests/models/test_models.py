@@ -1,4 +1,4 @@
-"""What holds for every model: how it starts, what it needs, how AGR and the phases act, what `build` refuses."""
+"""What holds for every model: how it starts, what it needs, how its active components act, what `build` refuses."""
 
 import math
 from typing import Any
@@ -17,7 +17,7 @@ from gsbench.models.factors import KINDS
 from gsbench.models.query import unit
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
-from gsbench.schedule import Phase
+from gsbench.schedule import ActiveComponents
 
 # ---- the start
 
@@ -85,7 +85,7 @@ def test_same_seed_same_model(variant: str) -> None:
 def test_slice_has_gradients(variant: str) -> None:
     """Catches a wrong or lost derivative on the way from any raw parameter to the slice (central differences)."""
     model = lively(variant, 4)
-    model.set_phase(Phase(3, True, True))
+    model.set_active(ActiveComponents(3, True, True))
     names = sorted(model.splats)
 
     values = [model.splats[name].detach().requires_grad_() for name in names]
@@ -118,7 +118,7 @@ def test_slices_can_be_drawn(variant: str, seed: int, time: float) -> None:
 def test_slice_at_its_own_mean_is_the_gaussian(variant: str) -> None:
     """Catches a query in other coordinates than the mean: at t = mu_t, d = mu_d nothing moves, nothing fades."""
     model = lively(variant)
-    model.set_phase(Phase(3, False, False))
+    model.set_active(ActiveComponents(3, False, False))
     if "directions" in model.splats:
         model.splats["directions"].data = unit(model.splats["directions"].data)
     for i in range(4):
@@ -166,7 +166,7 @@ def test_time_is_asked_for_where_it_is_needed(variant: str) -> None:
         assert model.slice(Query.at(CAMERA.float(), None)).means.shape == (N, 3)
 
 
-# ---- AGR and phases
+# ---- AGR and active components
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -175,9 +175,9 @@ def test_agr_changes_nothing_at_first(name: str) -> None:
     model = lively(f"{name}_agr")
     for p in (model.refinement.weight_out, model.refinement.bias_out):
         p.data.zero_()
-    model.set_phase(Phase(3, False, False))
+    model.set_active(ActiveComponents(3, False, False))
     off = model.slice(Query.at(CAMERA, 0.3))
-    model.set_phase(Phase(3, True, False))
+    model.set_active(ActiveComponents(3, True, False))
     assert all(torch.equal(a, b) for a, b in zip(off, model.slice(Query.at(CAMERA, 0.3)), strict=True))
 
 
@@ -185,7 +185,7 @@ def test_agr_changes_nothing_at_first(name: str) -> None:
 def test_agr_moves_what_it_should(name: str) -> None:
     """Catches residuals added to the wrong parameter, after the exp, or to colours and opacity."""
     model = lively(f"{name}_agr")
-    model.set_phase(Phase(3, True, False))
+    model.set_active(ActiveComponents(3, True, False))
     before, after = raw(model), model.refined(Query.at(CAMERA, 0.3))
     names = [*model.centers, *model.geometry]
     moved = model.refinement([before[k] for k in names], torch.tensor(0.3, dtype=torch.float64))
@@ -197,21 +197,21 @@ def test_agr_moves_what_it_should(name: str) -> None:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_what_is_off_does_not_learn(name: str) -> None:
-    """Catches a phase that does not reach the networks or the lambdas, or lambdas that can turn negative."""
+    """Catches a switch that does not reach the networks or the lambdas, or lambdas that can turn negative."""
     model = lively(f"{name}_agr")
     lambdas = {"direction": MODELS[name].get("lambda_d"), "time": MODELS[name].get("lambda_t", 1.0)}
-    for key in model.log_modulation:
-        torch.testing.assert_close(model.modulation(key).item(), lambdas[key], rtol=1e-6, atol=0)
+    for key in model.log_lambda:
+        torch.testing.assert_close(model.lambda_of(key).item(), lambdas[key], rtol=1e-6, atol=0)
     for refine, tune in [(False, False), (True, False), (False, True), (True, True)]:
-        model.set_phase(Phase(3, refine, tune))
+        model.set_active(ActiveComponents(3, refine, tune))
         model.zero_grad(set_to_none=True)
         sum(x.square().sum() for x in model.slice(Query.at(CAMERA, 0.3))).backward()
         learnt = model.refinement.weight_out.grad
         assert (learnt is not None and learnt.any(1).all().item()) == refine
-        assert all((p.grad is not None and p.grad.any().item()) == tune for p in model.log_modulation.parameters())
-    for p in model.log_modulation.parameters():
+        assert all((p.grad is not None and p.grad.any().item()) == tune for p in model.log_lambda.parameters())
+    for p in model.log_lambda.parameters():
         p.data -= 50
-    assert all(model.modulation(key) > 0 for key in model.log_modulation)
+    assert all(model.lambda_of(key) > 0 for key in model.log_lambda)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -225,10 +225,10 @@ def test_groups_hold_every_parameter_once(name: str) -> None:
 def test_sh_degree_grows_with_the_phase() -> None:
     """Catches colours that use coefficients of a degree not yet on."""
     model = lively("3dgs")
-    model.set_phase(Phase(0, False, False))
+    model.set_active(ActiveComponents(0, False, False))
     flat = model.slice(Query.at(CAMERA, None)).colors
     torch.testing.assert_close(flat, (SH_C0 * model.splats["sh0"][:, 0] + 0.5).clamp(min=0))
-    model.set_phase(Phase(1, False, False))
+    model.set_active(ActiveComponents(1, False, False))
     assert not torch.allclose(model.slice(Query.at(CAMERA, None)).colors, flat)
 
 

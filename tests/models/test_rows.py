@@ -11,7 +11,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import CHILDREN
-from gsbench.schedule import Phase
+from gsbench.schedule import ActiveComponents
 
 TRIANGULAR = [v for v in VARIANTS if v.startswith(("6dgs", "7dgs")) and "row_scaled" not in v]
 IN_TIME = [v for v in TRIANGULAR if v.startswith("7dgs")]
@@ -21,7 +21,7 @@ SHRINK = 1.6  # of the children of a split, in 3DGS' gaussian_model.py
 def quiet(variant: str, **options: Any) -> GaussianModel:
     """A lively model whose AGR does not act: rows are what is looked at."""
     model = lively(variant, **options)
-    model.set_phase(Phase(3, False, False))
+    model.set_active(ActiveComponents(3, False, False))
     return model
 
 
@@ -29,7 +29,7 @@ def split_all(model: GaussianModel, seed: int = 0) -> Tensor:
     """Replace every Gaussian by its children; the parent of each."""
     parents = torch.arange(len(model)).repeat_interleave(CHILDREN)
     model.select(parents)
-    model.split(torch.arange(len(model)), seeded(seed))
+    model.split_rows(torch.arange(len(model)), seeded(seed))
     return parents
 
 
@@ -70,7 +70,7 @@ def test_split_touches_only_its_rows(variant: str) -> None:
     model = quiet(variant)
     model.select(torch.tensor([0, 1, 2, 3, 3, 4, 4]))
     before = raw(model)
-    model.split(torch.tensor([3, 4, 5, 6]), seeded(0))
+    model.split_rows(torch.tensor([3, 4, 5, 6]), seeded(0))
     after = raw(model)
     for name, value in after.items():
         assert torch.equal(value[:3], before[name][:3])
@@ -80,7 +80,7 @@ def test_split_touches_only_its_rows(variant: str) -> None:
     assert all(value.isfinite().all() for value in after.values())
     again = quiet(variant)
     again.select(torch.tensor([0, 1, 2, 3, 3, 4, 4]))
-    again.split(torch.tensor([3, 4, 5, 6]), seeded(0))
+    again.split_rows(torch.tensor([3, 4, 5, 6]), seeded(0))
     assert all(torch.equal(a, b) for a, b in zip(raw(again).values(), after.values(), strict=True))
 
 
@@ -113,7 +113,7 @@ def test_children_lie_where_the_parent_is_dense(variant: str) -> None:
         centers, expected = ["means", "times"], F @ F.T
     where = torch.cat([raw(model)[name][0] for name in centers])
     model.select(torch.zeros(20_000, dtype=torch.long))
-    model.split(torch.arange(20_000), seeded(1))
+    model.split_rows(torch.arange(20_000), seeded(1))
     offsets = torch.cat([raw(model)[name] for name in centers], -1) - where
     assert (offsets.mean(0).abs() < 5 * expected.diagonal().sqrt() / math.sqrt(20_000)).all()
     torch.testing.assert_close(offsets.mT @ offsets / 20_000, expected, rtol=0, atol=0.05 * expected.trace().item())

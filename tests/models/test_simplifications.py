@@ -27,7 +27,7 @@ def test_fewer_harmonics_have_the_same_colour_on_average(variant: str) -> None:
     for simplification in simplifications:
         raw = dict(model.splats.items()) | simplification.raw
         colors = torch.stack(
-            [model.paint(raw, one.means, one.opacities, q) for q, one in zip(queries, seen, strict=True)]
+            [model.shade(raw, one.means, one.opacities, q) for q, one in zip(queries, seen, strict=True)]
         )
         change = colors - torch.stack([one.colors for one in seen])
         assert change.abs().amax() > 1e-3

@@ -13,7 +13,7 @@ from gsbench.models.factors import quaternions_in_space, rotation, rotation4d
 from gsbench.models.start import start_from
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
-from gsbench.schedule import Phase
+from gsbench.schedule import ActiveComponents
 
 N = 12
 
@@ -30,7 +30,7 @@ def started(variant: str, given: TrainedGaussians, **options: Any) -> GaussianMo
     name, own = VARIANTS[variant]
     model = build(name, **own | options)
     start_from(model, given, 2.0, seeded(0))
-    model.set_phase(Phase(model.sh_degree, False, False))
+    model.set_active(ActiveComponents(model.sh_degree, False, False))
     return model.requires_grad_(False)
 
 
@@ -73,7 +73,7 @@ def test_harmonics_of_another_degree(name: str, theirs: int, own: int) -> None:
     query = Query.at(CAMERA.float(), 0.3)
     model, still = started(name, given, sh_degree=own), started("3dgs", cut, sh_degree=own)
     opaque = torch.ones(N)
-    colors = [one.paint(dict(one.splats.items()), given.means, opaque, query) for one in (model, still)]
+    colors = [one.shade(dict(one.splats.items()), given.means, opaque, query) for one in (model, still)]
     torch.testing.assert_close(*colors)
     assert colors[0].std() > 0.1
 
@@ -111,7 +111,7 @@ def test_a_model_that_is_not_known_starts_with_spheres() -> None:
         def scales(self) -> Tensor:
             raise NotImplementedError
 
-        def divide(self, raw: Raw, generator: torch.Generator) -> Raw:
+        def split(self, raw: Raw, generator: torch.Generator) -> Raw:
             raise NotImplementedError
 
     model, given = Balls(), trained()

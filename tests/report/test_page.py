@@ -458,8 +458,8 @@ def test_events_are_those_of_the_schedule():
         resets = [step + 1 for step in range(length) if schedule.resets(step)]
         assert found["R"] == resets[:4]
         assert found["D"] == [schedule.densify_stop]
-        assert found["A"] == [next(s for s in range(length) if schedule.phase(s).refine)]
-        assert found["L"] == [next(s for s in range(length) if schedule.phase(s).tune_modulation)]
+        assert found["A"] == [next(s for s in range(length) if schedule.active(s).refine)]
+        assert found["L"] == [next(s for s in range(length) if schedule.active(s).tunes_lambda)]
     assert events_of(make()) == []
 
 

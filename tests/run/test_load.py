@@ -27,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_loaded_model_renders_what_was_measured(folder: Path) -> None:
-    """Catches a model that comes back without its phase, its background, AGR or lambda."""
+    """Catches a model that comes back without its active components, its background, AGR or lambda."""
     run = package.load_run(folder)
     measured = record.read(folder / record.FILE_NAME)
     scene = load_scene(run.config)

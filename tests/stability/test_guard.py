@@ -107,7 +107,7 @@ def test_resemblance_of_the_whole_model() -> None:
     model = trainer("7dgs").model
     assert "networks" in diagnosis.explain(model)
     for value, name in ((9.0, "oversensitive"), (-50.0, "insensitive")):
-        model.log_modulation["time"].data.fill_(value)
+        model.log_lambda["time"].data.fill_(value)
         assert diagnosis.resembles(model, 0) == name
     rotated = trainer("4dgs").model
     rotated.splats["left_quats"].data[0] *= 1e-6

@@ -38,7 +38,7 @@ def whole_path(model: GaussianModel, raw: dict[str, Tensor], center: Tensor, tim
     inputs = {name: value.clone().requires_grad_() for name, value in raw.items()}
     moment = torch.tensor(time)
     means, factors, opacities = model.observe(inputs, Query(center, moment))
-    shown = model.paint(inputs, means, opacities, Query(center, moment))
+    shown = model.shade(inputs, means, opacities, Query(center, moment))
     viewmat = torch.eye(4)
     viewmat[:3, 3] = -center
     K = torch.tensor([[20.0, 0, WIDTH / 2], [0, 20.0, HEIGHT / 2], [0, 0, 1]])

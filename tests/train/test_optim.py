@@ -104,7 +104,7 @@ def test_density_control_clones_small_splits_large_prunes_faint() -> None:
     gradients = torch.zeros(6, 2)
     gradients[[0, 3]] = torch.tensor([0.03, 0.0])  # x 100 / 2 pixels x 1 view = 1.5 > 1
     gradients[1] = torch.tensor([0.0, 0.03])  # x 50 / 2 = 0.75 < 1
-    control.observe(*drawn_with(gradients), width=100, height=50, views=1)
+    control.accumulate(*drawn_with(gradients), width=100, height=50, views=1)
     control.densify(torch.Generator().manual_seed(1), prune_large=False)
     means = model.splats["means"].detach()[:, 0]
     assert len(model) == 7  # 1, 2, 4 kept; 0 cloned to two; 3 split in two; 5 pruned
@@ -131,13 +131,13 @@ def test_no_more_gaussians_than_the_cap_and_the_largest_gradients_first() -> Non
         model.splats["means"].copy_(torch.arange(6.0)[:, None].expand(6, 3))
     gradients = torch.zeros(6, 2)
     gradients[:, 0] = torch.tensor([0.0, 0.2, 0.1, 0.3, 0.2, 0.2])
-    control.observe(*drawn_with(gradients), width=10, height=10, views=1)
+    control.accumulate(*drawn_with(gradients), width=10, height=10, views=1)
     assert control.densify(torch.Generator(), prune_large=False) == 2
     assert model.splats["means"].detach()[:, 0].tolist() == [0, 1, 2, 3, 4, 5, 1, 3, 4]
-    control.observe(*drawn_with(torch.ones(9, 2)), width=10, height=10, views=1)
+    control.accumulate(*drawn_with(torch.ones(9, 2)), width=10, height=10, views=1)
     assert control.densify(torch.Generator(), prune_large=False) == 9
     control.config = DensifyConfig(grad_threshold=0.0, max_gaussians=5)  # fewer than a file to start from has
-    control.observe(*drawn_with(torch.ones(9, 2)), width=10, height=10, views=1)
+    control.accumulate(*drawn_with(torch.ones(9, 2)), width=10, height=10, views=1)
     assert control.densify(torch.Generator(), prune_large=False) == 9
     assert len(model) == 9
 
@@ -152,7 +152,7 @@ def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
 
     def look(drawn: torch.Tensor, times: int) -> list[float]:
         for _ in range(times):
-            control.observe(*drawn_with(torch.zeros(4, 2)[: len(model)], drawn), 10, 10, views=1)
+            control.accumulate(*drawn_with(torch.zeros(4, 2)[: len(model)], drawn), 10, 10, views=1)
         control.densify(torch.Generator(), prune_large=False)
         return model.splats["means"].detach()[:, 0].tolist()
 
@@ -167,7 +167,7 @@ def test_counts_follow_the_rows_that_a_gate_kept() -> None:
     model, optimizer = fitted(4)
     control = DensityControl(model, optimizer, DensifyConfig(), min_opacity=0.01, views=3)
     for drawn in ([1, 0, 0, 0], [1, 1, 0, 1], [1, 0, 0, 1]):
-        control.observe(*drawn_with(torch.ones(4, 2), torch.tensor(drawn)), 10, 10, views=1)
+        control.accumulate(*drawn_with(torch.ones(4, 2), torch.tensor(drawn)), 10, 10, views=1)
     assert control.unseen.tolist() == [0, 1, 3, 0]
     rows = torch.tensor([3, 2, 1])
     model.select(rows)

@@ -17,11 +17,11 @@ def test_full_run_is_the_recipe_as_published() -> None:
     densified = [step + 1 for step in range(30_000) if s.densifies(step)]
     assert densified == list(range(600, 15_001, 100))
     assert [step + 1 for step in range(30_000) if s.resets(step)] == [3_000, 6_000, 9_000, 12_000]
-    assert [s.phase(step).sh_degree for step in (0, 999, 1_000, 2_999, 3_000, 29_999)] == [0, 0, 1, 2, 3, 3]
-    assert not s.phase(2_999).refine
-    assert s.phase(3_000).refine
-    assert not s.phase(14_999).tune_modulation
-    assert s.phase(15_000).tune_modulation
+    assert [s.active(step).sh_degree for step in (0, 999, 1_000, 2_999, 3_000, 29_999)] == [0, 0, 1, 2, 3, 3]
+    assert not s.active(2_999).refine
+    assert s.active(3_000).refine
+    assert not s.active(14_999).tunes_lambda
+    assert s.active(15_000).tunes_lambda
 
 
 @pytest.mark.parametrize("iterations", [200, 1_000, 7_000, 12_345])
@@ -30,8 +30,8 @@ def test_short_run_keeps_the_proportions(iterations: int) -> None:
     short = schedule(iterations)
     for recipe in (500, 1_000, 3_000, 15_000):
         assert short.scaled(recipe) == max(1, round(recipe / 30_000 * iterations))
-    assert short.phase(iterations - 1).sh_degree == 3
-    assert short.phase(iterations - 1).refine
+    assert short.active(iterations - 1).sh_degree == 3
+    assert short.active(iterations - 1).refine
     assert short.densify_stop == iterations // 2 or iterations % 2
 
 
@@ -56,7 +56,7 @@ def test_intervals_never_fall_below_what_they_wait_for() -> None:
 def test_agr_never_acts_where_it_is_off() -> None:
     """Catches a schedule that refines a model without AGR."""
     s = Schedule(TrainConfig(iterations=100), sh_degree=3, agr=False)
-    assert not any(s.phase(step).refine for step in range(100))
+    assert not any(s.active(step).refine for step in range(100))
 
 
 @pytest.mark.parametrize(("iterations", "points"), [(1_000, 10), (7, 3), (5, 20), (100, 1)])

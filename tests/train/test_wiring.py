@@ -58,7 +58,7 @@ def test_density_gradients_are_of_one_view_in_half_images() -> None:
     density = trainer("3dgs").density
     N = len(density.model)
     gradient = torch.tensor([3e-3, 4e-3]).expand(1, N, 2).clone()
-    density.observe(torch.ones(1, N, dtype=torch.int32), gradient, width=20, height=20, views=4)
+    density.accumulate(torch.ones(1, N, dtype=torch.int32), gradient, width=20, height=20, views=4)
     torch.testing.assert_close(density.gradient, torch.full((N,), 5e-3 * 4 * 10))
 
 
@@ -126,7 +126,7 @@ def test_counts_are_kept_while_gaussians_are_densified() -> None:
     """Catches a last densification that does not know the views before it, and counting for none (2 % of a step)."""
     fitted = trainer("3dgs", "train.batch_size=1")
     stop, counted = fitted.schedule.densify_stop, []
-    fitted.density.observe = lambda *_: counted.append(fitted.step)  # type: ignore[method-assign]
+    fitted.density.accumulate = lambda *_: counted.append(fitted.step)  # type: ignore[method-assign]
     for fitted.step in (stop - 2, stop - 1, stop, stop + 1):
         fitted._descend()
     assert counted == [stop - 2, stop - 1]
@@ -196,7 +196,7 @@ def test_children_in_time_stay_near_the_clip() -> None:
         model.splats["motion"][:, 3] = 100.0
     before = model.splats["times"].detach().clone()
     assert model.long_in_time().all()
-    model.split(torch.arange(len(model)), generator(0))
+    model.split_rows(torch.arange(len(model)), generator(0))
     moved = (model.splats["times"].detach() - before).abs()
     assert 0.5 < moved.max() < 6
 
@@ -215,7 +215,7 @@ def test_a_model_shows_the_same_by_kernels_and_in_torch(name: str, degree: int, 
             splat.add_(0.3 * torch.randn(splat.shape, generator=random))
         assert model.refinement is not None
         model.refinement.weight_out.normal_(0, 0.02, generator=random)
-    model.set_phase(replace(model.phase, sh_degree=degree, refine=True))
+    model.set_active(replace(model.active, sh_degree=degree, refine=True))
     shown = []
     for backend in (AUTO, REFERENCE):
         model.backend = backend

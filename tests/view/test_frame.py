@@ -20,7 +20,7 @@ from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, Classes
 from gsbench.models.render import rasterize_slice, render
 from gsbench.run.load import LoadedRun, SceneDescription
 from gsbench.scenes import Camera
-from gsbench.schedule import Phase
+from gsbench.schedule import ActiveComponents
 from gsbench.view import paths
 from gsbench.view.__main__ import main
 from gsbench.view.client import camera_at
@@ -34,7 +34,7 @@ SIZE = 40
 def painter(backend: Backend = AUTO, classes: Classes | None = None) -> Painter:
     """Of 7DGS with AGR, in the midst of a training."""
     model = lively("7dgs_agr", count=80, backend=backend).float()
-    model.set_phase(Phase(3, True, True))
+    model.set_active(ActiveComponents(3, True, True))
     model.classes = classes
     scene = SceneDescription("small", "0", 4.0, [0.0, 0.0, 0.0], True, SIZE, SIZE)
     return Painter(LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0")), most_cost(model))
@@ -83,7 +83,7 @@ def test_agr_is_switched_for_one_frame(one: Painter) -> None:
     assert (on != off).any()
     assert (on == again).all()
     early = painter()
-    early.trained_phase = replace(early.trained_phase, refine=False)
+    early.trained_active = replace(early.trained_active, refine=False)
     assert (early.paint(camera, FrameRequest(0.4)).image == off).all()
 
 
@@ -97,7 +97,7 @@ def test_harmonics_are_cut_for_one_frame(one: Painter) -> None:
     assert (to_bytes(render(flat.requires_grad_(False), camera, 0.4, torch.zeros(3)).cpu().numpy()) == images[0]).all()
     assert len({image.tobytes() for image in images}) == 3
     early = painter()
-    early.trained_phase = replace(early.trained_phase, sh_degree=1)
+    early.trained_active = replace(early.trained_active, sh_degree=1)
     assert (early.paint(camera, FrameRequest(0.4)).image == images[1]).all()
 
 

@@ -14,7 +14,7 @@ from gsbench.models.render import render
 from gsbench.raster import rasterize
 from gsbench.scenes import Camera
 from gsbench.scenes.trained import ply_of
-from gsbench.schedule import Phase
+from gsbench.schedule import ActiveComponents
 from gsbench.view.gaussians import decompose, trained_of
 from gsbench.view.paths import intrinsics, look_at
 
@@ -32,7 +32,7 @@ def camera(x: float, y: float, z: float) -> Camera:
 def trained(variant: str) -> GaussianModel:
     """A model in the midst of a training, with everything switched on."""
     model = lively(variant, count=60).float()
-    model.set_phase(Phase(3, model.agr, True))
+    model.set_active(ActiveComponents(3, model.agr, True))
     return model.requires_grad_(False)
 
 
