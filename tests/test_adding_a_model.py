@@ -27,7 +27,7 @@ def blocks() -> dict[str, str]:
 def methods_for_gates() -> str:
     """The methods that the page adds to the example so that gates can simplify it."""
     page = (ROOT / "docs" / "adding_a_model.md").read_text()
-    (found,) = re.findall(r"^```py\n(def still.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    (found,) = re.findall(r"^```py\n(def static.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
     return textwrap.indent(found.replace("\n\n\n", "\n\n"), "    ")
 
 

@@ -1,4 +1,4 @@
-"""Look which effects a scene calls for, without a training; gate the model of a finished run, or draw its classes.
+"""Look which effects a scene calls for, without a training; gate the model of a finished run, or draw its effect_sets.
 
 python -m gsbench.effects SCENE_FOLDER [--json]
 python -m gsbench.effects --checkpoint RUN_FOLDER [--budget-db 0.05] [--data-root PATH]
@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=_whole, default=0, help="of the points and the permutations")
     parser.add_argument("--checkpoint", type=Path, metavar="RUN_FOLDER", help="gate this run into one beside it")
     parser.add_argument("--budget-db", type=float, default=0.05, help="PSNR on val that the gate may cost")
-    parser.add_argument("--picture", type=Path, metavar="RUN_FOLDER", help="draw its Gaussians by class")
+    parser.add_argument("--picture", type=Path, metavar="RUN_FOLDER", help="draw its Gaussians by effect set")
     parser.add_argument("--camera", type=int, default=0, help="of --picture: the number of the evaluated view")
     parser.add_argument("--time", type=float, help="of --picture: in [0, 1]; that of the view by default")
     parser.add_argument("--out", type=Path, metavar="FILE.png", help="where --picture goes")

@@ -34,7 +34,7 @@ def gate_within(
     sensitivity: Sensitivity,
     budget_db: float,
     measure: Callable[[GaussianModel], float],
-    spans: Tensor | None = None,  # [N, 2]
+    intervals: Tensor | None = None,  # [N, 2]
 ) -> Gated | None:
     """Apply the largest of SHARES whose measured loss is within the budget; None where none is.
 
@@ -45,7 +45,7 @@ def gate_within(
         sensitivity: of its simplifications.
         budget_db: dB that `measure` may fall by.
         measure: the PSNR of a model, dB, on views that the probe did not look at.
-        spans: when each Gaussian can be seen, for AGR to rest at other times.
+        intervals: when each Gaussian can be seen, for AGR to rest at other times.
     """
     before = measure(model)
     for share in SHARES:
@@ -53,15 +53,15 @@ def gate_within(
             continue
         gated = copy.deepcopy(model)
         choice = choose(sensitivity, gated, share)
-        rows, changed = apply(gated, sensitivity, choice, spans)
+        rows, changed = apply(gated, sensitivity, choice, intervals)
         loss = before - measure(gated)
         if loss <= budget_db and len(gated):
             gate = Gate(
                 share=share,
                 predicted_db=10 * math.log10(1 + choice.predicted),
                 measured_db=loss,
-                rows=gated.count_classes() | {"removed": len(model) - len(gated)},
-                levels=levels_of(gated),
+                rows=gated.count_by_effects() | {"removed": len(model) - len(gated)},
+                orders=orders_of(gated),
                 bytes_before=model.stored_bytes(),
                 bytes=gated.stored_bytes(),
             )
@@ -69,11 +69,11 @@ def gate_within(
     return None
 
 
-def levels_of(model: GaussianModel) -> dict[str, int]:
+def orders_of(model: GaussianModel) -> dict[str, int]:
     """Count the Gaussians by the degree of their harmonics, and by frequencies of time where there are several."""
-    if model.classes is None or model.classes.levels is None:
+    if model.effect_sets is None or model.effect_sets.orders is None:
         return {}
-    values, counts = torch.unique(model.classes.levels, return_counts=True)
+    values, counts = torch.unique(model.effect_sets.orders, return_counts=True)
     orders = [order_of(packed) for packed in values.tolist()]
     names = [f"degree {one.degree}" + (f", {one.waves} waves" if one.waves > 1 else "") for one in orders]
     return dict(zip(names, counts.tolist(), strict=True))

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 
 import torch
 
-from gsbench.effects.gate import classes_of
+from gsbench.effects.gate import effect_sets_of
 from gsbench.effects.sensitivity import MOST_VIEWS
 from gsbench.measure.quality import evenly
 from gsbench.models import GaussianModel, Query
 from gsbench.models.effect_sets import DIRECTION
 from gsbench.models.gated import GatedModel
-from gsbench.models.simplifications import STILL, shares_of
+from gsbench.models.simplifications import STATIC, shares_of
 from gsbench.scenes import View
 
 
@@ -32,17 +32,17 @@ def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianMo
     weights = shares_of([model.slice(query).opacities for query in queries])
     frozen = model.frozen({name: value.detach() for name, value in model.splats.items()}, queries, weights)
     changed = copy.deepcopy(model)
-    name = "direction" if "direction" in frozen else STILL
+    name = "direction" if "direction" in frozen else STATIC
     for key, value in frozen[name].items():
         if key != "directions":  # AGR reads them
             changed.splats[key].data = value.clone()
-    if name == STILL:
-        changed.classes = classes_of(model)._replace(refined=0, sliced=0, spans=None)
+    if name == STATIC:
+        changed.effect_sets = effect_sets_of(model)._replace(refined=0, conditioned=0, intervals=None)
     return changed
 
 
 def share_with_direction(model: GaussianModel) -> float:
     """Return the share of Gaussians whose slices change with the direction of view."""
-    classes = classes_of(model)
-    assert classes.frozen is not None
-    return float((classes.frozen[: classes.sliced] & DIRECTION == 0).sum()) / max(1, len(model))
+    effect_sets = effect_sets_of(model)
+    assert effect_sets.frozen is not None
+    return float((effect_sets.frozen[: effect_sets.conditioned] & DIRECTION == 0).sum()) / max(1, len(model))

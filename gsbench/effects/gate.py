@@ -13,15 +13,15 @@ from torch import Tensor
 from gsbench.effects.sensitivity import Sensitivity
 from gsbench.models import GaussianModel
 from gsbench.models.color_order import MOST_PACKED, at_most, order_of
-from gsbench.models.effect_sets import DIRECTION, TIME, Classes
+from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
 from gsbench.models.gated import GatedModel
-from gsbench.models.simplifications import LIVE, REMOVED, SLICED, STILL
+from gsbench.models.simplifications import CONDITIONED, LIVE, REMOVED, STATIC
 
 # Nanoseconds that a Gaussian adds to a frame, as measured on an EPYC Zen 4 (AVX-512, one thread, 5,300 Gaussians at
 # 80 x 80). They are constants, so that the same seed chooses the same Gaussians on every machine.
 REFINING = 195.0
 SLICING = 28.0
-COSTS = {SLICED: SLICING, STILL: 8.0, REMOVED: -60.0}  # beyond what a Gaussian takes in the rasterizer, 60
+COSTS = {CONDITIONED: SLICING, STATIC: 8.0, REMOVED: -60.0}  # beyond what a Gaussian takes in the rasterizer, 60
 COLORING = (13.0, 19.0, 23.0, 28.0)  # by degree, for each frequency of time
 LESS_TO_READ = 1.0  # a frozen variable among others saves no arithmetic, only parameters
 BITS = {"time": TIME, "direction": DIRECTION}
@@ -33,7 +33,7 @@ class Choice:
     """The simplification of each Gaussian."""
 
     geometry: dict[str, Tensor]  # [N] bool by the name of a simplification: which Gaussians become it
-    levels: Tensor  # [N] int32 of colours, see Classes.levels
+    orders: Tensor  # [N] int32 of colours, see EffectSets.orders
     predicted: float  # error that the choice adds, as a share of the model's own
 
 
@@ -42,22 +42,22 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
 
     Args:
         sensitivity: of the model's simplifications.
-        model: whose they are; it may have classes already.
+        model: whose they are; it may have effect sets already.
         budget: a share, such as 0.01, which is 0.043 dB.
     """
-    now = classes_of(model)
+    now = effect_sets_of(model)
     live = _live_cost(model, now)
     none = torch.zeros_like(live)
     ways, errors = sensitivity.simplifications, sensitivity.errors
-    geometry = {LIVE: none} | {way.name: errors[way.name] for way in ways if way.level is None}
+    geometry = {LIVE: none} | {way.name: errors[way.name] for way in ways if way.order is None}
     costs = torch.stack([live if name == LIVE else torch.minimum(live, none + COSTS.get(name, SLICING - LESS_TO_READ))
                          for name in geometry])  # fmt: skip
     forms = torch.stack(list(geometry.values()))
     removes = torch.tensor([name == REMOVED for name in geometry], device=live.device)[:, None]
-    assert now.levels is not None
-    levels = torch.stack([now.levels] + [at_most(now.levels, way.level) for way in ways if way.level is not None])
-    hues = torch.stack([none] + [errors[way.name] for way in ways if way.level is not None])
-    shading = _shading(levels)
+    assert now.orders is not None
+    orders = torch.stack([now.orders] + [at_most(now.orders, way.order) for way in ways if way.order is not None])
+    hues = torch.stack([none] + [errors[way.name] for way in ways if way.order is not None])
+    shading = _shading(orders)
 
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
         """Choose for a price of error; return both choices, and the error of each Gaussian."""
@@ -73,14 +73,14 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
         low, high = (low, middle) if within else (middle, high)
     form, hue, error = decide(2.0**high)
     chosen = {name: form == i for i, name in enumerate(geometry)}
-    return Choice(chosen, levels.gather(0, hue[None])[0], float(error.sum()) / max(sensitivity.total, 1e-300))
+    return Choice(chosen, orders.gather(0, hue[None])[0], float(error.sum()) / max(sensitivity.total, 1e-300))
 
 
-def _live_cost(model: GaussianModel, now: Classes) -> Tensor:
+def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
     """Return the nanoseconds that each Gaussian takes as it is, colours not counted, [N]."""
     like = model.splats["opacities"].detach()
-    cost = torch.full_like(like, COSTS[STILL])
-    cost[: now.sliced] = SLICING
+    cost = torch.full_like(like, COSTS[STATIC])
+    cost[: now.conditioned] = SLICING
     assert now.frozen is not None
     cost -= LESS_TO_READ * (now.frozen > 0)
     cost[: now.refined] += REFINING
@@ -89,31 +89,31 @@ def _live_cost(model: GaussianModel, now: Classes) -> Tensor:
 
 def cost_of(model: GaussianModel) -> Tensor:
     """Return the nanoseconds that each Gaussian adds to a frame before it is rasterized, colours counted, [N]."""
-    now = classes_of(model)
-    assert now.levels is not None
-    return _live_cost(model, now) + _shading(now.levels)
+    now = effect_sets_of(model)
+    assert now.orders is not None
+    return _live_cost(model, now) + _shading(now.orders)
 
 
 def most_cost(model: GaussianModel) -> float:
     """Return the nanoseconds of a Gaussian that pays for everything that this model can have."""
-    return REFINING + SLICING + float(_shading(torch.tensor(model.full_level())))
+    return REFINING + SLICING + float(_shading(torch.tensor(model.full_order())))
 
 
-def _shading(levels: Tensor) -> Tensor:
+def _shading(orders: Tensor) -> Tensor:
     """Return the cost, ns, of evaluating colours of some orders, packed."""
-    order = order_of(levels)
-    return torch.tensor(COLORING, device=levels.device)[order.degree] * order.waves
+    order = order_of(orders)
+    return torch.tensor(COLORING, device=orders.device)[order.degree] * order.waves
 
 
-def classes_of(model: GaussianModel) -> Classes:
-    """Return the classes of a model, or those that say what each row of one without classes pays for."""
-    if model.classes is not None:
-        return model.classes
-    rows = model.count_classes()
-    sliced = rows["refined"] + rows["sliced"]
+def effect_sets_of(model: GaussianModel) -> EffectSets:
+    """Return the effect sets of a model, or those that say what each row of one without effect sets pays for."""
+    if model.effect_sets is not None:
+        return model.effect_sets
+    rows = model.count_by_effects()
+    conditioned = rows["refined"] + rows["conditioned"]
     device = model.splats["opacities"].device
-    levels = torch.full((len(model),), model.full_level(), dtype=torch.int32, device=device)
-    return Classes(rows["refined"], sliced, levels, torch.zeros(len(model), dtype=torch.uint8, device=device))
+    orders = torch.full((len(model),), model.full_order(), dtype=torch.int32, device=device)
+    return EffectSets(rows["refined"], conditioned, orders, torch.zeros(len(model), dtype=torch.uint8, device=device))
 
 
 @torch.no_grad()
@@ -121,54 +121,57 @@ def apply(
     model: GatedModel,
     sensitivity: Sensitivity,
     choice: Choice,
-    spans: Tensor | None = None,  # [N, 2]
+    intervals: Tensor | None = None,  # [N, 2]
 ) -> tuple[Tensor, Tensor]:
-    """Turn each Gaussian of a model into its simplification, drop the removed ones, sort the others by class.
+    """Turn each Gaussian of a model into its simplification, drop the removed ones, sort the others by effect set.
 
     Args:
         model: becomes the gated one.
         sensitivity: of its simplifications.
         choice: one of them for each Gaussian.
-        spans: when each Gaussian can be seen, see `Classes.spans`.
+        intervals: when each Gaussian can be seen, see `EffectSets.intervals`.
 
     Returns:
         The rows [M] that the Gaussians which are left had before, and which of them were changed, [M] bool.
     """
-    now = classes_of(model)
-    assert now.levels is not None
+    now = effect_sets_of(model)
+    assert now.orders is not None
     assert now.frozen is not None
     for simplification in sensitivity.simplifications:
         if simplification.raw is None:
             continue
-        rows = choice.geometry[simplification.name] if simplification.level is None else (
-            (choice.levels != now.levels) & (choice.levels == at_most(now.levels, simplification.level)))  # fmt: skip
+        rows = choice.geometry[simplification.name] if simplification.order is None else (
+            (choice.orders != now.orders) & (choice.orders == at_most(now.orders, simplification.order)))  # fmt: skip
         for key, value in simplification.raw.items():
             model.splats[key].data[rows] = value[rows]
-    place = torch.arange(len(model), device=now.levels.device)
-    refined, still = place < now.refined, place >= now.sliced
+    place = torch.arange(len(model), device=now.orders.device)
+    refined, static = place < now.refined, place >= now.conditioned
     frozen = now.frozen.clone()
     for name, rows in choice.geometry.items():
         if name != LIVE:
             refined = refined & ~rows
         if name in BITS:
             frozen[rows] |= BITS[name]
-    frozen[now.sliced :] = 0
-    still = still | choice.geometry.get(STILL, torch.zeros_like(still)) | (frozen == sum(BITS.values()))
-    frozen[still] = 0
-    kind = torch.where(refined, 0, torch.where(still, 2, 1))
-    # Rows of a class are sorted by what is frozen and by level, and otherwise stay in order: equal work lies together.
-    rank = (kind * 4 + frozen) * (MOST_PACKED + 1) + MOST_PACKED - choice.levels
-    if spans is None:
+    frozen[now.conditioned :] = 0
+    static = static | choice.geometry.get(STATIC, torch.zeros_like(static)) | (frozen == sum(BITS.values()))
+    frozen[static] = 0
+    kind = torch.where(refined, 0, torch.where(static, 2, 1))
+    # Rows of an effect set are sorted by what is frozen and by the order of their colours, and otherwise stay where
+    # they are: equal work lies together.
+    rank = (kind * 4 + frozen) * (MOST_PACKED + 1) + MOST_PACKED - choice.orders
+    if intervals is None:
         order = rank.argsort(stable=True)
     else:  # those that AGR moves at the same times lie together too: a GPU's warps rest as a whole
-        order = spans[:, 0].argsort(stable=True)
+        order = intervals[:, 0].argsort(stable=True)
         order = order[rank[order].argsort(stable=True)]
     rows = order[~choice.geometry[REMOVED][order]]
-    changed = (~choice.geometry[LIVE] | (choice.levels != now.levels))[rows]
+    changed = (~choice.geometry[LIVE] | (choice.orders != now.orders))[rows]
     model.select(rows)
     counts = [int((kind[rows] <= most).sum()) for most in (0, 1)]
-    own = now.spans if spans is None else spans
+    own = now.intervals if intervals is None else intervals
     own = None if own is None else own[rows[: counts[0]]].contiguous()
-    model.classes = Classes(counts[0], counts[1], choice.levels[rows].contiguous(), frozen[rows].contiguous(), own)
-    model.fill(model.classes)
+    model.effect_sets = EffectSets(
+        counts[0], counts[1], choice.orders[rows].contiguous(), frozen[rows].contiguous(), own
+    )
+    model.fill(model.effect_sets)
     return rows, changed

@@ -2,19 +2,19 @@
 
 from gsbench.measure.record import Direction, Gate, OnDemand, TimeScreen
 
-CLASSES = {  # of Gaussians: the names of gsbench.models.effect_sets, in its order, and what they are called
+EFFECT_SETS = {  # of Gaussians: the names of gsbench.models.effect_sets, in its order, and what they are called
     "refined": "refined by AGR",
-    "sliced": "sliced",
+    "conditioned": "conditioned",
     "time": "time frozen",
     "direction": "direction frozen",
-    "still": "still",
+    "static": "static",
 }
 _KEEP = {
     "refined": "have AGR",
-    "sliced": "are sliced without AGR",
+    "conditioned": "are conditioned without AGR",
     "time": "have time frozen",
     "direction": "have direction frozen",
-    "still": "are still",
+    "static": "are static",
 }
 
 

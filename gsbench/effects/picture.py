@@ -1,4 +1,4 @@
-"""Draw a model's image beside the same Gaussians in the colours of their classes, and what a pixel pays for.
+"""Draw a model's image beside the same Gaussians in the colours of their effect sets, and what a pixel pays for.
 
 The third panel is the cost of the Gaussians that a pixel shows, weighted as their colours are: nanoseconds of a frame
 by the constants of gsbench.effects.gate, black for none, bright yellow for a Gaussian with AGR and all harmonics.
@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsbench.effects.gate import classes_of, cost_of, most_cost
-from gsbench.effects.messages import CLASSES
+from gsbench.effects.gate import cost_of, effect_sets_of, most_cost
+from gsbench.effects.messages import EFFECT_SETS
 from gsbench.measure.images import Pixels, inferno, to_bytes
 from gsbench.models import GaussianModel, Query
 from gsbench.models.effect_sets import NAMES
@@ -20,10 +20,10 @@ from gsbench.scenes import Camera
 # RGB, those of the report's page on white: a Gaussian has the colour of the model whose effects it still has.
 COLOURS = {
     "refined": (0xB3, 0x47, 0x00),
-    "sliced": (0x9C, 0x3D, 0x82),
+    "conditioned": (0x9C, 0x3D, 0x82),
     "time": (0x00, 0x73, 0x4F),
     "direction": (0x00, 0x69, 0xA8),
-    "still": (0x5C, 0x60, 0x66),
+    "static": (0x5C, 0x60, 0x66),
 }
 LEAST_WIDTH, MOST_WIDTH = 300, 640  # pixels of a panel: smaller images are enlarged by an integer factor, larger shrunk
 GAP = 4  # pixels
@@ -39,10 +39,10 @@ def draw(
     """Draw the three panels with their titles and a legend: uint8 [H', W', 3] RGB.
 
     Args:
-        model: initialised; one without classes is refined, sliced or still everywhere.
+        model: initialised; one without effect sets is refined, conditioned or static everywhere.
         camera: sees it.
         time: in [0, 1]; None where the scene has no time.
-        background: colour [3] of the image; that of the classes is white.
+        background: colour [3] of the image; that of the effect sets is white.
         antialias: see `gsbench.raster.rasterize`.
 
     Raises:
@@ -51,7 +51,7 @@ def draw(
     seen = model.slice(Query.of(camera, time))
     layers = (
         (seen.colors, background),
-        (class_colors(model), torch.ones_like(background)),
+        (effect_set_colors(model), torch.ones_like(background)),
         (cost_colors(model, most_cost(model)), torch.zeros_like(background)),
     )
     images = [
@@ -60,11 +60,11 @@ def draw(
     ]
     panels = [to_bytes(image.cpu().numpy()) for image in images]
     panels[2] = inferno(panels[2][..., 0] / 255)
-    return _arranged(panels, model.count_classes(), most_cost(model))
+    return _arranged(panels, model.count_by_effects(), most_cost(model))
 
 
-def class_colors(model: GaussianModel) -> Tensor:
-    """Return the colour of each Gaussian's class, [N, 3] in [0, 1]."""
+def effect_set_colors(model: GaussianModel) -> Tensor:
+    """Return the colour of each Gaussian's effect set, [N, 3] in [0, 1]."""
     return torch.tensor([COLOURS[name] for name in NAMES]).to(model.splats["means"])[kinds_of(model)] / 255
 
 
@@ -74,13 +74,17 @@ def cost_colors(model: GaussianModel, most: float) -> Tensor:
 
 
 def kinds_of(model: GaussianModel) -> Tensor:
-    """Return the class of each Gaussian as its place among NAMES, [N] int64."""
-    classes = classes_of(model)
-    assert classes.frozen is not None
-    place = torch.arange(len(model), device=classes.frozen.device)
-    sliced = 1 + classes.frozen.long()  # TIME and DIRECTION follow one another as in NAMES, and both are still
-    still = torch.full_like(place, NAMES.index("still"))
-    return torch.where(place < classes.refined, 0, torch.where(place < classes.sliced, sliced, still))
+    """Return the effect set of each Gaussian as its place among NAMES, [N] int64."""
+    effect_sets = effect_sets_of(model)
+    assert effect_sets.frozen is not None
+    place = torch.arange(len(model), device=effect_sets.frozen.device)
+    conditioned = (
+        1 + effect_sets.frozen.long()
+    )  # TIME and DIRECTION follow one another as in NAMES, and both are static
+    static = torch.full_like(place, NAMES.index("static"))
+    return torch.where(
+        place < effect_sets.refined, 0, torch.where(place < effect_sets.conditioned, conditioned, static)
+    )
 
 
 def _arranged(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixels:
@@ -96,7 +100,11 @@ def _arranged(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixe
     row = np.concatenate([panels[0], gap, panels[1], gap, panels[2]], 1)
     step = width + GAP
     titles = _paper(1, row.shape[1])
-    names = ("image", f"{sum(counts.values()):,} Gaussians by class", f"cost of what a pixel shows, 0 to {most:.0f} ns")
+    names = (
+        "image",
+        f"{sum(counts.values()):,} Gaussians by effect set",
+        f"cost of what a pixel shows, 0 to {most:.0f} ns",
+    )
     for i, title in enumerate(names):
         _write(titles, title, i * step + 6, 0)
     there = {name: number for name, number in counts.items() if number}
@@ -104,7 +112,7 @@ def _arranged(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixe
     for i, (name, number) in enumerate(there.items()):
         line, left = i // COLUMNS, i % COLUMNS * step + 6
         legend[line * LINE + 5 : line * LINE + 17, left : left + 12] = COLOURS[name]
-        _write(legend, f"{CLASSES[name]}: {number:,}", left + 18, line)
+        _write(legend, f"{EFFECT_SETS[name]}: {number:,}", left + 18, line)
     return np.concatenate([titles, row, legend])
 
 

@@ -174,7 +174,7 @@ def _error(simplification: Simplification, here: Place, draw: Drawing) -> Tensor
     if simplification.raw is None:
         return _grown(here.removed)
     raw = dict(model.splats.items()) | simplification.raw
-    if simplification.level is not None:
+    if simplification.order is not None:
         colors = model.shade(raw, live.means, live.opacities, here.query)
         return _grown((here.products[..., COLOR] * (colors - live.colors)).sum(-1))
     means, factors, opacities = model.observe(raw, here.query)

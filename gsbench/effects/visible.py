@@ -47,9 +47,9 @@ def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
 
 
 def share_asleep(model: GaussianModel, views: Sequence[View]) -> float | None:
-    """Return the share of AGR's work that spans leave out, mean over views; None without spans."""
-    spans = None if model.classes is None else model.classes.spans
-    if spans is None or not len(spans):
+    """Return the share of AGR's work that intervals leave out, mean over views; None without intervals."""
+    intervals = None if model.effect_sets is None else model.effect_sets.intervals
+    if intervals is None or not len(intervals):
         return None
-    times = spans.new_tensor([view.time or 0.0 for view in views])[:, None]
-    return float(((times < spans[:, 0]) | (times > spans[:, 1])).float().mean())
+    times = intervals.new_tensor([view.time or 0.0 for view in views])[:, None]
+    return float(((times < intervals[:, 0]) | (times > intervals[:, 1])).float().mean())

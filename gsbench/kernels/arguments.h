@@ -22,7 +22,7 @@ namespace gsb {
 
 // Gaussians with a triangular factor over p and d, t or both, observed from a place and at a time (6DGS, 7DGS).
 struct TriangularArgs {
-    int64_t N, sliced;  // rows from `sliced` on are still: no query changes them
+    int64_t N, conditioned;  // rows from `conditioned` on are static: no query changes them
     bool conditioned_first;
     OffDiagonal form;
     bool subtracts;  // by the scheme that forms S, for comparison; on the CPU only
@@ -33,7 +33,7 @@ struct TriangularArgs {
     const float *time, *log_lambda_d, *log_lambda_t;          // [] [] []
     int threads;
 };
-GSB_FIELDS(TriangularArgs, INPUTS, N, sliced, conditioned_first, form, subtracts, half, means, directions, times,
+GSB_FIELDS(TriangularArgs, INPUTS, N, conditioned, conditioned_first, form, subtracts, half, means, directions, times,
            log_diagonal, shape, motion, coupling, opacities, center, time, log_lambda_d, log_lambda_t, threads)
 
 struct TriangularGrads {
@@ -45,13 +45,13 @@ GSB_FIELDS(TriangularGrads, GRADS, means, directions, times, log_diagonal, shape
 
 // Gaussians over (x, y, z, t) with the factor M_left M_right diag(exp scales), observed at a time (4DGS).
 struct RotatedArgs {
-    int64_t N, sliced;  // rows from `sliced` on are still
+    int64_t N, conditioned;  // rows from `conditioned` on are static
     const float *means, *times, *scales, *left_quats, *right_quats;  // [N, 3] [N, 1] [N, 4] [N, 4] [N, 4]
     const float *opacities, *clock, *time, *log_lambda_t;            // [N] logits, [] [] []
     int threads;
 };
-GSB_FIELDS(RotatedArgs, INPUTS, N, sliced, means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
-           threads)
+GSB_FIELDS(RotatedArgs, INPUTS, N, conditioned, means, times, scales, left_quats, right_quats, opacities, clock, time,
+           log_lambda_t, threads)
 
 struct RotatedGrads {
     float *means, *times, *scales, *left_quats, *right_quats, *opacities;
@@ -71,27 +71,27 @@ struct ObservationGrads {
 GSB_FIELDS(ObservationGrads, GIVEN, means, factors, opacities)
 
 // 3D Gaussians with the factor R diag(exp scales), which are their own slice (3DGS).
-struct StillArgs {
+struct StaticArgs {
     int64_t N;
     const float *scales, *quats, *opacities;  // [N, 3] [N, 4] [N] logits
     int threads;
 };
-GSB_FIELDS(StillArgs, INPUTS, N, scales, quats, opacities, threads)
+GSB_FIELDS(StaticArgs, INPUTS, N, scales, quats, opacities, threads)
 
-struct StillSlice {
+struct StaticSlice {
     float *factors, *opacities;  // [N, 3, 3] [N]
 };
-GSB_FIELDS(StillSlice, OUTPUTS, factors, opacities)
+GSB_FIELDS(StaticSlice, OUTPUTS, factors, opacities)
 
-struct StillSliceGrads {
+struct StaticSliceGrads {
     const float *factors, *opacities;
 };
-GSB_FIELDS(StillSliceGrads, GIVEN, factors, opacities)
+GSB_FIELDS(StaticSliceGrads, GIVEN, factors, opacities)
 
-struct StillGrads {
+struct StaticGrads {
     float *scales, *quats, *opacities;
 };
-GSB_FIELDS(StillGrads, GRADS, scales, quats, opacities)
+GSB_FIELDS(StaticGrads, GRADS, scales, quats, opacities)
 
 // ---- gsbench/kernels/colors.py
 
@@ -103,10 +103,10 @@ struct ColorArgs {
     const float *means, *opacities;  // [N, 3] [N]: one below 1/255 is not drawn, and has no colour
     const float* times;              // [N, 1], null: colours do not change
     const float *center, *time;      // [3] []
-    const int32_t* levels;           // [N] what a row has at most, degree + 4 (waves - 1); null: all of them have all
+    const int32_t* orders;           // [N] what a row has at most, degree + 4 (waves - 1); null: all of them have all
     int threads;
 };
-GSB_FIELDS(ColorArgs, INPUTS, N, degree, bases, waves, sh0, shN, means, opacities, times, center, time, levels, threads)
+GSB_FIELDS(ColorArgs, INPUTS, N, degree, bases, waves, sh0, shN, means, opacities, times, center, time, orders, threads)
 
 struct Colors {
     float* colors;  // [N, 3]
@@ -135,12 +135,12 @@ struct RefineArgs {
     const float* values[MAX_VALUES];     // [arrays] of [N, value_widths]
     const float *weight_in, *bias_in;    // [networks * 64, features] [networks * 64]
     const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
-    // [refined, 2] [], or both null: outside its span of time a row stays where it is, see is_awake.
-    const float *spans, *time;
+    // [refined, 2] [], or both null: outside its visible interval a row stays where it is, see is_awake.
+    const float *intervals, *time;
     int threads;
 };
 GSB_FIELDS(RefineArgs, INPUTS, N, refined, features, networks, arrays, outputs, widths, value_widths, values, weight_in,
-           bias_in, weight_out, bias_out, spans, time, threads)
+           bias_in, weight_out, bias_out, intervals, time, threads)
 
 struct Refined {
     float* values[MAX_VALUES];  // [arrays] of [N, value_widths]
@@ -284,8 +284,8 @@ GSB_FIELDS(AdamState, OUTPUTS, parameter, mean, square)
     kernel(observe_triangular_backward, TriangularArgs, ObservationGrads, TriangularGrads)         \
     kernel(observe_rotated, RotatedArgs, Observation)                                              \
     kernel(observe_rotated_backward, RotatedArgs, ObservationGrads, RotatedGrads)                  \
-    kernel(observe_still, StillArgs, StillSlice)                                                   \
-    kernel(observe_still_backward, StillArgs, StillSliceGrads, StillGrads)                         \
+    kernel(observe_static, StaticArgs, StaticSlice)                                                   \
+    kernel(observe_static_backward, StaticArgs, StaticSliceGrads, StaticGrads)                         \
     kernel(show_colors, ColorArgs, Colors)                                                         \
     kernel(show_colors_backward, ColorArgs, GivenColors, ColorGrads)                               \
     kernel(refine, RefineArgs, Refined)                                                            \

@@ -36,7 +36,7 @@ _show = Operation(
         "times": Input("N 1", left_out_with="time"),
         "center": Input("3", Gradient.REFUSED),
         "time": Input("", Gradient.REFUSED, left_out_with="time"),
-        "levels": Input("N", Gradient.REFUSED, torch.int32, left_out_with="levels"),
+        "orders": Input("N", Gradient.REFUSED, torch.int32, left_out_with="orders"),
     },
     outputs={"colors": Output("N 3")},
     numbers={"degree": int, "waves": int},
@@ -55,7 +55,7 @@ def show_colors(
     times: Tensor | None = None,  # [N, 1]
     time: Tensor | None = None,  # []
     waves: int = 1,
-    levels: Tensor | None = None,  # [N] int32
+    orders: Tensor | None = None,  # [N] int32
 ) -> Tensor:  # [N, 3]
     """Colours max(0, sum beta_nlm cos(2 pi n (t - mu_t)) Y_lm(d) + 0.5), d the direction from `center` to the mean.
 
@@ -72,7 +72,7 @@ def show_colors(
         times: mu_t, where colours change with time.
         time: clips.
         waves: frequencies of time, the constant one included.
-        levels: what each colour has at most, its degree + 4 (waves - 1); the coefficients above that are not read, and
+        orders: what each colour has at most, its degree + 4 (waves - 1); the coefficients above that are not read, and
             their gradient is zero. None: all colours have `degree` and `waves`.
 
     Raises:
@@ -83,4 +83,4 @@ def show_colors(
                          f"degree={degree!r:.40} and waves={waves!r:.40}")  # fmt: skip
     if waves == 1:
         times = time = None
-    return _show(sh0, shN, means, opacities, times, center, time, levels, degree, waves)[0]
+    return _show(sh0, shN, means, opacities, times, center, time, orders, degree, waves)[0]

@@ -16,7 +16,7 @@ def _constants(header: str, kind: str) -> dict[str, float]:
 _thresholds = _constants("math/thresholds.h", "float")
 LOG_SIZE_MAX = _thresholds["LOG_SIZE_MAX"]
 EXPONENT_MAX = _thresholds["EXPONENT_MAX"]
-TIME_GATE_MIN = _thresholds["TIME_GATE_MIN"]
+TIME_OPACITY_FACTOR_MIN = _thresholds["TIME_OPACITY_FACTOR_MIN"]
 ALPHA_MIN = _thresholds["ALPHA_MIN"]
 ALPHA_MAX = _thresholds["ALPHA_MAX"]
 TRANSMITTANCE_MIN = _thresholds["TRANSMITTANCE_MIN"]

@@ -14,6 +14,6 @@
 #include "math/scalar.h"
 #include "math/similarity.h"
 #include "math/slicing.h"
-#include "math/still.h"
-#include "math/still_triangular.h"
+#include "math/static.h"
+#include "math/static_triangular.h"
 #include "math/triangular.h"

@@ -24,16 +24,16 @@ class _Inputs(NamedTuple):
     bias_out: Tensor
     units: Tensor
     gamma: Tensor
-    spans: Tensor | None
+    intervals: Tensor | None
     time: Tensor | None
 
     @classmethod
     def of(cls, tensors: Tensors) -> "_Inputs":
-        """Take the list apart; spans and time are empty where they are left out."""
-        *values, weight_in, bias_in, weight_out, bias_out, units, gamma, spans, time = tensors
-        left_out = spans.shape == time.shape == (0,)
+        """Take the list apart; intervals and time are empty where they are left out."""
+        *values, weight_in, bias_in, weight_out, bias_out, units, gamma, intervals, time = tensors
+        left_out = intervals.shape == time.shape == (0,)
         return cls(values, weight_in, bias_in, weight_out, bias_out, units, gamma,
-                   None if left_out else spans, None if left_out else time)  # fmt: skip
+                   None if left_out else intervals, None if left_out else time)  # fmt: skip
 
     def named(self) -> list[tuple[str, Tensor]]:
         """Every tensor that is there, in order, with the name that messages have for it."""
@@ -113,13 +113,13 @@ class _Refine(Operation):
         return [*moved, *dense[features:], *own, None, None, None, None]
 
     def _slots(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        """What the kernels take, and what must live as long: the arrays, the layers and the spans."""
+        """What the kernels take, and what must live as long: the arrays, the layers and the intervals."""
         slots = self.match(tensors, numbers).copy()
         given = _Inputs.of(tensors)
         values, weights = in_rows(given.values), given.layers()
-        spans = None if given.spans is None else given.spans.contiguous()
-        slots |= {"values": _addresses(values), "spans": address(spans), "time": address(given.time),
-                  "rows": values, "layers": weights, "kept": (spans, given.time)}  # fmt: skip
+        intervals = None if given.intervals is None else given.intervals.contiguous()
+        slots |= {"values": _addresses(values), "intervals": address(intervals), "time": address(given.time),
+                  "rows": values, "layers": weights, "kept": (intervals, given.time)}  # fmt: skip
         return slots | {key: x.data_ptr() for key, x in weights.items()}
 
     def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
@@ -144,7 +144,7 @@ class _Refine(Operation):
         shapes: list[tuple[int, ...]] = [(len(like), c) for c in moved]
         shapes += [(hidden, features + len(given.gamma)), (hidden,), (outputs, HIDDEN), (outputs,)]
         shapes += [(outputs,), (len(given.gamma),)]
-        if given.spans is not None:
+        if given.intervals is not None:
             shapes += [(rows, 2), ()]
         for (name, x), shape in zip(listed, shapes, strict=True):
             if tuple(x.shape) != shape or x.device != like.device:
@@ -174,7 +174,7 @@ def refine(
     gamma: Tensor,  # [G]
     *,
     rows: int | None = None,
-    spans: Tensor | None = None,  # [rows, 2] clips
+    intervals: Tensor | None = None,  # [rows, 2] clips
     time: Tensor | None = None,  # []
 ) -> Tensors:  # of [N, c], as `values`
     """Values moved by P perceptrons (F + G) x 64 x c with ReLU, x + phi(features, gamma) (7DGS eq. 14 and 15).
@@ -190,15 +190,15 @@ def refine(
         units: what the perceptrons measure each number in.
         gamma: what is the same for all Gaussians, the encoded time.
         rows: how many of the first are moved, all by default; the others are copied.
-        spans: the first and the last time at which each of these rows is moved; always, by default.
-        time: needed with spans.
+        intervals: the first and the last time at which each of these rows is moved; always, by default.
+        time: needed with intervals.
 
     Raises:
         InputError: not float32 on one device, shapes that do not fit, or there are not so many rows.
     """
-    if (spans is None) != (time is None):
-        raise InputError("refine: expected spans and time together, got one of them")
+    if (intervals is None) != (time is None):
+        raise InputError("refine: expected intervals and time together, got one of them")
     nothing = gamma.new_empty(0)
-    when = (nothing, nothing) if spans is None else (spans, time)
+    when = (nothing, nothing) if intervals is None else (intervals, time)
     return _refine(*values, weight_in, bias_in, weight_out, bias_out, units, gamma, *when,
                    EVERY_ROW if rows is None else rows)  # fmt: skip

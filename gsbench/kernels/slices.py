@@ -27,15 +27,15 @@ _triangular = Operation(
         "log_lambda_t": Input("", Gradient.SUMMED, left_out_with="time"),
     },
     outputs=_SLICE,
-    numbers={"half": float, "conditioned_first": bool, "form": int, "subtracts": bool, "sliced": int},
-    derive=lambda given, numbers: _entries(given) | _sliced(given, numbers),
+    numbers={"half": float, "conditioned_first": bool, "form": int, "subtracts": bool, "conditioned": int},
+    derive=lambda given, numbers: _entries(given) | _conditioned(given, numbers),
     memory="a slice's Gaussians",
 )
 
 
-def _sliced(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
+def _conditioned(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
     """How many rows change with the query."""
-    return {"sliced": first_rows("sliced", numbers["sliced"], given["means"])}
+    return {"conditioned": first_rows("conditioned", numbers["conditioned"], given["means"])}
 
 
 def _entries(given: dict[str, Tensor]) -> dict[str, int]:
@@ -64,7 +64,7 @@ def observe_triangular(
     form: int = 0,
     directional_half: bool = True,
     subtracts: bool = False,
-    sliced: int | None = None,
+    conditioned: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Slice Gaussians over p and d, t or both at a query: means [N, 3], factors [N, 3, 3], opacities [N].
 
@@ -72,8 +72,8 @@ def observe_triangular(
     f_temp and f_dir (7DGS eq. 9 to 12) in the opacities. With `subtracts` by the scheme `cholesky` instead, which is
     there on the CPU only.
 
-    Rows from `sliced` on are still: no query changes their mean, their factor is L_pp alone, and their opacity has no
-    f_temp and no f_dir. By all that they do not depend on their gradient is zero.
+    Rows from `conditioned` on are static: no query changes their mean, their factor is L_pp alone, and their opacity
+    has no f_temp and no f_dir. By all that they do not depend on their gradient is zero.
 
     Args:
         means: mu_p, world units.
@@ -92,17 +92,17 @@ def observe_triangular(
         form: what entries below the diagonal are, a place in `gsbench.models.factors.OFF_DIAGONALS`.
         directional_half: whether f_dir has the 1/2 of 7DGS eq. 12.
         subtracts: by the scheme that forms S.
-        sliced: how many rows change with the query; all by default.
+        conditioned: how many rows change with the query; all by default.
 
     Raises:
         InputError: not float32 on one device, shapes that do not fit, nothing is observed, a gradient by `center` or
-            `time` is asked for, or more rows are sliced than there are.
+            `time` is asked for, or more rows are conditioned than there are.
     """
     timed = times is not None
     seen = _triangular(means, directions, times, log_diagonal, shape, motion, coupling, opacities, center,
                        time if timed else None, log_lambda_d, log_lambda_t if timed else None,
                        0.5 if directional_half else 1.0, conditioned_first, form, subtracts,
-                       EVERY_ROW if sliced is None else sliced)  # fmt: skip
+                       EVERY_ROW if conditioned is None else conditioned)  # fmt: skip
     return seen[0], seen[1], seen[2]
 
 
@@ -120,8 +120,8 @@ _rotated = Operation(
         "log_lambda_t": Input("", Gradient.SUMMED),
     },
     outputs=_SLICE,
-    numbers={"sliced": int},
-    derive=lambda given, numbers: _sliced(given, numbers),
+    numbers={"conditioned": int},
+    derive=lambda given, numbers: _conditioned(given, numbers),
     memory="a slice's Gaussians",
 )
 
@@ -137,15 +137,16 @@ def observe_rotated(
     time: Tensor,  # []
     log_lambda_t: Tensor,  # []
     *,
-    sliced: int | None = None,
+    conditioned: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Slice 4D Gaussians F = M_left M_right diag(exp scales) at `time`: means [N, 3], factors [N, 3, 3], opacities [N].
 
     The square-root scheme of `gsbench.models.slicing` for the parameters of `gsbench.models.gaussians4d`, with f_temp
     in the opacities, zero where it is not above 0.05 (4DGS).
 
-    Rows from `sliced` on are still: their factor is R diag(exp scales) over (x, y, z) as in 3DGS, with the rotation of
-    `gsbench.models.factors.turn_of_space`, and their opacity has no f_temp. Their gradient by all else is zero.
+    Rows from `conditioned` on are static: their factor is R diag(exp scales) over (x, y, z) as in 3DGS, with the
+    rotation of `gsbench.models.factors.turn_of_space`, and their opacity has no f_temp. Their gradient by all else is
+    zero.
 
     Args:
         means: world units.
@@ -157,25 +158,25 @@ def observe_rotated(
         clock: world units a clip.
         time: clips.
         log_lambda_t: ln lambda_t, the sensitivity of f_temp.
-        sliced: how many rows change with the time; all by default.
+        conditioned: how many rows change with the time; all by default.
 
     Raises:
-        InputError: not float32 on one device, shapes that do not fit, or more rows are sliced than there are.
+        InputError: not float32 on one device, shapes that do not fit, or more rows are conditioned than there are.
     """
     seen = _rotated(means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
-                    EVERY_ROW if sliced is None else sliced)  # fmt: skip
+                    EVERY_ROW if conditioned is None else conditioned)  # fmt: skip
     return seen[0], seen[1], seen[2]
 
 
-_still = Operation(
-    "observe_still",
+_static = Operation(
+    "observe_static",
     inputs={"scales": Input("N 3"), "quats": Input("N 4"), "opacities": Input("N")},
     outputs={"factors": Output("N 3 3"), "opacities": Output("N")},
     memory="a slice's Gaussians",
 )
 
 
-def observe_still(
+def observe_static(
     scales: Tensor,  # [N, 3] log scales
     quats: Tensor,  # [N, 4] wxyz
     opacities: Tensor,  # [N] logits
@@ -185,5 +186,5 @@ def observe_still(
     Raises:
         InputError: not float32 on one device, or shapes that do not fit.
     """
-    seen = _still(scales, quats, opacities)
+    seen = _static(scales, quats, opacities)
     return seen[0], seen[1]

@@ -87,6 +87,10 @@ class TimeScreen:
     seconds: float  # that the test took
 
 
+RENAMED_KEYS = {"levels": "orders"}  # of a gate in older records and checkpoints ..
+RENAMED_EFFECT_SETS = {"sliced": "conditioned", "still": "static"}  # .. and names of effect sets there
+
+
 @dataclass(frozen=True)
 class Gate:
     """The decision of one gate, by gsbench.effects."""
@@ -94,8 +98,8 @@ class Gate:
     share: float  # of the squared error, the budget of the prediction
     predicted_db: float
     measured_db: float  # PSNR lost on the views that it was checked on
-    rows: dict[str, int]  # Gaussians by class: gsbench.models.effect_sets.NAMES, and removed
-    levels: dict[str, int]  # Gaussians by the harmonics of their colours
+    rows: dict[str, int]  # Gaussians by effect set: gsbench.models.effect_sets.NAMES, and removed
+    orders: dict[str, int]  # Gaussians by the harmonics of their colours
     bytes_before: int
     bytes: int
     step: int | None = None  # of the training, before which it acted; None: at the end
@@ -105,6 +109,14 @@ class Gate:
     frame_ms_before: float | None = None  # medians of frames, rendered in turns with those after
     frame_ms: float | None = None
     asleep: float | None = None  # share of AGR's work left out: Gaussians that no training view shows at its time
+
+    @staticmethod
+    def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
+        """Return a gate as JSON with the names of now, where an older gsbench wrote it."""
+        plain = {RENAMED_KEYS.get(key, key): value for key, value in plain.items()}
+        if isinstance(rows := plain.get("rows"), dict):
+            plain["rows"] = {RENAMED_EFFECT_SETS.get(name, name): count for name, count in rows.items()}
+        return plain
 
 
 @dataclass(frozen=True)

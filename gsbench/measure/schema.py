@@ -15,7 +15,7 @@ def parse(kind: type[T], value: object, file: str) -> T:
     """Parse `value`, as json.loads gives it, into an instance of the dataclass `kind`.
 
     Fields may be dataclasses, named tuples, list[X], dict[str, X], X | None, bool, int, float (which accepts an int),
-    str, and Any (any plain JSON).
+    str, and Any (any plain JSON). A dataclass may rename what older files hold: `with_present_names`.
 
     Raises:
         InputError: ``<file>: <field>: expected ..., got ...``.
@@ -58,6 +58,8 @@ def _parse_fields(kind: Any, value: Any, file: str, field: str) -> Any:
     """Parse an object as the dataclass `kind`: it must have every field without a default, and no other key."""
     if type(value) is not dict:
         raise _fault(file, field, "an object", value)
+    if hasattr(kind, "with_present_names"):
+        value = kind.with_present_names(value)
     kinds = _kinds(kind)
     prefix = f"{field}." if field else ""
     for name in value:

@@ -33,18 +33,18 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(basis, -1)
 
 
-def sh_colors(coefficients: Tensor, directions: Tensor, degree: int, levels: Tensor | None = None) -> Tensor:
+def sh_colors(coefficients: Tensor, directions: Tensor, degree: int, orders: Tensor | None = None) -> Tensor:
     """Compute colours max(0, sum beta_lm Y_lm + 0.5), [N, K, 3] and [N, 3] -> [N, 3] (3DGS; 7DGS eq. 2).
 
-    Levels [N] int32 leave out what is above a row's own degree, as `gsbench.models.base.Classes` has it.
+    Orders [N] int32 leave out what is above a row's own degree, as `gsbench.models.base.EffectSets` has it.
     """
-    basis = _basis_within(directions, degree, levels)
+    basis = _basis_within(directions, degree, orders)
     used = coefficients[:, : basis.shape[-1]]
     return ((basis[..., None] * used).sum(1) + 0.5).clamp(min=0)
 
 
 def sh_time_colors(
-    coefficients: Tensor, directions: Tensor, degree: int, time_offset: Tensor, levels: Tensor | None = None
+    coefficients: Tensor, directions: Tensor, degree: int, time_offset: Tensor, orders: Tensor | None = None
 ) -> Tensor:
     """Compute colours by 4DSH: Y_lm(d) cos(2 pi n (t - mu_t) / T), T = 1 (4DGS, eq. 12).
 
@@ -53,20 +53,20 @@ def sh_time_colors(
         directions: [N, 3] unit vectors.
         degree: of the spherical harmonics in use.
         time_offset: [N] t - mu_t.
-        levels: [N] int32, the most that each row has, packed as by `ColorOrder`.
+        orders: [N] int32, the most that each row has, packed as by `ColorOrder`.
     """
     frequencies = torch.arange(coefficients.shape[1], device=time_offset.device, dtype=time_offset.dtype)
     waves = torch.cos(2 * math.pi * frequencies * time_offset[:, None])  # [N, M]
-    if levels is not None:
-        waves = torch.where(frequencies < order_of(levels).waves[:, None], waves, 0.0)
-    basis = _basis_within(directions, degree, levels)
+    if orders is not None:
+        waves = torch.where(frequencies < order_of(orders).waves[:, None], waves, 0.0)
+    basis = _basis_within(directions, degree, orders)
     used = (coefficients[:, :, : basis.shape[-1]] * waves[..., None, None]).sum(1)
     return ((basis[..., None] * used).sum(1) + 0.5).clamp(min=0)
 
 
-def _basis_within(directions: Tensor, degree: int, levels: Tensor | None) -> Tensor:
-    """Compute `sh_basis`, zero above the degree of each row's level."""
+def _basis_within(directions: Tensor, degree: int, orders: Tensor | None) -> Tensor:
+    """Compute `sh_basis`, zero above the degree of each row's order."""
     basis = sh_basis(directions, degree)
-    if levels is None:
+    if orders is None:
         return basis
-    return torch.where(coefficients_within(levels, degree)[:, 0], basis, 0.0)
+    return torch.where(coefficients_within(orders, degree)[:, 0], basis, 0.0)

@@ -15,7 +15,7 @@ from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.colors import show_colors
 from gsbench.models.appearance import sh_colors
 from gsbench.models.color_order import ColorOrder
-from gsbench.models.effect_sets import NAMES, Classes
+from gsbench.models.effect_sets import NAMES, EffectSets
 from gsbench.models.query import Query, unit
 from gsbench.models.refinement import OCTAVES, Refinement
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
@@ -43,7 +43,7 @@ class Conditioned(NamedTuple):
 
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
-    gate: Tensor  # [N] f_temp f_dir in [0, 1], a factor of the opacity
+    opacity_factor: Tensor  # [N] f_temp f_dir in [0, 1]
 
 
 class GaussianModel(nn.Module, ABC):
@@ -80,7 +80,7 @@ class GaussianModel(nn.Module, ABC):
         self.agr_octaves = agr_octaves
         self.sh_degree = sh_degree
         self.backend = backend
-        self.classes: Classes | None = None  # None: every row has every effect; a GatedModel may have them
+        self.effect_sets: EffectSets | None = None  # None: every row has every effect; a GatedModel may have them
         self.extent = 1.0  # of the scene, world units
         self.active = ActiveComponents(sh_degree, agr, False)
 
@@ -124,7 +124,7 @@ class GaussianModel(nn.Module, ABC):
         rest = dc.new_zeros(len(dc), (self.sh_degree + 1) ** 2 - 1, 3)
         return {"sh0": dc[:, None], "shN": rest}
 
-    def full_level(self) -> int:
+    def full_order(self) -> int:
         """Return the order of colour in use, packed as by `ColorOrder`."""
         return ColorOrder(self.active.sh_degree, 1).packed
 
@@ -135,8 +135,8 @@ class GaussianModel(nn.Module, ABC):
         """
         degree = self.active.sh_degree
         if self.backend.serves(means):
-            return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, degree, levels=self.levels)
-        return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), unit(means - query.center), degree, self.levels)
+            return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, degree, orders=self.orders)
+        return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), unit(means - query.center), degree, self.orders)
 
     # ---- what every model does
 
@@ -180,21 +180,21 @@ class GaussianModel(nn.Module, ABC):
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """Compute the means, factors and opacities of a slice; models that have a kernel for it call the kernel."""
-        means, factors, gate = self.condition(raw, query)
-        return means, factors, torch.sigmoid(raw["opacities"]) * gate
+        means, factors, opacity_factor = self.condition(raw, query)
+        return means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor
 
     @property
-    def levels(self) -> Tensor | None:
-        """The harmonics of each row's colours, [N] int32 as in `Classes`; None: all of them."""
-        return None if self.classes is None else self.classes.levels
+    def orders(self) -> Tensor | None:
+        """The harmonics of each row's colours, [N] int32 as in `EffectSets`; None: all of them."""
+        return None if self.effect_sets is None else self.effect_sets.orders
 
-    def count_classes(self) -> dict[str, int]:
-        """Count the Gaussians of each class, by the names of `gsbench.models.effect_sets.NAMES`."""
-        N, classes = len(self), self.classes
-        if classes is not None:
-            return classes.by_name(N)
-        refined, sliced = N if self.refines else 0, N if self.observes else 0
-        counts = refined, sliced - refined if sliced else 0, 0, 0, N - max(refined, sliced)
+    def count_by_effects(self) -> dict[str, int]:
+        """Count the Gaussians of each effect set, by the names of `gsbench.models.effect_sets.NAMES`."""
+        N, effect_sets = len(self), self.effect_sets
+        if effect_sets is not None:
+            return effect_sets.by_name(N)
+        refined, conditioned = N if self.refines else 0, N if self.observes else 0
+        counts = refined, conditioned - refined if conditioned else 0, 0, 0, N - max(refined, conditioned)
         return dict(zip(NAMES, counts, strict=True))
 
     @property
@@ -205,14 +205,14 @@ class GaussianModel(nn.Module, ABC):
     def refined(self, query: Query) -> Raw:
         """Apply AGR to the raw parameters: raw + phi(f) (7DGS eq. 15), to log-diagonals before the exp."""
         raw: Raw = dict(self.splats.items())
-        rows = None if self.classes is None else self.classes.refined
+        rows = None if self.effect_sets is None else self.effect_sets.refined
         if self.refinement is None or not self.active.refine or query.time is None or rows == 0:
             return raw
         names = (*self.centers, *self.geometry)
         by_kernel = self.backend.serves(raw["means"])
-        spans = None if self.classes is None else self.classes.spans
+        intervals = None if self.effect_sets is None else self.effect_sets.intervals
         values = [raw[name] for name in names]
-        moved = self.refinement(values, query.time, by_kernel=by_kernel, rows=rows, spans=spans)
+        moved = self.refinement(values, query.time, by_kernel=by_kernel, rows=rows, intervals=intervals)
         return raw | dict(zip(names, moved, strict=True))
 
     def add_lambda(self, name: str, value: float) -> None:

@@ -1,6 +1,6 @@
 """Say how much of a colour there is: spherical harmonics up to a degree, and frequencies of time.
 
-Kernels, checkpoints and `Classes` hold an order as one number, degree + 4 (waves - 1), as math/harmonics.h reads it.
+Kernels, checkpoints and `EffectSets` hold an order as one number, degree + 4 (waves - 1), as math/harmonics.h reads it.
 """
 
 import math

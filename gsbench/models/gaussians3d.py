@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsbench.kernels.slices import observe_still
+from gsbench.kernels.slices import observe_static
 from gsbench.models.base import SHRINK, Conditioned, Raw
 from gsbench.models.factors import rotation, sizes
 from gsbench.models.gated import GatedModel
@@ -35,13 +35,13 @@ class Gaussians3DModel(GatedModel):
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Return the Gaussian itself."""
-        return self.still(raw)
+        return self.static(raw)
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
         """Return the trained Gaussians' own scales and quaternions."""
         return {"scales": trained.log_scales, "quats": trained.quats}
 
-    def still(self, raw: Raw) -> Conditioned:
+    def static(self, raw: Raw) -> Conditioned:
         """Return the Gaussian itself, which no query changes."""
         return Conditioned(raw["means"], self.factors(raw), torch.ones_like(raw["opacities"]))
 
@@ -53,7 +53,7 @@ class Gaussians3DModel(GatedModel):
         """Slice by the kernel where the backend has one."""
         if not self.backend.serves(raw["means"]):
             return super().observe(raw, query)
-        return raw["means"], *observe_still(raw["scales"], raw["quats"], raw["opacities"])
+        return raw["means"], *observe_static(raw["scales"], raw["quats"], raw["opacities"])
 
     def scales(self) -> Tensor:
         """Return the largest of the three scales."""

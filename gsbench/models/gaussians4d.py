@@ -9,12 +9,12 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
-from gsbench.kernels.headers import LOG_SIZE_MAX, MAX_WAVES, TIME_GATE_MIN
+from gsbench.kernels.headers import LOG_SIZE_MAX, MAX_WAVES, TIME_OPACITY_FACTOR_MIN
 from gsbench.kernels.slices import observe_rotated
 from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Conditioned, Raw
 from gsbench.models.color_order import ColorOrder, coefficients_within, order_of
-from gsbench.models.effect_sets import Classes
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
 from gsbench.models.gated import OPACITY_MARGIN, GatedModel
 from gsbench.models.query import Query, unit
@@ -84,14 +84,14 @@ class Gaussians4DModel(GatedModel):
         # A Gaussian that is culled at this time is sliced at its own time and so stays at mu_p. Otherwise the huge
         # numbers of a Gaussian that is thin in time would reach its gradient as 0 x inf.
         with torch.no_grad():
-            seen = self.gate(factor, delta) > TIME_GATE_MIN
+            seen = self.opacity_factor(factor, delta) > TIME_OPACITY_FACTOR_MIN
         mean = torch.cat([raw["means"], raw["times"]], -1)
         at = torch.where(seen[:, None], time, raw["times"])
         means, factors, _ = slice_gaussians(mean, factor, at, scheme=self.scheme)
-        gate = self.gate(factor, torch.where(seen[:, None], delta, 0.0))
-        return Conditioned(means, factors, torch.where(seen, gate, 0.0))
+        opacity_factor = self.opacity_factor(factor, torch.where(seen[:, None], delta, 0.0))
+        return Conditioned(means, factors, torch.where(seen, opacity_factor, 0.0))
 
-    def still(self, raw: Raw) -> Conditioned:
+    def static(self, raw: Raw) -> Conditioned:
         """Return Gaussians that the left quaternion rotates in space only, whatever their times and sizes in time."""
         factors = rotation(turn_of_space(raw["left_quats"])) * sizes(raw["scales"][:, :3])[:, None, :]
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
@@ -111,9 +111,10 @@ class Gaussians4DModel(GatedModel):
         for query, weight in zip(queries, weights.double(), strict=True):
             assert query.time is not None
             delta = (query.time - raw["times"]).double()
-            gate = self.gate(factor, delta)
+            f_temp = self.opacity_factor(factor, delta)
             shift += weight[:, None] * delta
-            opacity += weight * torch.where(gate > TIME_GATE_MIN, gate, 0.0) * torch.sigmoid(raw["opacities"].double())
+            f_temp = torch.where(f_temp > TIME_OPACITY_FACTOR_MIN, f_temp, 0.0)
+            opacity += weight * f_temp * torch.sigmoid(raw["opacities"].double())
         turn, lengths, _ = torch.linalg.svd(blocks.T_pp)
         left = turn_of_space(quaternion(turn * torch.linalg.det(turn)[:, None, None]))
         new = {
@@ -123,43 +124,46 @@ class Gaussians4DModel(GatedModel):
             "right_quats": partner(left),
             "opacities": torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)),
         }
-        still = {name: value.to(raw[name].dtype) for name, value in new.items()}
-        return {"still": still}
+        static = {name: value.to(raw[name].dtype) for name, value in new.items()}
+        return {"static": static}
 
-    def full_level(self) -> int:
+    def full_order(self) -> int:
         """The degree in use with all waves."""
         return ColorOrder(self.active.sh_degree, self.time_degree + 1).packed
 
-    def lower_levels(self) -> list[int]:
+    def lower_orders(self) -> list[int]:
         """List every degree up to the one in use, with all waves and with the constant one alone."""
         degrees = range(self.active.sh_degree + 1)
         orders = {ColorOrder(degree, waves).packed for waves in (1, self.time_degree + 1) for degree in degrees}
-        return sorted(orders - {self.full_level()})
+        return sorted(orders - {self.full_order()})
 
-    def kept(self, classes: Classes) -> dict[str, Tensor]:
-        """Tell which entries matter: a still row has no right quaternion, and a time where its colour has waves."""
+    def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
+        """Tell which entries matter: a static row has no right quaternion, and a time where its colour has waves."""
         masks = {}
-        if classes.levels is not None:
-            stored = coefficients_within(classes.levels, self.sh_degree, self.time_degree + 1)
+        if effect_sets.orders is not None:
+            stored = coefficients_within(effect_sets.orders, self.sh_degree, self.time_degree + 1)
             masks["shN"] = stored.flatten(1)[:, 1:, None]  # the constant coefficient is sh0's
-        if classes.frozen is not None:
-            changes = torch.arange(len(classes.frozen), device=classes.frozen.device)[:, None] < classes.sliced
+        if effect_sets.frozen is not None:
+            changes = (
+                torch.arange(len(effect_sets.frozen), device=effect_sets.frozen.device)[:, None]
+                < effect_sets.conditioned
+            )
             space = torch.tensor([[True, True, True, False]], device=changes.device)
-            assert classes.levels is not None
-            timed = changes | (order_of(classes.levels).waves > 1)[:, None]
+            assert effect_sets.orders is not None
+            timed = changes | (order_of(effect_sets.orders).waves > 1)[:, None]
             masks |= {"times": timed, "right_quats": changes.expand(-1, 4), "scales": changes | space}
         return masks
 
     def constant(self, name: str) -> float:
-        """A still row is as long in time as it can be."""
+        """A static row is as long in time as it can be."""
         return LOG_SIZE_MAX if name == "scales" else 0.0
 
     @torch.no_grad()
-    def fill(self, classes: Classes) -> None:
-        """Give each left quaternion of a still row the right one that leaves the axis of t alone."""
-        super().fill(classes)
-        left = self.splats["left_quats"].data[classes.sliced :]
-        self.splats["right_quats"].data[classes.sliced :] = partner(left)
+    def fill(self, effect_sets: EffectSets) -> None:
+        """Give each left quaternion of a static row the right one that leaves the axis of t alone."""
+        super().fill(effect_sets)
+        left = self.splats["left_quats"].data[effect_sets.conditioned :]
+        self.splats["right_quats"].data[effect_sets.conditioned :] = partner(left)
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
         """Slice by the kernel where the backend has one, in the square-root scheme."""
@@ -176,7 +180,7 @@ class Gaussians4DModel(GatedModel):
             self.clock,
             query.time,
             self.log_lambda["time"],
-            sliced=self.sliced,
+            conditioned=self.conditioned,
         )
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
@@ -185,10 +189,10 @@ class Gaussians4DModel(GatedModel):
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.active.sh_degree, self.time_degree + 1
         if waves <= MAX_WAVES and self.backend.serves(means):
             return show_colors(sh0, raw["shN"], means, opacities, query.center, degree, raw["times"], query.time, waves,
-                               self.levels)  # fmt: skip
+                               self.orders)  # fmt: skip
         coefficients = torch.cat([sh0, raw["shN"]], 1).unflatten(1, (waves, -1))
         directions = unit(means - query.center)
-        return sh_time_colors(coefficients, directions, degree, query.time - raw["times"][:, 0], self.levels)
+        return sh_time_colors(coefficients, directions, degree, query.time - raw["times"][:, 0], self.orders)
 
     def initial_colors(self, dc: Tensor) -> Raw:
         """Return 4DSH coefficients [N, time_degree + 1, K, 3], of which only the constant one is not zero."""
@@ -214,7 +218,7 @@ class Gaussians4DModel(GatedModel):
             "scales": raw["scales"] - math.log(SHRINK),
         }
 
-    def gate(self, factor: Tensor, delta: Tensor) -> Tensor:
+    def opacity_factor(self, factor: Tensor, delta: Tensor) -> Tensor:
         """Compute f_temp [N] of factors [N, 4, 4] at a distance delta [N, 1] in time."""
         return torch.exp(-0.5 * self.lambda_of("time") * mahalanobis(factor[:, 3:], delta))
 

@@ -64,23 +64,23 @@ class Refinement(nn.Module):
 
     def forward(
         self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False, rows: int | None = None,
-        spans: Tensor | None = None,
+        intervals: Tensor | None = None,
     ) -> list[Tensor]:  # fmt: skip
         """Move raw parameters [N, c], those that are read and then the others, to a time [].
 
         The kernel (float32) writes no hidden layer to memory. With `rows` only so many first Gaussians are moved, with
-        `spans` [rows, 2] each of them only from a first to a last time.
+        `intervals` [rows, 2] each of them only from a first to a last time.
         """
         if by_kernel:
             gamma = encode_time(time, self.octaves)
             return refine(values, self.weight_in, self.bias_in, self.weight_out, self.bias_out, self.units, gamma,
-                          rows=rows, spans=spans, time=None if spans is None else time)  # fmt: skip
+                          rows=rows, intervals=intervals, time=None if intervals is None else time)  # fmt: skip
         if rows is not None:
-            still = [x[:rows] for x in values]
-            moved = self(still, time)
-            if spans is not None:
-                awake = ((spans[:, 0] <= time) & (time <= spans[:, 1]))[:, None]
-                moved = [torch.where(awake, x, y) for x, y in zip(moved, still, strict=True)]
+            resting = [x[:rows] for x in values]
+            moved = self(resting, time)
+            if intervals is not None:
+                awake = ((intervals[:, 0] <= time) & (time <= intervals[:, 1]))[:, None]
+                moved = [torch.where(awake, x, y) for x, y in zip(moved, resting, strict=True)]
             return [torch.cat([x, rest[rows:]]) for x, rest in zip(moved, values, strict=True)]
         # The units scale rows and columns of the layers instead of the parameters of every Gaussian.
         weight_in, bias_in = self.weight_in[:, : self.features] / self.units[: self.features], self.at_time(time)

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from gsbench.models.base import GaussianModel, Gaussians3D, Raw
-from gsbench.models.effect_sets import Classes
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel
 from gsbench.models.query import Query
 from gsbench.process.workers import side_by_side
 from gsbench.scenes.points import SH_C0
 
-LIVE, SLICED, STILL, REMOVED = "live", "sliced", "still", "removed"
+LIVE, CONDITIONED, STATIC, REMOVED = "live", "conditioned", "static", "removed"
 FEW = 1e-6  # added to weights: a Gaussian that no query sees is averaged over all
 
 
@@ -28,8 +28,8 @@ class Simplification:
 
     name: str
     raw: Raw | None  # the raw parameters that change; None: the Gaussian is removed
-    rows: int  # only this many first rows change: classes that are behind them have nothing of this to lose
-    level: int | None = None  # of the harmonics that are left (see Classes.levels), where only the colour changes
+    rows: int  # only this many first rows change: effect sets that are behind them have nothing of this to lose
+    order: int | None = None  # of the harmonics that are left (see EffectSets.orders), where only the colour changes
 
 
 def simplifications_of(
@@ -47,23 +47,23 @@ def simplifications_of(
     found = []
     names = (*model.centers, *model.geometry)
     raw: Raw = {name: value.detach() for name, value in model.splats.items()}
-    fewer = {level: raw | {"shN": raw["shN"] * model.kept(Classes(0, 0, _all(model, level)))["shN"]}
-             for level in model.lower_levels()}  # fmt: skip
-    rows = model.count_classes()
-    sliced = len(model) - rows["still"]
+    fewer = {order: raw | {"shN": raw["shN"] * model.kept(EffectSets(0, 0, _all(model, order)))["shN"]}
+             for order in model.lower_orders()}  # fmt: skip
+    rows = model.count_by_effects()
+    conditioned = len(model) - rows["static"]
     refined, lost = _averages(model, queries, slices, weights, names if rows["refined"] else (), list(fewer.values()))
     raw = raw | refined
     if rows["refined"]:
-        found.append(Simplification(SLICED, refined, rows["refined"]))
+        found.append(Simplification(CONDITIONED, refined, rows["refined"]))
     for name, frozen in model.frozen(raw, queries, weights).items():
-        if name != STILL and not by_halves:
+        if name != STATIC and not by_halves:
             continue
-        found.append(Simplification(name, {key: raw[key] for key in names} | frozen, sliced))
+        found.append(Simplification(name, {key: raw[key] for key in names} | frozen, conditioned))
     found.append(Simplification(REMOVED, None, len(model)))
-    for (level, less), missing in zip(fewer.items(), lost, strict=True):
+    for (order, less), missing in zip(fewer.items(), lost, strict=True):
         constant = less["sh0"].clone()
         constant.flatten(1, -2)[:, 0] += missing / SH_C0
-        found.append(Simplification(f"level{level}", {"sh0": constant, "shN": less["shN"]}, len(model), level))
+        found.append(Simplification(f"order{order}", {"sh0": constant, "shN": less["shN"]}, len(model), order))
     return found
 
 
@@ -73,9 +73,9 @@ def shares_of(opacities: Sequence[Tensor]) -> Tensor:
     return weights / weights.sum(0)
 
 
-def _all(model: GaussianModel, level: int) -> Tensor:
-    """Return one level of colour for all Gaussians, [N]."""
-    return torch.full((len(model),), level, dtype=torch.int32, device=model.splats["means"].device)
+def _all(model: GaussianModel, order: int) -> Tensor:
+    """Return one order of colour for all Gaussians, [N]."""
+    return torch.full((len(model),), order, dtype=torch.int32, device=model.splats["means"].device)
 
 
 def _averages(

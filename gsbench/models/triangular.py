@@ -12,7 +12,7 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.kernels.slices import observe_triangular
 from gsbench.models.base import SHRINK, Conditioned, Raw
-from gsbench.models.effect_sets import DIRECTION, TIME, Classes
+from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle, rotation, sizes
 from gsbench.models.gated import OPACITY_MARGIN, GatedModel
 from gsbench.models.query import Query, unit
@@ -97,21 +97,21 @@ class TriangularModel(GatedModel):
         factor, offset = self.factors(raw), self.offset(raw, query)
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
         # A Gaussian so far from the query that its opacity is zero is replaced by a unit Gaussian at the query, and its
-        # gate is zero. Otherwise its huge numbers would reach a gradient as 0 x inf.
+        # opacity factor is zero. Otherwise its huge numbers would reach a gradient as 0 x inf.
         with torch.no_grad():
             seen = self._exponent(reduced.T_qq, offset, whiten(reduced.T_qq, offset)) < EXPONENT_MAX
         delta = torch.where(seen[:, None], offset, 0.0)
         T_qq = torch.where(seen[:, None, None], reduced.T_qq, torch.eye(delta.shape[1]).to(delta))
         white = whiten(T_qq, delta)
-        gate = torch.where(seen, torch.exp(-self._exponent(T_qq, delta, white)), 0.0)
+        opacity_factor = torch.where(seen, torch.exp(-self._exponent(T_qq, delta, white)), 0.0)
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
             mean = F.pad(raw["means"], (0, offset.shape[1]))  # q is measured from mu_q
             means, factors, _ = slice_gaussians(mean, factor, offset, scheme=self.scheme)
-        return Conditioned(means, factors, gate)
+        return Conditioned(means, factors, opacity_factor)
 
-    def still(self, raw: Raw) -> Conditioned:
+    def static(self, raw: Raw) -> Conditioned:
         """Return Gaussians of the block L_pp alone."""
         space = self.rows["p"]
         factors = Triangle("ppp", self.triangle.form).factor(raw["log_diagonal"][:, space], raw)
@@ -139,7 +139,7 @@ class TriangularModel(GatedModel):
             form=OFF_DIAGONALS.index(self.triangle.form),
             directional_half=self.directional_half,
             subtracts=self.scheme == "cholesky",
-            sliced=self.sliced,
+            conditioned=self.conditioned,
         )
 
     def scales(self) -> Tensor:
@@ -178,14 +178,14 @@ class TriangularModel(GatedModel):
         factor = torch.cat([p_rows, q_rows], 1)[:, self.own_order()]
         return children | self.triangle.parameters(factor)
 
-    def kept(self, classes: Classes) -> dict[str, Tensor]:
-        """Tell which entries matter: none of a variable that is frozen, or of any where the row is still."""
-        masks = super().kept(classes)
-        if classes.frozen is None:
+    def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
+        """Tell which entries matter: none of a variable that is frozen, or of any where the row is static."""
+        masks = super().kept(effect_sets)
+        if effect_sets.frozen is None:
             return masks
-        still = torch.arange(len(classes.frozen), device=classes.frozen.device) >= classes.sliced
-        gone = {"p": torch.zeros_like(still), "t": still | (classes.frozen & TIME > 0),
-                "d": still | (classes.frozen & DIRECTION > 0)}  # fmt: skip
+        static = torch.arange(len(effect_sets.frozen), device=effect_sets.frozen.device) >= effect_sets.conditioned
+        gone = {"p": torch.zeros_like(static), "t": static | (effect_sets.frozen & TIME > 0),
+                "d": static | (effect_sets.frozen & DIRECTION > 0)}  # fmt: skip
         masks["log_diagonal"] = ~torch.stack([gone[x] for x in self.triangle.letters], -1)
         for kind in self.triangle.kinds[1:]:  # all but shape
             pairs = [self.triangle.pair(place) for place in self.triangle.places[kind]]
@@ -222,21 +222,22 @@ class TriangularModel(GatedModel):
         blocks = Reduced(*(block.double() for block in reduce(self.factors(raw))))
         gain = gain_of(blocks.T_pq, blocks.T_qq)
         by_name = {name: [name] for name in self.columns} if len(self.columns) > 1 else {}
-        by_name["still"] = list(self.columns)
-        shift, gates = torch.zeros_like(gain[:, 0]), {name: torch.zeros_like(gain[:, 0, 0]) for name in by_name}
+        by_name["static"] = list(self.columns)
+        shift = torch.zeros_like(gain[:, 0])
+        opacity_factors = {name: torch.zeros_like(gain[:, 0, 0]) for name in by_name}
         for query, weight in zip(queries, weights.double(), strict=True):
             delta = self.offset(raw, query).double()
             shift += weight[:, None] * delta
             exponents = self.exponents(blocks.T_qq, delta, whiten(blocks.T_qq, delta))
             for name, variables in by_name.items():
-                gates[name] += weight * torch.exp(-torch.stack([exponents[x] for x in variables]).sum(0))
+                opacity_factors[name] += weight * torch.exp(-torch.stack([exponents[x] for x in variables]).sum(0))
         changed = {}
         for name, variables in by_name.items():
             columns = [column for x in variables for column in self.columns[x]]
             moved = raw["means"] + (gain[..., columns] @ shift[:, columns, None])[..., 0]
-            opacity = (torch.sigmoid(raw["opacities"].double()) * gates[name]).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+            opacity = torch.sigmoid(raw["opacities"].double()) * opacity_factors[name]
             new = self.triangle.parameters(self._without(blocks, gain, variables)) | {"means": moved}
-            new["opacities"] = torch.logit(opacity)
+            new["opacities"] = torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))
             new |= {center: torch.zeros_like(raw[center]) for x in variables for center in [CENTERS[x]]}
             changed[name] = {key: value.to(raw["means"].dtype) for key, value in new.items()}
         return changed

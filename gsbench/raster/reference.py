@@ -105,7 +105,7 @@ def project(
         opacities = torch.where(area2 > 0, opacities * ratio.sqrt(), 0.0)
 
     # alpha >= 1/255 only where power <= ln(255 opacity); that ellipse's bounding box has half sizes
-    # sqrt(2 power cov_xx), sqrt(2 power cov_yy). A hundredth of a pixel more, lest rounding cut off a pixel.
+    # sqrt(2 power cov_xx), sqrt(2 power cov_yy). A hundredth of a pixel more: rounding cuts off no pixel.
     power = (255 * opacities.detach()).clamp(min=1).log()
     half_sizes = (2 * power[:, None] * torch.stack([xx + eps, yy], -1).detach()).sqrt() * size[:, None] + 0.01
     inside = ((means2d + half_sizes > 0) & (means2d - half_sizes < means2d.new_tensor([width, height]))).all(-1)

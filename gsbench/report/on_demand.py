@@ -9,7 +9,7 @@ from statistics import fmean
 
 import numpy as np
 
-from gsbench.effects.messages import CLASSES
+from gsbench.effects.messages import EFFECT_SETS
 from gsbench.measure.record import Gate, Record
 from gsbench.report.configurations import Configuration, Group
 from gsbench.report.intervals import Estimate, estimate
@@ -27,7 +27,7 @@ class Decided:
     name: str  # of the configuration: as short as tells it from the others here
     runs: list[Record]  # those that chose effects, in order of the seeds
     gated: int  # how many of them a gate has changed: the numbers below are theirs
-    rows: dict[str, float]  # Gaussians at the end by class, and how many all gates removed
+    rows: dict[str, float]  # Gaussians at the end by effect set, and how many all gates removed
     degrees: list[float]  # Gaussians at the end by the degree of their harmonics
     views: str  # that the change of PSNR was measured on
     psnr: Estimate  # change by the gate at the end, dB
@@ -69,7 +69,7 @@ def _average(group: Group, scene: str, configuration: Configuration, name: str, 
     loss: Callable[[Gate], float | None] = lambda g: g.eval_loss_db if evaluated else g.measured_db  # noqa: E731
     here = [gate for r, gate in at_end if r.provenance.machine == group.machine]
     splits = [str(r.protocol.get("eval_split", "evaluated")) if evaluated else gate.checked_on for r, gate in at_end]
-    kinds = [*CLASSES, REMOVED] if gates else []
+    kinds = [*EFFECT_SETS, REMOVED] if gates else []
     return Decided(
         scene,
         configuration,
@@ -94,14 +94,14 @@ def _ends(gates: list[Gate]) -> bool:
 
 
 def _rows(gates: list[Gate], name: str) -> int:
-    """Count the Gaussians of a class after the last gate; the removed ones are those of all gates."""
+    """Count the Gaussians of an effect set after the last gate; the removed ones are those of all gates."""
     of = gates if name == REMOVED else gates[-1:]
     return sum(max(0, gate.rows.get(name, 0)) for gate in of)
 
 
 def _of_degree(gate: Gate, degree: int) -> int:
     """Count the Gaussians whose harmonics have a degree, with any number of waves."""
-    return sum(max(0, n) for name, n in gate.levels.items() if re.match(rf"degree {degree}\b", name))
+    return sum(max(0, n) for name, n in gate.orders.items() if re.match(rf"degree {degree}\b", name))
 
 
 def _less(before: float | None, after: float | None) -> float:

@@ -14,7 +14,7 @@ from mpmath import mp, mpf
 DIGITS = 120
 STEP = mpf(10) ** -30
 LOG_SIZE_MAX = 16  # by definition, a larger logarithm of a size acts as this one (docs/stability.md)
-TIME_GATE_MIN = mpf("0.05")  # 4DGS culls a Gaussian unless its f_temp is above this
+TIME_OPACITY_FACTOR_MIN = mpf("0.05")  # 4DGS culls a Gaussian unless its f_temp is above this
 UNDEFINED = mpf(10) ** -20  # |v|^2 of a vector too short to have a direction; it becomes zero
 
 Vector = list[Any]  # of mpf
@@ -91,9 +91,9 @@ def slice_rotated(x: Vector, layout: dict[str, int], log_lambda: dict[str, float
     F = [[mp.fdot(left[i], [row[j] for row in right]) * size[j] for j in range(4)] for i in range(4)]
     S = [[mp.fdot(a, b) for b in F] for a in F]
     delta = mpf(time) - raw["times"][0]
-    gate = mp.exp(-mp.exp(mpf(log_lambda["time"])) * delta**2 / S[3][3] / 2)
+    f_temp = mp.exp(-mp.exp(mpf(log_lambda["time"])) * delta**2 / S[3][3] / 2)
     mean, cov = _condition(S, [0, 1, 2], [3], raw["means"], [delta])
-    return [*mean, *cov, gate * _sigmoid(raw["opacities"][0]) if gate > TIME_GATE_MIN else mpf(0)]
+    return [*mean, *cov, f_temp * _sigmoid(raw["opacities"][0]) if f_temp > TIME_OPACITY_FACTOR_MIN else mpf(0)]
 
 
 def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vector) -> tuple[Vector, Vector]:

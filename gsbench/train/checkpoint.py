@@ -25,7 +25,12 @@ TIMES = frozenset({"stages", "effort", "curve", "seconds", "frame_ms_before", "f
 
 # Keys of a training's state in checkpoints of older versions, and their names now; and how keys of its model began.
 RENAMED = {"floor": "minimum_scale"}
-RENAMED_IN_MODEL = {"log_modulation.": "log_lambda."}
+RENAMED_IN_MODEL = {
+    "log_modulation.": "log_lambda.",
+    "classes.levels": "effect_sets.orders",
+    "classes.spans": "effect_sets.intervals",
+    "classes.": "effect_sets.",
+}
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from gsbench.measure.record import Direction, Gate
 from gsbench.measure.schema import parse
 from gsbench.measure.speed import synchroniser, time_in_turns
 from gsbench.models import GaussianModel
-from gsbench.models.effect_sets import Classes
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import as_gated
 from gsbench.scenes import Scene, View
 from gsbench.train.density import DensityControl
@@ -42,19 +42,19 @@ HELD_OUT = 8  # every so many training views one, to check on where the scene ha
 FEW = 12  # training views, of which none is held out
 
 NO_GATES: dict[str, Any] = {"gates": [], "notes": []}  # the state of a training without gates
-Shape = tuple[dict[str, Tensor], Classes | None]  # raw parameters and classes
+Shape = tuple[dict[str, Tensor], EffectSets | None]  # raw parameters and effect sets
 
 
 def shape_of(model: GaussianModel) -> Shape:
     """Return the Gaussians of a model, for `become`."""
-    return {name: x.data for name, x in model.splats.items()}, model.classes
+    return {name: x.data for name, x in model.splats.items()}, model.effect_sets
 
 
 def become(model: GaussianModel, shape: Shape) -> None:
     """Give a model other Gaussians."""
     for name, value in shape[0].items():
         model.splats[name].data = value
-    model.classes = shape[1]
+    model.effect_sets = shape[1]
 
 
 class Gating:
@@ -147,11 +147,13 @@ class Gating:
         started = time.perf_counter()
         model, at_end = as_gated(self.model), step is None
         # In training AGR does not rest: when a Gaussian can be seen still changes.
-        spans = seen_times(model, self.probed) if at_end else None
-        hidden = None if spans is None else spans[:, 0].isinf()
+        intervals = seen_times(model, self.probed) if at_end else None
+        hidden = None if intervals is None else intervals[:, 0].isinf()
         sensitivity = probe(model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
                          antialias=self.renderer.antialias, by_halves=by_halves, hidden=hidden)  # fmt: skip
-        found = gate_within(model, sensitivity, budget_db, lambda gated: self.renderer.psnr(gated, self.checked), spans)
+        found = gate_within(
+            model, sensitivity, budget_db, lambda gated: self.renderer.psnr(gated, self.checked), intervals
+        )
         if found is None:
             self.notes.append(f"{'at the end' if at_end else f'at step {step}'} no simplification cost at most "
                               f"{budget_db} dB on {self.checked_on}")  # fmt: skip
@@ -168,7 +170,7 @@ class Gating:
         self.minimum_scale.update()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what was decided, for the checkpoint; the classes are the model's."""
+        """Return what was decided, for the checkpoint; the effect sets are the model's."""
         direction = asdict(self.direction) if self.direction else None
         return {"gates": [asdict(gate) for gate in self.gates], "notes": list(self.notes), "direction": direction}
 

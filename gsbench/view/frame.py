@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from gsbench.effects.picture import class_colors, cost_colors
+from gsbench.effects.picture import cost_colors, effect_set_colors
 from gsbench.measure.images import Pixels, inferno, to_bytes
 from gsbench.models.query import Query
 from gsbench.models.render import rasterize_slice
@@ -67,10 +67,10 @@ class Painter:
         self.name = f"{run.folder.parent.name} {run.folder.name}"  # such as "7dgs seed0"
         self.trained_active = run.model.active
         self.has_agr = run.model.refinement is not None
-        self.counts = run.model.count_classes()  # of Gaussians, by class
+        self.counts = run.model.count_by_effects()  # of Gaussians, by effect set
         background = torch.tensor(run.scene.background).to(run.config.device)
         self._backgrounds = {IMAGE: background, CLASS: torch.ones_like(background), COST: torch.zeros_like(background)}
-        self._colors = {CLASS: class_colors(run.model), COST: cost_colors(run.model, most_cost)}
+        self._colors = {CLASS: effect_set_colors(run.model), COST: cost_colors(run.model, most_cost)}
         self._lock = threading.Lock()
 
     def paint(self, camera: Camera, request: FrameRequest) -> Frame:

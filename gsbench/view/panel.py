@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from gsbench.effects.messages import CLASSES
+from gsbench.effects.messages import EFFECT_SETS
 from gsbench.effects.picture import COLOURS
 from gsbench.measure.images import ERROR_SCALE, inferno
 from gsbench.view.controls import ShownImage
@@ -42,10 +42,10 @@ def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
         most_cost: nanoseconds that have the brightest colour.
     """
     text = ""
-    if by_class := {painter.name: painter.counts for painter, colours in shown if colours == CLASS}:
-        rows = [_row("Gaussians", list(by_class), bold=True)]
-        for name, words in CLASSES.items():
-            counts = [counts[name] for counts in by_class.values()]
+    if by_effect_set := {painter.name: painter.counts for painter, colours in shown if colours == CLASS}:
+        rows = [_row("Gaussians", list(by_effect_set), bold=True)]
+        for name, words in EFFECT_SETS.items():
+            counts = [counts[name] for counts in by_effect_set.values()]
             if any(counts):
                 swatch = f'<span style="{_SWATCH};background-color:rgb{COLOURS[name]}"></span> {words}'
                 rows.append(_row(swatch, [f"{number:,}" for number in counts], escaped=True))

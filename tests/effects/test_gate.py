@@ -19,7 +19,7 @@ from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.measure.quality import psnr
 from gsbench.models import GaussianModel, Query
 from gsbench.models.base import Gaussians3D
-from gsbench.models.effect_sets import DIRECTION, Classes
+from gsbench.models.effect_sets import DIRECTION, EffectSets
 from gsbench.models.render import render
 from gsbench.models.simplifications import simplifications_of
 
@@ -71,15 +71,15 @@ def test_more_budget_buys_more(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_classes_are_as_the_rows(name: str) -> None:
-    """Catches rows sorted into the wrong class: with the classes forgotten the images stay the same."""
+def test_effect_sets_are_as_the_rows(name: str) -> None:
+    """Catches rows sorted into the wrong effect set: with the effect sets forgotten the images stay the same."""
     _, after = gated(name, 3.0)
-    rows, classes = after.count_classes(), after.classes
-    assert classes is not None
+    rows, effect_sets = after.count_by_effects(), after.effect_sets
+    assert effect_sets is not None
     assert sum(rows.values()) == len(after) < N
-    assert 0 <= classes.refined <= classes.sliced <= len(after)
+    assert 0 <= effect_sets.refined <= effect_sets.conditioned <= len(after)
     plain = copy.deepcopy(after)
-    plain.classes = classes._replace(sliced=len(after))
+    plain.effect_sets = effect_sets._replace(conditioned=len(after))
     for a, b in zip(images(after), images(plain), strict=True):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
 
@@ -89,12 +89,12 @@ def test_a_frozen_variable_changes_nothing() -> None:
     model, sensitivity = probed("7dgs")
     here = Query.at(torch.tensor([0.0, 0.0, -4.0]), 0.2)
     later, beside = Query.at(here.center, 0.9), Query.at(torch.tensor([4.0, 0.0, 0.0]), 0.2)
-    for name, same, different in (("time", later, beside), ("direction", beside, later), ("still", later, None)):
+    for name, same, different in (("time", later, beside), ("direction", beside, later), ("static", later, None)):
         after = copy.deepcopy(model)
         everything = choose(sensitivity, after, 0.0)
         all_rows = {key: torch.full((N,), key == name) for key in everything.geometry}
         apply(after, sensitivity, replace(everything, geometry=all_rows))
-        assert after.count_classes()[name] == len(after) == N
+        assert after.count_by_effects()[name] == len(after) == N
         for a, b in zip(after.slice(here)[:3], after.slice(same)[:3], strict=True):
             torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
         frozen = after.splats["log_diagonal"][:, [i for x in {"time": "t", "direction": "d"}.get(name, "td")
@@ -111,7 +111,7 @@ def test_a_second_gate_takes_no_more_for_nothing(name: str) -> None:
     again = copy.deepcopy(after)
     sensitivity = probe(after, views_of(after, 1)[:VIEWS], BLACK)
     rows, _ = apply(again, sensitivity, choose(sensitivity, again, 0.0))
-    assert again.count_classes()["refined"] <= after.count_classes()["refined"]
+    assert again.count_by_effects()["refined"] <= after.count_by_effects()["refined"]
     assert len(rows) <= len(after)
     for a, b in zip(images(after), images(again), strict=True):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
@@ -149,46 +149,48 @@ def test_only_what_matters_is_stored(name: str) -> None:
     assert stored < 0.9 * whole
     other = trained_a_little(name, 1)
     other.load_state(state)
-    assert other.classes is not None
-    assert after.classes is not None
+    assert other.effect_sets is not None
+    assert after.effect_sets is not None
     for key, value in after.state_dict().items():
         assert torch.equal(value, other.state_dict()[key]), key
-    assert torch.equal(other.classes.levels, after.classes.levels)
-    assert other.classes[:2] == after.classes[:2]
+    assert torch.equal(other.effect_sets.orders, after.effect_sets.orders)
+    assert other.effect_sets[:2] == after.effect_sets[:2]
 
 
-@pytest.mark.parametrize("fault", ["counts", "levels", "frozen", "spans", "short", "extra", "no_opacities", "missing"])
-def test_classes_of_a_checkpoint_are_checked(fault: str) -> None:
+@pytest.mark.parametrize(
+    "fault", ["counts", "orders", "frozen", "intervals", "short", "extra", "no_opacities", "missing"]
+)
+def test_effect_sets_of_a_checkpoint_are_checked(fault: str) -> None:
     """Catches a damaged checkpoint that reaches the kernels with rows that there are not."""
     _, after = gated("7dgs", 3.0)
     state = after.pack()
     if fault == "counts":
-        state["classes.counts"] = torch.tensor([5, len(after) + 1])
-    elif fault == "levels":
-        state["classes.levels"] = torch.full_like(state["classes.levels"], 77)
+        state["effect_sets.counts"] = torch.tensor([5, len(after) + 1])
+    elif fault == "orders":
+        state["effect_sets.orders"] = torch.full_like(state["effect_sets.orders"], 77)
     elif fault == "frozen":
-        state["classes.frozen"] = state["classes.frozen"][1:]
-    elif fault == "spans":
-        state["classes.spans"] = torch.zeros(int(state["classes.counts"][0]) + 1, 2)
+        state["effect_sets.frozen"] = state["effect_sets.frozen"][1:]
+    elif fault == "intervals":
+        state["effect_sets.intervals"] = torch.zeros(int(state["effect_sets.counts"][0]) + 1, 2)
     elif fault == "short":
         state["splats.motion"] = state["splats.motion"][:-1]
     elif fault == "extra":
-        state["classes.more"] = torch.zeros(1)
+        state["effect_sets.more"] = torch.zeros(1)
     elif fault == "no_opacities":
         del state["splats.opacities"]
     else:
-        del state["classes.levels"]
+        del state["effect_sets.orders"]
     with pytest.raises(InputError, match="checkpoint: "):
         trained_a_little("7dgs", 1).load_state(state)
 
 
 def test_the_share_with_direction_is_of_rows_that_change_with_it() -> None:
-    """Catches still rows that count as seen from each side otherwise: 20 of 60 are sliced, direction is frozen in 5."""
+    """Catches static rows that count as seen from each side: 20 of 60 are conditioned, direction is frozen in 5."""
     model = trained_a_little("7dgs", 0)
     assert share_with_direction(model) == 1
     frozen = torch.zeros(N, dtype=torch.uint8)
     frozen[15:20] = DIRECTION
-    model.classes = Classes(0, 20, torch.zeros(N, dtype=torch.int32), frozen)
+    model.effect_sets = EffectSets(0, 20, torch.zeros(N, dtype=torch.int32), frozen)
     assert share_with_direction(model) == 15 / 60
 
 
@@ -207,6 +209,6 @@ def test_the_loss_is_measured_and_not_only_predicted() -> None:
     assert found.gate.measured_db == pytest.approx(measure(model) - measure(found.model), abs=1e-9)
     assert sum(found.gate.rows.values()) == N
     assert found.gate.bytes < found.gate.bytes_before == model.stored_bytes()
-    assert model.classes is None
+    assert model.effect_sets is None
     worse = iter([30.0] + [20.0] * 20)
     assert gate_within(model, sensitivity, 0.3, lambda _: next(worse)) is None

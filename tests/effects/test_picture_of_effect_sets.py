@@ -1,4 +1,4 @@
-"""Gaussians drawn by class: each in its colour, counted in the legend, at its cost; of a run, by the command line."""
+"""Gaussians drawn by effect set: each in its colour, in the legend, at its cost; of a run, by the command line."""
 
 from pathlib import Path
 
@@ -11,14 +11,14 @@ from tiny_run import gsbench, overrides, write_moving_square
 from gsbench.effects import picture
 from gsbench.effects.__main__ import main
 from gsbench.effects.gate import COLORING, COSTS, LESS_TO_READ, REFINING, SLICING, cost_of, most_cost
-from gsbench.effects.messages import CLASSES
+from gsbench.effects.messages import EFFECT_SETS
 from gsbench.measure import record
 from gsbench.measure.images import Pixels
 from gsbench.models import GaussianModel, build
 from gsbench.models.base import Gaussians3D
-from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, Classes
-from gsbench.models.simplifications import STILL
-from gsbench.report.page.palette import CLASS_LIKE, LIGHT, MODELS
+from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, EffectSets
+from gsbench.models.simplifications import STATIC
+from gsbench.report.page.palette import EFFECT_SET_LIKE, LIGHT, MODELS
 from gsbench.scenes import Camera, Points
 from gsbench.schedule import ActiveComponents
 
@@ -28,23 +28,23 @@ ENLARGED = 3
 OPTIONS = {"7dgs": {"lambda_t": 0.5, "lambda_d": 0.3}, "3dgs": {}}
 
 
-def five(name: str = "7dgs", *, agr: bool = True, classes: Classes | None = None) -> GaussianModel:
+def five(name: str = "7dgs", *, agr: bool = True, effect_sets: EffectSets | None = None) -> GaussianModel:
     """A model of five opaque grey Gaussians in a row, whatever is asked of it."""
     model = build(name, agr=agr, **OPTIONS[name])
     means = torch.tensor([[(x - 50) / 10, 0.0, 5.0] for x in CENTRES])
     model.initialise(Points(means, torch.full((5, 3), 0.5)), 1.0, torch.Generator().manual_seed(0))
     model.set_active(ActiveComponents(3, agr, True))
-    model.classes = classes
+    model.effect_sets = effect_sets
     seen = Gaussians3D(means, 0.35 * torch.eye(3).expand(5, 3, 3), torch.full((5,), 0.999), torch.full((5, 3), 0.5))
     model.slice = lambda _: seen  # type: ignore[method-assign]
     return model
 
 
 def one_of_each() -> GaussianModel:
-    """One Gaussian of each class, in the order of NAMES, with harmonics of degrees 3, 3, 2, 1, 0."""
-    levels, frozen = torch.tensor([3, 3, 2, 1, 0], dtype=torch.int32), torch.zeros(5, dtype=torch.uint8)
+    """One Gaussian of each effect set, in the order of NAMES, with harmonics of degrees 3, 3, 2, 1, 0."""
+    orders, frozen = torch.tensor([3, 3, 2, 1, 0], dtype=torch.int32), torch.zeros(5, dtype=torch.uint8)
     frozen[2], frozen[3] = TIME, DIRECTION
-    return five(classes=Classes(1, 4, levels, frozen))
+    return five(effect_sets=EffectSets(1, 4, orders, frozen))
 
 
 def panel(image: Pixels, number: int) -> list[list[int]]:
@@ -54,15 +54,15 @@ def panel(image: Pixels, number: int) -> list[list[int]]:
 
 
 def test_each_class_has_its_colour() -> None:
-    """Catches rows taken for those of another class, swapped red and blue, and panels in another order."""
+    """Catches rows taken for those of another effect set, swapped red and blue, and panels in another order."""
     model = one_of_each()
     image = picture.draw(model, CAMERA, 0.5, torch.zeros(3))
     assert picture.kinds_of(model).tolist() == list(range(5))
-    assert dict(zip(NAMES, torch.bincount(picture.kinds_of(model)).tolist(), strict=True)) == model.count_classes()
+    assert dict(zip(NAMES, torch.bincount(picture.kinds_of(model)).tolist(), strict=True)) == model.count_by_effects()
     assert np.abs(np.array(panel(image, 0)) - 127.5).max() < 3
     assert np.abs(np.array(panel(image, 1)) - [picture.COLOURS[name] for name in NAMES]).max() < 6
     corner = image[picture.LINE, ENLARGED * 100 + picture.GAP]
-    assert corner.tolist() == [255, 255, 255], "the classes stand on white, whatever the background is"
+    assert corner.tolist() == [255, 255, 255], "the effect sets stand on white, whatever the background is"
 
 
 def test_the_legend_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,11 +70,11 @@ def test_the_legend_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     written = []
     monkeypatch.setattr(cv2, "putText", lambda *given: written.append(given[1]))
     frozen = torch.tensor([0, 0, 0, TIME, 0], dtype=torch.uint8)
-    model = five(classes=Classes(2, 4, torch.zeros(5, dtype=torch.int32), frozen))
+    model = five(effect_sets=EffectSets(2, 4, torch.zeros(5, dtype=torch.int32), frozen))
     image = picture.draw(model, CAMERA, 0.5, torch.ones(3))
-    counts = {"refined": 2, "sliced": 1, "time": 1, "still": 1}
-    assert written[3:] == [f"{CLASSES[name]}: {number}" for name, number in counts.items()]
-    assert written[1] == "5 Gaussians by class"
+    counts = {"refined": 2, "conditioned": 1, "time": 1, "static": 1}
+    assert written[3:] == [f"{EFFECT_SETS[name]}: {number}" for name, number in counts.items()]
+    assert written[1] == "5 Gaussians by effect set"
     legend = image[picture.LINE + ENLARGED * 20 :]
     for i, name in enumerate(counts):
         left = i % 3 * (ENLARGED * 100 + picture.GAP)
@@ -85,7 +85,7 @@ def test_what_a_pixel_pays_for() -> None:
     """Catches costs of other Gaussians than those that are seen, without colours, or on a scale of their own."""
     model = one_of_each()
     frozen = SLICING - LESS_TO_READ
-    geometry = [REFINING + SLICING, SLICING, frozen, frozen, COSTS[STILL]]
+    geometry = [REFINING + SLICING, SLICING, frozen, frozen, COSTS[STATIC]]
     expected = [g + COLORING[degree] for g, degree in zip(geometry, (3, 3, 2, 1, 0), strict=True)]
     assert cost_of(model).tolist() == pytest.approx(expected)
     assert most_cost(model) == REFINING + SLICING + COLORING[3]
@@ -97,7 +97,7 @@ def test_what_a_pixel_pays_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "agr", "kind"), [("7dgs", True, "refined"), ("7dgs", False, "sliced"), ("3dgs", False, "still")]
+    ("name", "agr", "kind"), [("7dgs", True, "refined"), ("7dgs", False, "conditioned"), ("3dgs", False, "static")]
 )
 def test_a_model_without_classes_is_of_one_class(name: str, agr: bool, kind: str) -> None:
     """Catches a model that was not gated and cannot be drawn, or is drawn as what it is not."""
@@ -116,10 +116,10 @@ def test_large_images_are_made_smaller() -> None:
 
 
 def test_the_page_has_the_same_colours() -> None:
-    """Catches a class that has one colour in the picture and another in the figure above it."""
-    page = {name: LIGHT[MODELS.index(like)] for name, like in CLASS_LIKE.items()}
+    """Catches an effect set that has one colour in the picture and another in the figure above it."""
+    page = {name: LIGHT[MODELS.index(like)] for name, like in EFFECT_SET_LIKE.items()}
     assert {name: f"#{r:02x}{g:02x}{b:02x}" for name, (r, g, b) in picture.COLOURS.items()} == page
-    assert tuple(page) == tuple(CLASSES) == NAMES
+    assert tuple(page) == tuple(EFFECT_SETS) == NAMES
 
 
 @pytest.fixture(scope="module")

@@ -56,7 +56,7 @@ def slice_of(model: GaussianModel, simplification: Simplification, live: Gaussia
     """All Gaussians as the simplification has them."""
     if simplification.raw is None:
         return live._replace(opacities=torch.zeros_like(live.opacities))
-    if simplification.level is not None:
+    if simplification.order is not None:
         raw = model.refined(query) | simplification.raw
         return live._replace(colors=model.shade(raw, live.means, live.opacities, query))
     raw = dict(model.splats.items()) | simplification.raw
@@ -98,7 +98,7 @@ def test_prediction_against_brute_force(name: str) -> None:
     for simplification in simplifications_of(model, queries, seen):
         true, guess = brute_force(model, views, simplification), predicted.errors[simplification.name]
         # The image is linear in opacities and colours, and not in what moves: docs/effects.md has the figures.
-        linear = simplification.raw is None or simplification.level is not None
+        linear = simplification.raw is None or simplification.order is not None
         # One that changes places in depth with another is predicted at 0.38 of its error.
         least_rank, least_share = (0.98, 0.5) if linear else (0.92 if name == "4dgs" else 0.95, 0.35)
         assert float(torch.corrcoef(torch.stack([ranks(true), ranks(guess)]))[0, 1]) > least_rank, simplification.name
@@ -124,8 +124,8 @@ def test_an_opaque_gaussian_is_no_harder_to_predict() -> None:
         views = views_of(model, 1)
         queries = [Query.of(view.camera, view.time) for view in views]
         ways = simplifications_of(model, queries, [model.slice(q) for q in queries])
-        still = next(way for way in ways if way.name == "still")
-        ratios[name] = probe(model, views, BLACK, draws=8).errors["still"] / brute_force(model, views, still)
+        static = next(way for way in ways if way.name == "static")
+        ratios[name] = probe(model, views, BLACK, draws=8).errors["static"] / brute_force(model, views, static)
     assert ratios["opaque"].mean() / ratios["transparent"].mean() == pytest.approx(1, abs=0.15)
 
 

@@ -72,13 +72,13 @@ def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyP
     whole = trainer("effects.gate=both")
     expected = end(whole)
     assert whole.gating.gates[0].step == 60
-    assert whole.model.classes is not None
+    assert whole.model.effect_sets is not None
     first = trainer("effects.gate=both")
     states: list[dict[str, object]] = []
     first.run(lambda state: states.append(copy.deepcopy(state)), "test", lambda: first.step < 75)
     second = trainer("effects.gate=both")
     second.load_state_dict(states[-1])
-    assert second.model.classes is not None
+    assert second.model.effect_sets is not None
     assert second.gating.gates == first.gating.gates
     assert_same(end(second), expected)
 
@@ -88,7 +88,7 @@ def test_off_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Gating, "_gate", lambda *_, **__: pytest.fail("a gate was asked"))
     plain = trainer("effects.gate=off")
     end(plain)
-    assert plain.model.classes is None
+    assert plain.model.effect_sets is None
 
 
 def test_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,12 +106,12 @@ def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsbench.effects.budget.SHARES", (0.5,))
     one = trainer("effects.gate=both")
     one.run(lambda _: None, "test", lambda: one.step < 61)
-    classes = one.model.classes
-    assert classes is not None
-    assert classes.sliced < len(one.model)
+    effect_sets = one.model.effect_sets
+    assert effect_sets is not None
+    assert effect_sets.conditioned < len(one.model)
     before = {name: value.detach().clone() for name, value in one.model.splats.items()}
     one.run(lambda _: None, "test", lambda: one.step < 70)
-    masks = one.model.kept(classes)
+    masks = one.model.kept(effect_sets)
     for name, value in one.model.splats.items():
         mask = masks[name].expand_as(value) if name in masks else torch.ones_like(value, dtype=torch.bool)
         assert torch.equal(value[~mask], before[name][~mask]), name
@@ -186,7 +186,7 @@ def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: 
 
 def fit(x: float) -> Gate:
     """A gate at the end that has measured nothing yet."""
-    return Gate(share=x, predicted_db=0.0, measured_db=0.0, rows={}, levels={}, bytes_before=2, bytes=1)
+    return Gate(share=x, predicted_db=0.0, measured_db=0.0, rows={}, orders={}, bytes_before=2, bytes=1)
 
 
 def test_what_a_gate_costs_is_what_the_images_lost() -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from test_sensitivity import BLACK, N, trained_a_little, views_of
 
-from gsbench.effects.gate import apply, choose, classes_of
+from gsbench.effects.gate import apply, choose, effect_sets_of
 from gsbench.effects.sensitivity import probe
 from gsbench.effects.visible import seen_times, share_asleep
 from gsbench.kernels.headers import ALPHA_MIN
@@ -27,12 +27,12 @@ def fleeting() -> GaussianModel:
 
 
 def test_when_a_gaussian_is_seen() -> None:
-    """Catches a span that leaves out a view which shows the Gaussian, moved by AGR or not, and one that is too long."""
+    """Catches a visible interval that leaves out a view which shows the Gaussian, moved or not, or that is too long."""
     model = fleeting()
     views = views_of(model, 1)
     times = sorted(view.time for view in views if view.time is not None)
     gap = max(b - a for a, b in itertools.pairwise(times))
-    spans = seen_times(model, views)
+    intervals = seen_times(model, views)
     shown = torch.zeros(N, len(views), dtype=torch.bool)
     for i, view in enumerate(views):
         query = Query.of(view.camera, view.time)
@@ -42,37 +42,39 @@ def test_when_a_gaussian_is_seen() -> None:
     for row in range(N):
         seen = at[shown[row]]
         if not len(seen):
-            assert spans[row].tolist() == [math.inf, -math.inf]
+            assert intervals[row].tolist() == [math.inf, -math.inf]
             continue
-        torch.testing.assert_close(spans[row], torch.stack([seen.min() - gap, seen.max() + gap]))
-    assert spans[:5, 0].isinf().all()
-    assert not spans[5:, 0].isinf().all()
-    assert (spans[:, 1] - spans[:, 0]).max() < 1 or shown.float().mean() < 0.9, "a model whose Gaussians never sleep"
+        torch.testing.assert_close(intervals[row], torch.stack([seen.min() - gap, seen.max() + gap]))
+    assert intervals[:5, 0].isinf().all()
+    assert not intervals[5:, 0].isinf().all()
+    assert (intervals[:, 1] - intervals[:, 0]).max() < 1 or shown.float().mean() < 0.9, (
+        "a model whose Gaussians never sleep"
+    )
 
 
 def test_a_scene_without_times() -> None:
     """Catches a Gaussian of a still scene that is taken for hidden because there is no time."""
     model = trained_a_little("6dgs", 0)
     still = [replace(view, time=None) for view in views_of(model, 1)[:8]]
-    spans = seen_times(model, still)
-    assert not spans[:, 0].isinf().all()
-    assert set(spans[:, 0].tolist()) <= {0.0, math.inf}
+    intervals = seen_times(model, still)
+    assert not intervals[:, 0].isinf().all()
+    assert set(intervals[:, 0].tolist()) <= {0.0, math.inf}
 
 
 def test_agr_rests_unseen() -> None:
-    """Catches spans of other rows than their own, that change a training view, or that no checkpoint holds."""
+    """Catches intervals of other rows than their own, that change a training view, or that no checkpoint holds."""
     model = fleeting()
     views = views_of(model, 1)
-    spans = seen_times(model, views)
+    intervals = seen_times(model, views)
     sensitivity = probe(model, views, BLACK)
     gated, resting = copy.deepcopy(model), copy.deepcopy(model)
     choice = choose(sensitivity, model, 0.0)
     rows, _ = apply(gated, sensitivity, choice)
-    again, _ = apply(resting, sensitivity, choice, spans)
+    again, _ = apply(resting, sensitivity, choice, intervals)
     assert sorted(rows.tolist()) == sorted(again.tolist())
-    assert resting.classes is not None
-    assert resting.classes.spans is not None
-    assert torch.equal(resting.classes.spans, spans[again[: resting.classes.refined]])
+    assert resting.effect_sets is not None
+    assert resting.effect_sets.intervals is not None
+    assert torch.equal(resting.effect_sets.intervals, intervals[again[: resting.effect_sets.refined]])
     assert not (again < 5).any(), "Gaussians that are never seen cost nothing to remove"
     for view in views:
         a, b = (render(one, view.camera, view.time, BLACK) for one in (gated, resting))
@@ -83,10 +85,10 @@ def test_agr_rests_unseen() -> None:
     assert share_asleep(gated, views) is None
     other = trained_a_little("7dgs", 1)
     other.load_state(resting.pack())
-    assert other.classes is not None
-    assert torch.equal(other.classes.spans, resting.classes.spans)
-    assert resting.stored_bytes() == gated.stored_bytes() + 8 * resting.classes.refined
-    assert len(classes_of(resting).spans) == resting.classes.refined
+    assert other.effect_sets is not None
+    assert torch.equal(other.effect_sets.intervals, resting.effect_sets.intervals)
+    assert resting.stored_bytes() == gated.stored_bytes() + 8 * resting.effect_sets.refined
+    assert len(effect_sets_of(resting).intervals) == resting.effect_sets.refined
 
 
 @pytest.mark.parametrize("most", [30, 10])

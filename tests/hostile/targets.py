@@ -12,7 +12,7 @@ from gsbench.kernels.adam import adam
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.refine import HIDDEN, refine
-from gsbench.kernels.slices import observe_rotated, observe_still, observe_triangular
+from gsbench.kernels.slices import observe_rotated, observe_static, observe_triangular
 from gsbench.measure.quality import evaluate, psnr, psnr_channel_mean, quantise, ssim
 from gsbench.models.slicing import slice_gaussians
 from gsbench.raster import rasterize
@@ -40,7 +40,7 @@ def targets() -> dict[str, Target]:
     scene = {key: x.float() if isinstance(x, Tensor) else x for key, x in (gaussians(g, N) | camera(20, 12)).items()}
     images = {"a": rand(12, 13, 3), "b": rand(12, 13, 3)}
     common = {"means": rand(N, 3), "opacities": rand(N)}
-    still = {"scales": rand(N, 3), "quats": rand(N, 4), "opacities": rand(N)}
+    static = {"scales": rand(N, 3), "quats": rand(N, 4), "opacities": rand(N)}
     rotated = {**common, "times": rand(N, 1), "scales": rand(N, 4), "left_quats": rand(N, 4),
                "right_quats": rand(N, 4), "clock": torch.tensor(2.0), "time": torch.tensor(0.5),
                "log_lambda_t": torch.tensor(0.1)}  # fmt: skip
@@ -62,7 +62,7 @@ def targets() -> dict[str, Target]:
             slice_gaussians, {"mean": rand(N, 7), "factor": rand(N, 7, 7) + 2 * torch.eye(7), "query": rand(N, 4),
                               "scheme": "square_root"}
         ),
-        "observe_still": Target(observe_still, still),
+        "observe_static": Target(observe_static, static),
         "observe_rotated": Target(observe_rotated, rotated, ("clock", "time")),
         "observe_triangular": Target(observe_triangular, triangular, ("center", "time")),
         "show_colors": Target(show_colors, colors, ("center", "opacities")),

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import test_tape
 import torch
-from test_observe import VARIANTS, assert_same, color_inputs, model_and_raw, rotated, still
-from test_prefixes import SHARES, gradients, kept, spans_around
+from test_observe import VARIANTS, assert_same, color_inputs, model_and_raw, rotated, static
+from test_prefixes import SHARES, gradients, intervals_around, kept
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -17,7 +17,7 @@ from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.appearance import sh_colors, sh_time_colors
-from gsbench.models.base import Classes
+from gsbench.models.base import EffectSets
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement
@@ -52,52 +52,52 @@ def assert_slices_agree(exact: GaussianModel, raw: dict[str, Tensor], move: Move
 
 @pytest.mark.parametrize(("name", "options"), VARIANTS)
 def test_slice(name: str, options: dict[str, Any], move: Move) -> None:
-    """Catches a wrong row order, reflection, gate or derivative of any parameter."""
+    """Catches a wrong row order, reflection, opacity factor or derivative of any parameter."""
     assert_slices_agree(*model_and_raw(name, options, torch.float64), move)
 
 
 def test_rotated_slice(move: Move) -> None:
-    """Catches a wrong sign of a quaternion's matrix, row order, gate or derivative of any parameter."""
+    """Catches a wrong sign of a quaternion's matrix, row order, opacity factor or derivative of any parameter."""
     assert_slices_agree(*rotated(torch.float64), move)
 
 
-def test_still_slice(move: Move) -> None:
+def test_static_slice(move: Move) -> None:
     """Catches a wrong sign of a rotation's entry, a size that does not stop, or a derivative."""
-    raw = still(torch.float64)
+    raw = static(torch.float64)
     raw = {"means": torch.zeros(len(raw["opacities"]), 3, dtype=torch.float64, requires_grad=True), **raw}
     assert_slices_agree(Gaussians3DModel(), raw, move)
 
 
 @pytest.mark.parametrize("share", SHARES)
 @pytest.mark.parametrize(("name", "options"), VARIANTS)
-def test_still_rows(name: str, options: dict[str, Any], share: float, move: Move) -> None:
-    """Catches a still row that reads a column of time or direction, or leaves a gradient unwritten."""
+def test_static_rows(name: str, options: dict[str, Any], share: float, move: Move) -> None:
+    """Catches a static row that reads a column of time or direction, or leaves a gradient unwritten."""
     exact, raw = model_and_raw(name, options, torch.float64)
-    exact.classes = Classes(0, round(share * 37), None)
+    exact.effect_sets = EffectSets(0, round(share * 37), None)
     assert_slices_agree(exact, raw, move)
 
 
 @pytest.mark.parametrize("share", SHARES)
-def test_still_rows_of_rotated_factors(share: float, move: Move) -> None:
-    """Catches a still row that is turned otherwise than by its left quaternion, or fades."""
+def test_static_rows_of_rotated_factors(share: float, move: Move) -> None:
+    """Catches a static row that is turned otherwise than by its left quaternion, or fades."""
     exact, raw = rotated(torch.float64)
-    exact.classes = Classes(0, round(share * 45), None)
+    exact.effect_sets = EffectSets(0, round(share * 45), None)
     assert_slices_agree(exact, raw, move)
 
 
 @pytest.mark.parametrize("waves", [1, 3])
-def test_levels(waves: int, move: Move) -> None:
-    """Catches a thread that reads another row's level, and a gradient above a row's own."""
+def test_orders(waves: int, move: Move) -> None:
+    """Catches a thread that reads another row's order, and a gradient above a row's own."""
     N, g = 300, torch.Generator().manual_seed(waves)
-    levels = torch.randint(0, 20, (N,), generator=g, dtype=torch.int32)
+    orders = torch.randint(0, 20, (N,), generator=g, dtype=torch.int32)
     sh0, shN, means, times = exact = color_inputs(waves, torch.float64, N)
     center = torch.tensor([0.1, 0.2, -2.0])
-    used = torch.cat([sh0, shN], 1).unflatten(1, (waves, 16)) * kept(levels, waves)
+    used = torch.cat([sh0, shN], 1).unflatten(1, (waves, 16)) * kept(orders, waves)
     expected = sh_time_colors(used, unit(means - center.double()), 2, 0.7 - times[:, 0])
     single, count = [move(x) for x in exact], 4 if waves > 1 else 3
     timed = (single[3], move(torch.tensor(0.7))) if waves > 1 else (None, None)
     actual = colors.show_colors(*single[:3], move(torch.ones(N)), move(center), 2, *timed, waves,
-                                levels.to(single[0].device))  # fmt: skip
+                                orders.to(single[0].device))  # fmt: skip
     assert_same([actual.cpu()], [expected])
     assert_same(back(gradients([actual], single[:count])), gradients([expected], list(exact[:count])))
 
@@ -149,7 +149,7 @@ def test_refinement(N: int, widths: list[int], move: Move) -> None:
 @pytest.mark.parametrize("rests", [False, True])
 @pytest.mark.parametrize("share", SHARES)
 def test_rows_that_agr_does_not_move(share: float, rests: bool, move: Move) -> None:
-    """Catches a row past the prefix, or outside its span of time, that is moved, or counted in a weight's gradient, or
+    """Catches a row past the prefix, or outside its visible interval, that is moved, counted in a weight's gradient, or
     not copied, forth or back."""
     g, count = torch.Generator().manual_seed(1), round(share * 300)
     exact = Refinement([3, 1, 9], g, units=0.5 + torch.rand(13, generator=g)).double()
@@ -158,10 +158,12 @@ def test_rows_that_agr_does_not_move(share: float, rests: bool, move: Move) -> N
             parameter.add_(0.2 * torch.randn(parameter.shape, generator=g))
     values = [torch.randn(300, c, generator=g, dtype=torch.float64).requires_grad_() for c in (3, 1, 2, 7)]
     time = torch.tensor(0.37)
-    awake, spans = spans_around(time, count) if rests else (torch.arange(count) < count, None)
-    expected = exact(values, time.double(), rows=count, spans=spans)
+    awake, intervals = intervals_around(time, count) if rests else (torch.arange(count) < count, None)
+    expected = exact(values, time.double(), rows=count, intervals=intervals)
     single, inputs = deepcopy(exact).to(move(values[0])), [move(x) for x in values]
-    actual = single(inputs, move(time), by_kernel=True, rows=count, spans=None if spans is None else move(spans))
+    actual = single(
+        inputs, move(time), by_kernel=True, rows=count, intervals=None if intervals is None else move(intervals)
+    )
     assert_same(back(actual), expected)
     at_rest = torch.cat([~awake, torch.ones(300 - count, dtype=torch.bool)])
     for x, y in zip(back(actual), back(inputs), strict=True):
@@ -189,7 +191,7 @@ def test_a_training_step_s_gradients_are_the_reference_s(name: str, agr: bool, c
     def step(backend: Backend, device: str) -> dict[str, Tensor]:
         made = test_tape.fitted(name, agr=agr, classed=classed).to(device)
         if classed:
-            made.classes = made.classes._replace(levels=made.classes.levels.to(device))
+            made.effect_sets = made.effect_sets._replace(orders=made.effect_sets.orders.to(device))
         made.backend = backend
         background = torch.tensor([0.1, 0.5, 0.9], device=device)
         Step(made, background, 0.2, False, StageClock(device))([view.to(device) for view in test_tape.views(2)])

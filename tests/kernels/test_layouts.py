@@ -12,7 +12,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import HIDDEN
 from gsbench.kernels.refine import refine
-from gsbench.kernels.slices import observe_still, observe_triangular
+from gsbench.kernels.slices import observe_static, observe_triangular
 from gsbench.raster import rasterize
 
 N = 5
@@ -45,7 +45,7 @@ def test_a_negated_view_is_negated() -> None:
     scales, quats, opacities = torch.rand(N, 3), torch.rand(N, 4), torch.rand(N)
     negated = torch._neg_view(-scales)
     assert negated.is_contiguous()
-    for x, y in zip(observe_still(negated, quats, opacities), observe_still(scales, quats, opacities), strict=True):
+    for x, y in zip(observe_static(negated, quats, opacities), observe_static(scales, quats, opacities), strict=True):
         assert torch.equal(x, y)
 
 

@@ -11,7 +11,7 @@ from gsbench.kernels import refine as refining
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.operation import EVERY_ROW
 from gsbench.kernels.refine import refine
-from gsbench.kernels.slices import observe_rotated, observe_still, observe_triangular
+from gsbench.kernels.slices import observe_rotated, observe_static, observe_triangular
 from gsbench.models import Query, build
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.factors import OFF_DIAGONALS
@@ -87,11 +87,11 @@ def assert_same(actual: list[Tensor], expected: list[Tensor]) -> None:
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize(("name", "options"), VARIANTS + SUBTRACTING)
 def test_slice(name: str, options: dict[str, Any]) -> None:
-    """Catches a wrong row order, reflection, gate or derivative of any parameter, in every instruction set."""
+    """Catches a wrong row order, reflection, opacity factor or derivative by a parameter, in every instruction set."""
     center = torch.tensor([0.3, -0.2, -3.0])
     exact, raw = model_and_raw(name, options, torch.float64)
     seen = exact.condition(raw, Query(center.double(), torch.tensor(0.4, dtype=torch.float64)))
-    expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
+    expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.opacity_factor]
     model, single = model_and_raw(name, options, torch.float32)
     lambdas = list(model.log_lambda.parameters())
     actual = list(observe_triangular(
@@ -121,11 +121,11 @@ def rotated(dtype: torch.dtype) -> tuple[Gaussians4DModel, dict[str, Tensor]]:
 
 @pytest.mark.usefixtures("instruction_set")
 def test_rotated_slice() -> None:
-    """Catches a wrong sign of a quaternion's matrix, row order, gate or derivative of any parameter."""
+    """Catches a wrong sign of a quaternion's matrix, row order, opacity factor or derivative of any parameter."""
     exact, raw = rotated(torch.float64)
     seen = exact.condition(raw, Query(torch.zeros(3, dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64)))
-    expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.gate]
-    assert 0 < (seen.gate == 0).sum() < len(seen.gate)  # some are gated away
+    expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.opacity_factor]
+    assert 0 < (seen.opacity_factor == 0).sum() < len(seen.opacity_factor)  # some are culled
     model, single = rotated(torch.float32)
     actual = list(observe_rotated(*single.values(), model.clock, torch.tensor(0.4), model.log_lambda["time"]))
     assert_same(actual, expected)
@@ -133,7 +133,7 @@ def test_rotated_slice() -> None:
                 gradients(expected, [*raw.values(), *exact.log_lambda.parameters()]))  # fmt: skip
 
 
-def still(dtype: torch.dtype) -> dict[str, Tensor]:
+def static(dtype: torch.dtype) -> dict[str, Tensor]:
     g = torch.Generator().manual_seed(5)
     raw = {"scales": 0.5 * torch.randn(45, 3, generator=g) - 1, "quats": torch.randn(45, 4, generator=g),
            "opacities": 2 * torch.randn(45, generator=g)}  # fmt: skip
@@ -142,11 +142,11 @@ def still(dtype: torch.dtype) -> dict[str, Tensor]:
 
 
 @pytest.mark.usefixtures("instruction_set")
-def test_still_slice() -> None:
+def test_static_slice() -> None:
     """Catches a wrong sign of a rotation's entry, a size that does not stop, or a derivative, at a vector's end too."""
-    raw, single = still(torch.float64), still(torch.float32)
+    raw, single = static(torch.float64), static(torch.float32)
     expected = [Gaussians3DModel.factors(raw), torch.sigmoid(raw["opacities"])]
-    actual = list(observe_still(*single.values()))
+    actual = list(observe_static(*single.values()))
     assert_same(actual, expected)
     assert_same(gradients(actual, list(single.values())), gradients(expected, list(raw.values())))
 
@@ -250,7 +250,7 @@ def test_refinement(N: int, widths: list[int]) -> None:
                 gradients(expected, [*values, *exact.parameters()]))  # fmt: skip
 
 
-COMMON = torch.ones(16), *[torch.empty(0)] * 3  # units, no encoded time, no spans
+COMMON = torch.ones(16), *[torch.empty(0)] * 3  # units, no encoded time, no intervals
 
 
 def nan_memory(what: str, like: Tensor, shape: tuple[int, ...]) -> Tensor:  # noqa: ARG001

@@ -11,7 +11,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.library import library_of
 from gsbench.kernels.operation import MOST_KNOWN, Operation
-from gsbench.kernels.slices import _still, observe_rotated, observe_still
+from gsbench.kernels.slices import _static, observe_rotated, observe_static
 
 
 def declared() -> list[Operation]:
@@ -55,7 +55,7 @@ def test_every_kernel_is_declared() -> None:
 def test_what_does_not_fit_is_refused(given: tuple[torch.Tensor, ...], said: str) -> None:
     """Catches arrays that a kernel would read past their end."""
     with pytest.raises(InputError, match=said):
-        observe_still(*given)
+        observe_static(*given)
 
 
 def test_coefficients_are_whole_harmonics_of_every_wave() -> None:
@@ -70,25 +70,25 @@ def test_known_calls_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> N
     """Catches models that are rendered in turns and pay for each other's checks (0.1 ms a frame), and sizes of
     Gaussians that are kept for ever."""
     matched: list[int] = []
-    own = _still._match
-    monkeypatch.setattr(_still, "_match", lambda tensors, numbers: (matched.append(1), own(tensors, numbers))[1])
+    own = _static._match
+    monkeypatch.setattr(_static, "_match", lambda tensors, numbers: (matched.append(1), own(tensors, numbers))[1])
     for _ in range(3):
         for N in (1003, 1005):
-            factors, opacities = observe_still(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
+            factors, opacities = observe_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
             assert factors.shape == (N, 3, 3)
             assert opacities.shape == (N,)
     assert len(matched) <= 2
     for N in range(2 * MOST_KNOWN):
-        observe_still(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
-    assert len(_still._known) <= MOST_KNOWN
+        observe_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
+    assert len(_static._known) <= MOST_KNOWN
 
 
 def test_columns_are_put_in_rows() -> None:
     """Catches a kernel that is given the address of a transposed tensor."""
     g = torch.Generator().manual_seed(0)
     scales, quats, opacities = (torch.randn(n, 4, generator=g) for n in (3, 4, 1))
-    columns = observe_still(scales.mT, quats.mT, opacities[0])
-    rows = observe_still(scales.mT.contiguous(), quats.mT.contiguous(), opacities[0])
+    columns = observe_static(scales.mT, quats.mT, opacities[0])
+    rows = observe_static(scales.mT.contiguous(), quats.mT.contiguous(), opacities[0])
     assert all(torch.equal(a, b) for a, b in zip(columns, rows, strict=True))
 
 
@@ -104,6 +104,6 @@ def test_the_extension_counts_and_types_its_values() -> None:
     """Catches a call that shifts every field by one: the last door looks at number and kind."""
     native = kernels.native()
     with pytest.raises(TypeError, match="expected 7 values"):
-        native.observe_still(1, 2, 3)
+        native.observe_static(1, 2, 3)
     with pytest.raises(TypeError):
-        native.observe_still(0, "means", 0, 0, 1, 0, 0)
+        native.observe_static(0, "means", 0, 0, 1, 0, 0)

@@ -10,11 +10,11 @@ from benchmarks.scene import camera, model
 from gsbench.kernels.backends import CPU
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
-from gsbench.kernels.slices import observe_still
+from gsbench.kernels.slices import observe_static
 from gsbench.kernels.tape import Tape
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
-from gsbench.models.base import Classes
+from gsbench.models.base import EffectSets
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes.scene import Camera, View
 from gsbench.train.step import Step, fitting_threads
@@ -42,8 +42,8 @@ def fitted(name: str, N: int = 300, *, agr: bool = False, classed: bool = False)
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
     made.set_active(replace(made.active, tunes_lambda=True))
     if classed:
-        levels = torch.randint(0, 12, (N,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
-        made.classes = Classes(N // 3, N // 2 + 1, levels)
+        orders = torch.randint(0, 12, (N,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
+        made.effect_sets = EffectSets(N // 3, N // 2 + 1, orders)
     return made
 
 
@@ -144,7 +144,7 @@ def test_what_torch_does_in_between_is_differentiated_too() -> None:
     leaves = [scales, quats, opacities, means, sh0, shN]
 
     def loss() -> Tensor:
-        factors, faded = observe_still(2 * scales, quats, opacities)  # torch before an operation
+        factors, faded = observe_static(2 * scales, quats, opacities)  # torch before an operation
         moved = means + (factors @ factors.mT).sum(-1) * faded[:, None]  # and after it
         colors = show_colors(sh0, shN, moved, faded, torch.zeros(3), 3)
         again = show_colors(sh0, shN, 3 * moved + 1, faded, torch.zeros(3), 3)  # coefficients that are read twice
@@ -183,8 +183,8 @@ def test_what_is_added_does_not_depend_on_what_is_there() -> None:
 def test_nothing_is_noted_where_nothing_is_wanted() -> None:
     """Catches a tape that keeps every tensor of a rendering."""
     with Tape() as tape, torch.no_grad():
-        observe_still(torch.zeros(2, 3, requires_grad=True), torch.ones(2, 4), torch.zeros(2))
+        observe_static(torch.zeros(2, 3, requires_grad=True), torch.ones(2, 4), torch.zeros(2))
     assert not tape._notes
     with Tape() as tape:
-        observe_still(torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2))
+        observe_static(torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2))
     assert not tape._notes

@@ -20,7 +20,7 @@ from gsbench.measure import machine
 from gsbench.measure import record as files
 from gsbench.measure.curve import Point
 from gsbench.measure.provenance import git_commit, provenance
-from gsbench.measure.record import METRICS, Cost, Effects, Provenance, Record, ViewScore
+from gsbench.measure.record import METRICS, Cost, Effects, Gate, OnDemand, Provenance, Record, ViewScore
 from gsbench.measure.speed import RenderTimes
 from gsbench.sweep import traces
 
@@ -275,6 +275,22 @@ def test_any_json_in_any_place_reads_or_is_refused(tmp_path, data, value):
         files.read(path)
     except InputError as error:
         assert str(path) in str(error)  # noqa: PT017  # reading well is fine, too
+
+
+def test_a_gate_of_older_names_is_read_as_before(tmp_path: Path) -> None:
+    """Catches effect sets and orders of colour that were renamed and are no longer found in records of before."""
+    kinds = {"refined": 5, "conditioned": 4, "time": 3, "direction": 2, "static": 1, "removed": 9}
+    gate = Gate(0.01, 0.04, 0.03, kinds, {"degree 3": 15}, 300, 200)
+    path = tmp_path / files.FILE_NAME
+    files.write(make(on_demand=OnDemand(gates=[gate])), path)
+    text = path.read_text()
+    for now, before in (("conditioned", "sliced"), ("static", "still"), ("orders", "levels")):
+        assert text.count(f'"{now}":') == 1
+        text = text.replace(f'"{now}":', f'"{before}":')
+    path.write_text(text)
+    (found,) = files.read(path).on_demand.gates
+    assert found == gate
+    assert list(found.rows) == list(kinds)
 
 
 def test_a_failure_while_writing_leaves_the_old_record(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Models whose rows have effects of their own: still rows, rows that AGR does not move, colours of fewer harmonics."""
+"""Models whose rows have effects of their own: static rows, rows that AGR does not move, colours of fewer harmonics."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models import GaussianModel, Query
-from gsbench.models.base import Classes
+from gsbench.models.base import EffectSets
 from gsbench.models.factors import rotation, rotation4d, turn_of_space
 from gsbench.models.triangular import TriangularModel
 from gsbench.schedule import ActiveComponents
@@ -16,11 +16,13 @@ OBSERVING = [name for name in VARIANTS if not name.startswith("3dgs")]
 QUERY = Query.at(CAMERA, 0.45)
 
 
-def classed(variant: str, count: int, refined: int, sliced: int, sh_degree: int = 3) -> GaussianModel:
-    """A lively model with levels from the constant colour to more than there is."""
+def classed(variant: str, count: int, refined: int, conditioned: int, sh_degree: int = 3) -> GaussianModel:
+    """A lively model with orders from the constant colour to more than there is."""
     model = lively(variant, count, sh_degree=sh_degree)
     model.set_active(ActiveComponents(sh_degree, model.agr, True))
-    model.classes = Classes(refined, sliced, torch.randint(0, 16, (count,), generator=seeded(3), dtype=torch.int32))
+    model.effect_sets = EffectSets(
+        refined, conditioned, torch.randint(0, 16, (count,), generator=seeded(3), dtype=torch.int32)
+    )
     return model
 
 
@@ -41,7 +43,7 @@ def test_slice_has_gradients(variant: str) -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_rows_have_the_effects_of_their_class_only(variant: str) -> None:
-    """Catches classes cut at another row: what is still is the same everywhere, what AGR leaves is as it was."""
+    """Catches effect sets cut at another row: what is static is the same everywhere, what AGR leaves is as it was."""
     model, whole = classed(variant, N, 8, 15), lively(variant)
     whole.set_active(model.active)
     moved, everything, raw = model.refined(QUERY), whole.refined(QUERY), dict(whole.splats.items())
@@ -55,18 +57,18 @@ def test_rows_have_the_effects_of_their_class_only(variant: str) -> None:
     moves = bool(model.observes)
     assert moves != torch.equal(here.means[8:15], there.means[8:15])
     assert torch.equal(here.opacities[15:], torch.sigmoid(model.splats["opacities"])[15:])
-    constant = (model.classes.levels == 0) & (torch.arange(N) >= 15)
+    constant = (model.effect_sets.orders == 0) & (torch.arange(N) >= 15)
     assert constant.any()
     assert torch.equal(here.colors[constant], there.colors[constant])
-    varied = (model.classes.levels % 4 > 0) & (torch.arange(N) >= 15)
+    varied = (model.effect_sets.orders % 4 > 0) & (torch.arange(N) >= 15)
     assert not torch.equal(here.colors[varied], there.colors[varied])
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_classes_that_leave_nothing_out_change_no_bit(variant: str) -> None:
-    """Catches arithmetic that depends on whether a model has classes."""
+def test_effect_sets_that_leave_nothing_out_change_no_bit(variant: str) -> None:
+    """Catches arithmetic that depends on whether a model has effect_sets."""
     model, whole = lively(variant), lively(variant)
-    model.classes = Classes(N, N, torch.full((N,), 31, dtype=torch.int32))
+    model.effect_sets = EffectSets(N, N, torch.full((N,), 31, dtype=torch.int32))
     for x, y in zip(model.slice(QUERY), whole.slice(QUERY), strict=True):
         assert torch.equal(x, y)
 
@@ -84,7 +86,9 @@ def test_agr_moves_a_row_within_its_span_alone(dtype: torch.dtype) -> None:
     model = classed("7dgs_agr", N, 4, 10).to(dtype)
     query = Query.at(CAMERA.to(dtype), 0.45)
     whole = model.refined(query)
-    model.classes = model.classes._replace(spans=torch.tensor([[0.5, 0.9], [0.1, 0.4], [0.4, 0.5], [0.0, 1.0]]))
+    model.effect_sets = model.effect_sets._replace(
+        intervals=torch.tensor([[0.5, 0.9], [0.1, 0.4], [0.4, 0.5], [0.0, 1.0]])
+    )
     moved = model.refined(query)["means"]
     assert torch.equal(moved[:2], model.splats["means"][:2])
     torch.testing.assert_close(moved[2:], whole["means"][2:])
@@ -106,8 +110,8 @@ def freeze(model: GaussianModel) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("variant", [name for name in OBSERVING if "agr" not in name])
-def test_a_still_row_is_a_frozen_one(variant: str, dtype: torch.dtype) -> None:
-    """Catches a still row that would look otherwise to whoever does not know of classes, by kernels or by torch.
+def test_a_static_row_is_a_frozen_one(variant: str, dtype: torch.dtype) -> None:
+    """Catches a static row that would look otherwise to whoever does not know of effect_sets, by kernels or by torch.
 
     An exponent of f_dir or f_temp is (q - mu)^2 / (2 e^32) = 1e-14 (q - mu)^2 there; factors may differ by a rotation
     from the right, covariances do not.
@@ -116,12 +120,12 @@ def test_a_still_row_is_a_frozen_one(variant: str, dtype: torch.dtype) -> None:
     freeze(model)
     query, raw = Query.at(CAMERA.to(dtype), 0.45), dict(model.splats.items())
     means, factors, opacities = model.observe(raw, query)
-    model.classes = Classes(0, 0, None)
-    still = model.observe(raw, query)
+    model.effect_sets = EffectSets(0, 0, None)
+    static = model.observe(raw, query)
     tolerance = {"rtol": 1e-11, "atol": 1e-11} if dtype == torch.float64 else {"rtol": 1e-5, "atol": 1e-5}
-    torch.testing.assert_close(still[0], means, **tolerance)
-    torch.testing.assert_close(still[1] @ still[1].mT, factors @ factors.mT, **tolerance)
-    torch.testing.assert_close(still[2], opacities, **tolerance)
+    torch.testing.assert_close(static[0], means, **tolerance)
+    torch.testing.assert_close(static[1] @ static[1].mT, factors @ factors.mT, **tolerance)
+    torch.testing.assert_close(static[2], opacities, **tolerance)
 
 
 def test_turn_of_space() -> None:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from small import CAMERA, MODELS, TRIANGULAR, N, fresh, joint, lively, raw, seeded
 
 from gsbench.models import GaussianModel, Gaussians3D, Query
-from gsbench.models.gaussians4d import TIME_GATE_MIN
+from gsbench.models.gaussians4d import TIME_OPACITY_FACTOR_MIN
 
 TIME = 0.45
 ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
@@ -126,7 +126,7 @@ def rotor_factor(left: np.ndarray, right: np.ndarray, scales: np.ndarray) -> np.
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_4dgs(scheme: str) -> None:
-    """Catches a wrong slice of (R S)(R S)^T at t, a lambda_t that is not 1, and the gate's exponent."""
+    """Catches a wrong slice of (R S)(R S)^T at t, a lambda_t that is not 1, and the opacity factor's exponent."""
     model = lively("4dgs", scheme=scheme)
     model.splats["times"].data[:4] += 3  # too far to be drawn
     values = {name: value.numpy() for name, value in raw(model).items()}
@@ -163,7 +163,7 @@ def test_4dgs_leaves_out_what_is_far_in_time() -> None:
     for factor, drawn in [(1 - 1e-4, True), (1 + 1e-4, False)]:
         model.splats["times"].data.fill_(TIME + factor * sigma * math.sqrt(-2 * math.log(0.05)))
         assert ((model.slice(Query.at(CAMERA, TIME)).opacities > 0) == drawn).all()
-    assert TIME_GATE_MIN == 0.05
+    assert TIME_OPACITY_FACTOR_MIN == 0.05
 
 
 def test_4dgs_at_a_time_of_its_own_is_3dgs() -> None:

@@ -10,7 +10,7 @@ from gsbench import models
 from gsbench.errors import InputError
 from gsbench.models import registry
 from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
-from gsbench.models.effect_sets import Classes
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel, as_gated
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.scenes.scene import Points
@@ -37,7 +37,7 @@ class Balls(GaussianModel):
 class Half(GatedModel, Balls):
     """Says that it can be gated, and has one of the two methods."""
 
-    def still(self, raw: Raw) -> Conditioned:
+    def static(self, raw: Raw) -> Conditioned:
         return self.condition(raw, None)
 
 
@@ -64,8 +64,8 @@ def test_a_model_that_lacks_a_method(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_checkpoint_with_gates_of_a_model_without_them() -> None:
     """Catches a checkpoint that loads and then fails at its first image."""
     model = made(Gaussians3DModel)
-    model.classes = Classes(0, 0, torch.full((6,), 3, dtype=torch.int32), torch.zeros(6, dtype=torch.uint8))
+    model.effect_sets = EffectSets(0, 0, torch.full((6,), 3, dtype=torch.int32), torch.zeros(6, dtype=torch.uint8))
     state = model.pack()
     made(Gaussians3DModel).load_state(dict(state))
-    with pytest.raises(InputError, match=r"not of this model: expected classes\.counts of shape none"):
+    with pytest.raises(InputError, match=r"not of this model: expected effect_sets\.counts of shape none"):
         made(Balls).load_state(dict(state))

@@ -183,15 +183,15 @@ def test_time_colors() -> None:
     torch.testing.assert_close(sh_time_colors(coefficients[:, :1], d, 2, offset), sh_colors(coefficients[:, 0], d, 2))
 
 
-def test_levels_leave_out_what_is_above_them() -> None:
-    """Catches a row that loses the highest degree or wave of its own level, or keeps one above: degree + 4 waves."""
+def test_orders_leave_out_what_is_above_them() -> None:
+    """Catches a row that loses the highest degree or wave of its own order, or keeps one above: degree + 4 waves."""
     coefficients, d, offset = normal(6, 12, 3, 16, 3), directions(7, 12), normal(8, 12)
-    levels = torch.tensor([degree + 4 * waves for degree in range(4) for waves in range(3)], dtype=torch.int32)
+    orders = torch.tensor([degree + 4 * waves for degree in range(4) for waves in range(3)], dtype=torch.int32)
     degrees = torch.tensor([degree for degree in range(4) for _ in range(2 * degree + 1)])
-    own = (degrees <= levels[:, None] % 4)[:, None] & (torch.arange(3) <= levels[:, None] // 4)[..., None]
+    own = (degrees <= orders[:, None] % 4)[:, None] & (torch.arange(3) <= orders[:, None] // 4)[..., None]
     cut = torch.where(own[..., None], coefficients, 0.0)
-    torch.testing.assert_close(sh_time_colors(coefficients, d, 3, offset, levels), sh_time_colors(cut, d, 3, offset))
-    torch.testing.assert_close(sh_colors(coefficients[:, 0], d, 3, levels), sh_colors(cut[:, 0], d, 3))
+    torch.testing.assert_close(sh_time_colors(coefficients, d, 3, offset, orders), sh_time_colors(cut, d, 3, offset))
+    torch.testing.assert_close(sh_colors(coefficients[:, 0], d, 3, orders), sh_colors(cut[:, 0], d, 3))
 
 
 # ---- refinement

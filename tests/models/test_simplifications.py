@@ -22,8 +22,8 @@ def test_fewer_harmonics_have_the_same_colour_on_average(variant: str) -> None:
     seen = [model.slice(query) for query in queries]
     weights = shares_of([one.opacities for one in seen])
     assert min(float(one.colors.amin()) for one in seen) > 0
-    simplifications = [one for one in simplifications_of(model, queries, seen) if one.level is not None]
-    assert [simplification.level for simplification in simplifications] == model.lower_levels()
+    simplifications = [one for one in simplifications_of(model, queries, seen) if one.order is not None]
+    assert [simplification.order for simplification in simplifications] == model.lower_orders()
     for simplification in simplifications:
         raw = dict(model.splats.items()) | simplification.raw
         colors = torch.stack(

@@ -73,13 +73,13 @@ def one(model: str, scene: str, seed: int, length: int, views: int, lengths: tup
 
 def gates(seed: int = 0) -> list[Gate]:
     """A gate in training and one at the end, with numbers that differ from seed to seed."""
-    first = {"refined": 500, "sliced": 200, "time": 0, "direction": 0, "still": 100, "removed": 200}
-    last = {"refined": 300 + 10 * seed, "sliced": 150, "time": 40, "direction": 10, "still": 200, "removed": 100}
+    first = {"refined": 500, "conditioned": 200, "time": 0, "direction": 0, "static": 100, "removed": 200}
+    last = {"refined": 300 + 10 * seed, "conditioned": 150, "time": 40, "direction": 10, "static": 200, "removed": 100}
     last["removed"] -= 10 * seed
-    levels = {"degree 0": 350, "degree 1": 50, "degree 2": 100, "degree 3, 2 waves": 200 + 10 * seed}
+    orders = {"degree 0": 350, "degree 1": 50, "degree 2": 100, "degree 3, 2 waves": 200 + 10 * seed}
     return [
         Gate(0.1, 0.4, 0.3, first, {"degree 3": 800}, 400_000, 300_000, step=600, seconds=1.0),
-        Gate(0.01, 0.04, 0.03, last, levels, 300_000, 200_000, None, "val", 2.0, 0.02 + 0.01 * seed, 4.0, 3.0,
+        Gate(0.01, 0.04, 0.03, last, orders, 300_000, 200_000, None, "val", 2.0, 0.02 + 0.01 * seed, 4.0, 3.0,
              asleep=0.25),
     ]  # fmt: skip
 
@@ -122,9 +122,9 @@ def hostile() -> list[Record]:
 def hostile_choice() -> OnDemand:
     """Words, classes and numbers that no gate would write."""
     screen = TimeScreen(HOSTILE, HOSTILE, 2.0, -1e300, 1e300, -1.0)
-    rows = {HOSTILE: 2**62, "refined": -(2**62), "removed": 2**62, "sliced": 0}
-    levels = {HOSTILE: 1, f"degree 1{HOSTILE}": -5, "degree 3": 2**62}
-    gate = Gate(-1.0, 1e300, -1e300, rows, levels, -1, 2**62, None, HOSTILE, -1.0, None, 1e300, -1e300)
+    rows = {HOSTILE: 2**62, "refined": -(2**62), "removed": 2**62, "conditioned": 0}
+    orders = {HOSTILE: 1, f"degree 1{HOSTILE}": -5, "degree 3": 2**62}
+    gate = Gate(-1.0, 1e300, -1e300, rows, orders, -1, 2**62, None, HOSTILE, -1.0, None, 1e300, -1e300)
     return OnDemand(screen, [gate], [HOSTILE, HOSTILE[::-1], "", *(f"note {i}" for i in range(50))])
 
 

@@ -37,8 +37,8 @@ def test_one_seed_in_words():
     (said,) = sentences(on_demand(WHOLE[:1]))
     assert said == (
         "On suzanne, auto: time is on, as what a static fit leaves over changes with time. Of 1,000 Gaussians the "
-        "gates left 700 (70 %): 300 refined by AGR, 150 sliced, 40 time frozen, 10 direction frozen and 200 still. At "
-        "any one time AGR moves 75 % of its Gaussians; the others cannot be seen then. The "
+        "gates left 700 (70 %): 300 refined by AGR, 150 conditioned, 40 time frozen, 10 direction frozen and 200 "
+        "static. At any one time AGR moves 75 % of its Gaussians; the others cannot be seen then. The "
         f"gate at the end changed PSNR on test by −0.020 dB and a frame of 4.00 ms by −1.00 ms; {NO_SPREAD}."
     )
 
@@ -48,9 +48,9 @@ def test_three_seeds_in_words():
     (said,) = sentences(on_demand(WHOLE))
     assert said == (
         "On suzanne, auto: time is on, as what a static fit leaves over changes with time; the same with all 3 seeds. "
-        "Of 1,000 Gaussians the gates left 710 (71 %): 310 refined by AGR, 150 sliced, 40 time frozen, 10 direction "
-        "frozen and 200 still. At any one time AGR moves 75 % of its Gaussians; the others cannot be seen then. "
-        "The gate at the end changed PSNR on test by −0.030 dB (95 % −0.055 to −0.005 over seeds) and a "
+        "Of 1,000 Gaussians the gates left 710 (71 %): 310 refined by AGR, 150 conditioned, 40 time frozen, 10 "
+        "direction frozen and 200 static. At any one time AGR moves 75 % of its Gaussians; the others cannot be seen "
+        "then. The gate at the end changed PSNR on test by −0.030 dB (95 % −0.055 to −0.005 over seeds) and a "
         "frame of 4.00 ms by −1.00 ms (95 % −1.00 to −1.00 over seeds)."
     )
 
@@ -89,7 +89,7 @@ def test_a_loss_that_was_not_evaluated_is_that_of_the_check():
     elsewhere = dataclasses.replace(run, provenance=other, seed=9)
     assert "a frame" not in sentences([*WHOLE, dataclasses.replace(elsewhere, model="auto")])[0]
     only_in_training = dataclasses.replace(run, on_demand=OnDemand(None, gates()[:1]))
-    assert sentences([only_in_training])[0].endswith("500 refined by AGR, 200 sliced and 100 still.")
+    assert sentences([only_in_training])[0].endswith("500 refined by AGR, 200 conditioned and 100 static.")
 
 
 def test_the_table_has_what_the_figure_shows():
@@ -101,7 +101,7 @@ def test_the_table_has_what_the_figure_shows():
     assert (row["scene"], row["model"], row["variant"], row["seeds"], row["time"]) == (
         "suzanne", "auto", "none", "3", "on 3",
     )  # fmt: skip
-    counts = {"refined by AGR": 310, "sliced": 150, "time frozen": 40, "direction frozen": 10, "still": 200}
+    counts = {"refined by AGR": 310, "conditioned": 150, "time frozen": 40, "direction frozen": 10, "static": 200}
     counts |= {
         "% of AGR left out of a frame": 25,
         "removed": 290,
@@ -118,8 +118,8 @@ def test_the_table_has_what_the_figure_shows():
         assert f"var(--model-{MODELS.index(name)})" in classes
     assert "mean degree 1.2" in degrees
     assert [f"{one.name}: {one.variable}" for one in section.swatches] == [
-        "refined by AGR: model-3", "sliced: model-4", "time frozen: model-2", "direction frozen: model-1",
-        "still: model-0", "removed: line", "degree 0: stage-3", "degree 1: stage-2", "degree 2: stage-1",
+        "refined by AGR: model-3", "conditioned: model-4", "time frozen: model-2", "direction frozen: model-1",
+        "static: model-0", "removed: line", "degree 0: stage-3", "degree 1: stage-2", "degree 2: stage-1",
         "degree 3: stage-0",
     ]  # fmt: skip
 

@@ -19,7 +19,7 @@ def row(observed: slicing_cases.Observed, i: int) -> list[float]:
 
 
 def test_independent_position() -> None:
-    """Catches a conditional covariance that is not S_pp where p does not correlate, and a gate that is not marginal."""
+    """Catches a covariance that is not S_pp where p does not correlate, and an opacity factor that is not marginal."""
     observed = CASES["ordinary_gaussians"](model="7dgs")
     for kind in KINDS:
         observed.raw[kind].zero_()
@@ -31,8 +31,10 @@ def test_independent_position() -> None:
     delta_d = offset / offset.norm() - observed.raw["directions"][0].double()
     delta_t = float(torch.tensor(observed.time)) - observed.raw["times"][0].double()
     squares = (delta_d / sizes[:3]).square().sum() + (delta_t / sizes[3]).square().sum()
-    gate = torch.exp(-0.5 * math.exp(np.float32(math.log(0.35))) * squares)
-    np.testing.assert_allclose(got[12], gate * torch.sigmoid(observed.raw["opacities"][0].double()), rtol=1e-14)
+    opacity_factor = torch.exp(-0.5 * math.exp(np.float32(math.log(0.35))) * squares)
+    np.testing.assert_allclose(
+        got[12], opacity_factor * torch.sigmoid(observed.raw["opacities"][0].double()), rtol=1e-14
+    )
 
 
 @pytest.mark.parametrize("model", ["4dgs", "7dgs"])

@@ -16,7 +16,7 @@ from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.kernels.library import Library
 from gsbench.measure.images import to_bytes
 from gsbench.models import Query
-from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, Classes
+from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, EffectSets
 from gsbench.models.render import rasterize_slice, render
 from gsbench.run.load import LoadedRun, SceneDescription
 from gsbench.scenes import Camera
@@ -31,20 +31,20 @@ from gsbench.view.stages import RASTER, SLICE, STAGES
 SIZE = 40
 
 
-def painter(backend: Backend = AUTO, classes: Classes | None = None) -> Painter:
+def painter(backend: Backend = AUTO, effect_sets: EffectSets | None = None) -> Painter:
     """Of 7DGS with AGR, in the midst of a training."""
     model = lively("7dgs_agr", count=80, backend=backend).float()
     model.set_active(ActiveComponents(3, True, True))
-    model.classes = classes
+    model.effect_sets = effect_sets
     scene = SceneDescription("small", "0", 4.0, [0.0, 0.0, 0.0], True, SIZE, SIZE)
     return Painter(LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0")), most_cost(model))
 
 
-def of_every_class() -> Classes:
-    """Of 80 Gaussians, 16 of each class."""
+def of_every_effect_set() -> EffectSets:
+    """Of 80 Gaussians, 16 of each effect set."""
     frozen = torch.zeros(80, dtype=torch.uint8)
     frozen[32:48], frozen[48:64] = TIME, DIRECTION
-    return Classes(16, 64, torch.full((80,), 3, dtype=torch.int32), frozen)
+    return EffectSets(16, 64, torch.full((80,), 3, dtype=torch.int32), frozen)
 
 
 @pytest.fixture(scope="module")
@@ -101,10 +101,10 @@ def test_harmonics_are_cut_for_one_frame(one: Painter) -> None:
     assert (early.paint(camera, FrameRequest(0.4)).image == images[1]).all()
 
 
-@pytest.mark.parametrize("classes", [None, of_every_class()], ids=["without classes", "with classes"])
-def test_colours_are_those_of_the_picture_of_classes(classes: Classes | None) -> None:
+@pytest.mark.parametrize("effect_sets", [None, of_every_effect_set()], ids=["without effect sets", "with effect sets"])
+def test_colours_are_those_of_the_picture_of_effect_sets(effect_sets: EffectSets | None) -> None:
     """Catches a viewer whose colours mean something else than those of classes.png, or stand on another background."""
-    made = painter(classes=classes)
+    made = painter(effect_sets=effect_sets)
     camera = seen_from(0.5, made)
     panels = picture.draw(made.run.model, camera, 0.4, torch.zeros(3))[picture.LINE :]
     factor = -(-picture.LEAST_WIDTH // SIZE)
@@ -112,8 +112,8 @@ def test_colours_are_those_of_the_picture_of_classes(classes: Classes | None) ->
     for i, colours in enumerate(("image", CLASS, COST)):
         panel = panels[: factor * SIZE : factor, i * step :][:, : factor * SIZE : factor]
         assert (made.paint(camera, FrameRequest(0.4, colours=colours)).image == panel).all()
-    assert made.counts == made.run.model.count_classes()
-    assert all(made.counts[name] == 16 for name in NAMES) == (classes is not None)
+    assert made.counts == made.run.model.count_by_effects()
+    assert all(made.counts[name] == 16 for name in NAMES) == (effect_sets is not None)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.effects.messages import CLASSES
+from gsbench.effects.messages import EFFECT_SETS
 from gsbench.effects.picture import COLOURS
 from gsbench.models.effect_sets import NAMES
 from gsbench.scenes import Camera, View
@@ -39,18 +39,18 @@ def test_the_table_splits_a_frame_by_stage() -> None:
 
 
 def shown(colours: str, name: str, *counts: int) -> Any:
-    """An image of a model with so many Gaussians of each class."""
+    """An image of a model with so many Gaussians of each effect set."""
     return SimpleNamespace(name=name, counts=dict(zip(NAMES, counts, strict=True))), colours
 
 
 def test_the_legend_counts_the_classes_that_there_are() -> None:
-    """Catches a count beside another class's name or colour, and classes that nothing shown has."""
+    """Catches a count beside the name of another effect set or colour, and effect sets that nothing shown has."""
     text = legend([shown(CLASS, "7dgs", 1200, 5, 0, 0, 30), shown(CLASS, "4dgs", 0, 700, 0, 0, 0)], 250.0)
     table = rows(text)
-    assert list(table) == ["Gaussians", CLASSES["refined"], CLASSES["sliced"], CLASSES["still"]]
+    assert list(table) == ["Gaussians", EFFECT_SETS["refined"], EFFECT_SETS["conditioned"], EFFECT_SETS["static"]]
     assert list(table.values()) == [["7dgs", "4dgs"], ["1,200", "0"], ["5", "700"], ["30", "0"]]
     colours = re.findall(r"color:rgb(\(.*?\))", text)
-    assert colours == [str(COLOURS[name]) for name in ("refined", "sliced", "still")]
+    assert colours == [str(COLOURS[name]) for name in ("refined", "conditioned", "static")]
 
 
 def test_the_legend_of_costs_has_its_scale() -> None:
@@ -58,8 +58,8 @@ def test_the_legend_of_costs_has_its_scale() -> None:
     one = "7dgs", 1, 0, 0, 0, 0
     both = legend([shown(CLASS, *one), shown(COST, *one)], 251.0)
     assert "251 ns" in both
-    assert CLASSES["refined"] in both
-    assert CLASSES["refined"] not in legend([shown(IMAGE, *one), shown(COST, *one)], 251.0)
+    assert EFFECT_SETS["refined"] in both
+    assert EFFECT_SETS["refined"] not in legend([shown(IMAGE, *one), shown(COST, *one)], 251.0)
     assert legend([shown(IMAGE, *one)], 251.0) == ""
 
 

@@ -1,8 +1,8 @@
 // Colours of Gaussians, sixteen at a time; the mathematics is math/harmonics.h. What cannot be drawn costs nothing.
 //
 // A 4D Gaussian has 144 coefficients and is drawn for part of the time, so memory is what counts here: those with
-// something to do are packed first, and the rows of all others are neither read nor worked on. Where rows have levels,
-// the packed are sorted by level: a vector is of one, and no coefficient above it is read.
+// something to do are packed first, and the rows of all others are neither read nor worked on. Where rows have orders,
+// the packed are sorted by order: a vector is of one, and no coefficient above it is read.
 #include "../math/projection.h"
 #include "../math/harmonics.h"
 
@@ -185,7 +185,7 @@ GSB_HD inline ColorArgs chunk_of(ColorArgs a, int64_t first) {
     a.means += first * 3;
     a.opacities += first;
     if (a.times) a.times += first;
-    if (a.levels) a.levels += first;
+    if (a.orders) a.orders += first;
     return a;
 }
 GSB_HD inline ColorGrads chunk_of(ColorGrads g, const ColorArgs& a, int64_t first) {
@@ -204,57 +204,57 @@ GSB_HD inline Mask learns(const ColorArgs& a, const float* g_colors, int i, int 
     return drawn(a, i, n) & !((color[0] == Vec(0.0f)) & (color[1] == Vec(0.0f)) & (color[2] == Vec(0.0f)));
 }
 
-GSB_HD inline ColorArgs at_level(ColorArgs a, Level level) {
-    a.degree = level.degree;
-    a.waves = level.waves;
+GSB_HD inline ColorArgs at_order(ColorArgs a, ColorOrder order) {
+    a.degree = order.degree;
+    a.waves = order.waves;
     return a;
 }
 
-// Where the rows of each level begin among those picked, once they are sorted by level.
+// Where the rows of each order begin among those picked, once they are sorted by order.
 struct Sorted {
-    static constexpr int LEVELS = 4 * MAX_WAVES;
-    int begin[LEVELS + 1] = {};
+    static constexpr int ORDERS = 4 * MAX_WAVES;
+    int begin[ORDERS + 1] = {};
 
     GSB_HD Sorted(const ColorArgs& a, Picked& picked) {
-        const Level most{a.degree, a.waves};
-        uint8_t level[CHUNK];
-        int first = most.number(), other = 0;  // other: not zero where some level is not the first row's
-        if (a.levels) {
-            for (int i = 0; i < a.N; ++i) level[i] = static_cast<uint8_t>(level_of(a.levels[i], most));
-            first = level[0];
-            for (int i = 0; i < a.N; ++i) other |= level[i] ^ first;
+        const ColorOrder most{a.degree, a.waves};
+        uint8_t order[CHUNK];
+        int first = most.number(), other = 0;  // other: not zero where some order is not the first row's
+        if (a.orders) {
+            for (int i = 0; i < a.N; ++i) order[i] = static_cast<uint8_t>(order_of(a.orders[i], most));
+            first = order[0];
+            for (int i = 0; i < a.N; ++i) other |= order[i] ^ first;
         }
         if (!other) {
-            for (int l = first; l < LEVELS; ++l) begin[l + 1] = picked.count;
+            for (int l = first; l < ORDERS; ++l) begin[l + 1] = picked.count;
             return;
         }
-        int next[LEVELS] = {};
-        for (int k = 0; k < picked.count; ++k) ++next[level[picked.which[k]]];
-        for (int l = 0; l < LEVELS; ++l) {
+        int next[ORDERS] = {};
+        for (int k = 0; k < picked.count; ++k) ++next[order[picked.which[k]]];
+        for (int l = 0; l < ORDERS; ++l) {
             begin[l + 1] = begin[l] + next[l];
             next[l] = begin[l];
         }
         uint32_t before[CHUNK];
         __builtin_memcpy(before, picked.which, sizeof(before));
-        for (int k = 0; k < picked.count; ++k) picked.which[next[level[before[k]]]++] = before[k];
+        for (int k = 0; k < picked.count; ++k) picked.which[next[order[before[k]]]++] = before[k];
     }
 
-    GSB_HD static int level_of(int32_t own, Level most) {
-        return Level::of(static_cast<uint32_t>(own)).at_most(most).number();
+    GSB_HD static int order_of(int32_t own, ColorOrder most) {
+        return ColorOrder::of(static_cast<uint32_t>(own)).at_most(most).number();
     }
 };
 
-// Calls f(arguments, picked) for the rows of each level, whose arguments have its degree and waves.
+// Calls f(arguments, picked) for the rows of each order, whose arguments have its degree and waves.
 template <class F>
-GSB_HD inline void each_level(const ColorArgs& a, Picked& picked, F f) {
+GSB_HD inline void each_order(const ColorArgs& a, Picked& picked, F f) {
     const Sorted sorted(a, picked);
-    for (int level = 0; level < Sorted::LEVELS; ++level) {
-        const int begin = sorted.begin[level], count = sorted.begin[level + 1] - begin;
-        if (count > 0) f(at_level(a, Level::of(static_cast<uint32_t>(level))), picked.which + begin, count);
+    for (int order = 0; order < Sorted::ORDERS; ++order) {
+        const int begin = sorted.begin[order], count = sorted.begin[order + 1] - begin;
+        if (count > 0) f(at_order(a, ColorOrder::of(static_cast<uint32_t>(order))), picked.which + begin, count);
     }
 }
 
-// Not inlined: what the compiler then knows of a level's range would change what it rounds.
+// Not inlined: what the compiler then knows of an order's range would change what it rounds.
 __attribute__((noinline)) void show_rows(const ColorArgs& a, const uint32_t* which, int count, int stride, float* out) {
     for (int k = 0; k < count; k += LANES) {
         const Rows rows(which + k, lanes_from(k, count), stride);
@@ -306,7 +306,7 @@ void show_colors(const ColorArgs& all, const Colors& shown) {
         float* out = shown.colors + first * 3;
         Picked picked(size, [&](int i, int n) { return drawn(a, i, n); });
         picked.each_gap(size, [&](int from, int end) { fill_zero(out, 3, from, end); });
-        each_level(a, picked, [&](const ColorArgs& own, const uint32_t* which, int count) {
+        each_order(a, picked, [&](const ColorArgs& own, const uint32_t* which, int count) {
             show_rows(own, which, count, stride_of(a), out);
         });
     }
@@ -324,7 +324,7 @@ void show_colors_backward(const ColorArgs& all, const GivenColors& given, const 
             fill_zero(out.means, 3, from, end);
             if (a.times) fill_zero(out.times, 1, from, end);
         });
-        each_level(a, picked, [&](const ColorArgs& own, const uint32_t* which, int count) {
+        each_order(a, picked, [&](const ColorArgs& own, const uint32_t* which, int count) {
             for (int k = 0; k < count; k += LANES) {
                 backward_rows(own, g_colors, out, Rows(which + k, lanes_from(k, count), stride_of(a)));
             }

@@ -256,7 +256,7 @@ int rows_with_gradient(const RefineArgs& a, const float* const* grads, int64_t f
                        float* const* g_features, int32_t* rows) {
     int count = 0;
     for (int64_t i = first; i < last; ++i) {
-        if (is_awake(a.spans, a.time, i) && has_gradient(a, grads, i)) {
+        if (is_awake(a.intervals, a.time, i) && has_gradient(a, grads, i)) {
             rows[count++] = static_cast<int32_t>(i - first);
         } else {
             copy_row(a, grads, a.networks - 1, g_features, i);
@@ -281,7 +281,7 @@ void refine_block(const RefineArgs& a, const Block& block, float* const* out, co
 int rows_awake(const RefineArgs& a, int64_t first, int64_t last, float* const* out, int32_t* rows) {
     int count = 0;
     for (int64_t i = first; i < last; ++i) {
-        if (is_awake(a.spans, a.time, i)) {
+        if (is_awake(a.intervals, a.time, i)) {
             rows[count++] = static_cast<int32_t>(i - first);
         } else {
             copy_row(a, a.values, a.arrays, out, i);

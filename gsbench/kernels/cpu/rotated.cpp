@@ -1,7 +1,7 @@
-// Slices of 4D Gaussians with rotated factors, sixteen at a time; the mathematics is math/rotated.h, and that of rows
-// that are still math/still.h.
+// Slices of 4D Gaussians with rotated factors, sixteen at a time; the mathematics is math/rotated.h; that of
+// static rows is math/static.h.
 #include "../math/rotated.h"
-#include "../math/still.h"
+#include "../math/static.h"
 
 #include "buffer.h"
 #include "isa.h"
@@ -27,7 +27,7 @@ GSB_HD inline void load(const RotatedArgs& a, int64_t i, int n, RotatedParameter
     p.right[0] = select(real, p.right[0], Vec(1.0f));
 }
 
-GSB_HD inline void load_still(const RotatedArgs& a, int64_t i, int n, StillParameters<Vec>& p) {
+GSB_HD inline void load_static(const RotatedArgs& a, int64_t i, int n, StaticParameters<Vec>& p) {
     Vec left[4];
     gather_columns(a.scales, 4, 0, i, n, p.scales);
     gather_row(a.left_quats, i, n, left);
@@ -35,28 +35,28 @@ GSB_HD inline void load_still(const RotatedArgs& a, int64_t i, int n, StillParam
     p.opacity = load_first(a.opacities + i, n);
 }
 
-void observe_still_rows(const RotatedArgs& a, const Observation& out) {
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.sliced > CHUNK)
-    for (int64_t i = a.sliced; i < a.N; i += LANES) {
+void observe_static_rows(const RotatedArgs& a, const Observation& out) {
+#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > CHUNK)
+    for (int64_t i = a.conditioned; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
-        StillParameters<Vec> raw;
-        load_still(a, i, n, raw);
-        const StillGaussian<Vec> seen(raw);
+        StaticParameters<Vec> raw;
+        load_static(a, i, n, raw);
+        const StaticGaussian<Vec> seen(raw);
         copy_rows(a.means, out.means, 3, i, i + n);
         scatter_matrix(seen.factor, out.factors, i, n);
         store_first(seen.opacity, out.opacities + i, n);
     }
 }
 
-void observe_still_rows_backward(const RotatedArgs& a, const ObservationGrads& grads, const RotatedGrads& out) {
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.sliced > CHUNK)
-    for (int64_t i = a.sliced; i < a.N; i += LANES) {
+void observe_static_rows_backward(const RotatedArgs& a, const ObservationGrads& grads, const RotatedGrads& out) {
+#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > CHUNK)
+    for (int64_t i = a.conditioned; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
-        StillParameters<Vec> raw, g;
+        StaticParameters<Vec> raw, g;
         Vec g_factor[3][3], g_left[4];
-        load_still(a, i, n, raw);
+        load_static(a, i, n, raw);
         gather_matrix(grads.factors, i, n, g_factor);
-        StillGaussian<Vec>(raw).vjp(g_factor, load_first(grads.opacities + i, n), g);
+        StaticGaussian<Vec>(raw).vjp(g_factor, load_first(grads.opacities + i, n), g);
         turn_of_space(g.quat, g_left);
         copy_rows(grads.means, out.means, 3, i, i + n);
         fill_zero(out.times, 1, i, i + n);
@@ -71,10 +71,10 @@ void observe_still_rows_backward(const RotatedArgs& a, const ObservationGrads& g
 
 void observe_rotated(const RotatedArgs& a, const Observation& out) {
     const float lambda_t = expf(*a.log_lambda_t), time = *a.time * *a.clock;
-    observe_still_rows(a, out);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.sliced > CHUNK)
-    for (int64_t i = 0; i < a.sliced; i += LANES) {
-        const int n = lanes_from(i, a.sliced);
+    observe_static_rows(a, out);
+#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.conditioned > CHUNK)
+    for (int64_t i = 0; i < a.conditioned; i += LANES) {
+        const int n = lanes_from(i, a.conditioned);
         RotatedParameters<Vec> raw;
         load(a, i, n, raw);
         const Observed<Vec> seen = RotatedGaussian<Vec>(raw, lambda_t, time).observe();
@@ -86,12 +86,12 @@ void observe_rotated(const RotatedArgs& a, const Observation& out) {
 
 void observe_rotated_backward(const RotatedArgs& a, const ObservationGrads& grads, const RotatedGrads& out) {
     const float lambda_t = expf(*a.log_lambda_t), time = *a.time * *a.clock;
-    observe_still_rows_backward(a, grads, out);
-    const int64_t chunks = (a.sliced + CHUNK - 1) / CHUNK;
+    observe_static_rows_backward(a, grads, out);
+    const int64_t chunks = (a.conditioned + CHUNK - 1) / CHUNK;
     Buffer<float> lambdas(static_cast<size_t>(chunks));
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (chunks > 1)
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-        const int64_t end = (chunk + 1) * CHUNK < a.sliced ? (chunk + 1) * CHUNK : a.sliced;
+        const int64_t end = (chunk + 1) * CHUNK < a.conditioned ? (chunk + 1) * CHUNK : a.conditioned;
         Vec g_lambda(0.0f);
         for (int64_t i = chunk * CHUNK; i < end; i += LANES) {
             const int n = lanes_from(i, end);

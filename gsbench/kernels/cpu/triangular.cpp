@@ -1,6 +1,6 @@
-// Slices of Gaussians with triangular factors, sixteen at a time; the mathematics is math/triangular.h, and that of rows
-// that are still math/still_triangular.h.
-#include "../math/still_triangular.h"
+// Slices of Gaussians with triangular factors, sixteen at a time; the mathematics is math/triangular.h; that of
+// static rows is math/static_triangular.h.
+#include "../math/static_triangular.h"
 #include "../math/triangular.h"
 
 #include "buffer.h"
@@ -40,9 +40,9 @@ GSB_HD inline void load(const ObservationGrads& o, int64_t i, int n, Observed<Ve
 template <Query Q, template <class, int> class Reduction>
 void observe(const TriangularArgs& a, const Observation& out) {
     const TriangularModel model = model_of(a);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.sliced > CHUNK)
-    for (int64_t i = 0; i < a.sliced; i += LANES) {
-        const int n = lanes_from(i, a.sliced);
+#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.conditioned > CHUNK)
+    for (int64_t i = 0; i < a.conditioned; i += LANES) {
+        const int n = lanes_from(i, a.conditioned);
         TriangularParameters<Vec, Q> raw;
         load<Q>(a, i, n, raw);
         TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
@@ -56,11 +56,11 @@ void observe(const TriangularArgs& a, const Observation& out) {
 template <Query Q, template <class, int> class Reduction>
 void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     const TriangularModel model = model_of(a);
-    const int64_t chunks = (a.sliced + CHUNK - 1) / CHUNK;
+    const int64_t chunks = (a.conditioned + CHUNK - 1) / CHUNK;
     Buffer<float> lambdas(static_cast<size_t>(chunks) * 2);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (chunks > 1)
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-        const int64_t end = (chunk + 1) * CHUNK < a.sliced ? (chunk + 1) * CHUNK : a.sliced;
+        const int64_t end = (chunk + 1) * CHUNK < a.conditioned ? (chunk + 1) * CHUNK : a.conditioned;
         Vec lambda_d(0.0f), lambda_t(0.0f);
         for (int64_t i = chunk * CHUNK; i < end; i += LANES) {
             const int n = lanes_from(i, end);
@@ -91,15 +91,15 @@ void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, co
     if (a.times) *out.log_lambda_t = static_cast<float>(totals[1]) * model.lambda_t;
 }
 
-// What a still row is made of: of its log_diagonal, the columns of p only.
-struct StillRows {
+// What a static row is made of: of its log_diagonal, the columns of p only.
+struct StaticRows {
     const TriangularArgs& a;
     int width, space;  // of log_diagonal; where the columns of p begin
 
-    GSB_HD explicit StillRows(const TriangularArgs& a)
+    GSB_HD explicit StaticRows(const TriangularArgs& a)
         : a(a), width(3 + (a.directions ? 3 : 0) + (a.times ? 1 : 0)), space(a.conditioned_first ? width - 3 : 0) {}
 
-    GSB_HD void load(int64_t i, int n, StillTriangularParameters<Vec>& p) const {
+    GSB_HD void load(int64_t i, int n, StaticTriangularParameters<Vec>& p) const {
         gather_columns(a.log_diagonal, width, space, i, n, p.log_diagonal);
         gather_row(a.shape, i, n, p.shape);
         p.opacity = load_first(a.opacities + i, n);
@@ -108,30 +108,30 @@ struct StillRows {
     // Calls f(first, end) for tasks of CHUNK rows at most.
     template <class F>
     void each_chunk(F f) const {
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.sliced > CHUNK)
-        for (int64_t first = a.sliced; first < a.N; first += CHUNK) {
+#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > CHUNK)
+        for (int64_t first = a.conditioned; first < a.N; first += CHUNK) {
             f(first, first + CHUNK < a.N ? first + CHUNK : a.N);
         }
     }
 };
 
-void observe_still_rows(const TriangularArgs& a, const Observation& out) {
-    const StillRows rows(a);
+void observe_static_rows(const TriangularArgs& a, const Observation& out) {
+    const StaticRows rows(a);
     rows.each_chunk([&](int64_t first, int64_t end) {
         copy_rows(a.means, out.means, 3, first, end);
         for (int64_t i = first; i < end; i += LANES) {
             const int n = lanes_from(i, end);
-            StillTriangularParameters<Vec> raw;
+            StaticTriangularParameters<Vec> raw;
             rows.load(i, n, raw);
-            const StillTriangularGaussian<Vec> seen(raw, a.form);
+            const StaticTriangularGaussian<Vec> seen(raw, a.form);
             scatter_matrix(seen.factor, out.factors, i, n);
             store_first(seen.opacity, out.opacities + i, n);
         }
     });
 }
 
-void observe_still_rows_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
-    const StillRows rows(a);
+void observe_static_rows_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
+    const StaticRows rows(a);
     const int k = rows.width - 3;
     rows.each_chunk([&](int64_t first, int64_t end) {
         copy_rows(grads.means, out.means, 3, first, end);
@@ -142,11 +142,11 @@ void observe_still_rows_backward(const TriangularArgs& a, const ObservationGrads
         fill_zero(out.coupling, k * (k - 1) / 2, first, end);
         for (int64_t i = first; i < end; i += LANES) {
             const int n = lanes_from(i, end);
-            StillTriangularParameters<Vec> raw, g;
+            StaticTriangularParameters<Vec> raw, g;
             Vec g_factor[3][3];
             rows.load(i, n, raw);
             gather_matrix(grads.factors, i, n, g_factor);
-            StillTriangularGaussian<Vec>(raw, a.form).vjp(g_factor, load_first(grads.opacities + i, n), g);
+            StaticTriangularGaussian<Vec>(raw, a.form).vjp(g_factor, load_first(grads.opacities + i, n), g);
             scatter_columns(g.log_diagonal, out.log_diagonal, rows.width, rows.space, i, n);
             scatter_row(g.shape, out.shape, i, n);
             store_first(g.opacity, out.opacities + i, n);
@@ -165,12 +165,12 @@ void dispatch(const TriangularArgs& a, Run run) {
 }  // namespace
 
 void observe_triangular(const TriangularArgs& a, const Observation& out) {
-    observe_still_rows(a, out);
+    observe_static_rows(a, out);
     dispatch(a, [&]<Query Q, template <class, int> class Reduction>() { observe<Q, Reduction>(a, out); });
 }
 
 void observe_triangular_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
-    observe_still_rows_backward(a, grads, out);
+    observe_static_rows_backward(a, grads, out);
     dispatch(a, [&]<Query Q, template <class, int> class Reduction>() { observe_backward<Q, Reduction>(a, grads, out); });
 }
 

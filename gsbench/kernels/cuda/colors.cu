@@ -15,17 +15,17 @@ struct Weights {
     int used;  // harmonics
     float Y[MAX_BASIS], cosines[MAX_WAVES], sines[MAX_WAVES];
 
-    __device__ Weights(const ColorArgs& a, Level level, int64_t i)
+    __device__ Weights(const ColorArgs& a, ColorOrder order, int64_t i)
         : unit({a.means[i * 3] - a.center[0], a.means[i * 3 + 1] - a.center[1], a.means[i * 3 + 2] - a.center[2]}) {
-        used = harmonics(unit.direction, level.degree, Y);
-        waves_of(a.times ? *a.time - a.times[i] : 0.0f, level.waves, cosines, sines);
+        used = harmonics(unit.direction, order.degree, Y);
+        waves_of(a.times ? *a.time - a.times[i] : 0.0f, order.waves, cosines, sines);
     }
 };
 
 // How much of its colour a Gaussian has.
-__device__ Level level_of(const ColorArgs& a, int64_t i) {
-    const Level all{a.degree, a.waves};
-    return a.levels ? Level::of(static_cast<uint32_t>(a.levels[i])).at_most(all) : all;
+__device__ ColorOrder order_of(const ColorArgs& a, int64_t i) {
+    const ColorOrder all{a.degree, a.waves};
+    return a.orders ? ColorOrder::of(static_cast<uint32_t>(a.orders[i])).at_most(all) : all;
 }
 
 // Coefficient k of Gaussian i, three channels: that of the constant is kept apart from the others.
@@ -36,17 +36,17 @@ __device__ F* coefficient(const ColorArgs& a, F* sh0, F* shN, int64_t i, int k) 
 
 // Calls visit(coefficient's number, harmonic, wave) for all in use.
 template <class Visit>
-__device__ void each_coefficient(const ColorArgs& a, Level level, Visit visit) {
-    for (int wave = 0; wave < level.waves; ++wave) {
+__device__ void each_coefficient(const ColorArgs& a, ColorOrder order, Visit visit) {
+    for (int wave = 0; wave < order.waves; ++wave) {
         GSB_UNROLL for (int basis = 0; basis < MAX_BASIS; ++basis) {
-            if (basis < (level.degree + 1) * (level.degree + 1)) visit(wave * a.bases + basis, basis, wave);
+            if (basis < (order.degree + 1) * (order.degree + 1)) visit(wave * a.bases + basis, basis, wave);
         }
     }
 }
 
-__device__ void sum_colors(const ColorArgs& a, Level level, const Weights& w, int64_t i, float (&color)[3]) {
+__device__ void sum_colors(const ColorArgs& a, ColorOrder order, const Weights& w, int64_t i, float (&color)[3]) {
     for (float& channel : color) channel = 0.5f;
-    each_coefficient(a, level, [&](int k, int basis, int wave) {
+    each_coefficient(a, order, [&](int k, int basis, int wave) {
         const float* p = coefficient(a, a.sh0, a.shN, i, k);
         const float weight = w.Y[basis] * w.cosines[wave];
         for (int channel = 0; channel < 3; ++channel) color[channel] += p[channel] * weight;
@@ -57,20 +57,20 @@ __global__ void color_kernel(ColorArgs a, Colors out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
     float color[3] = {};
-    const Level level = level_of(a, i);
-    if (a.opacities[i] >= ALPHA_MIN) sum_colors(a, level, Weights(a, level, i), i, color);
+    const ColorOrder order = order_of(a, i);
+    if (a.opacities[i] >= ALPHA_MIN) sum_colors(a, order, Weights(a, order, i), i, color);
     for (int channel = 0; channel < 3; ++channel) out.colors[i * 3 + channel] = max(color[channel], 0.0f);
 }
 
 // Adds to the gradients of Gaussian i's coefficients, and returns that of its mean.
 __device__ Vec3<float> color_vjp(const ColorArgs& a, const float (&given)[3], const ColorGrads& out, int64_t i,
                                  float& g_time) {
-    const Level level = level_of(a, i);
-    const Weights w(a, level, i);
+    const ColorOrder order = order_of(a, i);
+    const Weights w(a, order, i);
     float color[3], g[3], g_Y[MAX_BASIS] = {};
-    sum_colors(a, level, w, i, color);
+    sum_colors(a, order, w, i, color);
     for (int channel = 0; channel < 3; ++channel) g[channel] = color[channel] >= 0.0f ? given[channel] : 0.0f;
-    each_coefficient(a, level, [&](int k, int basis, int wave) {
+    each_coefficient(a, order, [&](int k, int basis, int wave) {
         const float* p = coefficient(a, a.sh0, a.shN, i, k);
         float* g_p = coefficient(a, out.sh0, out.shN, i, k);
         const float weight = w.Y[basis] * w.cosines[wave];
@@ -82,7 +82,7 @@ __device__ Vec3<float> color_vjp(const ColorArgs& a, const float (&given)[3], co
         g_Y[basis] += along * w.cosines[wave];
         g_time += along * w.Y[basis] * w.sines[wave] * (TURN * static_cast<float>(wave));  // by mu_t
     });
-    return w.unit.vjp(harmonics_vjp(w.unit.direction, level.degree, g_Y));
+    return w.unit.vjp(harmonics_vjp(w.unit.direction, order.degree, g_Y));
 }
 
 // The rows of coefficients of a Gaussian that is not drawn, or whose colour has no gradient, are left alone.

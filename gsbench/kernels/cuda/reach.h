@@ -5,7 +5,7 @@
 
 namespace gsb::cuda {
 
-constexpr float POWER_MARGIN = 0.01f;  // on log2(255 opacity), lest rounding cut off a pixel; far above that of the
+constexpr float POWER_MARGIN = 0.01f;  // on log2(255 opacity), so that rounding cuts off no pixel; far above that of the
                                        // instructions that divide and take logarithms fast
 
 struct Reach {

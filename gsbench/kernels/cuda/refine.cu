@@ -26,9 +26,9 @@ struct Networks {
     int features, count, widths[MAX_NETWORKS];
     Column read[MAX_FEATURES];              // what the networks read
     Column moved[MAX_NETWORKS][MAX_WIDTH];  // what each network moves; backward: the gradient of what it was moved to
-    const float *weight_in, *bias_in, *weight_out, *bias_out, *spans, *time;  // as in RefineArgs
+    const float *weight_in, *bias_in, *weight_out, *bias_out, *intervals, *time;  // as in RefineArgs
 
-    __device__ bool moves(int64_t i) const { return i < N && is_awake(spans, time, i); }
+    __device__ bool moves(int64_t i) const { return i < N && is_awake(intervals, time, i); }
 };
 
 // The features as columns of gradients.
@@ -244,7 +244,7 @@ Column column_of(const RefineArgs& a, const float* const* from, float* const* to
 // `from` and `to` are what the networks move. Each moves the columns that follow those of the network before it.
 Networks networks_of(const RefineArgs& a, const float* const* from, float* const* to) {
     Networks all{a.refined,   a.features, a.networks,   {},         {},      {},
-                 a.weight_in, a.bias_in,  a.weight_out, a.bias_out, a.spans, a.time};
+                 a.weight_in, a.bias_in,  a.weight_out, a.bias_out, a.intervals, a.time};
     const int widest = *std::max_element(a.widths, a.widths + MAX_NETWORKS);
     if (a.features > MAX_FEATURES || widest > MAX_WIDTH) {
         throw std::invalid_argument("refine: expected on a GPU at most " + std::to_string(MAX_FEATURES) +

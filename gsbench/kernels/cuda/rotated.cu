@@ -1,7 +1,7 @@
 // Slices of 4D Gaussians with rotated factors and their derivative, one a thread; the mathematics is math/rotated.h, and
-// that of rows that are still math/still.h.
+// that of static rows is math/static.h.
 #include "../math/rotated.h"
-#include "../math/still.h"
+#include "../math/static.h"
 
 #include "rows.h"
 
@@ -20,8 +20,8 @@ __device__ RotatedParameters<float> parameters(const RotatedArgs& a, int64_t i) 
     return p;
 }
 
-__device__ StillParameters<float> still_parameters(const RotatedArgs& a, int64_t i) {
-    StillParameters<float> p{};
+__device__ StaticParameters<float> static_parameters(const RotatedArgs& a, int64_t i) {
+    StaticParameters<float> p{};
     float left[4];
     GSB_UNROLL for (int k = 0; k < 3; ++k) p.scales[k] = a.scales[i * 4 + k];
     load_row(a.left_quats, i, left);
@@ -33,9 +33,9 @@ __device__ StillParameters<float> still_parameters(const RotatedArgs& a, int64_t
 __global__ void observe_kernel(RotatedArgs a, Observation out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    if (i >= a.sliced) {
-        const StillParameters<float> raw = still_parameters(a, i);
-        store_still(StillGaussian<float>(raw), a.means, out, i);
+    if (i >= a.conditioned) {
+        const StaticParameters<float> raw = static_parameters(a, i);
+        store_static(StaticGaussian<float>(raw), a.means, out, i);
         return;
     }
     const RotatedParameters<float> raw = parameters(a, i);
@@ -44,18 +44,18 @@ __global__ void observe_kernel(RotatedArgs a, Observation out) {
 
 __global__ void observe_backward_kernel(RotatedArgs a, ObservationGrads grads, RotatedGrads out) {
     const int64_t i = global_thread();
-    RotatedParameters<float> g{};  // of a still row mostly zero
-    if (i >= a.sliced && i < a.N) {
-        const StillParameters<float> raw = still_parameters(a, i);
-        StillParameters<float> g_still{};
+    RotatedParameters<float> g{};  // of a static row mostly zero
+    if (i >= a.conditioned && i < a.N) {
+        const StaticParameters<float> raw = static_parameters(a, i);
+        StaticParameters<float> g_static{};
         const Observed<float> given = load_observed(grads, i);
-        StillGaussian<float>(raw).vjp(given.factor, given.opacity, g_still);
+        StaticGaussian<float>(raw).vjp(given.factor, given.opacity, g_static);
         GSB_UNROLL for (int k = 0; k < 3; ++k) {
             g.mean[k] = given.mean[k];
-            g.scales[k] = g_still.scales[k];
+            g.scales[k] = g_static.scales[k];
         }
-        turn_of_space(g_still.quat, g.left);
-        g.opacity = g_still.opacity;
+        turn_of_space(g_static.quat, g.left);
+        g.opacity = g_static.opacity;
     } else if (i < a.N) {
         const RotatedParameters<float> raw = parameters(a, i);
         RotatedGaussian<float> gaussian(raw, expf(*a.log_lambda_t), *a.time * *a.clock);

@@ -35,7 +35,7 @@ __device__ inline void store_observed(const Observed<float>& seen, const Observa
 
 // A Gaussian that is its own slice, but for its mean.
 template <class Gaussian>
-__device__ void store_still(const Gaussian& gaussian, const float* means, const Observation& out, int64_t i) {
+__device__ void store_static(const Gaussian& gaussian, const float* means, const Observation& out, int64_t i) {
     float mean[3];
     load_row(means, i, mean);
     store_row(mean, out.means, i);

@@ -1,6 +1,6 @@
 // Slices of Gaussians with triangular factors and their derivative, one a thread; the mathematics is math/triangular.h,
-// and that of rows that are still math/still_triangular.h.
-#include "../math/still_triangular.h"
+// and that of static rows is math/static_triangular.h.
+#include "../math/static_triangular.h"
 #include "../math/triangular.h"
 
 #include <stdexcept>
@@ -37,8 +37,8 @@ template <Query Q, bool CONDITIONED>
 constexpr int SPACE = CONDITIONED ? TriangularParameters<float, Q>::K : 0;
 
 template <Query Q, bool CONDITIONED>
-__device__ StillTriangularParameters<float> still_parameters(const TriangularArgs& a, int64_t i) {
-    StillTriangularParameters<float> p{};
+__device__ StaticTriangularParameters<float> static_parameters(const TriangularArgs& a, int64_t i) {
+    StaticTriangularParameters<float> p{};
     const float* log_diagonal = a.log_diagonal + i * TriangularParameters<float, Q>::N + SPACE<Q, CONDITIONED>;
     GSB_UNROLL for (int k = 0; k < 3; ++k) p.log_diagonal[k] = log_diagonal[k];
     load_row(a.shape, i, p.shape);
@@ -50,10 +50,10 @@ template <Query Q, bool CONDITIONED>
 __global__ void observe_kernel(TriangularArgs a, Observation out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    if (i >= a.sliced) {
-        const auto raw = still_parameters<Q, CONDITIONED>(a, i);
-        const StillTriangularGaussian<float> gaussian(raw, a.form);
-        store_still(gaussian, a.means, out, i);
+    if (i >= a.conditioned) {
+        const auto raw = static_parameters<Q, CONDITIONED>(a, i);
+        const StaticTriangularGaussian<float> gaussian(raw, a.form);
+        store_static(gaussian, a.means, out, i);
         return;
     }
     const TriangularModel model = model_of<Q, CONDITIONED>(a);
@@ -65,18 +65,18 @@ __global__ void observe_kernel(TriangularArgs a, Observation out) {
 template <Query Q, bool CONDITIONED>
 __global__ void observe_backward_kernel(TriangularArgs a, ObservationGrads grads, TriangularGrads out) {
     const int64_t i = global_thread();
-    TriangularParameters<float, Q> g{};  // of a still row mostly zero
-    if (i >= a.sliced && i < a.N) {
-        const auto raw = still_parameters<Q, CONDITIONED>(a, i);
-        StillTriangularParameters<float> g_still{};
+    TriangularParameters<float, Q> g{};  // of a static row mostly zero
+    if (i >= a.conditioned && i < a.N) {
+        const auto raw = static_parameters<Q, CONDITIONED>(a, i);
+        StaticTriangularParameters<float> g_static{};
         const Observed<float> given = load_observed(grads, i);
-        StillTriangularGaussian<float>(raw, a.form).vjp(given.factor, given.opacity, g_still);
+        StaticTriangularGaussian<float>(raw, a.form).vjp(given.factor, given.opacity, g_static);
         GSB_UNROLL for (int k = 0; k < 3; ++k) {
             g.mean[k] = given.mean[k];
-            g.log_diagonal[SPACE<Q, CONDITIONED> + k] = g_still.log_diagonal[k];
-            g.shape[k] = g_still.shape[k];
+            g.log_diagonal[SPACE<Q, CONDITIONED> + k] = g_static.log_diagonal[k];
+            g.shape[k] = g_static.shape[k];
         }
-        g.opacity = g_still.opacity;
+        g.opacity = g_static.opacity;
     } else if (i < a.N) {
         const TriangularModel model = model_of<Q, CONDITIONED>(a);
         const auto raw = parameters<Q>(a, i);

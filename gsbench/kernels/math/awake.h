@@ -8,9 +8,10 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-// `spans` [., 2] and `time` []: a Gaussian is moved at times from the first to the last of its span. Null: always.
-GSB_HD inline bool is_awake(const float* spans, const float* time, int64_t i) {
-    return !spans || (spans[2 * i] <= *time && *time <= spans[2 * i + 1]);
+// `intervals` [., 2] and `time` []: a Gaussian is moved from the first to the last time of its visible interval. Null:
+// always.
+GSB_HD inline bool is_awake(const float* intervals, const float* time, int64_t i) {
+    return !intervals || (intervals[2 * i] <= *time && *time <= intervals[2 * i + 1]);
 }
 
 }  // namespace GSB_ISA

@@ -78,14 +78,14 @@ GSB_HD inline Vec3<T> harmonics_vjp(const Vec3<T>& d, int degree, const T (&g)[M
 }
 
 // How much of a colour there is: harmonics up to a degree, and frequencies of time. As a number: degree + 4 (waves - 1).
-struct Level {
+struct ColorOrder {
     int degree, waves;
 
-    GSB_HD static Level of(uint32_t number) {
+    GSB_HD static ColorOrder of(uint32_t number) {
         return {static_cast<int>(number % 4), static_cast<int>(number / 4) + 1};
     }
     GSB_HD int number() const { return degree + 4 * (waves - 1); }
-    GSB_HD Level at_most(Level o) const {
+    GSB_HD ColorOrder at_most(ColorOrder o) const {
         return {degree < o.degree ? degree : o.degree, waves < o.waves ? waves : o.waves};
     }
 };

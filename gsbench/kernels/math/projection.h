@@ -17,7 +17,7 @@ inline namespace GSB_ISA {
 
 constexpr float HALF_LOG2_E = 0.721347520f;       // exp(-x/2) = 2^(-HALF_LOG2_E x)
 constexpr float SQRT_HALF_LOG2_E = 0.849321800f;  // so this scales the root
-constexpr float BOUNDS_MARGIN = 0.01f;            // pixels, lest rounding cut off a pixel
+constexpr float BOUNDS_MARGIN = 0.01f;            // pixels, so that rounding cuts off no pixel
 
 // A pinhole camera and what the caller asked of the projection.
 struct Camera {

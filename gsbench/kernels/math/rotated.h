@@ -25,7 +25,7 @@ GSB_HD constexpr float RIGHT_SIGN(int i, int j) {
     return table[i][j];
 }
 
-// The quaternion of a still Gaussian's rotation from its left one. M_left(l) M_right(r) keeps the axis of t where it is
+// The quaternion of a static Gaussian's rotation from its left one. M_left(l) M_right(r) keeps the axis of t where it is
 // for one right quaternion only, r = (l0, -l1, -l2, l3), and then turns space by this one. Twice, nothing is changed: it
 // is the inverse too, and what takes a gradient back.
 template <class T>
@@ -45,7 +45,7 @@ struct RotatedGaussian {
     T leads[4];                            // 1 for the column that is largest in t, else 0
     Reflections<T, 1> reflections;
     Reduced<T, 1> t;
-    T white[1], gate, opacity;
+    T white[1], opacity_factor, opacity;
 
     GSB_HD RotatedGaussian(const RotatedParameters<T>& raw, float lambda_t, float time)
         : raw(raw), lambda_t(lambda_t), observed(time), left(raw.left), right(raw.right) {}
@@ -75,10 +75,10 @@ struct RotatedGaussian {
         reflections.reduce(rows, t);
         const T delta[1] = {T(observed) - raw.time};
         whiten(t, delta, white);
-        gate = exp(white[0] * white[0] * (-0.5f * lambda_t));
-        // What is not drawn stays where it is, lest its huge numbers reach a gradient.
-        const auto seen = gate > T(TIME_GATE_MIN);
-        gate = select(seen, gate, zero);
+        opacity_factor = exp(white[0] * white[0] * (-0.5f * lambda_t));
+        // What is not drawn stays where it is: its huge numbers must not reach a gradient.
+        const auto seen = opacity_factor > T(TIME_OPACITY_FACTOR_MIN);
+        opacity_factor = select(seen, opacity_factor, zero);
         white[0] = select(seen, white[0], zero);
         t.qq[0][0] = select(seen, t.qq[0][0], T(1.0f));
         opacity = sigmoid(raw.opacity);
@@ -91,7 +91,7 @@ struct RotatedGaussian {
         for (int i = 0; i < 3; ++i) {
             for (int j = 0; j < 3; ++j) out.factor[i][j] = t.pp[i][j];
         }
-        out.opacity = opacity * gate;
+        out.opacity = opacity * opacity_factor;
         return out;
     }
 
@@ -104,12 +104,12 @@ struct RotatedGaussian {
             for (int j = 0; j < 3; ++j) g_t.pp[i][j] = g.factor[i][j];
             out.mean[i] = g.mean[i];
         }
-        out.opacity = g.opacity * gate * opacity * (T(1.0f) - opacity);
-        const T g_exponent = zero - g.opacity * opacity * gate;
+        out.opacity = g.opacity * opacity_factor * opacity * (T(1.0f) - opacity);
+        const T g_exponent = zero - g.opacity * opacity * opacity_factor;
         out.lambda_t = g_exponent * white[0] * white[0] * 0.5f;
         T g_white[1] = {g_exponent * white[0] * lambda_t};
         moved_mean_vjp(t, white, {g.mean[0], g.mean[1], g.mean[2]}, g_white, g_t);
-        g_white[0] = select(gate > zero, g_white[0], zero);
+        g_white[0] = select(opacity_factor > zero, g_white[0], zero);
         whiten_vjp(t, white, g_white, g_t);  // now that of delta
         out.time = zero - g_white[0];
         T g_rows[4][4], g_M[4][4], g_left[4] = {zero, zero, zero, zero}, g_right[4] = {zero, zero, zero, zero};

@@ -11,7 +11,7 @@ constexpr float LOG_SIZE_MAX = 16.0f;
 // exp(-80) = 2e-35: beyond, nothing is left of a Gaussian.
 constexpr float EXPONENT_MAX = 80.0f;
 // A 4D Gaussian whose f_temp is not above this is not drawn (4DGS, gaussian_renderer).
-constexpr float TIME_GATE_MIN = 0.05f;
+constexpr float TIME_OPACITY_FACTOR_MIN = 0.05f;
 // An alpha below this is skipped, one above that held (3DGS, forward.cu); a pixel is full where less than
 // TRANSMITTANCE_MIN of the light behind would be left.
 constexpr float ALPHA_MIN = 1.0f / 255.0f;

@@ -57,7 +57,7 @@ struct TriangularGaussian {
     Reduction<T, K> reduction;
     Reduced<T, K> t;
     Vec3<T> offset;  // camera to mean
-    T white[K], delta_t, spread_t, gate, opacity;
+    T white[K], delta_t, spread_t, opacity_factor, opacity;
 
     GSB_HD TriangularGaussian(const TriangularModel& model, const Parameters& raw) : model(model), raw(raw) {}
 
@@ -101,9 +101,9 @@ struct TriangularGaussian {
             delta_t = delta[TIME_ROW] / spread_t;
             exponent = exponent + delta_t * delta_t * (0.5f * model.lambda_t);
         }
-        // What is too far from the query to be seen stays where it is, lest its huge numbers reach a gradient.
+        // What is too far from the query to be seen stays where it is: its huge numbers must not reach a gradient.
         const auto seen = exponent < T(EXPONENT_MAX);
-        gate = select(seen, exp(zero - exponent), zero);
+        opacity_factor = select(seen, exp(zero - exponent), zero);
         GSB_UNROLL for (int i = 0; i < K; ++i) white[i] = select(seen, white[i], zero);
         if constexpr (TIME) delta_t = select(seen, delta_t, zero);
         opacity = sigmoid(raw.opacity);
@@ -116,7 +116,7 @@ struct TriangularGaussian {
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
             GSB_UNROLL for (int j = 0; j < 3; ++j) out.factor[i][j] = t.pp[i][j];
         }
-        out.opacity = opacity * gate;
+        out.opacity = opacity * opacity_factor;
         return out;
     }
 
@@ -128,8 +128,8 @@ struct TriangularGaussian {
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
             GSB_UNROLL for (int j = 0; j < 3; ++j) g_t.pp[i][j] = g.factor[i][j];
         }
-        out.opacity = g.opacity * gate * opacity * (T(1.0f) - opacity);
-        const T g_exponent = zero - g.opacity * opacity * gate;
+        out.opacity = g.opacity * opacity_factor * opacity * (T(1.0f) - opacity);
+        const T g_exponent = zero - g.opacity * opacity * opacity_factor;
         out.lambda_d = zero;
         if constexpr (DIRECTION) out.lambda_d = g_exponent * squares_d() * model.half;
         T g_white[K];
@@ -137,7 +137,7 @@ struct TriangularGaussian {
             g_white[i] = i < TIME_ROW ? g_exponent * white[i] * (2.0f * model.half * model.lambda_d) : zero;
         }
         moved_mean_vjp(t, white, {g.mean[0], g.mean[1], g.mean[2]}, g_white, g_t);
-        const auto seen = gate > zero;
+        const auto seen = opacity_factor > zero;
         GSB_UNROLL for (int i = 0; i < K; ++i) g_white[i] = select(seen, g_white[i], zero);
         whiten_vjp(t, white, g_white, g_t);  // now that of delta
         out.lambda_t = out.time = zero;

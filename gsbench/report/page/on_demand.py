@@ -5,14 +5,14 @@ from collections import Counter
 from pathlib import Path
 from statistics import fmean
 
-from gsbench.effects.messages import CLASSES, of_decision
+from gsbench.effects.messages import EFFECT_SETS, of_decision
 from gsbench.measure.record import Record, TimeScreen
 from gsbench.report.configurations import Group
 from gsbench.report.intervals import Estimate
 from gsbench.report.on_demand import DEGREES, REMOVED, Decided, decided
 from gsbench.report.page import charts, gallery, messages
 from gsbench.report.page.content import Canvas, Column, DataTable, Image, PageFigure, PageSection, Swatch, Tab, Value
-from gsbench.report.page.palette import CLASS_LIKE, MODELS
+from gsbench.report.page.palette import EFFECT_SET_LIKE, MODELS
 from gsbench.report.page.svg import LINE, model_colour, stage_colour
 
 PICTURE = "classes.png"
@@ -26,11 +26,11 @@ IN_TRAINING = (
     "What the gate in training changed is not in these dB and ms, as the training goes on after it: the frontier has "
     "runs with and without gates, where both were run."
 )
-NAMES = CLASSES | {REMOVED: "removed"}
+NAMES = EFFECT_SETS | {REMOVED: "removed"}
 
 
 def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection | None:
-    """Describe the decisions, and draw the classes and the harmonics of the Gaussians; None without decisions."""
+    """Describe the decisions, and draw the effect sets and the harmonics of the Gaussians; None without decisions."""
     found = decided(group)
     if not found:
         return None
@@ -87,7 +87,7 @@ def _gate_words(one: Decided) -> list[str]:
     """Say which Gaussians the gates left, and what the gate at the end changed."""
     if not one.gated:
         return ["No gate has changed a Gaussian."]
-    kept = [f"{one.rows[name]:,.0f} {said}" for name, said in CLASSES.items() if one.rows[name] >= 0.5]
+    kept = [f"{one.rows[name]:,.0f} {said}" for name, said in EFFECT_SETS.items() if one.rows[name] >= 0.5]
     share = f" ({100 * one.left / one.before:.0f} %)" if one.before else ""
     where = "" if one.gated == len(one.runs) else f" On {one.gated} of {len(one.runs)} seeds:"
     text = f"{where} Of {one.before:,.0f} Gaussians the gates left {one.left:,.0f}{share}"
@@ -133,17 +133,17 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
 
 
 def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
-    """Draw a bar of classes and a bar of degrees for each scene and model."""
+    """Draw a bar of effect sets and a bar of degrees for each scene and model."""
     label = lambda one: messages.shorten_middle(f"{one.scene}, {one.name}", LONGEST_LABEL, LABEL_END)  # noqa: E731
-    classes = [
+    effect_sets = [
         charts.Bar(label(one), _shares([one.rows[name] for name in NAMES]), f"{one.left:,.0f} of {one.before:,.0f}")
         for one in gated
     ]
     degrees = [charts.Bar(label(one), _shares(one.degrees), f"mean degree {_mean_degree(one)}") for one in gated]
-    colours = [model_colour(MODELS.index(CLASS_LIKE[name])) for name in CLASSES]
-    whose = messages.listing([bar.label for bar in classes])
+    colours = [model_colour(MODELS.index(EFFECT_SET_LIKE[name])) for name in EFFECT_SETS]
+    whose = messages.listing([bar.label for bar in effect_sets])
     drawn = (
-        ("Gaussians by class, of those before the gates", "k", classes, [*colours, LINE]),
+        ("Gaussians by effect set, of those before the gates", "k", effect_sets, [*colours, LINE]),
         ("Harmonics by degree, of the Gaussians left", "d", degrees, [stage_colour(_stage(i)) for i in range(DEGREES)]),
     )
     return [
@@ -170,13 +170,13 @@ def _mean_degree(one: Decided) -> str:
 
 def _swatches() -> list[Swatch]:
     """Name the colours of both drawings."""
-    classes = [Swatch(said, f"model-{MODELS.index(CLASS_LIKE[name])}") for name, said in CLASSES.items()]
+    effect_sets = [Swatch(said, f"model-{MODELS.index(EFFECT_SET_LIKE[name])}") for name, said in EFFECT_SETS.items()]
     degrees = [Swatch(f"degree {i}", f"stage-{_stage(i)}") for i in range(DEGREES)]
-    return [*classes, Swatch(NAMES[REMOVED], "line"), *degrees]
+    return [*effect_sets, Swatch(NAMES[REMOVED], "line"), *degrees]
 
 
 def _images(found: list[Decided], folder: Path) -> list[Image]:
-    """Show the picture by class of the first seed of each scene and model, as many as there is room for."""
+    """Show the picture by effect set of the first seed of each scene and model, as many as there is room for."""
     places = gallery.places(folder, PICTURE)
     paths = [next((p for r in one.runs if (p := places.get(r.path))), None) for one in found]
     captions = [f"{one.scene}, {one.name}" for one in found]

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "3dgs_agr", "4dgs_agr", "6dgs_agr", "auto",
           "7dgs_nodir", "7dgs_nodir_agr")  # fmt: skip
-CLASS_LIKE = {  # a Gaussian has the colour of the model whose effects it still has
+EFFECT_SET_LIKE = {  # a Gaussian has the colour of the model whose effects it still has
     "refined": "7dgs",
-    "sliced": "7dgs_noagr",
+    "conditioned": "7dgs_noagr",
     "time": "6dgs",
     "direction": "4dgs",
-    "still": "3dgs",
+    "static": "3dgs",
 }
 LIGHT = ("#5c6066", "#0069a8", "#00734f", "#b34700", "#9c3d82", "#7d6608", "#1f6f78", "#4b4fa3", "#8c2d2d", "#3d6b1f",
          "#b0185a", "#6a4a2f")  # fmt: skip

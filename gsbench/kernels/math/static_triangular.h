@@ -7,17 +7,17 @@ namespace gsb {
 inline namespace GSB_ISA {
 
 template <class T>
-struct StillTriangularParameters {
+struct StaticTriangularParameters {
     T log_diagonal[3], shape[3], opacity;  // of the rows of p; below the diagonal, row by row; a logit
 };
 
 template <class T>
-struct StillTriangularGaussian {
-    const StillTriangularParameters<T>& raw;
+struct StaticTriangularGaussian {
+    const StaticTriangularParameters<T>& raw;
     OffDiagonal form;
     T factor[3][3], opacity;
 
-    GSB_HD StillTriangularGaussian(const StillTriangularParameters<T>& raw, OffDiagonal form) : raw(raw), form(form) {
+    GSB_HD StaticTriangularGaussian(const StaticTriangularParameters<T>& raw, OffDiagonal form) : raw(raw), form(form) {
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
             const T size = size_of(raw.log_diagonal[i]);
             GSB_UNROLL for (int j = 0; j < 3; ++j) {
@@ -28,7 +28,7 @@ struct StillTriangularGaussian {
         opacity = sigmoid(raw.opacity);
     }
 
-    GSB_HD void vjp(const T (&g_factor)[3][3], T g_opacity, StillTriangularParameters<T>& out) const {
+    GSB_HD void vjp(const T (&g_factor)[3][3], T g_opacity, StaticTriangularParameters<T>& out) const {
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
             T g_size = g_factor[i][i];
             GSB_UNROLL for (int j = 0; j < i; ++j) {

@@ -1,5 +1,5 @@
-// Factors and opacities of Gaussians that are their own slice, sixteen at a time; the mathematics is math/still.h.
-#include "../math/still.h"
+// Factors and opacities of Gaussians that are their own slice, sixteen at a time; the mathematics is math/static.h.
+#include "../math/static.h"
 
 #include "isa.h"
 #include "rows.h"
@@ -10,7 +10,7 @@ namespace {
 
 constexpr int64_t FEW = 512;  // Gaussians that are not worth a second thread
 
-GSB_HD inline void load(const StillArgs& a, int64_t i, int n, StillParameters<Vec>& p) {
+GSB_HD inline void load(const StaticArgs& a, int64_t i, int n, StaticParameters<Vec>& p) {
     gather_row(a.scales, i, n, p.scales);
     gather_row(a.quats, i, n, p.quat);
     p.opacity = load_first(a.opacities + i, n);
@@ -18,27 +18,27 @@ GSB_HD inline void load(const StillArgs& a, int64_t i, int n, StillParameters<Ve
 
 }  // namespace
 
-void observe_still(const StillArgs& a, const StillSlice& out) {
+void observe_static(const StaticArgs& a, const StaticSlice& out) {
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > FEW)
     for (int64_t i = 0; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
-        StillParameters<Vec> raw;
+        StaticParameters<Vec> raw;
         load(a, i, n, raw);
-        const StillGaussian<Vec> seen(raw);
+        const StaticGaussian<Vec> seen(raw);
         scatter_matrix(seen.factor, out.factors, i, n);
         store_first(seen.opacity, out.opacities + i, n);
     }
 }
 
-void observe_still_backward(const StillArgs& a, const StillSliceGrads& grads, const StillGrads& out) {
+void observe_static_backward(const StaticArgs& a, const StaticSliceGrads& grads, const StaticGrads& out) {
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > FEW)
     for (int64_t i = 0; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
-        StillParameters<Vec> raw, g;
+        StaticParameters<Vec> raw, g;
         Vec g_factor[3][3];
         load(a, i, n, raw);
         gather_matrix(grads.factors, i, n, g_factor);
-        StillGaussian<Vec>(raw).vjp(g_factor, load_first(grads.opacities + i, n), g);
+        StaticGaussian<Vec>(raw).vjp(g_factor, load_first(grads.opacities + i, n), g);
         scatter_row(g.scales, out.scales, i, n);
         scatter_row(g.quat, out.quats, i, n);
         store_first(g.opacity, out.opacities + i, n);

@@ -7,17 +7,17 @@ namespace gsb {
 inline namespace GSB_ISA {
 
 template <class T>
-struct StillParameters {
+struct StaticParameters {
     T scales[3], quat[4], opacity;  // logs; wxyz of any length; a logit
 };
 
 template <class T>
-struct StillGaussian {
-    const StillParameters<T>& raw;
+struct StaticGaussian {
+    const StaticParameters<T>& raw;
     UnitQuaternion<T> unit;
     T factor[3][3], size[3], opacity;
 
-    GSB_HD explicit StillGaussian(const StillParameters<T>& raw) : raw(raw), unit(raw.quat) {
+    GSB_HD explicit StaticGaussian(const StaticParameters<T>& raw) : raw(raw), unit(raw.quat) {
         const T w = unit.q[0], x = unit.q[1], y = unit.q[2], z = unit.q[3], one(1.0f), two(2.0f);
         const T R[3][3] = {{one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)},
                            {two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)},
@@ -29,7 +29,7 @@ struct StillGaussian {
         opacity = sigmoid(raw.opacity);
     }
 
-    GSB_HD void vjp(const T (&g_factor)[3][3], T g_opacity, StillParameters<T>& out) const {
+    GSB_HD void vjp(const T (&g_factor)[3][3], T g_opacity, StaticParameters<T>& out) const {
         T g[3][3];  // of R
         GSB_UNROLL for (int j = 0; j < 3; ++j) {
             T along(0.0f);  // the gradient of log size is that of the factor's column along the column itself

@@ -1,0 +1,49 @@
+// Factors and opacities of Gaussians that are their own slice, one a thread; the mathematics is math/static.h.
+#include "../math/static.h"
+
+#include "rows.h"
+
+namespace gsb::cuda {
+namespace {
+
+__device__ StaticParameters<float> parameters(const StaticArgs& a, int64_t i) {
+    StaticParameters<float> p{};
+    load_row(a.scales, i, p.scales);
+    load_row(a.quats, i, p.quat);
+    p.opacity = a.opacities[i];
+    return p;
+}
+
+__global__ void static_kernel(StaticArgs a, StaticSlice out) {
+    const int64_t i = global_thread();
+    if (i >= a.N) return;
+    const StaticParameters<float> raw = parameters(a, i);
+    const StaticGaussian<float> seen(raw);
+    store_matrix(seen.factor, out.factors, i);
+    out.opacities[i] = seen.opacity;
+}
+
+__global__ void static_backward_kernel(StaticArgs a, StaticSliceGrads grads, StaticGrads out) {
+    const int64_t i = global_thread();
+    if (i >= a.N) return;
+    const StaticParameters<float> raw = parameters(a, i);
+    StaticParameters<float> g{};
+    float g_factor[3][3];
+    load_matrix(grads.factors, i, g_factor);
+    StaticGaussian<float>(raw).vjp(g_factor, grads.opacities[i], g);
+    store_row(g.scales, out.scales, i);
+    store_row(g.quat, out.quats, i);
+    out.opacities[i] = g.opacity;
+}
+
+}  // namespace
+
+void observe_static(const StaticArgs& a, const StaticSlice& out, Stream stream) {
+    if (a.N > 0) launch(static_kernel, small_blocks(a.N), SMALL_BLOCK, stream, a, out);
+}
+
+void observe_static_backward(const StaticArgs& a, const StaticSliceGrads& grads, const StaticGrads& out, Stream stream) {
+    if (a.N > 0) launch(static_backward_kernel, small_blocks(a.N), SMALL_BLOCK, stream, a, grads, out);
+}
+
+}  // namespace gsb::cuda
