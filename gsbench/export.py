@@ -23,7 +23,7 @@ PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
 MOST_FRAMES = 100_000
 
 
-class Asked(NamedTuple):
+class ExportRequest(NamedTuple):
     """What a command line asks for, checked."""
 
     run: LoadedRun
@@ -75,7 +75,7 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def prepare(options: argparse.Namespace) -> Asked:
+def prepare(options: argparse.Namespace) -> ExportRequest:
     """Load what is asked for; raises InputError where it cannot be had."""
     if not (options.ply or options.video or options.images):
         raise InputError("expected --ply OUT.ply, --video OUT.mp4 or --images FOLDER, got none of them")
@@ -93,10 +93,10 @@ def prepare(options: argparse.Namespace) -> Asked:
         raise InputError(f"--time: expected a scene with times, {run.scene.name} has none: leave it out")
     filming = options.video or options.images
     needed = options.camera is not None or (filming and options.path == "test")
-    return Asked(run, scene_of(run, options.data_root) if needed else None, options)
+    return ExportRequest(run, scene_of(run, options.data_root) if needed else None, options)
 
 
-def write_ply(asked: Asked, path: Path) -> None:
+def write_ply(asked: ExportRequest, path: Path) -> None:
     """Write one slice as a PLY and say what it holds."""
     run, options = asked.run, asked.options
     query, keep = slice_place(asked)
@@ -110,7 +110,7 @@ def write_ply(asked: Asked, path: Path) -> None:
           f"their opacity there is below 1/255")  # fmt: skip
 
 
-def slice_place(asked: Asked) -> tuple[Query, bool]:
+def slice_place(asked: ExportRequest) -> tuple[Query, bool]:
     """Return the query of the slice, and whether its colours stay harmonics: where no place is asked for."""
     run, options = asked.run, asked.options
     time = options.time
@@ -135,7 +135,7 @@ def direction(text: str) -> torch.Tensor:
     return (found / found.norm()).float()
 
 
-def shots(asked: Asked) -> list[paths.Shot]:
+def shots(asked: ExportRequest) -> list[paths.Shot]:
     """Return the cameras and the times of a video: time runs once from 0 to 1 unless it is asked to stand still."""
     options = asked.options
     count = round(options.fps * options.seconds)

@@ -34,7 +34,7 @@ ON, OFF, UNDECIDED = "on", "off", "undecided"
 
 
 @dataclass(frozen=True)
-class Answer:
+class ScreenResult:
     """What one test says."""
 
     decision: str
@@ -71,15 +71,15 @@ def import_compiler() -> None:
     torch.optim.Adam([torch.zeros(1)])
 
 
-def _answer(scene: Scene, seed: int, backend: str) -> Answer:
+def _answer(scene: Scene, seed: int, backend: str) -> ScreenResult:
     """Ask the tests that the scene's cameras allow."""
     views = scene.train
     if not scene.has_time:
-        return Answer(OFF, "the views have no times")
+        return ScreenResult(OFF, "the views have no times")
     if len({view.time for view in views}) == 1:
-        return Answer(UNDECIDED, "all training views are of one time")
+        return ScreenResult(UNDECIDED, "all training views are of one time")
     if len(views) < LEAST_VIEWS:
-        return Answer(UNDECIDED, f"{len(views)} training views are too few to tell, {LEAST_VIEWS} are needed")
+        return ScreenResult(UNDECIDED, f"{len(views)} training views are too few to tell, {LEAST_VIEWS} are needed")
     places = find_places(views, scene.extent)
     answers = []
     if places.fixed:
@@ -89,19 +89,19 @@ def _answer(scene: Scene, seed: int, backend: str) -> Answer:
     return answers[0] if len(answers) == 1 else _both(*answers)
 
 
-def _of_fixed(views: Sequence[View], places: Places, seed: int) -> Answer:
+def _of_fixed(views: Sequence[View], places: Places, seed: int) -> ScreenResult:
     """Compare the images of each fixed camera place."""
     found = compare_places(views, places.fixed, seed)
     count = len(places.fixed)
     where = f"each of {count} camera places" if count > 1 else "the camera's place"
     if not found.changed:
-        return Answer(OFF, f"the images of {where} differ by exposure and noise only")
+        return ScreenResult(OFF, f"the images of {where} differ by exposure and noise only")
     said = f"the images of {where} differ, in {_percent(found.changed)} of their blocks"
     if found.p is None:
-        return Answer(UNDECIDED, f"{said}, and are too few to tell whether with time")
+        return ScreenResult(UNDECIDED, f"{said}, and are too few to tell whether with time")
     if found.p <= LEVEL:
-        return Answer(ON, f"{said}, and with time (p = {found.p:.3f}, z = {found.z:.1f})", found.p, found.z)
-    return Answer(UNDECIDED, f"{said}, but not by slow waves of time (p = {found.p:.3f}, z = {found.z:.1f})",
+        return ScreenResult(ON, f"{said}, and with time (p = {found.p:.3f}, z = {found.z:.1f})", found.p, found.z)
+    return ScreenResult(UNDECIDED, f"{said}, but not by slow waves of time (p = {found.p:.3f}, z = {found.z:.1f})",
                   found.p, found.z)  # fmt: skip
 
 
@@ -109,7 +109,7 @@ def _percent(share: float) -> str:
     return f"{share:.0%}" if share >= 0.01 else "less than 1%"
 
 
-def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> Answer:
+def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> ScreenResult:
     """Look at what a static fit leaves over of the views that no fixed camera place has."""
     numbers = [*(v for place in places.held for v in place)] if places.held else places.other
     views = [smaller(scene.train[v]) for v in numbers]
@@ -121,7 +121,7 @@ def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> Answer:
     camera = _dummies(held) if held else camera_basis(views)
     found = evidence(leftovers(views, scene, seed, backend), times, camera, seed, held or None)
     if found.free < LEAST_FREE:
-        return Answer(UNDECIDED, f"the camera moves along with time: it leaves {found.free:.0%} of time's slow "
+        return ScreenResult(UNDECIDED, f"the camera moves along with time: it leaves {found.free:.0%} of time's slow "
                                  f"waves free, {LEAST_FREE:.0%} are needed", found.p, found.z, found.free)  # fmt: skip
     said = f"p = {found.p:.3f}, z = {found.z:.1f}, {found.free:.0%} of time's slow waves are free of the camera"
     if found.p <= LEVEL:
@@ -132,7 +132,7 @@ def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> Answer:
                   f"clearly change with time ({said})")  # fmt: skip
     else:
         decision, reason = OFF, f"what a static fit leaves over does not change with time ({said})"
-    return Answer(decision, reason, found.p, found.z, found.free)
+    return ScreenResult(decision, reason, found.p, found.z, found.free)
 
 
 def _dummies(places: list[list[int]]) -> Array:  # [V, P]
@@ -143,26 +143,26 @@ def _dummies(places: list[list[int]]) -> Array:  # [V, P]
     return columns
 
 
-def _both(fixed: Answer, loose: Answer) -> Answer:
+def _both(fixed: ScreenResult, loose: ScreenResult) -> ScreenResult:
     """Combine the tests of fixed places and of other views, which share no view, by Fisher's method (1925).
 
     With two tests its p is q (1 - ln q) of the product q of theirs.
     """
     reason = f"{fixed.reason}; of the other views, {loose.reason}"
     if OFF == fixed.decision == loose.decision:
-        return Answer(OFF, reason, loose.p, loose.z, loose.free)
+        return ScreenResult(OFF, reason, loose.p, loose.z, loose.free)
     tested = [one for one in (fixed, loose) if one.p is not None and not (one is loose and _is_blind(loose))]
     if not tested:
-        return Answer(UNDECIDED, reason, free=loose.free)
+        return ScreenResult(UNDECIDED, reason, free=loose.free)
     if len(tested) == 1:
         p, z = tested[0].p, tested[0].z
     else:
         q = math.prod(one.p or 1.0 for one in tested)
         p, z = q * (1 - math.log(q)), sum(one.z or 0.0 for one in tested) / math.sqrt(2)
         reason += f"; together p = {p:.3f}"
-    return Answer(ON if p is not None and p <= LEVEL else UNDECIDED, reason, p, z, loose.free)
+    return ScreenResult(ON if p is not None and p <= LEVEL else UNDECIDED, reason, p, z, loose.free)
 
 
-def _is_blind(loose: Answer) -> bool:
+def _is_blind(loose: ScreenResult) -> bool:
     """Tell whether the camera moved along with time, so that p says nothing."""
     return loose.free is not None and loose.free < LEAST_FREE

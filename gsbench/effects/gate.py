@@ -29,7 +29,7 @@ BISECTIONS = 32
 
 
 @dataclass(frozen=True)
-class Choice:
+class ChosenSimplifications:
     """The simplification of each Gaussian."""
 
     geometry: dict[str, Tensor]  # [N] bool by the name of a simplification: which Gaussians become it
@@ -37,7 +37,7 @@ class Choice:
     predicted: float  # error that the choice adds, as a share of the model's own
 
 
-def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Choice:
+def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> ChosenSimplifications:
     """Choose the cheapest simplifications whose predicted errors add up to at most a share of the model's own error.
 
     Args:
@@ -73,7 +73,9 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
         low, high = (low, middle) if within else (middle, high)
     form, hue, error = decide(2.0**high)
     chosen = {name: form == i for i, name in enumerate(geometry)}
-    return Choice(chosen, orders.gather(0, hue[None])[0], float(error.sum()) / max(sensitivity.total, 1e-300))
+    return ChosenSimplifications(
+        chosen, orders.gather(0, hue[None])[0], float(error.sum()) / max(sensitivity.total, 1e-300)
+    )
 
 
 def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
@@ -120,7 +122,7 @@ def effect_sets_of(model: GaussianModel) -> EffectSets:
 def apply(
     model: GatedModel,
     sensitivity: Sensitivity,
-    choice: Choice,
+    choice: ChosenSimplifications,
     intervals: Tensor | None = None,  # [N, 2]
 ) -> tuple[Tensor, Tensor]:
     """Turn each Gaussian of a model into its simplification, drop the removed ones, sort the others by effect set.

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Compared:
+class PlaceComparison:
     """What the images of the places say."""
 
     changed: float  # share of the blocks, over all places
@@ -42,7 +42,7 @@ class Compared:
     z: float | None
 
 
-def compare_places(views: Sequence[View], places: Sequence[Sequence[int]], seed: int) -> Compared:
+def compare_places(views: Sequence[View], places: Sequence[Sequence[int]], seed: int) -> PlaceComparison:
     """Compare the images of each place with one another.
 
     Args:
@@ -61,9 +61,9 @@ def compare_places(views: Sequence[View], places: Sequence[Sequence[int]], seed:
             means.append(halves.mean(0).reshape(len(chosen), -1).astype(np.float64))
             times.append(np.array([views[v].time for v in chosen], dtype=np.float64))
     if not changed or not means:
-        return Compared(changed / blocks, None, None)
+        return PlaceComparison(changed / blocks, None, None)
     p, z = _slow(means, times, seed)
-    return Compared(changed / blocks, p, z)
+    return PlaceComparison(changed / blocks, p, z)
 
 
 def _spread(ordered: list[int], most: int, start: float) -> list[int]:

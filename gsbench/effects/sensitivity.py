@@ -92,7 +92,7 @@ def probe(
     def errors_in(v: int) -> tuple[float, list[Tensor]]:
         """Return the squared error of a view as it is, and what each simplification would add to it."""
         view = looked_at[v]
-        drawing = Drawing(model, view.camera, background, antialias)
+        drawing = ViewRasterizer(model, view.camera, background, antialias)
         here = drawing(seen[v])
         residual = here.image - view.image
         own = torch.Generator().manual_seed(seeds[v])
@@ -138,7 +138,7 @@ class Drawn(NamedTuple):
         return torch.stack(found)
 
 
-class Drawing(NamedTuple):
+class ViewRasterizer(NamedTuple):
     """The rasterizer of one view."""
 
     model: GaussianModel
@@ -168,7 +168,7 @@ class Place(NamedTuple):
     removed: Tensor  # [K, N] what each Gaussian's removal changes, times each of the vectors
 
 
-def _error(simplification: Simplification, here: Place, draw: Drawing) -> Tensor:
+def _error(simplification: Simplification, here: Place, draw: ViewRasterizer) -> Tensor:
     """Compute E [N] of a simplification in one view."""
     model, live = here.model, here.live
     if simplification.raw is None:

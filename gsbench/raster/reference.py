@@ -17,7 +17,7 @@ TILE = 8  # pixels a side; small tiles waste fewer of the pairs that blending ev
 CHUNK = 1 << 21  # (Gaussian, pixel) products blended at a time: bounds memory, and fits caches
 
 
-class Splats(NamedTuple):
+class CameraSplats(NamedTuple):
     """Gaussians on the image plane of one camera."""
 
     means2d: Tensor  # [N, 2] pixels
@@ -66,7 +66,7 @@ def project(
     far: float,
     eps2d: float,
     antialias: bool,
-) -> Splats:
+) -> CameraSplats:
     """Project Gaussians by the affine approximation of the pinhole at their means (EWA splatting, eq. 29)."""
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     means_c = means @ rotation.T + translation
@@ -110,11 +110,11 @@ def project(
     half_sizes = (2 * power[:, None] * torch.stack([xx + eps, yy], -1).detach()).sqrt() * size[:, None] + 0.01
     inside = ((means2d + half_sizes > 0) & (means2d - half_sizes < means2d.new_tensor([width, height]))).all(-1)
     drawn = drawn & (opacities >= ALPHA_MIN) & inside
-    return Splats(means2d, conics, opacities, means_c[:, 2], torch.where(drawn[:, None], half_sizes, 0.0))
+    return CameraSplats(means2d, conics, opacities, means_c[:, 2], torch.where(drawn[:, None], half_sizes, 0.0))
 
 
 @torch.no_grad()
-def bin_tiles(splats: Splats, width: int, height: int) -> tuple[Tensor, Tensor]:
+def bin_tiles(splats: CameraSplats, width: int, height: int) -> tuple[Tensor, Tensor]:
     """List (tile, Gaussian) pairs sorted by tile, then by depth, then by index: tiles [P], gaussians [P]."""
     order = torch.argsort(splats.depths, stable=True)
     order = order[splats.half_sizes[order].amax(-1) > 0]
@@ -136,7 +136,7 @@ def bin_tiles(splats: Splats, width: int, height: int) -> tuple[Tensor, Tensor]:
 
 
 def blend(
-    splats: Splats,
+    splats: CameraSplats,
     colors: Tensor,  # [N, D]
     tiles: Tensor,  # [P]
     gaussians: Tensor,  # [P]

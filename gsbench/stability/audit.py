@@ -38,8 +38,8 @@ class Audit:
     cells: list[Cell] = field(default_factory=list)
     verified: dict[str, float] = field(default_factory=dict)  # float64 against mpmath, by factor order
     conditions: list[curves.ConditionCurve] = field(default_factory=list)
-    accuracy: list[curves.Point] = field(default_factory=list)
-    safety: list[curves.Cost] = field(default_factory=list)
+    accuracy: list[curves.AccuracyPoint] = field(default_factory=list)
+    safety: list[curves.SliceTime] = field(default_factory=list)
     seconds: float = 0.0
 
     @property

@@ -20,7 +20,7 @@ COPIES = 1024  # of a case's Gaussians, for its timing
 
 
 @dataclass
-class Shown:
+class ColorInputs:
     """Gaussians of one model, with the place and the time of a query."""
 
     model: str
@@ -31,21 +31,21 @@ class Shown:
     time: float = 0.4
 
 
-def ordinary(g: Generator, model: str) -> Shown:
+def ordinary(g: Generator, model: str) -> ColorInputs:
     """Make colours of the size that training finds."""
     sh = 0.3 * torch.randn(COUNT, 16 * WAVES[model], 3, generator=g)
-    return Shown(model, torch.randn(COUNT, 3, generator=g), torch.rand(COUNT, 1, generator=g), sh,
+    return ColorInputs(model, torch.randn(COUNT, 3, generator=g), torch.rand(COUNT, 1, generator=g), sh,
                  torch.tensor([0.3, -0.2, -4.0]))  # fmt: skip
 
 
 @case("colour", "3dgs", "4dgs")
-def ordinary_colors(g: Generator, severity: float, model: str) -> Shown:  # noqa: ARG001
+def ordinary_colors(g: Generator, severity: float, model: str) -> ColorInputs:  # noqa: ARG001
     """Nothing is stressed: this row is the floor to compare the others with."""
     return ordinary(g, model)
 
 
 @case("colour", "3dgs", "4dgs")
-def seen_from_within(g: Generator, severity: float, model: str) -> Shown:
+def seen_from_within(g: Generator, severity: float, model: str) -> ColorInputs:
     """The camera on a mean, and 10^-12 and 10^-6 beside it: the direction is 0/0, by definition 0, and its gradient."""
     shown = ordinary(g, model)
     aside = torch.tensor([0.0, 1e-12, 1e-6])[:, None] + 1 - severity
@@ -54,7 +54,7 @@ def seen_from_within(g: Generator, severity: float, model: str) -> Shown:
 
 
 @case("colour", "3dgs", "4dgs")
-def loud_harmonics(g: Generator, severity: float, model: str) -> Shown:
+def loud_harmonics(g: Generator, severity: float, model: str) -> ColorInputs:
     """Coefficients of 10^4: harmonics of degree 3 that cancel to a visible colour."""
     shown = ordinary(g, model)
     shown.sh *= 10 ** (4 * severity)
@@ -62,7 +62,7 @@ def loud_harmonics(g: Generator, severity: float, model: str) -> Shown:
 
 
 @case("colour", "4dgs", forward=1e-3, gradient=1e-2)
-def far_in_time(g: Generator, severity: float, model: str) -> Shown:
+def far_in_time(g: Generator, severity: float, model: str) -> ColorInputs:
     """t - mu_t = 1000 periods: mu_t itself has an ulp of 6e-5 there, which is 8e-4 in the phase of the second wave."""
     shown = ordinary(g, model)
     shown.times += 1000 * severity
@@ -88,7 +88,7 @@ def judge(found: Case, backends: list[str]) -> Iterator[Cell]:
             )  # fmt: skip
 
 
-def truth(shown: Shown, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
+def truth(shown: ColorInputs, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     """Compute exact colours [COUNT, 3] and gradients [COUNT, 5]: by mean, time, and along one line of coefficients."""
     layout = {"means": 3, "times": 1, "sh": len(along)}
     time = float(torch.tensor(shown.time))
@@ -106,7 +106,7 @@ def truth(shown: Shown, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     return torch.tensor(colors, dtype=torch.float64), torch.tensor(slopes, dtype=torch.float64)
 
 
-def differentiate(shown: Shown, backend: str, weight: Tensor, copies: int) -> tuple[Tensor, Tensor]:
+def differentiate(shown: ColorInputs, backend: str, weight: Tensor, copies: int) -> tuple[Tensor, Tensor]:
     """Compute colours [N, 3] and their gradients [N, 4 + coefficients] in float32."""
     model, device = build(shown.model, backend=BACKENDS[backend]), device_of(backend)
     rows = torch.arange(COUNT).repeat(copies)

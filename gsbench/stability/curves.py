@@ -43,7 +43,7 @@ class ConditionCurve:
 
 
 @dataclass(frozen=True)
-class Cost:
+class SliceTime:
     """Milliseconds of slicing TIMED 7D Gaussians; for kernels the medians over REPEATS."""
 
     order: str
@@ -54,7 +54,7 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Point:
+class AccuracyPoint:
     """The accuracy and the time of one way to do a thing."""
 
     thing: str  # "slicing" or "picture"
@@ -63,7 +63,7 @@ class Point:
     ms: float  # forward and backward
 
 
-def accuracy_for_time(backends: list[str]) -> Iterator[Point]:
+def accuracy_for_time(backends: list[str]) -> Iterator[AccuracyPoint]:
     """Slice SLICED hard Gaussians and render a crowd, in every scheme, precision and instruction set."""
     hard = population.draw(torch.Generator().manual_seed(4), SLICED, "paper")
     known = population.truth(hard, "paper")
@@ -90,7 +90,9 @@ def accuracy_for_time(backends: list[str]) -> Iterator[Point]:
     yield _drawn(arguments, truth, "reference", torch.float64, "reference float64")
 
 
-def _sliced(hard: population.Hard, known: population.Truth, scheme: str, backend: str, dtype: torch.dtype) -> Point:
+def _sliced(
+    hard: population.Hard, known: population.PopulationTruth, scheme: str, backend: str, dtype: torch.dtype
+) -> AccuracyPoint:
     model = population.all_seen("paper", scheme, backend).to(dtype)
     device = device_of(backend)
     raw = {
@@ -108,16 +110,18 @@ def _sliced(hard: population.Hard, known: population.Truth, scheme: str, backend
     exact = torch.from_numpy(known.cov)
     errors = ((F @ F.mT - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))).numpy()
     precision = str(dtype).removeprefix("torch.")
-    return Point("slicing", f"{scheme} {backend} {precision}", percentile(errors), slices.fastest(both))
+    return AccuracyPoint("slicing", f"{scheme} {backend} {precision}", percentile(errors), slices.fastest(both))
 
 
-def _drawn(arguments: Arguments, truth: pictures.Truth, backend: str, dtype: torch.dtype, way: str) -> Point:
+def _drawn(
+    arguments: Arguments, truth: pictures.ImageTruth, backend: str, dtype: torch.dtype, way: str
+) -> AccuracyPoint:
     image, _, decided, _ = truth
     weights = pictures.weights(arguments)
     cast = {name: value.to(dtype) if isinstance(value, Tensor) else value for name, value in arguments.items()}
     got, _, _ = pictures.differentiate(cast, backend, *weights)
     error = float(torch.where(decided, (got - image).abs().amax(-1), 0.0).max())
-    return Point("picture", way, error, slices.fastest(lambda: pictures.differentiate(cast, backend, *weights)))
+    return AccuracyPoint("picture", way, error, slices.fastest(lambda: pictures.differentiate(cast, backend, *weights)))
 
 
 def percentile(errors: population.Floats) -> float:
@@ -147,7 +151,7 @@ def by_condition() -> Iterator[ConditionCurve]:
         yield curve
 
 
-def safety(backends: list[str]) -> Iterator[Cost]:
+def safety(backends: list[str]) -> Iterator[SliceTime]:
     """Time every scheme on every backend that has it."""
     for order in FACTOR_ORDERS:
         hard = population.draw(torch.Generator().manual_seed(3), TIMED, order, 1.0)
@@ -169,4 +173,4 @@ def safety(backends: list[str]) -> Iterator[Cost]:
                     wait()
                     forward.append(1e3 * (middle - start))
                     backward.append(1e3 * (time.perf_counter() - middle))
-                yield Cost(order, scheme, backend, float(np.median(forward)), float(np.median(backward)))
+                yield SliceTime(order, scheme, backend, float(np.median(forward)), float(np.median(backward)))

@@ -16,7 +16,8 @@ from gsbench.stability.slices import fastest, worst
 
 UNDECIDED = 1e-3  # a pixel relatively nearer to a threshold may fall to either side of it in float32
 Arguments = dict[str, Any]
-Truth = tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]  # image and alpha [1, H, W, .], decided [1, H, W], gradients
+# image and alpha [1, H, W, .], decided [1, H, W], gradients
+ImageTruth = tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]
 
 
 def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
@@ -51,7 +52,7 @@ def weights(arguments: Arguments) -> tuple[Tensor, Tensor]:
             torch.randn(*shape, 1, generator=g, dtype=torch.float64))  # fmt: skip
 
 
-def together(arguments: Arguments) -> Truth:
+def together(arguments: Arguments) -> ImageTruth:
     """Render the exact image and gradients by brute force."""
     exact: Arguments = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
     with torch.no_grad():
@@ -62,7 +63,7 @@ def together(arguments: Arguments) -> Truth:
     return picture.image, picture.alpha, decided, gradients
 
 
-def alone(arguments: Arguments) -> Truth:
+def alone(arguments: Arguments) -> ImageTruth:
     """Compute the exact image and gradients by mpmath, for one Gaussian whose one channel is 1: image equals alpha."""
     size = (arguments["width"], arguments["height"])
     pixels = [(i + 0.5, j + 0.5) for j in range(size[1]) for i in range(size[0])]
@@ -100,7 +101,7 @@ def differentiate(
     return image.detach(), alpha.detach(), dict(zip(inputs, gradients, strict=True))
 
 
-def compare(arguments: Arguments, known: Truth, backend: str) -> tuple[float, float, float]:
+def compare(arguments: Arguments, known: ImageTruth, backend: str) -> tuple[float, float, float]:
     """Return the largest error of decided pixels, relative to the brightest colour or 1, and of gradients; 1 if bad."""
     image, alpha, decided, exact = known
     weight, weight_alpha = (w * decided[..., None] for w in weights(arguments))

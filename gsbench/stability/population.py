@@ -42,7 +42,7 @@ class Hard:
 
 
 @dataclass(frozen=True)
-class Truth:
+class PopulationTruth:
     """The mean [N, 3] and the covariance [N, 3, 3] of each slice, and the gradient of the loss by raw parameters."""
 
     mean: Floats
@@ -90,12 +90,14 @@ def weights(N: int) -> tuple[Floats, Floats]:
     return random.standard_normal((N, 3)), W + W.transpose(0, 2, 1)
 
 
-def truth(hard: Hard, order: str) -> Truth:
+def truth(hard: Hard, order: str) -> PopulationTruth:
     """Compute means, covariances and the gradient of the loss w . mean / |mean| + <W, cov> / |cov|, in float64."""
     w, W = weights(len(hard))
     chunks = [slice(i, i + CHUNK) for i in range(0, len(hard), CHUNK)]
     parts = [_truth(hard.rows(rows), order, w[rows].T, W[rows].transpose(1, 2, 0)) for rows in chunks]
-    return Truth(*(np.ascontiguousarray(np.moveaxis(np.concatenate(x, -1), -1, 0)) for x in zip(*parts, strict=True)))
+    return PopulationTruth(
+        *(np.ascontiguousarray(np.moveaxis(np.concatenate(x, -1), -1, 0)) for x in zip(*parts, strict=True))
+    )
 
 
 def _truth(hard: Hard, order: str, w: Floats, W: Floats) -> tuple[Floats, Floats, Floats]:
@@ -196,7 +198,7 @@ def _relative(found: Floats, exact: Floats) -> float:
     return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
 
 
-def judge(hard: Hard, known: Truth, order: str, scheme: str, backend: str) -> Errors:
+def judge(hard: Hard, known: PopulationTruth, order: str, scheme: str, backend: str) -> Errors:
     """Measure the errors of 7DGS in float32 on hard slices.
 
     Args:
@@ -224,7 +226,7 @@ def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
 
 
 def _judge(
-    model: TriangularModel, hard: Hard, known: Truth, w: Floats, W: Floats, rows: slice
+    model: TriangularModel, hard: Hard, known: PopulationTruth, w: Floats, W: Floats, rows: slice
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     some = hard.rows(rows)
     leaves = some.log_diagonal.clone().requires_grad_(), some.off_diagonal.clone().requires_grad_()

@@ -28,7 +28,7 @@ COPIES = 1024  # of a case's Gaussians, for its timing
 
 
 @dataclass(frozen=True)
-class Truth:
+class SliceTruth:
     """The exact mean, covariance (by rows), opacity and gradient of the loss of the Gaussians of a case."""
 
     outputs: Tensor  # [COUNT, 13] float64
@@ -47,7 +47,7 @@ def judge(case: Case, backends: list[str], schemes: Sequence[str] = SCHEMES) -> 
                 yield _cell(case, observed, known, scheme, backend)
 
 
-def truth(observed: Observed) -> Truth:
+def truth(observed: Observed) -> SliceTruth:
     """Evaluate mpmath, and choose the loss: a sum of mean, covariance and opacity, each relative to its size.
 
     A Gaussian that is too faint to be rendered counts by its opacity alone, so that its gradient is nearly zero.
@@ -67,7 +67,7 @@ def truth(observed: Observed) -> Truth:
         outputs.append(values)
         scales.append(scale)
         gradients.append([float(v) for v in oracle.gradient(function, x, weights[i].tolist())])
-    return Truth(torch.stack(outputs), weights, torch.stack(scales), torch.tensor(gradients, dtype=torch.float64))
+    return SliceTruth(torch.stack(outputs), weights, torch.stack(scales), torch.tensor(gradients, dtype=torch.float64))
 
 
 def exact(observed: Observed) -> oracle.Function:
@@ -110,7 +110,7 @@ def differentiate(
     return outputs.detach(), torch.cat([g.reshape(len(g), -1).double() for g in gradients], 1)
 
 
-def _cell(case: Case, observed: Observed, known: Truth, scheme: str, backend: str) -> Cell:
+def _cell(case: Case, observed: Observed, known: SliceTruth, scheme: str, backend: str) -> Cell:
     model, raw = load(observed, scheme, backend)
     outputs, gradient = differentiate(model, raw, observed, known.weights)
     bad = ~(outputs.isfinite().all(1) & gradient.isfinite().all(1))
@@ -134,7 +134,7 @@ def worst(errors: Tensor) -> float:
     return float(errors.max()) if bool(errors.isfinite().all()) else float("nan")
 
 
-def _milliseconds(observed: Observed, known: Truth, scheme: str, backend: str) -> float:
+def _milliseconds(observed: Observed, known: SliceTruth, scheme: str, backend: str) -> float:
     model, raw = load(observed, scheme, backend, COPIES)
     weights = known.weights.repeat(COPIES, 1)
     return fastest(lambda: differentiate(model, raw, observed, weights))
