@@ -1,4 +1,4 @@
-"""Draw the Gaussians of a finished run by class, as one of the evaluated cameras sees them."""
+"""Draw the Gaussians of a finished run by effect set, as one of the evaluated cameras sees them."""
 
 from pathlib import Path
 

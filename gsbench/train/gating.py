@@ -103,7 +103,7 @@ class Gating:
                               f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
             return
         most = LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING
-        # Kernels keep the entries of still Gaussians; those of one that is frozen by halves would learn on.
+        # Kernels keep the entries of static Gaussians; those of one that is frozen by halves would learn on.
         self._gate(step, most, VIEWS_IN_TRAINING, by_halves=False)
 
     def slows_agr(self, step: int) -> float:

@@ -188,7 +188,7 @@ def test_pictures_by_class_are_part_of_the_page(tmp_path):
     assert (image.caption, image.width, image.height) == ("suzanne, auto", 912, 120)
     text = build.render(runs, folder)
     assert text.count(image.source) == 1
-    assert 'alt="suzanne, auto: the image beside its Gaussians by class"' in text
+    assert 'alt="suzanne, auto: the image beside its Gaussians by effect set"' in text
     (folder / "suzanne" / "auto" / "seed0" / "classes.png").write_bytes(b"damaged")
     assert page_part.on_demand_section(group(runs), canvas(), folder).images == []
 
