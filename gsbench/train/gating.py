@@ -31,8 +31,8 @@ GATES = ("off", "end", "both")
 # makes up for on every scene tried, without AGR and with it (docs/effects.md).
 LOSS_IN_TRAINING = 0.1
 LOSS_WITH_AGR = 0.5
-# A model of fewer Gaussians is not gated in training, for it needs them all: limited to 300 and 600 Gaussians, models of
-# four of five scenes ended 0.2 to 0.5 dB lower on val by that gate (docs/effects.md).
+# A model of fewer Gaussians is not gated in training, for it needs them all: limited to 300 and 600 Gaussians, models
+# of four of five scenes ended 0.2 to 0.5 dB lower on val by that gate (docs/effects.md).
 LEAST_IN_TRAINING = 1_000
 VIEWS_IN_TRAINING = 30  # that the probe looks at: the gate must cost less than it saves
 # AGR's rate is constant, and fewer Gaussians end farther from where its steps swing around: on trex a gated training
