@@ -79,6 +79,7 @@ class ModelConfig:
 class DensifyConfig:
     """Adaptive density control (3DGS, section 5.2). All steps but `every` are those of a run of `recipe_iterations`."""
 
+    kind: str = "gradient"  # the rule by which Gaussians are added and removed
     start: int = 500  # after this step Gaussians are cloned, split and pruned ..
     stop: int = 15_000  # .. until this one
     every: int = 100  # steps of a run of any length: clones need them to move apart before the next decision ..
@@ -87,7 +88,25 @@ class DensifyConfig:
     grad_threshold: float = 2e-4  # mean gradient of a 2D mean, in units of half the image
     clone_below: float = 0.01  # clone if the largest scale is below this part of the extent, else split
     prune_above: float = 0.1  # prune if it is above this part, after the first opacity reset
+    thin_to: float | None = None  # after `stop` keep this share, those of the largest blend weights; None: all
     max_gaussians: int | None = None  # more are not made: those of the largest gradients come first; None: 2,000,000
+
+
+@dataclass
+class PenaltyConfig:
+    """A penalty that is added to the loss of every view (gsbench/train/penalties.py)."""
+
+    weight: float = 0.0
+    start: int = 0  # a step of a run of `recipe_iterations`, from which it acts ..
+    stop: int | None = None  # .. until this one; None: until the end
+
+
+@dataclass
+class PenaltiesConfig:
+    """The penalties there are."""
+
+    opacity: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean opacity
+    size: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean largest scale, in parts of the scene's extent
 
 
 @dataclass
@@ -102,6 +121,8 @@ class TrainConfig:
     refine_from: int = 3_000  # the step from which AGR acts and learns
     modulation_from: int = 15_000  # the step from which lambda_t and lambda_d learn
     densify: DensifyConfig = field(default_factory=DensifyConfig)
+    coarse: list[list[int]] | None = None  # [[4, 3000]]: a quarter of the width until step 3,000
+    penalties: PenaltiesConfig = field(default_factory=PenaltiesConfig)
     curve_points: int = 20  # measurements on the val split during the run
     checkpoint_minutes: float = 2.0  # a killed run loses at most this much
 

@@ -16,6 +16,8 @@ STEPS_BETWEEN_RESETS = 300
 # them left three times as many Gaussians on trex, and lower PSNR on val (docs/tuning.md).
 MOST_ROUNDS = 36
 
+# The step of the recipe after which Gaussians of little blend weight are dropped, if densification is over.
+THIN = 15_600
 GATE = 18_000  # the step of the recipe after which the model is gated in training, if densification is over ..
 STEPS_TO_RECOVER = 300  # .. and so many are left: with 120 left of 300, a gated training ended 0.4 dB lower
 
@@ -70,6 +72,19 @@ class Schedule:
     def has_reset(self, step: int) -> bool:
         """Tell whether there was an opacity reset; from then on Gaussians that are too large are pruned."""
         return step + 1 > self.reset_every
+
+    def resolution(self, step: int) -> int:
+        """Return the factor by which the images of a step are smaller: 1, or that of the first window that holds it."""
+        coarse = self.config.coarse or []
+        return next((factor for factor, until in coarse if step < self.scaled(until)), 1)
+
+    def within(self, step: int, start: int, stop: int | None) -> bool:
+        """Tell whether a step lies in a window of steps of the recipe; None is the end of the run."""
+        return self.scaled(start) <= step + 1 and (stop is None or step + 1 <= self.scaled(stop))
+
+    def thins(self, step: int) -> bool:
+        """Tell whether Gaussians of little blend weight are dropped after a step: once densification is over."""
+        return self.config.densify.thin_to is not None and step + 1 == max(self.scaled(THIN), self.densify_stop)
 
     def gates(self, step: int) -> bool:
         """Tell whether the model is gated after a step: once densification is over, while steps are left to recover."""

@@ -22,6 +22,11 @@ PLACES = (
     "results", "resume", "launch", "data.root", "data.published", "data.scenes", "init.ply", "scene.released_as",
     "train.checkpoint_minutes", "protocol.lpips_alex", "protocol.lpips_vgg",
 )  # fmt: skip
+# Keys that older configs lack, with the value that they all had.
+ALWAYS = {
+    "train.densify.kind": "gradient",
+    **{f"train.penalties.{name}.{key}": 0 for name in ("opacity", "size") for key in ("weight", "start")},
+}
 _MOST_NAMED = 5  # differences that are named
 
 
@@ -47,8 +52,8 @@ def training_hash(plain: Plain) -> str:
 
 
 def given(plain: Plain) -> Plain:
-    """Flatten a config; a null key counts as absent, so a new key changes no older run."""
-    return {key: value for key, value in flat(plain) if value is not None}
+    """Flatten a config without keys that are null or as they always were, so that a new key changes no older run."""
+    return {key: value for key, value in flat(plain) if value is not None and ALWAYS.get(key) != value}
 
 
 def flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, Any]]:

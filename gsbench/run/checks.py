@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.resources
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -21,8 +22,11 @@ from gsbench.models.gated import as_gated
 from gsbench.run.identity import hash_of
 from gsbench.scenes import Scene, View
 from gsbench.scenes.trained import TrainedGaussians, read_trained
+from gsbench.train.densify import check_kind
 from gsbench.train.gating import GATES
+from gsbench.train.losses import WINDOW
 from gsbench.train.optim import OPTIMIZERS
+from gsbench.train.penalties import check_penalties
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 PACKAGE = "pkg://"  # in front of the module whose files data.root names
@@ -45,6 +49,9 @@ RANGES = {  # of numbers that the schema types but does not bound, both ends inc
     "train.densify.grad_threshold": (0, math.inf),
     "train.densify.clone_below": (0, math.inf),
     "train.densify.prune_above": (0, math.inf),
+    "train.densify.thin_to": (1e-3, 1),
+    "train.penalties.opacity.weight": (0, math.inf),
+    "train.penalties.size.weight": (0, math.inf),
     "train.densify.max_gaussians": (LEAST_GAUSSIANS, ENDLESS),
     "train.curve_points": (1, MAX_POINTS),
     "train.checkpoint_minutes": (0, ENDLESS),
@@ -81,6 +88,9 @@ def check_values(config: Config) -> None:
         if not low <= value <= high:
             expected = f"{low} to {high}" if high < ENDLESS else f"at least {low}"
             raise InputError(f"{key}: expected {expected}, got {value}")
+    check_kind(config.train.densify.kind)
+    check_penalties(config.train.penalties)
+    _check_coarse(config.train.coarse or [])
     for name, rate in config.model.lr.items():
         _check_rate(f"model.lr.{name}", rate)
 
@@ -141,6 +151,17 @@ def _check_rate(key: str, rate: LearningRate) -> None:
     if rate.start < 0 or (rate.end is not None and (rate.end <= 0 or rate.start == 0)):
         raise InputError(f"{key}: expected start >= 0, and start > 0 with end > 0 or null, "
                          f"got start {rate.start}, end {rate.end}")  # fmt: skip
+
+
+def _check_coarse(coarse: list[list[int]]) -> None:
+    """Raise InputError unless factors are whole, fall, and end at steps that rise: [[4, 3000], [2, 15000]]."""
+    factors, steps = [pair[0] for pair in coarse], [pair[-1] for pair in coarse]
+    fall = all(a > b for a, b in itertools.pairwise([*factors, 1]))
+    rise = all(a < b for a, b in itertools.pairwise([0, *steps]))
+    if not fall or not rise or any(len(pair) != 2 for pair in coarse):
+        raise InputError(f"train.coarse: expected pairs (factor above 1, step of the recipe until which images are so "
+                         f"much smaller), factors falling and steps rising, such as [[4,3000],[2,15000]], "
+                         f"got {coarse}")  # fmt: skip
 
 
 def check_folder(folder: Path) -> None:
@@ -219,6 +240,11 @@ def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
     if not scene.extent > 0:
         raise InputError(f"{scene.name}: expected training cameras at different places, all are at one: sizes and "
                          f"rates are relative to the cameras' radius, which is 0")  # fmt: skip
+    factor = max((pair[0] for pair in config.train.coarse or []), default=1)
+    side = min(min(view.camera.width, view.camera.height) for view in scene.train)
+    if side // factor < WINDOW:
+        raise InputError(f"train.coarse: expected images of at least {WINDOW} pixels, the loss's window, after the "
+                         f"factor {factor}, got {side // factor}")  # fmt: skip
 
 
 def evaluated_views(scene: Scene, split: str) -> list[View]:

@@ -21,10 +21,8 @@ from gsbench.models import GaussianModel
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import as_gated
 from gsbench.scenes import Scene, View
-from gsbench.train.density import DensityControl
-from gsbench.train.minimum_scale import MinimumScale
-from gsbench.train.optim import Optimizer
 from gsbench.train.renderer import Renderer
+from gsbench.train.rows import Rows
 
 GATES = ("off", "end", "both")
 # dB on val that a gate in training may cost at once: of 0.5, 0.2 and 0.1 the largest that the rest of the training
@@ -60,25 +58,17 @@ def become(model: GaussianModel, shape: Shape) -> None:
 class Gating:
     """The gates of one training."""
 
-    def __init__(
-        self, model: GaussianModel, optimizer: Optimizer, density: DensityControl, minimum_scale: MinimumScale,
-        scene: Scene, renderer: Renderer, config: Config,
-    ) -> None:  # fmt: skip
-        """Gate `model`; the moments, the counts and the minimum scale of its Gaussians follow.
+    def __init__(self, rows: Rows, scene: Scene, renderer: Renderer, config: Config) -> None:
+        """Gate the model of `rows`; what follows its rows follows the gate.
 
         Args:
-            model: of the training.
-            optimizer: of the model.
-            density: of the model.
-            minimum_scale: of the model.
+            rows: of the training.
             scene: gives the views that are probed and those that the loss is measured on.
             renderer: of the training.
             config: says by which gates, and what they may cost.
         """
-        self.model = model
-        self.optimizer = optimizer
-        self.density = density
-        self.minimum_scale = minimum_scale
+        self.rows = rows
+        self.model = rows.model
         self.renderer = renderer
         self.config = config
         self.gates: list[Gate] = []
@@ -96,15 +86,15 @@ class Gating:
                 self.checked = scene.train[::HELD_OUT]
                 self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
 
-    def in_training(self, step: int) -> None:
-        """Gate before a step; what that costs on val at once is bounded by LOSS_WITH_AGR or LOSS_IN_TRAINING."""
+    def in_training(self, step: int) -> bool:
+        """Gate before a step, and tell whether it was done; its loss on val at once is bounded (LOSS_IN_TRAINING)."""
         if len(self.model) < LEAST_IN_TRAINING:
             self.notes.append(f"at step {step} the model has {len(self.model)} Gaussians: of fewer than "
                               f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
-            return
+            return False
         most = LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING
         # Kernels keep the entries of static Gaussians; those of one that is frozen by halves would learn on.
-        self._gate(step, most, VIEWS_IN_TRAINING, by_halves=False)
+        return self._gate(step, most, VIEWS_IN_TRAINING, by_halves=False)
 
     def slows_agr(self, step: int) -> float:
         """Return the factor of AGR's rate at a step: after a gate in training it falls log-linearly to LAST_RATE."""
@@ -113,9 +103,9 @@ class Gating:
         begun, iterations = self.gates[0].step, self.config.train.iterations
         return float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))
 
-    def at_end(self, by_halves: bool) -> None:
-        """Gate the finished model within `effects.budget_db`."""
-        self._gate(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
+    def at_end(self, by_halves: bool) -> bool:
+        """Gate the finished model within `effects.budget_db`, and tell whether it was."""
+        return self._gate(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
 
     def now(self) -> Shape:
         """Return the model's Gaussians as they are, for `compare`."""
@@ -142,8 +132,8 @@ class Gating:
         return psnr(one, views) - psnr(other, views), [one.p50 for one in times]
 
     @torch.no_grad()
-    def _gate(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> None:
-        """Probe, choose and apply; where nothing is within the budget, note that."""
+    def _gate(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> bool:
+        """Probe, choose and apply, and tell whether that was done; where nothing is within the budget, note that."""
         started = time.perf_counter()
         model, at_end = as_gated(self.model), step is None
         # In training AGR does not rest: when a Gaussian can be seen still changes.
@@ -157,17 +147,16 @@ class Gating:
         if found is None:
             self.notes.append(f"{'at the end' if at_end else f'at step {step}'} no simplification cost at most "
                               f"{budget_db} dB on {self.checked_on}")  # fmt: skip
-            return
+            return False
         self._adopt(found)
         seconds = time.perf_counter() - started
         self.gates.append(replace(found.gate, step=step, checked_on=self.checked_on, seconds=seconds,
                                   asleep=share_asleep(self.model, self.probed)))  # fmt: skip
+        return True
 
     def _adopt(self, found: Gated) -> None:
         become(self.model, shape_of(found.model))
-        self.optimizer.follow(self.model, found.rows, found.changed)
-        self.density.follow(found.rows)
-        self.minimum_scale.update()
+        self.rows.moved(found.rows, found.changed)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what was decided, for the checkpoint; the effect sets are the model's."""

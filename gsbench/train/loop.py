@@ -19,14 +19,19 @@ from gsbench.models import GaussianModel
 from gsbench.scenes import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.train.checkpoint import whole_number
-from gsbench.train.density import MOST_GAUSSIANS, DensityControl
+from gsbench.train.densify import densification
+from gsbench.train.densify.base import MOST_GAUSSIANS
+from gsbench.train.densify.minimum_scale import MinimumScale
 from gsbench.train.finite_check import DivergedError, FiniteCheck
 from gsbench.train.gating import NO_GATES, Gating
-from gsbench.train.minimum_scale import MinimumScale
 from gsbench.train.optim import Optimizer
+from gsbench.train.penalties import penalties_at
+from gsbench.train.pyramid import Pyramid
 from gsbench.train.renderer import Renderer
+from gsbench.train.rows import Rows
 from gsbench.train.seeding import batch, generator
 from gsbench.train.step import Step, fitting_threads
+from gsbench.train.thinning import blend_weights, heaviest
 
 
 @dataclass
@@ -64,12 +69,15 @@ class Trainer:
         self.renderer = Renderer(scene.train[0].image.new_tensor(scene.background), config.raster.antialias)
         self.schedule = Schedule(train, config.model.sh_degree, config.agr)
         self.optimizer = Optimizer(model, config.model, train, scene.extent, config.optim)
-        self.density = DensityControl(model, self.optimizer, train.densify, config.model.min_opacity, len(scene.train))
+        self.rows = Rows(model, self.optimizer)
+        self.density = densification(self.rows, train.densify, config.model.min_opacity, len(scene.train))
         self.minimum_scale = MinimumScale(model, [view.camera for view in scene.train])
+        self.rows.add(self.minimum_scale)
+        self.pyramid = Pyramid(scene.train)
         self.stages = StageClock(config.device)
         self.effort = Effort()
         self.gradients = Step(model, self.renderer.background, train.ssim_weight, self.renderer.antialias, self.stages)
-        self.gating = Gating(model, self.optimizer, self.density, self.minimum_scale, scene, self.renderer, config)
+        self.gating = Gating(self.rows, scene, self.renderer, config)
         self.finite_check = FiniteCheck(config.device)
         if config.device.startswith("cuda"):  # a bad step is found some steps later, and must not be applied until then
             self.optimizer.adam.found_inf = self.finite_check.skip  # type: ignore[attr-defined]
@@ -100,8 +108,8 @@ class Trainer:
             total=train.iterations, initial=self.step, desc=label, unit="it", mininterval=every, maxinterval=every
         ) as bar:
             while self.step < train.iterations:
-                camera = self.scene.train[0].camera
-                with self.effort, fitting_threads(len(self.model), camera.width * camera.height):
+                camera, factor = self.scene.train[0].camera, self.schedule.resolution(self.step)
+                with self.effort, fitting_threads(len(self.model), camera.width * camera.height // factor**2):
                     self._descend()
                 if self.schedule.measures(self.step):
                     self._measure()
@@ -132,19 +140,22 @@ class Trainer:
         self.model.set_active(self.schedule.active(self.step - 1))
         ungated = self.gating.now()
         with self.effort, self.stages("gate"):
-            self.gating.at_end(by_halves)
+            if self.gating.at_end(by_halves):
+                self.minimum_scale.update()
         self.gating.compare(ungated, self.views)
 
     def _descend(self) -> None:
         """Do one step: the loss is the mean over a batch of views."""
-        step, train, stages = self.step, self.config.train, self.stages
+        step, train, stages, schedule = self.step, self.config.train, self.stages, self.schedule
         self.model.set_active(self.schedule.active(step))
-        views = [self.scene.train[i] for i in batch(step, len(self.scene.train), train.batch_size, self.config.seed)]
+        factor = schedule.resolution(step)
+        chosen = batch(step, len(self.scene.train), train.batch_size, self.config.seed)
+        views = [self.pyramid.view(i, factor) for i in chosen]
         try:
-            seen = self.gradients(views)
+            seen = self.gradients(views, penalties_at(step, train.penalties, schedule))
         except DivergedError as error:
             raise DivergedError(f"step {step}: {error}") from None
-        if step < self.schedule.densify_stop:
+        if step < schedule.densify_stop:
             with stages("density"):
                 for view, one in zip(views, seen, strict=True):
                     self.density.accumulate(one.radii, one.g_means2d, view.camera.width, view.camera.height, len(views))
@@ -154,14 +165,25 @@ class Trainer:
             self.optimizer.step(step, drawn, slowed=self.gating.slows_agr(step))
             self.minimum_scale.hold()
         with stages("density"):
-            if self.schedule.densifies(step):
-                refused = self.density.densify(generator(self.config.seed, step), self.schedule.has_reset(step))
+            if schedule.densifies(step):
+                refused = self.density.densify(generator(self.config.seed, step), schedule.has_reset(step))
                 self._tell_full(refused)
-            if (step + 1) % self.schedule.densify_every == 0:
+            if schedule.thins(step):
+                self._thin()
+            if (step + 1) % schedule.densify_every == 0:
                 self.minimum_scale.update()
-        if self.config.effects.gate == "both" and self.schedule.gates(step):
+            if schedule.resolution(step + 1) != factor:
+                self.pyramid.keep_only(schedule.resolution(step + 1))
+        if self.config.effects.gate == "both" and schedule.gates(step):
             with stages("gate"):
-                self.gating.in_training(step + 1)
+                if self.gating.in_training(step + 1):
+                    self.minimum_scale.update()
+
+    def _thin(self) -> None:
+        """Drop the Gaussians of the smallest summed blend weight, until `train.densify.thin_to` of them are left."""
+        share = self.config.train.densify.thin_to
+        assert share is not None
+        self.rows.select(heaviest(blend_weights(self.model, self.scene.train, self.renderer.antialias), share))
 
     def _tell_full(self, refused: int) -> None:
         """Say once that no more Gaussians are made than the config allows."""

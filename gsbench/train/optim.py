@@ -102,9 +102,9 @@ class Optimizer:
                    state["step"])  # fmt: skip
         parameter.grad = None
 
-    def follow(self, model: GaussianModel, rows: Tensor, fresh: Tensor) -> None:
+    def follow(self, rows: Tensor, fresh: Tensor) -> None:
         """Move Adam's moments as `model.select(rows)` moved the Gaussians; those of `fresh` rows become zero."""
-        for parameter in model.splats.values():
+        for parameter in self.model.splats.values():
             state = self.adam.state.get(parameter, {})
             for name in ("exp_avg", "exp_avg_sq"):
                 if name in state:

@@ -21,6 +21,7 @@ from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.losses import photometric
+from gsbench.train.penalties import Penalty
 
 Sums = dict[int, Tensor]  # gradients by the id of what they are by
 
@@ -62,14 +63,16 @@ class Step:
         self.ssim_weight = ssim_weight
         self.antialias = antialias
         self.stages = stages
+        self.penalties: Sequence[tuple[float, Penalty]] = ()
 
-    def __call__(self, views: Sequence[View]) -> list[Seen]:
-        """The loss is the mean over `views`.
+    def __call__(self, views: Sequence[View], penalties: Sequence[tuple[float, Penalty]] = ()) -> list[Seen]:
+        """The loss is the mean over `views`, each with `penalties` (weight, penalty) added to it.
 
         Raises:
             DivergedError: a slice is not finite.
             InputError: the rasterizer refuses a slice for another reason; TooLargeError: memory would not suffice.
         """
+        self.penalties = penalties
         sources = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
         workers = min(len(views), self.model.backend.workers(self.model.splats["means"]))
         total: Sums = {}
@@ -104,7 +107,8 @@ class Step:
         """See one view of a batch; its gradients are added to `sums`."""
         with Tape() as tape:
             with stages("slice"):
-                gaussians = self.model.slice(Query.of(view.camera, view.time))
+                query = Query.of(view.camera, view.time)
+                gaussians = self.model.slice(query)
             with stages("raster"):
                 try:
                     output = rasterize_slice(
@@ -116,6 +120,8 @@ class Step:
                     raise DivergedError(str(error)) from None
             with stages("loss"):
                 loss = photometric(output.image, view.image[None], self.ssim_weight, self.model.backend)
+                for weight, penalty in self.penalties:
+                    loss = loss + weight * penalty(self.model, query)
         with stages("backward"):
             means2d = output.info.means2d
             tape.backward(loss, torch.full_like(loss, 1 / views), [*sources, means2d], sums)

@@ -103,7 +103,8 @@ def test_every_key_is_of_training_or_of_measuring() -> None:
             "iterations", "recipe_iterations", "batch_size", "ssim_weight", "sh_every", "refine_from",
             "modulation_from", "curve_points", *(f"densify.{name}" for name in (
                 "start", "stop", "every", "rounds", "reset_every", "grad_threshold", "clone_below", "prune_above",
-                "max_gaussians")))),
+                "max_gaussians", "thin_to", "kind")), "coarse", "penalties.opacity.weight", "penalties.opacity.start",
+                "penalties.opacity.stop", "penalties.size.weight", "penalties.size.start", "penalties.size.stop")),
     }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from gsbench.models import GaussianModel, Query, build
 from gsbench.models.render import render
 from gsbench.scenes import Camera
 from gsbench.scenes.points import random_points
-from gsbench.train.minimum_scale import LEAST_PIXELS, MinimumScale
+from gsbench.train.densify.minimum_scale import LEAST_PIXELS, MinimumScale
 
 OPTIONS = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_d": 0.05, "lambda_t": 0.05}}
 

@@ -12,8 +12,9 @@ from gsbench.errors import InputError
 from gsbench.kernels.adam import adam
 from gsbench.models import GaussianModel, build
 from gsbench.scenes.points import random_points
-from gsbench.train.density import DensityControl
+from gsbench.train.densify.gradient import GradientDensification
 from gsbench.train.optim import Optimizer, adam_reference, rate_at
+from gsbench.train.rows import Rows
 
 RATES = {name: LearningRate(1e-2) for name in ("means", "scales", "quats", "opacities", "sh0", "shN")}
 
@@ -64,7 +65,7 @@ def test_a_copied_gaussian_does_not_inherit_momentum() -> None:
     before = copy.deepcopy({n: optimizer.adam.state[p]["exp_avg"] for n, p in model.splats.items()})
     rows = torch.tensor([5, 3, 3, 19])
     model.select(rows)
-    optimizer.follow(model, rows, fresh=torch.tensor([False, False, True, False]))
+    optimizer.follow(rows, fresh=torch.tensor([False, False, True, False]))
     for name, parameter in model.splats.items():
         moments = optimizer.adam.state[parameter]["exp_avg"]
         assert moments.shape == parameter.shape
@@ -94,7 +95,7 @@ def test_density_control_clones_small_splits_large_prunes_faint() -> None:
     """
     model, optimizer = fitted(6)
     descend(model, optimizer, 0)
-    control = DensityControl(model, optimizer, DensifyConfig(grad_threshold=1.0), min_opacity=0.01, views=3)
+    control = GradientDensification(Rows(model, optimizer), DensifyConfig(grad_threshold=1.0), 0.01, views=3)
     with torch.no_grad():
         model.splats["scales"].fill_(math.log(0.001))  # small: below 0.01 x extent 2
         model.splats["scales"][3:5] = math.log(0.1)  # large
@@ -105,7 +106,7 @@ def test_density_control_clones_small_splits_large_prunes_faint() -> None:
     gradients[[0, 3]] = torch.tensor([0.03, 0.0])  # x 100 / 2 pixels x 1 view = 1.5 > 1
     gradients[1] = torch.tensor([0.0, 0.03])  # x 50 / 2 = 0.75 < 1
     control.accumulate(*drawn_with(gradients), width=100, height=50, views=1)
-    control.densify(torch.Generator().manual_seed(1), prune_large=False)
+    control.densify(torch.Generator().manual_seed(1), has_reset=False)
     means = model.splats["means"].detach()[:, 0]
     assert len(model) == 7  # 1, 2, 4 kept; 0 cloned to two; 3 split in two; 5 pruned
     assert means[:5].tolist() == [0, 1, 2, 4, 0]
@@ -124,7 +125,7 @@ def test_no_more_gaussians_than_the_cap_and_the_largest_gradients_first() -> Non
     in a sort that is not stable, or takes the first rows whatever their gradients."""
     model, optimizer = fitted(6)
     config = DensifyConfig(grad_threshold=0.0, max_gaussians=9)
-    control = DensityControl(model, optimizer, config, min_opacity=0.01, views=3)
+    control = GradientDensification(Rows(model, optimizer), config, 0.01, views=3)
     with torch.no_grad():
         model.splats["scales"].fill_(math.log(0.001))
         model.splats["opacities"].fill_(0.0)
@@ -132,13 +133,13 @@ def test_no_more_gaussians_than_the_cap_and_the_largest_gradients_first() -> Non
     gradients = torch.zeros(6, 2)
     gradients[:, 0] = torch.tensor([0.0, 0.2, 0.1, 0.3, 0.2, 0.2])
     control.accumulate(*drawn_with(gradients), width=10, height=10, views=1)
-    assert control.densify(torch.Generator(), prune_large=False) == 2
+    assert control.densify(torch.Generator(), has_reset=False) == 2
     assert model.splats["means"].detach()[:, 0].tolist() == [0, 1, 2, 3, 4, 5, 1, 3, 4]
     control.accumulate(*drawn_with(torch.ones(9, 2)), width=10, height=10, views=1)
-    assert control.densify(torch.Generator(), prune_large=False) == 9
+    assert control.densify(torch.Generator(), has_reset=False) == 9
     control.config = DensifyConfig(grad_threshold=0.0, max_gaussians=5)  # fewer than a file to start from has
     control.accumulate(*drawn_with(torch.ones(9, 2)), width=10, height=10, views=1)
-    assert control.densify(torch.Generator(), prune_large=False) == 9
+    assert control.densify(torch.Generator(), has_reset=False) == 9
     assert len(model) == 9
 
 
@@ -147,13 +148,13 @@ def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
     model, optimizer = fitted(4)
     with torch.no_grad():
         model.splats["means"].copy_(torch.arange(4.0)[:, None].expand(4, 3))
-    control = DensityControl(model, optimizer, DensifyConfig(grad_threshold=1.0), min_opacity=0.01, views=3)
+    control = GradientDensification(Rows(model, optimizer), DensifyConfig(grad_threshold=1.0), 0.01, views=3)
     now_and_then, never = torch.tensor([True, False, True, True]), torch.tensor([True, False, False, True])
 
     def look(drawn: torch.Tensor, times: int) -> list[float]:
         for _ in range(times):
             control.accumulate(*drawn_with(torch.zeros(4, 2)[: len(model)], drawn), 10, 10, views=1)
-        control.densify(torch.Generator(), prune_large=False)
+        control.densify(torch.Generator(), has_reset=False)
         return model.splats["means"].detach()[:, 0].tolist()
 
     assert look(never, 4) == [0, 1, 2, 3]  # four views in a row may miss one of three
@@ -165,13 +166,12 @@ def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
 def test_counts_follow_the_rows_that_a_gate_kept() -> None:
     """Catches counts of views that stay where they were while the Gaussians move, and gradients of other Gaussians."""
     model, optimizer = fitted(4)
-    control = DensityControl(model, optimizer, DensifyConfig(), min_opacity=0.01, views=3)
+    control = GradientDensification(Rows(model, optimizer), DensifyConfig(), 0.01, views=3)
     for drawn in ([1, 0, 0, 0], [1, 1, 0, 1], [1, 0, 0, 1]):
         control.accumulate(*drawn_with(torch.ones(4, 2), torch.tensor(drawn)), 10, 10, views=1)
     assert control.unseen.tolist() == [0, 1, 3, 0]
     rows = torch.tensor([3, 2, 1])
-    model.select(rows)
-    control.follow(rows)
+    control.rows.select(rows)
     assert control.unseen.tolist() == [0, 3, 1]
     assert control.gradient.tolist() == control.seen.tolist() == [0, 0, 0]
 
@@ -182,10 +182,10 @@ def test_large_gaussians_are_pruned_only_when_asked() -> None:
     with torch.no_grad():
         model.splats["scales"].fill_(math.log(0.1))
         model.splats["scales"][0] = math.log(0.3)  # above 0.1 x extent 2
-    control = DensityControl(model, optimizer, DensifyConfig(), min_opacity=0.01, views=3)
-    control.densify(torch.Generator(), prune_large=False)
+    control = GradientDensification(Rows(model, optimizer), DensifyConfig(), 0.01, views=3)
+    control.densify(torch.Generator(), has_reset=False)
     assert len(model) == 4
-    control.densify(torch.Generator(), prune_large=True)
+    control.densify(torch.Generator(), has_reset=True)
     assert len(model) == 3
 
 
@@ -193,7 +193,7 @@ def test_opacity_reset_forgets_momentum() -> None:
     """Catches momentum that undoes the reset in the next steps, and a reset to below what is pruned."""
     model, optimizer = fitted(4)
     descend(model, optimizer, 0)
-    control = DensityControl(model, optimizer, DensifyConfig(), min_opacity=0.01, views=3)
+    control = GradientDensification(Rows(model, optimizer), DensifyConfig(), 0.01, views=3)
     control.reset_opacities()
     assert torch.sigmoid(model.splats["opacities"]).max().item() == pytest.approx(0.02)
     assert not optimizer.adam.state[model.splats["opacities"]]["exp_avg"].any()

@@ -2,22 +2,28 @@
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
 
+from gsbench.config import PenaltiesConfig
+from gsbench.errors import InputError
 from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
 from gsbench.models import Query
+from gsbench.models.render import rasterize_slice
+from gsbench.run.checks import check_values
 from gsbench.run.setup import build
-from gsbench.scenes.scene import Scene
+from gsbench.scenes.scene import Scene, View
 from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import rate_at
+from gsbench.train.penalties import PENALTIES, penalties_at
 from gsbench.train.seeding import generator
 from gsbench.train.step import Seen
+from gsbench.train.thinning import blend_weights
 
 
 def trainer(model: str = "7dgs", *overrides: str, scene: Scene | None = None) -> Trainer:
@@ -112,7 +118,7 @@ def test_what_any_view_of_the_batch_saw_is_moved() -> None:
     for view in range(3):
         radii[view, 0, view] = 5  # each view sees the Gaussian of its number
     seen = [Seen(torch.ones(()), one, torch.zeros(1, N, 2)) for one in radii]
-    fitted.gradients = lambda _: seen  # type: ignore[assignment]
+    fitted.gradients = lambda *_: seen  # type: ignore[assignment]
     moved = []
     fitted.optimizer.step = lambda _, drawn, **__: moved.append(drawn)  # type: ignore[method-assign]
     for step in (0, 1):
@@ -137,7 +143,7 @@ def test_large_gaussians_go_once_opacities_were_reset() -> None:
     """Catches pruning by size that is never asked for, or asked for from the start."""
     fitted = trainer()
     asked = []
-    fitted.density.densify = lambda _, prune_large: asked.append(prune_large)  # type: ignore[method-assign]
+    fitted.density.densify = lambda _, has_reset: asked.append(has_reset)  # type: ignore[method-assign]
     fitted.schedule.densifies = lambda _: True  # type: ignore[method-assign]
     fitted.schedule.resets = lambda _: False  # type: ignore[method-assign]
     for step in (0, fitted.schedule.reset_every - 1, fitted.schedule.reset_every):
@@ -181,7 +187,7 @@ def test_what_is_long_in_time_is_split_along_its_path() -> None:
     density.gradient[:2], density.seen[:2] = 1.0, 1.0
     times = model.splats["times"].detach()[:2].clone()
     N = len(model)
-    density.densify(generator(0), prune_large=False)
+    density.densify(generator(0), has_reset=False)
     assert len(model) == N + 2
     children, clone = model.splats["times"].detach()[-2:], model.splats["times"].detach()[-3]
     assert (children != times[0]).all()
@@ -276,3 +282,85 @@ def test_the_bar_tells_seconds_and_val_without_reading_the_clock(
     last = capsys.readouterr().err.split("\r")[-1]
     assert fitted.curve.progress in last
     assert re.search(r"\d+ s of training, val \d+\.\d\d dB \([+-]\d", last)
+
+
+def test_early_steps_see_small_images() -> None:
+    """Catches a resolution that is not the schedule's, a camera that does not shrink with its image, or its centre."""
+    fitted = trainer("3dgs", "train.coarse=[[2,15000]]", "train.batch_size=1")
+    looked: list[View] = []
+    real = fitted.gradients
+    fitted.gradients = lambda views, penalties: looked.extend(views) or real(views, penalties)  # type: ignore[assignment]
+    half = fitted.schedule.scaled(15_000)
+    for fitted.step in (0, half - 1, half):
+        fitted._descend()
+    width = fitted.scene.train[0].camera.width
+    assert [view.camera.width for view in looked] == [width // 2] * 2 + [width]
+    small, full = looked[0], next(view for view in fitted.scene.train if view.name == looked[0].name)
+    assert list(small.image.shape[:2]) == [small.camera.height, small.camera.width]
+    torch.testing.assert_close(small.camera.K[:2], full.camera.K[:2] / 2)
+    torch.testing.assert_close(small.image[3, 5], full.image[6:8, 10:12].mean((0, 1)))
+    assert not fitted.pyramid._reduced, "small images that no later step needs"
+
+
+def test_the_lightest_gaussians_go_and_moments_follow() -> None:
+    """Catches the heaviest that go, a weight of the wrong rows, and moments or counts of other Gaussians."""
+    fitted = trainer("3dgs", "train.densify.thin_to=0.5")
+    fitted._descend()
+    model, N = fitted.model, len(fitted.model)
+    weights = blend_weights(model, fitted.scene.train, antialias=False)
+    kept = weights.argsort(descending=True, stable=True)[: round(N / 2)].sort().values
+    means = model.splats["means"].detach().clone()
+    moments = fitted.optimizer.adam.state[model.splats["means"]]["exp_avg"].clone()
+    fitted._thin()
+    assert torch.equal(model.splats["means"], means[kept])
+    assert torch.equal(fitted.optimizer.adam.state[model.splats["means"]]["exp_avg"], moments[kept])
+    assert len(fitted.minimum_scale.least) == len(fitted.density.unseen) == len(kept)
+    at = max(fitted.schedule.scaled(15_600), fitted.schedule.densify_stop)
+    assert [step for step in range(100) if fitted.schedule.thins(step)] == [at - 1]
+
+
+def test_blend_weights_add_up_to_alpha() -> None:
+    """Catches weights of another channel count or view: the weights of a pixel add up to its alpha."""
+    fitted = trainer("3dgs")
+    view = fitted.scene.train[0]
+    seen = fitted.model.slice(Query.of(view.camera, view.time))
+    alpha = rasterize_slice(seen, view.camera, torch.zeros(3), fitted.model.backend).alpha
+    weights = blend_weights(fitted.model, [view], antialias=False)
+    torch.testing.assert_close(weights.sum(), alpha.detach().sum(), rtol=1e-4, atol=0)
+
+
+def test_penalties_act_in_their_window_and_reach_the_gradient() -> None:
+    """Catches a penalty that acts always or never, or that is added once for each view of a batch."""
+    words = ("train.batch_size=2", "train.penalties.opacity.weight=3.0", "train.penalties.opacity.start=15000")
+    plain, penalised = trainer("3dgs", "train.batch_size=2"), trainer("3dgs", *words)
+    start = penalised.schedule.scaled(15_000)
+    for step, acts in ((start - 2, False), (start - 1, True)):
+        found = []
+        for one in (plain, penalised):
+            one.gradients(one.scene.train[:2], penalties_at(step, one.config.train.penalties, one.schedule))
+            found.append(one.model.splats["opacities"].grad)
+        opacities = torch.sigmoid(plain.model.splats["opacities"].detach())
+        expected = 3.0 * opacities * (1 - opacities) / len(opacities)
+        torch.testing.assert_close(found[1] - found[0], expected * acts, rtol=1e-3, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("train.densify.kind=gradiant", "train.densify.kind 'gradiant' is not known. Did you mean 'gradient'"),
+        ("train.penalties.opacity.stop=0", "train.penalties.opacity: expected stop above start"),
+        ("train.penalties.size.weight=-1", "train.penalties.size.weight: expected"),
+        ("train.coarse=[[2,3000],[4,15000]]", "factors falling and steps rising"),
+        ("train.coarse=[[1,3000]]", "expected pairs (factor above 1"),
+    ],
+)
+def test_faulty_schedules_are_refused(word: str, said: str) -> None:
+    """Catches a typo that trains by another rule than was asked for."""
+    with pytest.raises(InputError) as refused:
+        check_values(compose("3dgs", 100, word))
+    assert said in str(refused.value)
+
+
+def test_every_penalty_has_its_settings() -> None:
+    """Catches a penalty without a weight in the config, and a weight that nothing reads."""
+    assert {field.name for field in fields(PenaltiesConfig)} == set(PENALTIES)

@@ -1,4 +1,4 @@
-"""Keep Gaussians from shrinking below what the training cameras resolve, a small part of a pixel."""
+"""Keep Gaussians at a minimum scale: a small part of a pixel of the training camera that resolves them best."""
 
 import torch
 from torch import Tensor
@@ -14,10 +14,10 @@ LEAST_PIXELS = 0.05
 
 
 class MinimumScale:
-    """The least size of each Gaussian in space: LEAST_PIXELS in the training camera in which it is largest."""
+    """The minimum scale of each Gaussian in space: LEAST_PIXELS in the training camera in which it is largest."""
 
     def __init__(self, model: GaussianModel, cameras: list[Camera]) -> None:
-        """Measure the minimum scale of `model`, which is initialised and on its device, for the training `cameras`."""
+        """Measure the minimum scales of `model`, which is initialised and on its device, for the training `cameras`."""
         self.model = model
         self.centers = torch.stack([camera.center for camera in cameras])  # [C, 3]
         self.focal = torch.stack([camera.K[[0, 1], [0, 1]].amax() for camera in cameras])  # [C] pixels
@@ -25,20 +25,24 @@ class MinimumScale:
 
     @torch.no_grad()
     def update(self) -> None:
-        """Measure the minimum scale again, after Gaussians were moved, added or removed."""
+        """Measure them again, after Gaussians were moved, added or removed."""
         means = self.model.splats["means"]
         pixel = means.new_full((len(means),), torch.inf)  # [N] width of a pixel at the Gaussian's distance, world units
         for center, focal in zip(self.centers, self.focal, strict=True):
             pixel = torch.minimum(pixel, (means - center).norm(dim=-1) / focal)
         self.least = LEAST_PIXELS * pixel
 
+    def follow(self, rows: Tensor, fresh: Tensor) -> None:
+        """Keep the minimum scales of the given rows, until they are measured again."""
+        self.least = self.least[rows]
+
     @torch.no_grad()
     def hold(self) -> None:
-        """Raise sizes that are below the minimum scale."""
+        """Raise sizes that are below."""
         self.model.hold_sizes(self.least)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the minimum scale, for the checkpoint."""
+        """Return the minimum scales, for the checkpoint."""
         return {"least": self.least}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:

@@ -1,44 +1,41 @@
-"""Control the density of Gaussians: clone small ones, split large ones, prune faint and unseen ones (3DGS, 5.2)."""
+"""Densify by gradients: clone small Gaussians, split large ones, prune faint and unseen ones (3DGS, section 5.2)."""
 
 import torch
 from torch import Tensor
 
 from gsbench.config import DensifyConfig
-from gsbench.models import GaussianModel
 from gsbench.models.base import CHILDREN
 from gsbench.train.checkpoint import tensor
-from gsbench.train.optim import Optimizer
-
-# Of the runs of the 7DGS paper the largest has 1.41 million, of those here 0.55. A Gaussian of 7DGS has 84 numbers,
-# four times with its gradient and moments: 2.7 GB for so many.
-MOST_GAUSSIANS = 2_000_000
+from gsbench.train.densify.base import MOST_GAUSSIANS, Densification
+from gsbench.train.rows import Rows
 
 
-class DensityControl:
-    """Adaptive density control: collects gradients of 2D means, then edits the model and the optimizer's moments."""
+class GradientDensification(Densification):
+    """The adaptive density control of 3DGS: Gaussians whose 2D mean has a large mean gradient are cloned or split.
 
-    def __init__(
-        self, model: GaussianModel, optimizer: Optimizer, config: DensifyConfig, min_opacity: float, views: int
-    ) -> None:
-        """Start with nothing collected.
+    Defaults of `train.densify`, whose steps are those of a run of 30,000:
 
-        Args:
-            model: initialised.
-            optimizer: of the model; its moments follow the Gaussians.
-            config: thresholds.
-            min_opacity: a Gaussian below it is pruned.
-            views: the number of training views, an epoch.
-        """
-        self.model = model
-        self.optimizer = optimizer
-        self.config = config
-        self.min_opacity = min_opacity
+    - every 100 steps (and at most 36 rounds) from 500 to 15,000: where the mean gradient of the 2D mean, in units of
+      half the image, is above 2e-4, a Gaussian is cloned if its largest scale is at most 0.01 of the scene's extent and
+      it is not long in time, and otherwise split into two that are 1.6 times smaller;
+    - in the same round a Gaussian is pruned whose opacity is below 0.005, that no view of an epoch has seen, or, after
+      the first reset of opacities, whose largest scale is above 0.1 of the extent;
+    - every 3,000 steps opacities are lowered to at most twice the pruning threshold.
+
+    Source: 3DGS, section 5.2, and its code for the numbers; 7DGS, section 4.4, for splits of Gaussians long in time.
+    """
+
+    kind = "gradient"
+
+    def __init__(self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int) -> None:
+        """Start with nothing accumulated; see `Densification`."""
+        super().__init__(rows, config, min_opacity, views)
         self.patience = 2 * views - 1  # this many views in a row contain a whole epoch, wherever they begin
-        self.unseen = torch.zeros(len(model), dtype=torch.int32, device=model.splats["means"].device)
+        self.unseen = torch.zeros(len(rows), dtype=torch.int32, device=self.model.splats["means"].device)
         self.forget()
 
     def forget(self) -> None:
-        """Drop the collected gradients."""
+        """Drop the accumulated gradients."""
         like = self.model.splats["opacities"].detach()
         self.gradient = torch.zeros_like(like)  # [N] sum over views of |gradient of the 2D mean|
         self.seen = torch.zeros_like(like)  # [N] number of views in which the Gaussian was visible
@@ -52,15 +49,7 @@ class DensityControl:
         height: int,
         views: int,
     ) -> None:
-        """Add the gradients of one view, in units of half the image (NDC).
-
-        Args:
-            radii: of the splats in pixels; 0 where the Gaussian was culled.
-            g_means2d: gradient of the loss, a mean over `views`, by the 2D means.
-            width: of the image, pixels.
-            height: of the image, pixels.
-            views: in the batch.
-        """
+        """Add the gradients of one view, in units of half the image (NDC); see `Densification.accumulate`."""
         x, y = g_means2d.unbind(-1)  # scaled separately: making a tensor of the two sizes would wait for the GPU
         self.gradient += torch.hypot(x * (views * width / 2), y * (views * height / 2)).sum(0)
         drawn = (radii > 0).sum(0)
@@ -69,7 +58,7 @@ class DensityControl:
         self.unseen = torch.where(drawn > 0, 0, self.unseen + len(radii))
 
     @torch.no_grad()
-    def densify(self, generator: torch.Generator, prune_large: bool) -> int:
+    def densify(self, generator: torch.Generator, has_reset: bool) -> int:
         """Clone, split and prune Gaussians; the children of a split are sampled with `generator`.
 
         Returns:
@@ -84,16 +73,16 @@ class DensityControl:
 
         kept, cloned = (~split).nonzero()[:, 0], clone.nonzero()[:, 0]
         parents = split.nonzero()[:, 0].repeat_interleave(CHILDREN)
-        self._select(torch.cat([kept, cloned, parents]), fresh=len(cloned) + len(parents))
+        chosen = torch.cat([kept, cloned, parents])
+        self.rows.select(chosen, fresh=torch.arange(len(chosen), device=chosen.device) >= len(kept))
         children = torch.arange(len(model) - len(parents), len(model), device=parents.device)
         model.split_rows(children, generator)
 
         # A Gaussian that no view sees gets no gradient, so it would never come back, and it costs as much as any other.
         keep = (torch.sigmoid(model.splats["opacities"]) >= self.min_opacity) & (self.unseen < self.patience)
-        if prune_large:
+        if has_reset:  # from then on Gaussians that are too large are pruned
             keep &= model.scales() <= config.prune_above * model.extent
-        self._select(keep.nonzero()[:, 0], fresh=0)
-        self.forget()
+        self.rows.select(keep.nonzero()[:, 0])
         return refused
 
     def _wanted(self) -> tuple[Tensor, int]:
@@ -113,10 +102,10 @@ class DensityControl:
     def reset_opacities(self) -> None:
         """Lower opacities to twice the pruning threshold; needed Gaussians grow back before the next pruning."""
         self.model.reset_opacities(2 * self.min_opacity)
-        self.optimizer.forget(self.model.splats["opacities"])
+        self.rows.forget("opacities")
 
-    def follow(self, rows: Tensor) -> None:
-        """Keep the counts of the given rows, in their order, after `model.select(rows)`."""
+    def follow(self, rows: Tensor, fresh: Tensor) -> None:
+        """Keep since when the given rows are unseen; gradients begin anew with every change of the rows."""
         self.unseen = self.unseen[rows]
         self.forget()
 
@@ -131,9 +120,3 @@ class DensityControl:
             tensor(state, name, opacities.shape, opacities.dtype) for name in ("gradient", "seen")
         )
         self.unseen = tensor(state, "unseen", opacities.shape, torch.int32)
-
-    def _select(self, rows: Tensor, fresh: int) -> None:
-        is_fresh = torch.arange(len(rows), device=rows.device) >= len(rows) - fresh
-        self.model.select(rows)
-        self.unseen = self.unseen[rows]
-        self.optimizer.follow(self.model, rows, is_fresh)

@@ -1,0 +1,21 @@
+"""Choose how a training adds and removes Gaussians: one interface (base.py), a rule for each `train.densify.kind`."""
+
+from gsbench.config import DensifyConfig
+from gsbench.errors import InputError, did_you_mean
+from gsbench.train.densify.base import Densification
+from gsbench.train.densify.gradient import GradientDensification
+from gsbench.train.rows import Rows
+
+KINDS: dict[str, type[Densification]] = {rule.kind: rule for rule in (GradientDensification,)}
+
+
+def check_kind(kind: str) -> None:
+    """Raise InputError for a kind of densification that is not known."""
+    if kind not in KINDS:
+        raise InputError(f"train.densify.kind '{kind}' is not known. {did_you_mean(kind, KINDS)}")
+
+
+def densification(rows: Rows, config: DensifyConfig, min_opacity: float, views: int) -> Densification:
+    """Make the rule of a training; see `Densification` for the arguments."""
+    check_kind(config.kind)
+    return KINDS[config.kind](rows, config, min_opacity, views)

@@ -1,0 +1,87 @@
+"""Define what a rule of densification must have.
+
+A rule sees every view's gradients (`accumulate`), and changes rows in rounds (`densify`). It edits Gaussians by
+`Rows.select` and the model's own `split`, so it knows no parameter of a model.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from gsbench.config import DensifyConfig
+from gsbench.train.rows import Rows
+
+# Of the runs of the 7DGS paper the largest has 1.41 million, of those here 0.55. A Gaussian of 7DGS has 84 numbers,
+# four times with its gradient and moments: 2.7 GB for so many.
+MOST_GAUSSIANS = 2_000_000
+
+
+class Densification(ABC):
+    """A rule by which Gaussians are added and removed during a training."""
+
+    kind: ClassVar[str]  # its name in train.densify.kind
+
+    def __init__(self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int) -> None:
+        """Prepare the rule for a training, and follow its rows.
+
+        Args:
+            rows: of the model, which is initialised.
+            config: thresholds.
+            min_opacity: a Gaussian below it is of no use.
+            views: the number of training views, an epoch.
+        """
+        self.rows = rows
+        self.model = rows.model
+        self.config = config
+        self.min_opacity = min_opacity
+        self.views = views
+        rows.add(self)
+
+    @abstractmethod
+    def accumulate(
+        self,
+        radii: Tensor,  # [C, N]
+        g_means2d: Tensor,  # [C, N, 2] per pixel
+        width: int,
+        height: int,
+        views: int,
+    ) -> None:
+        """Take in the gradients of one view of a batch.
+
+        Args:
+            radii: of the splats in pixels; 0 where the Gaussian was culled.
+            g_means2d: gradient of the loss, a mean over `views`, by the 2D means.
+            width: of the image, pixels.
+            height: of the image, pixels.
+            views: in the batch.
+        """
+
+    @abstractmethod
+    def densify(self, generator: torch.Generator, has_reset: bool) -> int:
+        """Do one round; all random numbers come from `generator`.
+
+        Args:
+            generator: of this round.
+            has_reset: whether opacities were reset before.
+
+        Returns:
+            How many Gaussians were refused because there would be too many.
+        """
+
+    @abstractmethod
+    def reset_opacities(self) -> None:
+        """Lower all opacities, if the rule does so; called at the steps that `Schedule.resets` names."""
+
+    @abstractmethod
+    def follow(self, rows: Tensor, fresh: Tensor) -> None:
+        """Keep what was accumulated for `rows`; see `gsbench.train.rows.Follower`."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Return what was accumulated, for the checkpoint."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from the `state_dict` of a checkpoint; raises InputError where it is not of this many Gaussians."""

@@ -1,0 +1,62 @@
+"""Keep all that has one entry for each Gaussian in step with the model: moments, counts and minimum scales."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from gsbench.models import GaussianModel
+
+
+class Follower(Protocol):
+    """Part of a training that has one entry for each Gaussian."""
+
+    def follow(self, rows: Tensor, fresh: Tensor) -> None:
+        """Keep the entries of `rows` [M], in their order; those where `fresh` [M] bool start anew."""
+
+
+class Moments(Follower, Protocol):
+    """The optimizer's moments, which also follow a parameter that was set directly."""
+
+    def forget(self, parameter: Tensor) -> None:
+        """Zero the moments of a parameter."""
+
+
+class Rows:
+    """The rows of a model, one for each Gaussian, and all that follows them.
+
+    Densification, thinning and gates change rows here and nowhere else, so that nothing is left behind.
+    """
+
+    def __init__(self, model: GaussianModel, moments: Moments) -> None:
+        """Start with a model that its optimizer's moments follow, and nothing else."""
+        self.model = model
+        self._moments = moments
+        self._followers: list[Follower] = [moments]
+
+    def __len__(self) -> int:
+        return len(self.model)
+
+    def add(self, follower: Follower) -> None:
+        """Let a part follow every change of the rows from now on."""
+        self._followers.append(follower)
+
+    def select(self, rows: Tensor, fresh: Tensor | None = None) -> None:
+        """Keep `rows` [M] of the model, in their order; a row may be repeated.
+
+        Args:
+            rows: indices of the rows before.
+            fresh: which of them are new Gaussians, [M] bool; none by default.
+        """
+        self.model.select(rows)
+        self.moved(rows, fresh)
+
+    def forget(self, name: str) -> None:
+        """Zero the moments of the parameter `name`, which was set directly."""
+        self._moments.forget(self.model.splats[name])
+
+    def moved(self, rows: Tensor, fresh: Tensor | None = None) -> None:
+        """Let all followers know of rows [M] that the model has taken already."""
+        fresh = torch.zeros(len(rows), dtype=torch.bool, device=rows.device) if fresh is None else fresh
+        for follower in self._followers:
+            follower.follow(rows, fresh)
