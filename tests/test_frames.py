@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsbench.kernels.backends import CPU, CUDA, Backend
-from gsbench.run import attempt
+from gsbench.run import measuring
 from gsbench.scenes.scene import Camera, View
 from gsbench.train.renderer import Renderer
 
@@ -35,7 +35,7 @@ class Refused(Recorded):
 
 def test_on_a_cpu_frames_are_launched() -> None:
     """Catches a protocol that speaks of replays where there are none."""
-    frame, made = attempt.frames(trainer(CPU), VIEW)
+    frame, made = measuring.frames(trainer(CPU), VIEW)
     assert (frame(VIEW), made) == ("launched", {})
 
 
@@ -44,8 +44,8 @@ def test_on_a_gpu_the_record_says_which(
     replay: type[Recorded], made: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches a finished training lost to a model that waits for the device, and an FPS that hides how it was made."""
-    monkeypatch.setattr(attempt, "GraphedFrames", replay)
-    frame, told = attempt.frames(trainer(CUDA), VIEW)
+    monkeypatch.setattr(measuring, "GraphedFrames", replay)
+    frame, told = measuring.frames(trainer(CUDA), VIEW)
     assert (frame(VIEW), told) == (made, {"frames": made})
     said = capsys.readouterr().err
     assert ("cannot record this model: operation not permitted when stream is capturing\n" in said) == (

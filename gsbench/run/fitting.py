@@ -1,0 +1,106 @@
+"""Fit a model: initialise it, train it from step 0 or from a checkpoint, and stop when the process is told to."""
+
+import signal
+import sys
+from typing import Any
+
+import torch
+
+from gsbench.config import Config, DataConfig
+from gsbench.errors import InputError
+from gsbench.measure.settings import training_hash
+from gsbench.measure.speed import reset_peak_memory
+from gsbench.models import GaussianModel
+from gsbench.models.start import start_from
+from gsbench.run import progress, stop
+from gsbench.run.checks import evaluated_views
+from gsbench.run.identity import Run
+from gsbench.run.load import plain_description
+from gsbench.run.resolve import Resolved
+from gsbench.scenes import Points, Scene
+from gsbench.scenes.points import frustum_points, random_points
+from gsbench.scenes.trained import TrainedGaussians
+from gsbench.train import checkpoint
+from gsbench.train.checkpoint import Checkpoint
+from gsbench.train.finite_check import DivergedError
+from gsbench.train.loop import Trainer
+from gsbench.train.seeding import generator
+
+
+def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: TrainedGaussians | None) -> Trainer:
+    """Initialise a model and prepare its training.
+
+    Args:
+        model: without Gaussians.
+        scene: gives the views, and the points where the data set has some.
+        config: of the run.
+        start: trained Gaussians to start from; None: points.
+    """
+    random = generator(config.seed)
+    if start is not None:
+        start_from(model, start, scene.extent, random)
+    else:
+        model.initialise(scene.points or initial_points(config.data, scene, random), scene.extent, random)
+    model.to(config.device)
+    return Trainer(model, scene, evaluated_views(scene, config.scene.eval_split), config)
+
+
+def fit(trainer: Trainer, this: Run, resolved: Resolved, plain: dict[str, Any]) -> None:
+    """Train to the end, starting from this training's checkpoint where the run's folder has one.
+
+    Args:
+        trainer: at step 0.
+        this: the run.
+        resolved: its config, and the seconds of the time screen, which count as training.
+        plain: the config in plain values, for the checkpoint.
+
+    Raises:
+        InputError: the checkpoint is damaged, or no Gaussian is left.
+        DivergedError: a loss or gradient was not finite.
+        Stopped: the process was told to end; the checkpoint is saved.
+    """
+    config = resolved.config
+    reset_peak_memory(config.device)
+    path, hashes = this.folder / checkpoint.FILE_NAME, (training_hash(this.plain), trainer.scene.fingerprint)
+    state = checkpoint.load(path, *hashes, config.device) if config.resume else None
+    if state is not None:
+        trainer.load_state_dict(state)
+        print(f"{this.name}: continues from step {trainer.step} of {path}", file=sys.stderr)
+    elif resolved.screen is not None:
+        trainer.stages.add("screen", resolved.screen.seconds)
+        trainer.effort.add(resolved.effort)
+    about = plain, plain_description(trainer.scene)
+    with stop.requested() as request:
+        report = progress.Reporter(this.folder, this.overrides, config.train.iterations)
+
+        def goes_on() -> bool:
+            if report.is_due():
+                report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
+            return request.signal is None
+
+        trainer.run(lambda state: checkpoint.save(path, Checkpoint(*hashes, state, *about)), this.name, goes_on)
+        if request.signal is not None and trainer.step < config.train.iterations:
+            report.end()
+            if request.signal == signal.SIGUSR2:  # submitit's handler puts the job back into the queue, and ends it
+                request.hand_on(request.signal)
+            raise stop.Stopped(request.signal, f"{this.name}: stopped at step {trainer.step}, saved in {path}: "
+                                               f"the same command continues from there")  # fmt: skip
+    _check_fitted(trainer)
+
+
+def _check_fitted(trainer: Trainer) -> None:
+    """Raise DivergedError for a parameter that is not finite, and InputError where no Gaussian is left."""
+    for name, parameter in trainer.model.named_parameters():  # no image shows a colour of -inf: it is black
+        if not parameter.isfinite().all():
+            raise DivergedError(f"step {trainer.step}: '{name}' has values that are not finite")
+    if not len(trainer.model):
+        raise InputError("no Gaussian is left: the training pruned all of them; look at train.densify, "
+                         "model.min_opacity and data.initial_half_width")  # fmt: skip
+
+
+def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:
+    """Sample points to start from where the data set has none: in a cube, or in the frustum that all cameras share."""
+    if data.initial_half_width is not None:
+        return random_points(data.initial_points, data.initial_half_width, random)
+    cameras = [view.to("cpu").camera for view in scene.train]
+    return frustum_points(data.initial_points, cameras, scene.extent, random)

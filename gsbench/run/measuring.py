@@ -1,0 +1,119 @@
+"""Measure a fitted model: the quality of its images, the time of a frame, what the training cost."""
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy.typing as npt
+from torch import Tensor
+
+from gsbench.config import Config
+from gsbench.effects import picture
+from gsbench.errors import one_line
+from gsbench.measure.images import Pixels, strip
+from gsbench.measure.quality import Quality, evaluate, evenly
+from gsbench.measure.record import Cost, ViewScore
+from gsbench.measure.speed import peak_memory, synchroniser, time_renders
+from gsbench.models.cuda_graph import GraphedFrames
+from gsbench.run.checks import lpips_weights
+from gsbench.scenes import View
+from gsbench.train.loop import Trainer
+
+Pairs = list[tuple[npt.ArrayLike, npt.ArrayLike]]  # render and ground truth, [H, W, 3] each
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was measured of a fitted model, for its record, and the images that people look at."""
+
+    metrics: dict[str, float | None]
+    missing: dict[str, str]  # why a metric has no value
+    per_view: list[ViewScore]
+    cost: Cost
+    frames: dict[str, str]  # how frames are made on a GPU, for the record's protocol
+    images: dict[str, Pixels]  # by file name
+
+
+def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measured:
+    """Measure a fitted model on the evaluated views.
+
+    Args:
+        trainer: at its end.
+        config: of the run.
+        with_effect_sets: whether the Gaussians are drawn by their effect sets too.
+    """
+    views = trainer.views
+    shown: Pairs = []
+    quality = evaluate(
+        _rendered(trainer, config.protocol.pictures, shown),
+        background=trainer.scene.background,
+        quantised=config.protocol.quantise,
+        weights=lpips_weights(config),
+    )
+    frame, made = frames(trainer, views[0])
+    times = time_renders(
+        lambda i: frame(views[i % len(views)]),
+        count=max(config.protocol.renders, len(views)),
+        synchronise=synchroniser(config.device),
+    )
+    cost = Cost(
+        train_s=sum(trainer.stages.seconds.values()),
+        stage_s=trainer.stages.state_dict(),
+        render_ms=times,
+        fps=times.fps,
+        num_gaussians=len(trainer.model),
+        bytes=trainer.model.stored_bytes(),
+        peak_memory=peak_memory(config.device),
+        train_cpu_s=trainer.effort.cpu_s,
+        load=trainer.effort.load,
+    )
+    metrics, missing = with_best(quality, trainer, config)
+    metrics["psnr_train"] = trainer.psnr(evenly(trainer.scene.train, len(views)))
+    images = {"pictures.png": strip(shown)} if shown else {}
+    if shown and with_effect_sets:
+        first, renderer = views[0], trainer.renderer
+        images["classes.png"] = picture.draw(
+            trainer.model, first.camera, first.time, renderer.background, renderer.antialias
+        )
+    return Measured(metrics, missing, quality.per_view, cost, made, images)
+
+
+def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[str, Tensor, Tensor]]:
+    """Yield (name, render, ground truth) of every evaluated view; a few evenly spaced pairs go to `shown` too."""
+    views = trainer.views
+    chosen = range(0, len(views), max(1, len(views) // max(1, pictures)))[:pictures]
+    for i, view in enumerate(views):  # one at a time: fifty views of 2048 x 1088 take 3 GB
+        render, truth = trainer.render(view), view.image
+        if i in chosen:
+            shown.append((render.cpu().numpy(), truth.cpu().numpy()))
+        yield view.name, render, truth
+
+
+def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dict[str, str]]:
+    """Choose the function whose FPS is measured, and the record's protocol entry on how it makes frames on a GPU.
+
+    Frames are `replayed` from a CUDA graph where CUDA can record the model. Otherwise each frame is `launched` anew.
+    """
+    if trainer.model.backend.name != "cuda":
+        return trainer.render, {}
+    graphed = GraphedFrames(trainer.model, trainer.renderer.background, trainer.renderer.antialias)
+    try:
+        graphed(first.camera, first.time)
+    except RuntimeError as error:  # an operation that waits for the device, in a model or a scheme written in torch
+        print(f"FPS is that of launched frames: CUDA cannot record this model: {one_line(error)}", file=sys.stderr)
+        return trainer.render, {"frames": "launched"}
+    return lambda view: graphed(view.camera, view.time), {"frames": "replayed"}
+
+
+def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[str, float | None], dict[str, str]]:
+    """Add the metrics of the evaluated split at the best iterations to those of the last iteration."""
+    metrics, missing = dict(quality.metrics), dict(quality.missing)
+    metrics["psnr_best_on_val"] = trainer.best.eval_at_best_val
+    if config.scene.eval_split == "val":
+        metrics["psnr_best_on_val"] = None
+        missing["psnr_best_on_val"] = "measured on val, so no other split is left to choose an iteration by"
+    elif metrics["psnr_best_on_val"] is None:
+        missing["psnr_best_on_val"] = "the scene has no val split"
+    if config.protocol.best_on_test:
+        metrics["psnr_best_on_test"] = trainer.best.eval
+    return metrics, missing
