@@ -3,10 +3,14 @@
 This module needs no torch, so that the page of a report can mark what a schedule did.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from gsbench.config import TrainConfig
+if TYPE_CHECKING:  # config.py needs hydra, which a machine that checks kernels may lack
+    from gsbench.config import TrainConfig
 
 # Some intervals are a number of steps in a run of any length: clones need `densify.every` steps to move apart, so it is
 # not scaled, and Adam needs this many between two resets to raise opacities again at its rate of 0.05.

@@ -6,15 +6,20 @@ A penalty is computed for every view of a batch, on the tape of that view. To ad
 PENALTIES and in `gsbench.config.PenaltiesConfig`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from gsbench.config import PenaltiesConfig, PenaltyConfig
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query
-from gsbench.schedule import Schedule
+
+if TYPE_CHECKING:  # config.py needs hydra, which a machine that checks kernels may lack
+    from gsbench.config import PenaltiesConfig, PenaltyConfig
+    from gsbench.schedule import Schedule
 
 Penalty = Callable[[GaussianModel, Query], Tensor]
 

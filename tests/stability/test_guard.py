@@ -48,8 +48,8 @@ def poison(run: Trainer, parameter: str, after: int) -> None:
     """From so many steps on, one Gaussian's gradient is NaN."""
     gradients, steps = run.gradients, [0]
 
-    def poisoned(batch: Sequence[View]) -> list[Seen]:
-        seen = gradients(batch)
+    def poisoned(batch: Sequence[View], *penalties: object) -> list[Seen]:
+        seen = gradients(batch, *penalties)
         steps[0] += 1
         if steps[0] > after:
             gradient = run.model.splats[parameter].grad
