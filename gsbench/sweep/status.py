@@ -159,10 +159,12 @@ def _launching(requested: RequestedRun, queue: Queue) -> bool:
 
 
 def _explained(experiment: Experiment, one: Identity, run: RunStatus, endings: dict[str, str]) -> RunStatus:
-    """Add to a lost run on Slurm how its job ended and the telling line of its log."""
-    if run.state != "lost" or run.job is None:
+    """Add to a run on Slurm without a record how its job ended, where it is lost, and the telling line of its log."""
+    if run.state not in BROKEN or run.job is None or run.record is not None:
         return run
-    parts = [run.reason or "", f"job {run.job} ended: {endings.get(run.job, 'Slurm no longer knows how')}"]
+    parts = [run.reason or ""]
+    if run.state == "lost":
+        parts.append(f"job {run.job} ended: {endings.get(run.job, 'Slurm no longer knows how')}")
     requested = experiment.requested.get(one)
     if requested and requested.job == run.job:
         log = requested.folder / JOBS / run.job / f"{run.job}_0_log.err"

@@ -145,6 +145,19 @@ def test_a_slurm_that_is_silent_is_said(tmp_path: Path) -> None:
     assert "squeue is not on this machine" in "\n".join(show.lines(tmp_path, [run], down.silent))
 
 
+def test_a_job_that_ended_without_a_record_quotes_its_log(tmp_path: Path) -> None:
+    """Catches a full disk that is named nowhere: the note of the run's end still fitted, its record did not."""
+    folder = planned(tmp_path)
+    job = folder / plan.JOBS / "7"
+    job.mkdir(parents=True)
+    (job / "7_0_log.err").write_text("step 5\ngsbench: error: its record cannot be written: No space left on device\n")
+    plan.write_ended(folder, 0, plan.Ended(None, "it ended without a record"))
+    run = only(tmp_path, Queue({}))
+    assert run.state == "failed"
+    assert "it ended without a record; its log ends: gsbench: error: its record" in str(run.reason)
+    assert "No space left on device" in str(run.reason)
+
+
 @pytest.mark.parametrize(
     ("job", "step", "log", "said"),
     [
