@@ -1,0 +1,79 @@
+"""Draw README's frontier: PSNR on test against seconds of training, a line for each model, from published records.
+
+python docs/site/frontier_chart.py
+"""
+
+import statistics
+from collections import defaultdict
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib import pyplot
+
+from gsbench.measure.record import FILE_NAME, read
+from gsbench.report.page.palette import LIGHT, styles
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDS = ROOT / "results" / "published" / "frontier"
+PICTURE = ROOT / "docs" / "images" / "frontier.png"
+LENGTHS = (250, 500, 1000, 2000, 4000)  # iterations
+NAMES = {"auto": "7DGS on demand (auto)", "7dgs": "7DGS", "7dgs_nodir": "7DGS without direction", "4dgs": "4DGS",
+         "7dgs_noagr": "7DGS without AGR", "6dgs": "6DGS", "3dgs": "3DGS"}  # fmt: skip
+T_95 = 4.303  # of Student's t, three seeds
+# dB: the height of each label.
+LABELS = {"7dgs_nodir": 24.5, "4dgs": 24.18, "auto": 23.86, "7dgs": 23.54, "7dgs_noagr": 23.22,
+          "3dgs": 19.35, "6dgs": 18.65}  # fmt: skip
+
+Point = tuple[float, float, float]  # seconds, dB, half of the 95 % interval
+
+
+def points(model: str) -> list[Point]:
+    """Average the runs of a model over the two scenes at each length; the interval is over the seeds' averages."""
+    found = []
+    for length in LENGTHS:
+        folder = model if length == 1000 else f"{model},iterations={length}"
+        by_seed = defaultdict(list)
+        for path in RECORDS.glob(f"*/{folder}/seed*/{FILE_NAME}"):
+            record = read(path)
+            assert record.metrics is not None
+            assert record.cost is not None
+            by_seed[record.seed].append((record.cost.train_s, record.metrics["psnr"] or 0.0))
+        means = [[statistics.fmean(column) for column in zip(*runs, strict=True)] for runs in by_seed.values()]
+        seconds, psnr = ([mean[i] for mean in means] for i in (0, 1))
+        half = T_95 * statistics.stdev(psnr) / len(psnr) ** 0.5
+        found.append((statistics.fmean(seconds), statistics.fmean(psnr), half))
+    return found
+
+
+def draw() -> None:
+    """Draw the chart, and write it to docs/images/."""
+    mpl.rcParams |= {"font.family": "DejaVu Sans", "font.size": 11, "svg.hashsalt": "gsbench"}
+    figure, axes = pyplot.subplots(figsize=(8, 4.6), dpi=150)
+    chosen = styles(list(NAMES))
+    for model, name in NAMES.items():
+        seconds, psnr, half = zip(*points(model), strict=True)
+        colour = LIGHT[chosen[model].colour]
+        axes.errorbar(
+            seconds, psnr, half, color=colour, marker=chosen[model].marker, markersize=5, linewidth=1.8, elinewidth=0.8,
+            capsize=2, alpha=0.95,
+        )  # fmt: skip
+        axes.annotate(
+            name, (seconds[-1], psnr[-1]), (170, LABELS[model]), color=colour, va="center", fontsize=10, weight="bold",
+            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.6, "shrinkA": 0, "shrinkB": 4,
+                        "relpos": (0, 0.5)},
+        )  # fmt: skip
+    axes.set_xscale("log")
+    axes.set_xlim(0.45, 150)
+    axes.set_ylim(18.2, 25.2)
+    axes.set_xticks([0.5, 1, 2, 5, 10, 20, 50, 100], ["0.5 s", "1 s", "2 s", "5 s", "10 s", "20 s", "50 s", "100 s"])
+    axes.minorticks_off()
+    axes.set_xlabel("time of training, two CPU cores, two runs at once")
+    axes.set_ylabel("PSNR on test, dB")
+    axes.grid(color="#e4e6ea", linewidth=0.8)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.subplots_adjust(left=0.085, right=0.7, top=0.97, bottom=0.125)
+    figure.savefig(PICTURE, facecolor="white", metadata={"Software": None})
+
+
+if __name__ == "__main__":
+    draw()
