@@ -1,4 +1,4 @@
-"""Write the tables of docs/models.md and docs/config.md from the registry of models, conf/ and the config's schema.
+"""Write tables of docs/: models and config keys from the code, results from the published records.
 
 `make docs` runs it; a test fails where a table is not what this writes.
 """
@@ -7,8 +7,9 @@ import dataclasses
 import inspect
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import hydra
@@ -16,12 +17,14 @@ import torch
 from omegaconf import MISSING, DictConfig
 
 from gsbench.config import CONF, Config, register_schema
+from gsbench.measure.record import FILE_NAME, Record, read
 from gsbench.models import find
 from gsbench.models.base import GaussianModel
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Points
 
 DOCS = Path(__file__).resolve().parents[1]
+PUBLISHED = DOCS.parent / "results" / "published"
 MARKS = "<!-- written by docs/site/tables.py: {} -->", "<!-- end -->"
 
 
@@ -99,20 +102,80 @@ def default_of(field: "dataclasses.Field[Any]") -> str:
     return f"`{words[value] if isinstance(value, bool | str | None) and value in words else value}`"
 
 
-TABLES = {"models": models, "config": config}
+def table1() -> str:
+    """Return a row for each model of `make table1`, means over the two embedded scenes and three seeds."""
+    rows = [
+        "| model | PSNR | SSIM | LPIPS-Alex | training, s | FPS | Gaussians |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for model in ("3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs", "auto"):
+        runs = published("mini", model)
+        psnr, similarity, distance = (mean(runs, lambda run, key=key: run.metrics[key]) for key in METRICS)
+        seconds, fps, count = (mean(runs, lambda run, key=key: getattr(run.cost, key)) for key in COSTS)
+        rows.append(
+            f"| {model} | {psnr:.2f} | {similarity:.3f} | {distance:.3f} | {seconds:.1f} | {fps:,.0f} | {count:,.0f} |"
+        )
+    return "\n".join(rows)
 
 
-def filled(name: str) -> str:
-    """Return the page of a table as it should be."""
-    first, last = MARKS[0].format(name), MARKS[1]
-    before, _, rest = (DOCS / f"{name}.md").read_text().partition(first)
-    return f"{before}{first}\n\n{TABLES[name]()}\n\n{last}{rest.partition(last)[2]}"
+def frontier() -> str:
+    """Return PSNR and seconds of each model at each length and capacity, means over two scenes and three seeds."""
+    models = ("3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto")
+    rows = [f"| iterations | {' | '.join(models)} |", f"| ---: |{' ---: |' * len(models)}"]
+    for title, variant in CASES.items():
+        runs = [published("frontier", f"{model}{variant}") for model in models]
+        psnr = [mean(one, lambda run: run.metrics["psnr"]) for one in runs]
+        shown = [f"**{x:.2f}**" if x == max(psnr) else f"{x:.2f}" for x in psnr]
+        seconds = [f"{mean(one, lambda run: run.cost.train_s):.1f} s" for one in runs]
+        cells = [f"{x}, {s}" for x, s in zip(shown, seconds, strict=True)]
+        rows.append(f"| {title} | {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def published(experiment: str, folder: str) -> list[Record]:
+    """Read the published records of an experiment in model folders of that name, of all scenes and seeds."""
+    found = [read(path) for path in sorted((PUBLISHED / experiment).glob(f"*/{folder}/seed*/{FILE_NAME}"))]
+    assert len(found) == len({(run.scene, run.seed) for run in found}) == RUNS, (
+        f"{experiment}/{folder}: {len(found)} runs"
+    )
+    return found
+
+
+def mean(runs: list[Record], value: Callable[[Any], float]) -> float:
+    """Average a value over runs: the scenes have the same seeds, so this is the mean over scenes too."""
+    return fmean(value(run) for run in runs)
+
+
+METRICS = ("psnr", "ssim", "lpips_alex")
+COSTS = ("train_s", "fps", "num_gaussians")
+RUNS = 6  # two scenes, three seeds
+CASES = {
+    "250": ",iterations=250",
+    "500": ",iterations=500",
+    "1,000": "",
+    "1,000, threshold 4e-4": ",densify.grad_threshold=0.0004",
+    "1,000, threshold 1e-4": ",densify.grad_threshold=0.0001",
+    "2,000": ",iterations=2000",
+    "4,000": ",iterations=4000",
+}
+TABLES = {"models": models, "config": config, "table1": table1, "frontier": frontier}
+PAGES = {"models": ("models",), "config": ("config",), "results": ("table1", "frontier")}
+
+
+def filled(page: str) -> str:
+    """Return a page with its tables as they should be."""
+    text = (DOCS / f"{page}.md").read_text()
+    for name in PAGES[page]:
+        first, last = MARKS[0].format(name), MARKS[1]
+        before, _, rest = text.partition(first)
+        text = f"{before}{first}\n\n{TABLES[name]()}\n\n{last}{rest.partition(last)[2]}"
+    return text
 
 
 def main() -> int:
-    """Write both pages."""
-    for name in TABLES:
-        (DOCS / f"{name}.md").write_text(filled(name))
+    """Write the pages."""
+    for page in PAGES:
+        (DOCS / f"{page}.md").write_text(filled(page))
     return 0
 
 
