@@ -1,5 +1,6 @@
 """Fixtures for tests of the compiled kernels, those of the CPU and those of CUDA."""
 
+import fcntl
 import importlib.util
 import os
 import shutil
@@ -32,22 +33,25 @@ def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def shim(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
-    """The CUDA kernels built to run on the CPU (cuda_shim.h), once a session.
+def shim() -> ModuleType:
+    """The CUDA kernels built to run on the CPU (cuda_shim.h): once for all processes, and again where a source changed.
 
-    They are kept in the folder GSBENCH_SHIM_BUILD, and have the sanitizers GSBENCH_SANITIZE names. Skips without the
-    tools to build them.
+    They are kept in build/shim or the folder GSBENCH_SHIM_BUILD, and have the sanitizers GSBENCH_SANITIZE names. Skips
+    without the tools to build them.
     """
     if not all(map(shutil.which, ("cmake", "ninja", "c++"))):
         pytest.skip("needs a GPU and the built extension, or cmake, ninja and a C++ compiler for the shim")
-    folder = Path(os.environ.get("GSBENCH_SHIM_BUILD") or tmp_path_factory.mktemp("cuda_shim"))
-    options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Release", f"-DPython_EXECUTABLE={sys.executable}",
-               f"-DGSB_SANITIZE={os.environ.get('GSBENCH_SANITIZE', '')}"]  # fmt: skip
+    folder = Path(os.environ.get("GSBENCH_SHIM_BUILD") or ROOT / "build/shim" / str(sys.implementation.cache_tag))
+    options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Release", "-DCMAKE_CXX_FLAGS_RELEASE=-O1 -DNDEBUG",
+               f"-DPython_EXECUTABLE={sys.executable}", f"-DGSB_SANITIZE={os.environ.get('GSBENCH_SANITIZE', '')}"]  # fmt: skip
     plain = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}  # a sanitizer's is not cmake's
-    for command in (["cmake", "-S", str(ROOT), "-B", str(folder), *options],
-                    ["cmake", "--build", str(folder), "--target", "_cuda"]):  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True, env=plain)
-        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # another process of these tests waits until it is built
+        for command in (["cmake", "-S", str(ROOT), "-B", str(folder), *options],
+                        ["cmake", "--build", str(folder), "--target", "_cuda"]):  # fmt: skip
+            done = subprocess.run(command, capture_output=True, text=True, env=plain)
+            assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     spec = importlib.util.spec_from_file_location("_cuda", next(folder.glob("_cuda.*.so")))
     assert spec is not None
     assert spec.loader is not None

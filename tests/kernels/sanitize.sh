@@ -8,8 +8,7 @@ cd "$(dirname "$0")/../.."
 python=${1:-python}
 build=build/sanitize
 # One instruction set, the best this machine has: the sources are the same, and sanitized ones compile slowly.
-level=$(grep -qs avx512dq /proc/cpuinfo && echo v4 || echo v3)
-cmake -S . -B $build -DCMAKE_BUILD_TYPE=RelWithDebInfo -DGSB_LEVELS="$level" -DGSB_SANITIZE=address,undefined \
+cmake -S . -B $build -DCMAKE_BUILD_TYPE=RelWithDebInfo -DGSB_LEVELS=native -DGSB_SANITIZE=address,undefined \
     -DCUDA=off -DPython_EXECUTABLE="$("$python" -c "import sys; print(sys.executable)")"
 cmake --build $build
 rm -rf $build/site
