@@ -43,7 +43,8 @@ def shim() -> ModuleType:
         pytest.skip("needs a GPU and the built extension, or cmake, ninja and a C++ compiler for the shim")
     folder = Path(os.environ.get("GSBENCH_SHIM_BUILD") or ROOT / "build/shim" / str(sys.implementation.cache_tag))
     options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Release", "-DCMAKE_CXX_FLAGS_RELEASE=-O1 -DNDEBUG",
-               f"-DPython_EXECUTABLE={sys.executable}", f"-DGSB_SANITIZE={os.environ.get('GSBENCH_SANITIZE', '')}"]  # fmt: skip
+               f"-DPython_EXECUTABLE={sys.executable}",
+               f"-DGSB_SANITIZE={os.environ.get('GSBENCH_SANITIZE', '')}"]  # fmt: skip
     plain = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}  # a sanitizer's is not cmake's
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
