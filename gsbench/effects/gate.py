@@ -40,6 +40,13 @@ class ChosenSimplifications:
 def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> ChosenSimplifications:
     """Choose the cheapest simplifications whose predicted errors add up to at most a share of the model's own error.
 
+    Each Gaussian i takes the simplification s that minimises
+
+        cost(i, s) + lambda error(i, s)
+
+    with its nanoseconds of a frame (COSTS, COLORING) and its predicted squared error (`Sensitivity.errors`). lambda is
+    the smallest, found by bisection, for which the errors add up to at most `budget` x `sensitivity.total`.
+
     Args:
         sensitivity: of the model's simplifications.
         model: whose they are; it may have effect sets already.

@@ -34,11 +34,18 @@ def evenly(items: Sequence[T], count: int) -> list[T]:
 
 
 def psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
-    """Compute the PSNR in dB from the mean squared error over H x W x 3; it is infinite for equal images.
+    """Compute the peak signal-to-noise ratio of two images:
+
+        PSNR = 10 log10(1 / MSE),   MSE = mean over H x W x 3 of (a - b)^2
+
+    The channels are joined in one mean; `psnr_channel_mean` has the mean of the channels' PSNR instead.
 
     Args:
         a: an image [H, W, 3] of floats, clamped to [0, 1].
         b: another one of the same size, on the same device.
+
+    Returns:
+        dB; infinite for equal images.
 
     Raises:
         InputError: they are not two images of one size.
@@ -61,13 +68,19 @@ def psnr_channel_mean(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
 
 
 def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
-    """Compute SSIM by scikit-image with the settings of Wang et al. 2004, in float64, as the mean over channels.
+    """Compute the structural similarity of two images (Wang et al. 2004), by scikit-image in float64:
 
-    data_range is given because scikit-image assumes 2 for floats; use_sample_covariance=False is as in the paper.
+        SSIM = mean of (2 m_a m_b + C1) (2 s_ab + C2) / ((m_a^2 + m_b^2 + C1) (s_a^2 + s_b^2 + C2))
+
+    over pixels and channels, with means m, variances s^2 and the covariance s_ab in a Gaussian window of sigma 1.5 (11
+    pixels), C1 = 0.01^2 and C2 = 0.03^2. `data_range` is 1; scikit-image would assume 2 for floats.
 
     Args:
         a: an image [H, W, 3] of floats, clamped to [0, 1], of at least 11 pixels a side.
         b: another one of the same size, on the same device.
+
+    Returns:
+        SSIM in [-1, 1]; 1 for equal images.
 
     Raises:
         InputError: they are not two images of one size, or they are too small.

@@ -31,7 +31,11 @@ class RenderTimes:
 
     @property
     def fps(self) -> float:
-        """Frames per second: 1000 / median milliseconds."""
+        """Frames per second: FPS = 1000 / p50, the median milliseconds of a render.
+
+        A render is timed from the query to the image, slices and AGR included, between two synchronisations of the
+        device, after warm-up renders; the evaluated views take turns.
+        """
         return 1000.0 / self.p50
 
 

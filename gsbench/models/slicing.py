@@ -45,7 +45,12 @@ def slice_gaussians(
     *,
     scheme: str = "square_root",
 ) -> Slice:
-    """Condition N joint Gaussians on q = query (7DGS eq. 9 and 10).
+    """Condition N joint Gaussians on q = query: slice them (7DGS eq. 9 and 10).
+
+        mean = mu_p + S_pq S_qq^-1 (q - mu_q)        cov = S_pp - S_pq S_qq^-1 S_qp
+
+    with S = F F^T and p = (x, y, z). By `square_root` no covariance is formed: an orthogonal matrix turns F into
+    [T_pp T_pq; 0 T_qq], and then gain = T_pq T_qq^-1 and cov = T_pp T_pp^T.
 
     Args:
         mean: (mu_p, mu_q), [N, 3+k].
@@ -55,7 +60,8 @@ def slice_gaussians(
             with a Cholesky factor of S_qq and subtracts. The last two are for comparison: they lose half the digits.
 
     Returns:
-        The conditional Gaussians: mean [N, 3] and factor [N, 3, 3] in the units of p, gain [N, 3, k].
+        Slice(mean, factor, gain): mean [N, 3] and factor [N, 3, 3] of the conditional Gaussians in the units of p, with
+        cov = factor factor^T; gain = S_pq S_qq^-1 [N, 3, k], the motion of the mean with q.
 
     Raises:
         InputError: types or shapes do not fit, or the scheme is unknown.
