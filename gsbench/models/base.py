@@ -102,6 +102,14 @@ class GaussianModel(nn.Module, ABC):
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Return the raw geometry of children; `raw` holds CHILDREN copies of each parent, one after the other."""
 
+    def log_sizes(self, index: int) -> Tensor:
+        """Return the log sizes of a Gaussian in all its dimensions, [n]; by default its largest one in space, [1]."""
+        return self.scales()[index : index + 1].log()
+
+    def log_duration(self, index: int) -> float | None:
+        """Return the log size of a Gaussian in time, clips; None for a model that has none or does not say."""
+        return None
+
     def hold_sizes(self, least: Tensor) -> None:
         """Raise raw sizes in space to at least `least` [N], world units; a model without such sizes does nothing."""
         return

@@ -59,6 +59,10 @@ class Gaussians3DModel(GatedModel):
         """Return the largest of the three scales."""
         return self.splats["scales"].detach().amax(-1).exp()
 
+    def log_sizes(self, index: int) -> Tensor:
+        """Return the three log scales."""
+        return self.splats["scales"].detach()[index]
+
     def hold_sizes(self, least: Tensor) -> None:
         """Raise all three scales."""
         self.splats["scales"].data.clamp_(min=least.log()[:, None])

@@ -204,6 +204,14 @@ class Gaussians4DModel(GatedModel):
         """Return the largest of the three spatial scales, as density control in 4DGS does."""
         return self.splats["scales"].detach()[:, :3].amax(-1).exp()
 
+    def log_sizes(self, index: int) -> Tensor:
+        """Return the four log scales."""
+        return self.splats["scales"].detach()[index]
+
+    def log_duration(self, index: int) -> float | None:
+        """Return the fourth log scale in clips."""
+        return float(self.splats["scales"].detach()[index, 3] - self.clock.log())
+
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the three spatial scales."""
         self.splats["scales"].data[:, :3].clamp_(min=least.log()[:, None])

@@ -147,6 +147,14 @@ class TriangularModel(GatedModel):
         T_pp = reduce(self.factors(dict(self.splats.items())).detach()).T_pp
         return torch.linalg.matrix_norm(T_pp, ord=2)
 
+    def log_sizes(self, index: int) -> Tensor:
+        """Return the log diagonal of the factor."""
+        return self.splats["log_diagonal"].detach()[index]
+
+    def log_duration(self, index: int) -> float | None:
+        """Return the log diagonal at t, for a model that has time."""
+        return float(self.log_sizes(index)[self.rows["t"][0]]) if "time" in self.observes else None
+
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the diagonal of L_pp."""
         space = self.rows["p"]

@@ -3,14 +3,9 @@
 import math
 
 import torch
-from torch import Tensor
 
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models import GaussianModel
-from gsbench.models.base import Raw
-from gsbench.models.gaussians3d import Gaussians3DModel
-from gsbench.models.gaussians4d import Gaussians4DModel
-from gsbench.models.triangular import TriangularModel
 
 THIN = -10.0  # log of a size in time: e^-10 of the clip is less than a frame of any scene
 NEEDLE = math.log(1e5)
@@ -39,7 +34,7 @@ def resembles(model: GaussianModel, index: int) -> str | None:
     raw = {name: parameter[index].flatten() for name, parameter in model.splats.items()}
     if not all(value.isfinite().all() for value in raw.values()):
         return "learning_rates_times_30"  # the previous step was too long
-    sizes, in_time = _log_sizes(model, raw, index), _log_size_in_time(model, raw)
+    sizes, in_time = model.log_sizes(index), model.log_duration(index)
     colors = torch.cat([raw[name] for name in ("sh0", "shN") if name in raw])
     lambdas = [float(value) for value in model.log_lambda.parameters()]
     checks = {
@@ -56,19 +51,3 @@ def resembles(model: GaussianModel, index: int) -> str | None:
         "insensitive": any(value < math.log(1e-6) for value in lambdas),
     }
     return next((name for name, found in checks.items() if found), None)
-
-
-def _log_sizes(model: GaussianModel, raw: Raw, index: int) -> Tensor:
-    """Return the log sizes of a Gaussian, [n]; of a model that is not known here the largest in space, [1]."""
-    if isinstance(model, TriangularModel):
-        return raw["log_diagonal"]
-    if isinstance(model, Gaussians3DModel | Gaussians4DModel):
-        return raw["scales"]
-    return model.scales()[index : index + 1].log()
-
-
-def _log_size_in_time(model: GaussianModel, raw: Raw) -> float | None:
-    """Return the log size in time; None for a model that does not observe time, or is not known here."""
-    if isinstance(model, TriangularModel) and "time" in model.observes:
-        return float(raw["log_diagonal"][model.rows["t"][0]])
-    return float(raw["scales"][3] - model.clock.log()) if isinstance(model, Gaussians4DModel) else None
