@@ -108,10 +108,18 @@ struct ColorArgs {
 };
 GSB_FIELDS(ColorArgs, INPUTS, N, degree, bases, waves, sh0, shN, means, opacities, times, center, time, orders, threads)
 
+// A channel that is clamped is -0 instead of 0, so that backward knows it without another look at the coefficients.
+constexpr float CLAMPED = -0.0f;
+
 struct Colors {
     float* colors;  // [N, 3]
 };
 GSB_FIELDS(Colors, OUTPUTS, colors)
+
+struct ShownColors {
+    const float* colors;
+};
+GSB_FIELDS(ShownColors, OUTPUTS, colors)
 
 struct GivenColors {
     const float* colors;
@@ -287,7 +295,7 @@ GSB_FIELDS(AdamState, OUTPUTS, parameter, mean, square)
     kernel(observe_static, StaticArgs, StaticSlice)                                                   \
     kernel(observe_static_backward, StaticArgs, StaticSliceGrads, StaticGrads)                         \
     kernel(show_colors, ColorArgs, Colors)                                                         \
-    kernel(show_colors_backward, ColorArgs, GivenColors, ColorGrads)                               \
+    kernel(show_colors_backward, ColorArgs, ShownColors, GivenColors, ColorGrads)                  \
     kernel(refine, RefineArgs, Refined)                                                            \
     kernel(refine_backward, RefineArgs, RefinedGrads, RefineGrads)                                 \
     kernel(project, ProjectArgs, Splats)                                                           \

@@ -43,129 +43,116 @@ struct Picked {
 
 // Sixteen picked rows, or what is left of them; lanes without one read zero.
 struct Rows {
-    int count;
+    const uint32_t* which;
+    int left, count, stride;  // left: these rows and those that are picked after them
     alignas(64) int32_t ones[LANES] = {}, threes[LANES] = {}, all[LANES] = {};
 
-    GSB_HD Rows(const uint32_t* which, int count, int stride) : count(count) {
+    GSB_HD Rows(const uint32_t* which, int left, int stride)
+        : which(which), left(left), count(left < LANES ? left : LANES), stride(stride) {
         for (int k = 0; k < count; ++k) {
             ones[k] = static_cast<int32_t>(which[k]);
             threes[k] = ones[k] * 3;
             all[k] = ones[k] * stride;
         }
     }
+    // Asks memory for the first floats of the row sixteen further on: picked rows are apart, so nothing else would.
+    template <bool WRITE>
+    GSB_HD void prefetch(const float* p, int width, int i) const {
+        if (!width || i + LANES >= left || which[i + LANES] == which[i + LANES - 1] + 1) return;
+        const float* row = p + static_cast<int64_t>(which[i + LANES]) * stride;
+        for (int k = 0; k < width; k += LANES) __builtin_prefetch(row + k, WRITE);
+        __builtin_prefetch(row + width - 1, WRITE);
+    }
     GSB_HD Vec load(const float* p, const int32_t (&offsets)[LANES]) const { return gather_rows(p, offsets, count); }
     GSB_HD void store(Vec x, float* p, const int32_t (&offsets)[LANES]) const { scatter_rows(x, p, offsets, count); }
     GSB_HD void load3(const float* p, Vec (&out)[3]) const {
         for (int k = 0; k < 3; ++k) out[k] = load(p + k, threes);
-    }
-    GSB_HD void add3(const Vec (&x)[3], float* p) const {
-        for (int k = 0; k < 3; ++k) store(load(p + k, threes) + x[k], p + k, threes);
     }
     GSB_HD void store3(const Vec (&x)[3], float* p) const {
         for (int k = 0; k < 3; ++k) store(x[k], p + k, threes);
     }
 };
 
-// `width` columns of picked rows, one after the other. A column's floats are far apart, a row's are not: sixteen columns
-// are read as pieces of rows, and turned.
-class ColumnsIn {
-public:
-    GSB_HD ColumnsIn(const float* p, const int32_t (&offsets)[LANES], int count, int width)
-        : p(p), offsets(offsets), count(count), left(width) {}
+// A row of shN is read in pieces as it lies in memory: up to five coefficients of one wave, of three channels each. So a
+// lane's channel is its number modulo three in every piece, and only sums and weights are turned from rows to columns.
+constexpr int PIECE_BASES = 5;
 
-    GSB_HD Vec next() {
-        if (at == LANES) fill();
-        return block[at++];
-    }
-
-private:
-    GSB_HD void fill() {
-        const int n = left < LANES ? left : LANES;
-        for (int i = 0; i < count; ++i) __builtin_prefetch(p + offsets[i] + 2 * LANES);  // far apart, so nothing else would
-        for (int i = 0; i < LANES; ++i) block[i] = i < count ? load_some(p + offsets[i], n) : Vec(0.0f);
-        transpose(block);
-        p += n;
-        left -= n;
-        at = 0;
-    }
-
-    const float* p;
-    const int32_t (&offsets)[LANES];
-    int count, left, at = LANES;
-    Vec block[LANES];
+struct Piece {
+    int at, floats, wave;           // where in the row it begins, and how many floats it has
+    alignas(64) int32_t spread[LANES];   // each lane's basis
+    alignas(64) int32_t bases_at[LANES]; // for a lane that is a basis of this piece, where its first channel lies
+    Mask bases;                     // these lanes
 };
 
-// The same, to be added to; `flush` at the end.
-class ColumnsOut {
-public:
-    GSB_HD ColumnsOut(float* p, const int32_t (&offsets)[LANES], int count) : p(p), offsets(offsets), count(count) {
-        for (auto& column : block) column = Vec(0.0f);
-    }
+struct Pieces {
+    int count = 0, width = 0;  // width: floats of a row up to the last of them
+    Piece piece[MAX_WAVES * ((MAX_BASIS + PIECE_BASES - 1) / PIECE_BASES)];
 
-    GSB_HD void put(Vec x) {
-        block[at++] = x;
-        if (at == LANES) flush();
+    // The constant's coefficients are kept in an array of their own, sh0.
+    GSB_HD explicit Pieces(const ColorArgs& a) {
+        const int used = (a.degree + 1) * (a.degree + 1);
+        for (int wave = 0; wave < a.waves; ++wave) {
+            for (int basis = wave == 0; basis < used; basis += PIECE_BASES) {
+                const int n = used - basis < PIECE_BASES ? used - basis : PIECE_BASES;
+                Piece& p = piece[count++];
+                p.at = (wave * a.bases - 1 + basis) * 3;
+                p.floats = n * 3;
+                p.wave = wave;
+                width = p.at + p.floats;
+                for (int i = 0; i < LANES; ++i) {
+                    p.spread[i] = basis + i / 3 < LANES ? basis + i / 3 : LANES - 1;
+                    p.bases_at[i] = i >= basis && i < basis + n ? (i - basis) * 3 : 0;
+                }
+                const Vec lane = Vec::load(INDEX);
+                p.bases = (lane >= Vec(static_cast<float>(basis))) & (lane < Vec(static_cast<float>(basis + n)));
+            }
+        }
     }
-    // Goes on at another column.
-    GSB_HD void move_to(float* to) {
-        flush();
-        p = to;
-    }
-    GSB_HD void flush() {
-        if (at == 0) return;
-        transpose(block);
-        for (int i = 0; i < count; ++i) store_first(load_some(p + offsets[i], at) + block[i], p + offsets[i], at);
-        p += at;
-        at = 0;
-    }
-
-private:
-    float* p;
-    const int32_t (&offsets)[LANES];
-    int count, at = 0;
-    Vec block[LANES];
 };
+
+alignas(64) constexpr int32_t CHANNELS[LANES] = {0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 3};  // lane 3 is zero
+alignas(64) constexpr int32_t NEXT[LANES] = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 15};
+alignas(64) constexpr int32_t AFTER_NEXT[LANES] = {2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 15, 15};
 
 // What the colours of sixteen Gaussians are made of.
 struct Shades {
     Unit<Vec> unit;
-    int used;  // harmonics
-    Vec Y[MAX_BASIS], cosines[MAX_WAVES], sines[MAX_WAVES];
+    Vec Y[LANES];                                                   // a Gaussian's harmonics in each vector
+    alignas(64) float cosines[MAX_WAVES][LANES], sines[MAX_WAVES][LANES];
 
     GSB_HD Shades(const ColorArgs& a, const Rows& rows) : unit(offset(a, rows)) {
-        used = harmonics(unit.direction, a.degree, Y);
-        waves_of(a.times ? Vec(*a.time) - rows.load(a.times, rows.ones) : Vec(0.0f), a.waves, cosines, sines);
-    }
-
-    // Where a wave's coefficients begin in a row of shN, and how many floats of them are used. The constant's are kept in
-    // an array of their own, sh0.
-    GSB_HD static int begin(const ColorArgs& a, int wave) { return wave ? (wave * a.bases - 1) * 3 : 0; }
-    GSB_HD int width(int wave) const { return (used - (wave == 0)) * 3; }
-
-    // Calls f(wave, basis, coefficients of the three channels) for every basis that is used.
-    template <class F>
-    GSB_HD void each(const ColorArgs& a, const Rows& rows, F f) const {
+        static_assert(MAX_BASIS == LANES);
+        for (auto& y : Y) y = Vec(0.0f);
+        harmonics(unit.direction, a.degree, Y);
+        transpose(Y);
+        Vec cosine[MAX_WAVES], sine[MAX_WAVES];
+        waves_of(a.times ? Vec(*a.time) - rows.load(a.times, rows.ones) : Vec(0.0f), a.waves, cosine, sine);
         for (int wave = 0; wave < a.waves; ++wave) {
-            ColumnsIn columns(a.shN + begin(a, wave), rows.all, rows.count, width(wave));
-            for (int basis = 0; basis < used; ++basis) {
-                Vec c[3];
-                if (wave == 0 && basis == 0) {
-                    rows.load3(a.sh0, c);
-                } else {
-                    for (auto& channel : c) channel = columns.next();
-                }
-                f(wave, basis, c);
-            }
+            cosine[wave].store(cosines[wave]);
+            sine[wave].store(sines[wave]);
         }
     }
 
-    // Before they are clamped.
-    GSB_HD void sum(const ColorArgs& a, const Rows& rows, Vec (&color)[3]) const {
-        for (auto& channel : color) channel = Vec(0.5f);
-        each(a, rows, [&](int wave, int basis, const Vec (&c)[3]) {
-            const Vec weight = Y[basis] * cosines[wave];
-            for (int channel = 0; channel < 3; ++channel) color[channel] += c[channel] * weight;
-        });
+    // Of each channel before it is clamped.
+    GSB_HD void sum(const ColorArgs& a, const Pieces& pieces, const Rows& rows, Vec (&color)[3]) const {
+        Vec sums[LANES];
+        for (int i = 0; i < rows.count; ++i) {
+            const float* row = a.shN + rows.all[i];
+            rows.prefetch<false>(a.shN, pieces.width, i);
+            Vec total(0.0f);
+            for (int k = 0; k < pieces.count; ++k) {
+                const Piece& p = pieces.piece[k];
+                const Vec weight = p.wave ? Y[i] * Vec(cosines[p.wave][i]) : Y[i];
+                total += load_some(row + p.at, p.floats) * permute(weight, p.spread);
+            }
+            sums[i] = total;
+        }
+        for (int i = rows.count; i < LANES; ++i) sums[i] = Vec(0.0f);
+        transpose(sums);
+        rows.load3(a.sh0, color);
+        for (int c = 0; c < 3; ++c) {
+            color[c] = color[c] * SH_0 + 0.5f + (sums[c] + sums[c + 3] + (sums[c + 6] + sums[c + 9]) + sums[c + 12]);
+        }
     }
 
     GSB_HD static Vec3<Vec> offset(const ColorArgs& a, const Rows& rows) {
@@ -256,44 +243,54 @@ GSB_HD inline void each_order(const ColorArgs& a, Picked& picked, F f) {
 
 // Not inlined: what the compiler then knows of an order's range would change what it rounds.
 __attribute__((noinline)) void show_rows(const ColorArgs& a, const uint32_t* which, int count, int stride, float* out) {
+    const Pieces pieces(a);
     for (int k = 0; k < count; k += LANES) {
-        const Rows rows(which + k, lanes_from(k, count), stride);
+        const Rows rows(which + k, count - k, stride);
         Vec color[3];
-        Shades(a, rows).sum(a, rows, color);
-        for (auto& channel : color) channel = max(channel, Vec(0.0f));
+        Shades(a, rows).sum(a, pieces, rows, color);
+        for (auto& channel : color) channel = select(channel >= Vec(0.0f), channel, Vec(CLAMPED));
         rows.store3(color, out);
     }
 }
 
-GSB_HD inline void backward_rows(const ColorArgs& a, const float* g_colors, const ColorGrads& out, const Rows& rows) {
+GSB_HD inline void backward_rows(const ColorArgs& a, const Pieces& pieces, const float* colors, const float* g_colors,
+                                 const ColorGrads& out, const Rows& rows) {
     const Vec zero(0.0f);
-    Vec color[3], g[3], g_Y[MAX_BASIS], g_time(0.0f);
     const Shades s(a, rows);
-    s.sum(a, rows, color);
-    rows.load3(g_colors, g);
-    for (int k = 0; k < 3; ++k) g[k] = select(color[k] >= zero, g[k], zero);
-    for (auto& y : g_Y) y = zero;
-    ColumnsOut columns(out.shN, rows.all, rows.count);
-    s.each(a, rows, [&](int wave, int basis, const Vec (&c)[3]) {
-        if (basis == 0) columns.move_to(out.shN + Shades::begin(a, wave));
-        const Vec weight = s.Y[basis] * s.cosines[wave];
-        Vec along(0.0f), g_c[3];
-        for (int channel = 0; channel < 3; ++channel) {
-            along += c[channel] * g[channel];
-            g_c[channel] = g[channel] * weight;
+    Vec g_Y[LANES], g_time[LANES];  // of a Gaussian in each vector
+    // What is added is rounded first, so that it does not depend on which views share a sum.
+    const auto add = [](Vec x, float* p, int n) { store_first(load_some(p, n) + rounded(x), p, n); };
+    for (int i = 0; i < rows.count; ++i) {
+        const Vec color = load_some(colors + rows.threes[i], 3);
+        Vec g = load_some(g_colors + rows.threes[i], 3);
+        g = select(Vec(1.0f) / color > zero, g, zero);  // 1 / -0 is -inf
+        add(g * SH_0, out.sh0 + rows.threes[i], 3);
+        g = permute(g, CHANNELS);
+        const float* row = a.shN + rows.all[i];
+        float* g_row = out.shN + rows.all[i];
+        rows.prefetch<false>(a.shN, pieces.width, i);
+        rows.prefetch<true>(out.shN, pieces.width, i);
+        g_Y[i] = g_time[i] = zero;
+        for (int k = 0; k < pieces.count; ++k) {
+            const Piece& p = pieces.piece[k];
+            const Vec cosine(s.cosines[p.wave][i]), weight = p.wave ? s.Y[i] * cosine : s.Y[i];
+            add(permute(weight, p.spread) * g, g_row + p.at, p.floats);
+            const Vec product = load_some(row + p.at, p.floats) * g;
+            const Vec channels = product + permute(product, NEXT) + permute(product, AFTER_NEXT);
+            const Vec along = select(p.bases, permute(channels, p.bases_at), zero);
+            g_Y[i] += p.wave ? along * cosine : along;
+            if (p.wave) g_time[i] += along * s.Y[i] * (s.sines[p.wave][i] * (TURN * static_cast<float>(p.wave)));
         }
-        if (wave == 0 && basis == 0) {
-            rows.add3(g_c, out.sh0);
-        } else {
-            for (const auto& channel : g_c) columns.put(channel);
-        }
-        g_Y[basis] += along * s.cosines[wave];
-        g_time += along * s.Y[basis] * s.sines[wave] * (TURN * static_cast<float>(wave));  // by mu_t
-    });
-    columns.flush();
+    }
+    for (int i = rows.count; i < LANES; ++i) g_Y[i] = g_time[i] = zero;
+    transpose(g_Y);
     const Vec3<Vec> g_mean = s.unit.vjp(harmonics_vjp(s.unit.direction, a.degree, g_Y));
     rows.store3({g_mean.x, g_mean.y, g_mean.z}, out.means);
-    if (a.times) rows.store(g_time, out.times, rows.ones);
+    if (!a.times) return;
+    transpose(g_time);
+    Vec total = g_time[0];  // by mu_t
+    for (int k = 1; k < LANES; ++k) total += g_time[k];
+    rows.store(total, out.times, rows.ones);
 }
 
 }  // namespace
@@ -312,12 +309,13 @@ void show_colors(const ColorArgs& all, const Colors& shown) {
     }
 }
 
-void show_colors_backward(const ColorArgs& all, const GivenColors& given, const ColorGrads& grads) {
+void show_colors_backward(const ColorArgs& all, const ShownColors& shown, const GivenColors& given,
+                          const ColorGrads& grads) {
 #pragma omp parallel for num_threads(all.threads) schedule(static) if (all.N > CHUNK)
     for (int64_t first = 0; first < all.N; first += CHUNK) {
         const ColorArgs a = chunk_of(all, first);
         const ColorGrads out = chunk_of(grads, all, first);
-        const float* g_colors = given.colors + first * 3;
+        const float *colors = shown.colors + first * 3, *g_colors = given.colors + first * 3;
         const int size = static_cast<int>(a.N);
         Picked picked(size, [&](int i, int n) { return learns(a, g_colors, i, n); });
         picked.each_gap(size, [&](int from, int end) {
@@ -325,8 +323,9 @@ void show_colors_backward(const ColorArgs& all, const GivenColors& given, const 
             if (a.times) fill_zero(out.times, 1, from, end);
         });
         each_order(a, picked, [&](const ColorArgs& own, const uint32_t* which, int count) {
+            const Pieces pieces(own);
             for (int k = 0; k < count; k += LANES) {
-                backward_rows(own, g_colors, out, Rows(which + k, lanes_from(k, count), stride_of(a)));
+                backward_rows(own, pieces, colors, g_colors, out, Rows(which + k, count - k, stride_of(a)));
             }
         });
     }

@@ -3,7 +3,7 @@
 
 #include "buffer.h"
 #include "isa.h"
-#include "simd.h"
+#include "rows.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
@@ -71,6 +71,17 @@ void store_splat(const Splat<Vec>& s, const Splats& out, int64_t i, int n) {
     scatter(s.half_y, out.half_sizes + i * 2 + 1, 2, n);
 }
 
+void store_nothing(const Splats& out, int64_t i, int n) {
+    fill_zero(out.means2d, 2, i, i + n);
+    fill_zero(out.roots, 4, i, i + n);
+    fill_zero(out.depths, 1, i, i + n);
+    fill_zero(out.half_sizes, 2, i, i + n);
+}
+
+bool is_zero(const SplatGrads& s, int64_t i, int n) {
+    return all_zero(s.means2d, 2, i, n) && all_zero(s.roots, 4, i, n) && (!s.depths || all_zero(s.depths, 1, i, n));
+}
+
 Vec3<Vec> masked(Mask m, const Vec3<Vec>& v) {
     return {select(m, v.x, Vec(0.0f)), select(m, v.y, Vec(0.0f)), select(m, v.z, Vec(0.0f))};
 }
@@ -82,7 +93,11 @@ void project(const ProjectArgs& a, const Splats& out) {
         const Camera camera = camera_of(a, c);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
         for (int64_t i = 0; i < a.N; i += LANES) {
-            const int n = static_cast<int>(a.N - i < LANES ? a.N - i : LANES);
+            const int n = lanes_from(i, a.N);
+            if (!any(load_first(a.opacities + i, n) >= Vec(ALPHA_MIN))) {  // nothing that is drawn, whatever the rest
+                store_nothing(out, c * a.N + i, n);
+                continue;
+            }
             store_splat(load(a, camera, i, n).splat(), out, c * a.N + i, n);
         }
     }
@@ -99,7 +114,14 @@ void project_backward(const ProjectArgs& a, const SplatGrads& grads, const Proje
             Vec3<Vec> g_view[4] = {};
             for (auto& row : g_view) row = {Vec(0.0f), Vec(0.0f), Vec(0.0f)};
             for (int64_t i = begin; i < end; i += LANES) {
-                const int n = static_cast<int>(end - i < LANES ? end - i : LANES);
+                const int n = lanes_from(i, end);
+                if (is_zero(grads, c * a.N + i, n)) {
+                    if (c > 0) continue;
+                    fill_zero(out.means, 3, i, i + n);
+                    fill_zero(out.factors, 9, i, i + n);
+                    fill_zero(out.opacities, 1, i, i + n);
+                    continue;
+                }
                 Projection<Vec> projection = load(a, camera, i, n);
                 const Splat<Vec> splat = projection.splat();
                 const Mask drawn = splat.half_x > Vec(0.0f);

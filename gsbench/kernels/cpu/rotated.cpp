@@ -67,6 +67,20 @@ void observe_static_rows_backward(const RotatedArgs& a, const ObservationGrads& 
     }
 }
 
+GSB_HD inline bool is_zero(const ObservationGrads& o, int64_t i, int n) {
+    return all_zero(o.opacities, 1, i, n) && all_zero(o.means, 3, i, n) && all_zero(o.factors, 9, i, n);
+}
+
+// The gradient of rows that the view does not show.
+GSB_HD inline void store_zero(const RotatedGrads& out, int64_t i, int n) {
+    fill_zero(out.means, 3, i, i + n);
+    fill_zero(out.times, 1, i, i + n);
+    fill_zero(out.scales, 4, i, i + n);
+    fill_zero(out.left_quats, 4, i, i + n);
+    fill_zero(out.right_quats, 4, i, i + n);
+    fill_zero(out.opacities, 1, i, i + n);
+}
+
 }  // namespace
 
 void observe_rotated(const RotatedArgs& a, const Observation& out) {
@@ -95,6 +109,10 @@ void observe_rotated_backward(const RotatedArgs& a, const ObservationGrads& grad
         Vec g_lambda(0.0f);
         for (int64_t i = chunk * CHUNK; i < end; i += LANES) {
             const int n = lanes_from(i, end);
+            if (is_zero(grads, i, n)) {
+                store_zero(out, i, n);
+                continue;
+            }
             RotatedParameters<Vec> raw, g;
             Observed<Vec> given;
             load(a, i, n, raw);

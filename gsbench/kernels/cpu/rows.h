@@ -71,6 +71,17 @@ GSB_HD inline void scatter_columns(const Vec (&x)[W], float* rows, int width, in
     GSB_UNROLL for (int k = 0; k < W; ++k) scatter(x[k], rows + i * width + first + k, width, n);
 }
 
+// Whether rows i to i + n - 1 of `width` floats hold nothing but zeros: where no gradient comes in, none goes out.
+GSB_HD inline bool all_zero(const float* rows, int width, int64_t i, int n) {
+    const float* p = rows + i * width;
+    const int size = n * width;
+    for (int k = 0; k < size; k += LANES) {
+        const Vec x = load_some(p + k, size - k < LANES ? size - k : LANES);
+        if (any(!(x == Vec(0.0f)))) return false;
+    }
+    return true;
+}
+
 // Rows [first, end). Arrays of no rows have no address, which memcpy and memset do not take.
 GSB_HD inline void copy_rows(const float* from, float* to, int width, int64_t first, int64_t end) {
     if (first == end) return;

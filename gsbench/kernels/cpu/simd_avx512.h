@@ -142,6 +142,17 @@ GSB_HD inline void scatter_rows(Vec x, float* p, const int32_t* offsets, int n) 
     for (int i = 0; i < n; ++i) p[offsets[i]] = lane[i];
 }
 
+// x, rounded: the compiler fuses no product with the sum that it goes into.
+GSB_HD inline Vec rounded(Vec x) {
+    __asm__("" : "+v"(x.v));
+    return x;
+}
+
+// Lane i is lane from[i] of x; `from` is aligned.
+GSB_HD inline Vec permute(Vec x, const int32_t* from) {
+    return _mm512_permutexvar_ps(_mm512_load_si512(from), x.v);
+}
+
 // Sixteen rows of sixteen floats as sixteen columns.
 GSB_HD inline void transpose(Vec (&x)[LANES]) {
     __m512 a[LANES], b[LANES];

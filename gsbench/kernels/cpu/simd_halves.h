@@ -197,6 +197,37 @@ GSB_HD inline void scatter_rows(Vec x, float* p, const int32_t* offsets, int n) 
     for (int i = 0; i < n; ++i) p[offsets[i]] = lane[i];
 }
 
+// x, rounded: the compiler fuses no product with the sum that it goes into.
+GSB_HD inline Register rounded(Register x) {
+#if defined(__x86_64__)
+    __asm__("" : "+x"(x.v));
+#else
+    __asm__("" : "+w"(x.v));
+#endif
+    return x;
+}
+template <class Half>
+GSB_HD inline Pair<Half> rounded(Pair<Half> x) {
+    return {rounded(x.lo), rounded(x.hi)};
+}
+
+// Lane i is lane from[i] of x.
+GSB_HD inline Vec permute(Vec x, const int32_t* from) {
+#if defined(__AVX2__)
+    const auto half = [&](const int32_t* p) {
+        const __m256i at = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(p));
+        const __m256 low = _mm256_permutevar8x32_ps(x.lo.v, at), high = _mm256_permutevar8x32_ps(x.hi.v, at);
+        return Register(Floats(_mm256_blendv_ps(low, high, _mm256_castsi256_ps(_mm256_slli_epi32(at, 28)))));
+    };
+    return {half(from), half(from + WIDTH)};
+#else
+    alignas(64) float in[LANES], out[LANES];
+    x.store(in);
+    for (int i = 0; i < LANES; ++i) out[i] = in[from[i]];
+    return Vec::load(out);
+#endif
+}
+
 // Sixteen rows of sixteen floats as sixteen columns.
 GSB_HD inline void transpose(Vec (&x)[LANES]) {
     alignas(64) float rows[LANES][LANES];

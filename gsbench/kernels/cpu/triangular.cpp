@@ -31,6 +31,10 @@ GSB_HD inline void load(const TriangularArgs& a, int64_t i, int n, TriangularPar
     p.opacity = load_first(a.opacities + i, n);
 }
 
+GSB_HD inline bool is_zero(const ObservationGrads& o, int64_t i, int n) {
+    return all_zero(o.opacities, 1, i, n) && all_zero(o.means, 3, i, n) && all_zero(o.factors, 9, i, n);
+}
+
 GSB_HD inline void load(const ObservationGrads& o, int64_t i, int n, Observed<Vec>& out) {
     gather_row(o.means, i, n, out.mean);
     gather_matrix(o.factors, i, n, out.factor);
@@ -53,6 +57,20 @@ void observe(const TriangularArgs& a, const Observation& out) {
     }
 }
 
+// The gradient of rows that the view does not show.
+template <Query Q>
+GSB_HD inline void store_zero(const TriangularGrads& out, int64_t i, int n) {
+    using P = TriangularParameters<Vec, Q>;
+    fill_zero(out.means, 3, i, i + n);
+    if constexpr (P::DIRECTION) fill_zero(out.directions, 3, i, i + n);
+    if constexpr (P::TIME) fill_zero(out.times, 1, i, i + n);
+    fill_zero(out.log_diagonal, P::N, i, i + n);
+    fill_zero(out.shape, 3, i, i + n);
+    fill_zero(out.motion, 3 * P::K, i, i + n);
+    if constexpr (P::COUPLED) fill_zero(out.coupling, P::K * (P::K - 1) / 2, i, i + n);
+    fill_zero(out.opacities, 1, i, i + n);
+}
+
 template <Query Q, template <class, int> class Reduction>
 void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     const TriangularModel model = model_of(a);
@@ -64,6 +82,10 @@ void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, co
         Vec lambda_d(0.0f), lambda_t(0.0f);
         for (int64_t i = chunk * CHUNK; i < end; i += LANES) {
             const int n = lanes_from(i, end);
+            if (is_zero(grads, i, n)) {
+                store_zero<Q>(out, i, n);
+                continue;
+            }
             TriangularParameters<Vec, Q> raw, g;
             Observed<Vec> given;
             load<Q>(a, i, n, raw);

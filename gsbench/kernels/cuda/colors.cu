@@ -59,17 +59,20 @@ __global__ void color_kernel(ColorArgs a, Colors out) {
     float color[3] = {};
     const ColorOrder order = order_of(a, i);
     if (a.opacities[i] >= ALPHA_MIN) sum_colors(a, order, Weights(a, order, i), i, color);
-    for (int channel = 0; channel < 3; ++channel) out.colors[i * 3 + channel] = max(color[channel], 0.0f);
+    for (int channel = 0; channel < 3; ++channel) {
+        out.colors[i * 3 + channel] = color[channel] >= 0.0f ? color[channel] : CLAMPED;
+    }
 }
 
 // Adds to the gradients of Gaussian i's coefficients, and returns that of its mean.
-__device__ Vec3<float> color_vjp(const ColorArgs& a, const float (&given)[3], const ColorGrads& out, int64_t i,
-                                 float& g_time) {
+__device__ Vec3<float> color_vjp(const ColorArgs& a, const float* color, const float (&given)[3], const ColorGrads& out,
+                                 int64_t i, float& g_time) {
     const ColorOrder order = order_of(a, i);
     const Weights w(a, order, i);
-    float color[3], g[3], g_Y[MAX_BASIS] = {};
-    sum_colors(a, order, w, i, color);
-    for (int channel = 0; channel < 3; ++channel) g[channel] = color[channel] >= 0.0f ? given[channel] : 0.0f;
+    float g[3], g_Y[MAX_BASIS] = {};
+    for (int channel = 0; channel < 3; ++channel) {
+        g[channel] = 1.0f / color[channel] > 0.0f ? given[channel] : 0.0f;  // 1 / -0 is -inf
+    }
     each_coefficient(a, order, [&](int k, int basis, int wave) {
         const float* p = coefficient(a, a.sh0, a.shN, i, k);
         float* g_p = coefficient(a, out.sh0, out.shN, i, k);
@@ -86,14 +89,14 @@ __device__ Vec3<float> color_vjp(const ColorArgs& a, const float (&given)[3], co
 }
 
 // The rows of coefficients of a Gaussian that is not drawn, or whose colour has no gradient, are left alone.
-__global__ void color_backward_kernel(ColorArgs a, GivenColors given, ColorGrads out) {
+__global__ void color_backward_kernel(ColorArgs a, ShownColors shown, GivenColors given, ColorGrads out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
     const float g[3] = {given.colors[i * 3], given.colors[i * 3 + 1], given.colors[i * 3 + 2]};
     Vec3<float> g_mean{};
     float g_time = 0.0f;
     if (a.opacities[i] >= ALPHA_MIN && (g[0] != 0.0f || g[1] != 0.0f || g[2] != 0.0f)) {
-        g_mean = color_vjp(a, g, out, i, g_time);
+        g_mean = color_vjp(a, shown.colors + i * 3, g, out, i, g_time);
     }
     out.means[i * 3] = g_mean.x;
     out.means[i * 3 + 1] = g_mean.y;
@@ -107,8 +110,9 @@ void show_colors(const ColorArgs& a, const Colors& out, Stream stream) {
     if (a.N > 0) launch(color_kernel, blocks_for(a.N), THREADS, stream, a, out);
 }
 
-void show_colors_backward(const ColorArgs& a, const GivenColors& given, const ColorGrads& out, Stream stream) {
-    if (a.N > 0) launch(color_backward_kernel, blocks_for(a.N), THREADS, stream, a, given, out);
+void show_colors_backward(const ColorArgs& a, const ShownColors& shown, const GivenColors& given, const ColorGrads& out,
+                          Stream stream) {
+    if (a.N > 0) launch(color_backward_kernel, blocks_for(a.N), THREADS, stream, a, shown, given, out);
 }
 
 }  // namespace gsb::cuda
