@@ -36,6 +36,7 @@ struct TriangularArgs {
 GSB_FIELDS(TriangularArgs, INPUTS, N, conditioned, conditioned_first, form, subtracts, half, means, directions, times,
            log_diagonal, shape, motion, coupling, opacities, center, time, log_lambda_d, log_lambda_t, threads)
 
+// Those of Gaussians are added to.
 struct TriangularGrads {
     float *means, *directions, *times, *log_diagonal, *shape, *motion, *coupling, *opacities;
     float *log_lambda_d, *log_lambda_t;  // zero on entry
@@ -53,6 +54,7 @@ struct RotatedArgs {
 GSB_FIELDS(RotatedArgs, INPUTS, N, conditioned, means, times, scales, left_quats, right_quats, opacities, clock, time,
            log_lambda_t, threads)
 
+// Those of Gaussians are added to.
 struct RotatedGrads {
     float *means, *times, *scales, *left_quats, *right_quats, *opacities;
     float* log_lambda_t;  // zero on entry
@@ -89,7 +91,7 @@ struct StaticSliceGrads {
 GSB_FIELDS(StaticSliceGrads, GIVEN, factors, opacities)
 
 struct StaticGrads {
-    float *scales, *quats, *opacities;
+    float *scales, *quats, *opacities;  // added to
 };
 GSB_FIELDS(StaticGrads, GRADS, scales, quats, opacities)
 

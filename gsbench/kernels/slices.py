@@ -13,14 +13,14 @@ _SLICE = {"means": Output("N 3"), "factors": Output("N 3 3"), "opacities": Outpu
 _triangular = Operation(
     "observe_triangular",
     inputs={
-        "means": Input("N 3"),
-        "directions": Input("N 3", left_out_with="direction"),
-        "times": Input("N 1", left_out_with="time"),
-        "log_diagonal": Input("N rows"),
-        "shape": Input("N 3"),
-        "motion": Input("N moves"),
-        "coupling": Input("N couplings"),
-        "opacities": Input("N"),
+        "means": Input("N 3", Gradient.ADDED),
+        "directions": Input("N 3", Gradient.ADDED, left_out_with="direction"),
+        "times": Input("N 1", Gradient.ADDED, left_out_with="time"),
+        "log_diagonal": Input("N rows", Gradient.ADDED),
+        "shape": Input("N 3", Gradient.ADDED),
+        "motion": Input("N moves", Gradient.ADDED),
+        "coupling": Input("N couplings", Gradient.ADDED),
+        "opacities": Input("N", Gradient.ADDED),
         "center": Input("3", Gradient.REFUSED),
         "time": Input("", Gradient.REFUSED, left_out_with="time"),
         "log_lambda_d": Input("", Gradient.SUMMED, left_out_with="direction"),
@@ -109,12 +109,12 @@ def observe_triangular(
 _rotated = Operation(
     "observe_rotated",
     inputs={
-        "means": Input("N 3"),
-        "times": Input("N 1"),
-        "scales": Input("N 4"),
-        "left_quats": Input("N 4"),
-        "right_quats": Input("N 4"),
-        "opacities": Input("N"),
+        "means": Input("N 3", Gradient.ADDED),
+        "times": Input("N 1", Gradient.ADDED),
+        "scales": Input("N 4", Gradient.ADDED),
+        "left_quats": Input("N 4", Gradient.ADDED),
+        "right_quats": Input("N 4", Gradient.ADDED),
+        "opacities": Input("N", Gradient.ADDED),
         "clock": Input("", Gradient.REFUSED),
         "time": Input("", Gradient.REFUSED),
         "log_lambda_t": Input("", Gradient.SUMMED),
@@ -170,7 +170,11 @@ def observe_rotated(
 
 _static = Operation(
     "observe_static",
-    inputs={"scales": Input("N 3"), "quats": Input("N 4"), "opacities": Input("N")},
+    inputs={
+        "scales": Input("N 3", Gradient.ADDED),
+        "quats": Input("N 4", Gradient.ADDED),
+        "opacities": Input("N", Gradient.ADDED),
+    },
     outputs={"factors": Output("N 3 3"), "opacities": Output("N")},
     memory="a slice's Gaussians",
 )

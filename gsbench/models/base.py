@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from gsbench.errors import InputError
 from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.colors import show_colors
+from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models.appearance import sh_colors
 from gsbench.models.color_order import ColorOrder
 from gsbench.models.effect_sets import NAMES, EffectSets
@@ -108,6 +109,10 @@ class GaussianModel(nn.Module, ABC):
 
     def log_duration(self, index: int) -> float | None:
         """Return the log size of a Gaussian in time, clips; None for a model that has none or does not say."""
+        return None
+
+    def durations(self) -> Tensor | None:
+        """Return each Gaussian's standard deviation in time, [N] clips; None for a model without `times` and lambda_t."""
         return None
 
     def hold_sizes(self, least: Tensor) -> None:
@@ -255,6 +260,22 @@ class GaussianModel(nn.Module, ABC):
         return groups
 
     # ---- density control: keep, copy and split rows
+
+    @torch.no_grad()
+    def visible_intervals(self) -> Tensor | None:
+        """Return the first and the last time at which each Gaussian can be visible, [N, 2] clips; None without time.
+
+        The opacity in a slice, o exp(-lambda_t (t - mu_t)^2 / (2 S_t)) at most, is then at least ALPHA_MIN. AGR may move
+        a Gaussian out of its interval, so this is for the order of rows only. (inf, inf) is never.
+        """
+        deviations = self.durations()
+        if deviations is None:
+            return None
+        opacities, times = torch.sigmoid(self.splats["opacities"]), self.splats["times"]
+        reach = (2 * (opacities / ALPHA_MIN).log().clamp(min=0) / self.lambda_of("time")).sqrt() * deviations
+        interval = torch.cat([times - reach[:, None], times + reach[:, None]], 1)
+        never = (reach == 0) | (interval[:, 1] < 0) | (interval[:, 0] > 1)
+        return torch.where(never[:, None], math.inf, interval.clamp(0, 1))
 
     @torch.no_grad()
     def select(self, rows: Tensor) -> None:

@@ -212,6 +212,10 @@ class Gaussians4DModel(GatedModel):
         """Return the fourth log scale in clips."""
         return float(self.splats["scales"].detach()[index, 3] - self.clock.log())
 
+    def durations(self) -> Tensor:
+        """Return sqrt(S_t), the norm of the factor's row of t."""
+        return self.factors(dict(self.splats.items())).detach()[:, 3].norm(dim=-1)
+
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the three spatial scales."""
         self.splats["scales"].data[:, :3].clamp_(min=least.log()[:, None])

@@ -155,6 +155,10 @@ class TriangularModel(GatedModel):
         """Return the log diagonal at t, for a model that has time."""
         return float(self.log_sizes(index)[self.rows["t"][0]]) if "time" in self.observes else None
 
+    def durations(self) -> Tensor | None:
+        """Return sqrt(S_t), the norm of the factor's row of t."""
+        return self.factors(dict(self.splats.items())).detach()[:, -1].norm(dim=-1) if "time" in self.observes else None
+
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the diagonal of L_pp."""
         space = self.rows["p"]

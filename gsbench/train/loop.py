@@ -170,6 +170,8 @@ class Trainer:
                 self._tell_full(refused)
             if schedule.thins(step):
                 self._thin()
+            if schedule.densifies(step) or schedule.thins(step):
+                self.rows.sort_by_time()
             if (step + 1) % schedule.densify_every == 0:
                 self.minimum_scale.update()
             if schedule.resolution(step + 1) != factor:

@@ -8,6 +8,9 @@ from torch import Tensor
 from gsbench.models import GaussianModel
 
 
+START_BINS = 16  # of a clip, by which rows are sorted
+
+
 class Follower(Protocol):
     """Part of a training that has one entry for each Gaussian."""
 
@@ -50,6 +53,18 @@ class Rows:
         """
         self.model.select(rows)
         self.moved(rows, fresh)
+
+    def sort_by_time(self) -> None:
+        """Order rows by when they can be visible: first by the start of the interval, in sixteenths, then by its end.
+
+        Kernels take rows sixteen at a time, and leave out a vector of which no row is visible. At a quarter of trex'
+        iterations a view of 4DGS shows 36 % of the rows; they were in 96 % of the vectors, and are in 42 % so. Rows of
+        effect sets have an order of their own.
+        """
+        intervals = None if self.model.effect_sets is not None else self.model.visible_intervals()
+        if intervals is not None:
+            first, last = intervals.unbind(1)
+            self.select(((first * START_BINS).floor() + last / 2).argsort(stable=True))
 
     def forget(self, name: str) -> None:
         """Zero the moments of the parameter `name`, which was set directly."""

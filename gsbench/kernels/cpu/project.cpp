@@ -31,44 +31,34 @@ Camera camera_of(const ProjectArgs& a, int64_t c) {
     return camera;
 }
 
-Vec3<Vec> gather3(const float* p, int stride, int n) {
-    return {gather(p, stride, n), gather(p + 1, stride, n), gather(p + 2, stride, n)};
-}
-
-void scatter3(const Vec3<Vec>& v, float* p, int stride, int n) {
-    scatter(v.x, p, stride, n);
-    scatter(v.y, p + 1, stride, n);
-    scatter(v.z, p + 2, stride, n);
-}
-
 Projection<Vec> load(const ProjectArgs& a, const Camera& camera, int64_t i, int n) {
-    const float* f = a.factors + i * 9;
-    const Vec3<Vec> factor[3] = {gather3(f, 9, n), gather3(f + 3, 9, n), gather3(f + 6, 9, n)};
-    return Projection<Vec>(camera, gather3(a.means + i * 3, 3, n), factor, load_first(a.opacities + i, n));
+    Vec mean[3], f[3][3];
+    gather_row(a.means, i, n, mean);
+    gather_matrix(a.factors, i, n, f);
+    const Vec3<Vec> factor[3] = {{f[0][0], f[0][1], f[0][2]}, {f[1][0], f[1][1], f[1][2]}, {f[2][0], f[2][1], f[2][2]}};
+    return Projection<Vec>(camera, {mean[0], mean[1], mean[2]}, factor, load_first(a.opacities + i, n));
 }
 
 Splat<Vec> load_splat(const SplatGrads& s, int64_t i, int n) {
+    Vec mean[2], root[4];
+    gather_row(s.means2d, i, n, mean);
+    gather_row(s.roots, i, n, root);
     Splat<Vec> out;
-    out.x = gather(s.means2d + i * 2, 2, n);
-    out.y = gather(s.means2d + i * 2 + 1, 2, n);
-    out.p = gather(s.roots + i * 4, 4, n);
-    out.q = gather(s.roots + i * 4 + 1, 4, n);
-    out.r = gather(s.roots + i * 4 + 2, 4, n);
-    out.opacity = gather(s.roots + i * 4 + 3, 4, n);
+    out.x = mean[0];
+    out.y = mean[1];
+    out.p = root[0];
+    out.q = root[1];
+    out.r = root[2];
+    out.opacity = root[3];
     out.depth = s.depths ? load_first(s.depths + i, n) : Vec(0.0f);
     return out;
 }
 
 void store_splat(const Splat<Vec>& s, const Splats& out, int64_t i, int n) {
-    scatter(s.x, out.means2d + i * 2, 2, n);
-    scatter(s.y, out.means2d + i * 2 + 1, 2, n);
-    scatter(s.p, out.roots + i * 4, 4, n);
-    scatter(s.q, out.roots + i * 4 + 1, 4, n);
-    scatter(s.r, out.roots + i * 4 + 2, 4, n);
-    scatter(s.opacity, out.roots + i * 4 + 3, 4, n);
+    scatter_row({s.x, s.y}, out.means2d, i, n);
+    scatter_row({s.p, s.q, s.r, s.opacity}, out.roots, i, n);
     store_first(s.depth, out.depths + i, n);
-    scatter(s.half_x, out.half_sizes + i * 2, 2, n);
-    scatter(s.half_y, out.half_sizes + i * 2 + 1, 2, n);
+    scatter_row({s.half_x, s.half_y}, out.half_sizes, i, n);
 }
 
 void store_nothing(const Splats& out, int64_t i, int n) {
@@ -127,17 +117,24 @@ void project_backward(const ProjectArgs& a, const SplatGrads& grads, const Proje
                 const Mask drawn = splat.half_x > Vec(0.0f);
                 const Splat<Vec> g = load_splat(grads, c * a.N + i, n);
                 const GaussianGrad<Vec> grad = projection.vjp(splat, g);
-                Vec3<Vec> mean = masked(drawn, grad.mean), factor[3];
-                for (int k = 0; k < 3; ++k) factor[k] = masked(drawn, grad.factor[k]);
-                Vec opacity = select(drawn, grad.opacity, Vec(0.0f));
-                if (c > 0) {
-                    mean += gather3(out.means + i * 3, 3, n);
-                    for (int k = 0; k < 3; ++k) factor[k] += gather3(out.factors + i * 9 + k * 3, 9, n);
-                    opacity += load_first(out.opacities + i, n);
+                const Vec3<Vec> m = masked(drawn, grad.mean);
+                const Vec mean[3] = {m.x, m.y, m.z}, opacity = select(drawn, grad.opacity, Vec(0.0f));
+                Vec factor[9];
+                for (int k = 0; k < 3; ++k) {
+                    const Vec3<Vec> row = masked(drawn, grad.factor[k]);
+                    factor[k * 3] = row.x;
+                    factor[k * 3 + 1] = row.y;
+                    factor[k * 3 + 2] = row.z;
                 }
-                scatter3(mean, out.means + i * 3, 3, n);
-                for (int k = 0; k < 3; ++k) scatter3(factor[k], out.factors + i * 9 + k * 3, 9, n);
-                store_first(opacity, out.opacities + i, n);
+                if (c > 0) {
+                    add_row(mean, out.means, i, n);
+                    add_row(factor, out.factors, i, n);
+                    add_first(opacity, out.opacities + i, n);
+                } else {
+                    scatter_row(mean, out.means, i, n);
+                    scatter_row(factor, out.factors, i, n);
+                    store_first(opacity, out.opacities + i, n);
+                }
                 if (out.viewmats) {
                     for (int k = 0; k < 3; ++k) g_view[k] += masked(drawn, grad.rotation[k]);
                     g_view[3] += masked(drawn, grad.translation);

@@ -35,6 +35,10 @@ GSB_HD inline void load_static(const RotatedArgs& a, int64_t i, int n, StaticPar
     p.opacity = load_first(a.opacities + i, n);
 }
 
+GSB_HD inline bool is_zero(const ObservationGrads& o, int64_t i, int n) {
+    return all_zero(o.opacities, 1, i, n) && all_zero(o.means, 3, i, n) && all_zero(o.factors, 9, i, n);
+}
+
 void observe_static_rows(const RotatedArgs& a, const Observation& out) {
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > CHUNK)
     for (int64_t i = a.conditioned; i < a.N; i += LANES) {
@@ -52,33 +56,19 @@ void observe_static_rows_backward(const RotatedArgs& a, const ObservationGrads& 
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > CHUNK)
     for (int64_t i = a.conditioned; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
+        if (is_zero(grads, i, n)) continue;
         StaticParameters<Vec> raw, g;
-        Vec g_factor[3][3], g_left[4];
+        Vec g_mean[3], g_factor[3][3], g_left[4];
         load_static(a, i, n, raw);
+        gather_row(grads.means, i, n, g_mean);
         gather_matrix(grads.factors, i, n, g_factor);
         StaticGaussian<Vec>(raw).vjp(g_factor, load_first(grads.opacities + i, n), g);
         turn_of_space(g.quat, g_left);
-        copy_rows(grads.means, out.means, 3, i, i + n);
-        fill_zero(out.times, 1, i, i + n);
-        scatter_row({g.scales[0], g.scales[1], g.scales[2], Vec(0.0f)}, out.scales, i, n);
-        scatter_row(g_left, out.left_quats, i, n);
-        fill_zero(out.right_quats, 4, i, i + n);
-        store_first(g.opacity, out.opacities + i, n);
+        add_row(g_mean, out.means, i, n);
+        add_columns(g.scales, out.scales, 4, 0, i, n);
+        add_row(g_left, out.left_quats, i, n);
+        add_first(g.opacity, out.opacities + i, n);
     }
-}
-
-GSB_HD inline bool is_zero(const ObservationGrads& o, int64_t i, int n) {
-    return all_zero(o.opacities, 1, i, n) && all_zero(o.means, 3, i, n) && all_zero(o.factors, 9, i, n);
-}
-
-// The gradient of rows that the view does not show.
-GSB_HD inline void store_zero(const RotatedGrads& out, int64_t i, int n) {
-    fill_zero(out.means, 3, i, i + n);
-    fill_zero(out.times, 1, i, i + n);
-    fill_zero(out.scales, 4, i, i + n);
-    fill_zero(out.left_quats, 4, i, i + n);
-    fill_zero(out.right_quats, 4, i, i + n);
-    fill_zero(out.opacities, 1, i, i + n);
 }
 
 }  // namespace
@@ -109,10 +99,7 @@ void observe_rotated_backward(const RotatedArgs& a, const ObservationGrads& grad
         Vec g_lambda(0.0f);
         for (int64_t i = chunk * CHUNK; i < end; i += LANES) {
             const int n = lanes_from(i, end);
-            if (is_zero(grads, i, n)) {
-                store_zero(out, i, n);
-                continue;
-            }
+            if (is_zero(grads, i, n)) continue;
             RotatedParameters<Vec> raw, g;
             Observed<Vec> given;
             load(a, i, n, raw);
@@ -122,12 +109,12 @@ void observe_rotated_backward(const RotatedArgs& a, const ObservationGrads& grad
             RotatedGaussian<Vec> gaussian(raw, lambda_t, time);
             gaussian.observe();
             gaussian.vjp(given, g);
-            scatter_row(g.mean, out.means, i, n);
-            store_first(g.time * *a.clock, out.times + i, n);
-            scatter_row(g.scales, out.scales, i, n);
-            scatter_row(g.left, out.left_quats, i, n);
-            scatter_row(g.right, out.right_quats, i, n);
-            store_first(g.opacity, out.opacities + i, n);
+            add_row(g.mean, out.means, i, n);
+            add_first(g.time * *a.clock, out.times + i, n);
+            add_row(g.scales, out.scales, i, n);
+            add_row(g.left, out.left_quats, i, n);
+            add_row(g.right, out.right_quats, i, n);
+            add_first(g.opacity, out.opacities + i, n);
             g_lambda += g.lambda_t;  // lanes past the end were given zero
         }
         lambdas[static_cast<size_t>(chunk)] = sum(g_lambda);

@@ -33,31 +33,38 @@ GSB_HD inline void keep_rows(const float* copy, int width, float* rows, int64_t 
 template <int W>
 GSB_HD inline void gather_row(const float* rows, int64_t i, int n, Vec (&out)[W]) {
     float copy[LANES * W];
-    const float* p = sixteen_rows(rows, W, i, n, copy);
-    GSB_UNROLL for (int k = 0; k < W; ++k) out[k] = gather(p + k, W);
+    load_columns(sixteen_rows(rows, W, i, n, copy), out);
 }
 
 template <int W>
 GSB_HD inline void scatter_row(const Vec (&x)[W], float* rows, int64_t i, int n) {
     float copy[LANES * W];
-    float* p = n == LANES ? rows + i * W : copy;
-    GSB_UNROLL for (int k = 0; k < W; ++k) scatter(x[k], p + k, W);
+    store_columns(x, n == LANES ? rows + i * W : copy);
     keep_rows(copy, W, rows, i, n);
 }
 
+// The same, added to what is there. What is added is rounded first, so that it does not depend on which views share a sum.
+template <int W>
+GSB_HD inline void add_row(const Vec (&x)[W], float* rows, int64_t i, int n) {
+    Vec sum[W];
+    gather_row(rows, i, n, sum);
+    GSB_UNROLL for (int k = 0; k < W; ++k) sum[k] += rounded(x[k]);
+    scatter_row(sum, rows, i, n);
+}
+GSB_HD inline void add_first(Vec x, float* p, int n) { store_first(load_first(p, n) + rounded(x), p, n); }
+
 template <int H, int W>
 GSB_HD inline void gather_matrix(const float* rows, int64_t i, int n, Vec (&out)[H][W]) {
-    float copy[LANES * H * W];
-    const float* p = sixteen_rows(rows, H * W, i, n, copy);
-    GSB_UNROLL for (int k = 0; k < H * W; ++k) out[k / W][k % W] = gather(p + k, H * W);
+    Vec flat[H * W];
+    gather_row(rows, i, n, flat);
+    GSB_UNROLL for (int k = 0; k < H * W; ++k) out[k / W][k % W] = flat[k];
 }
 
 template <int H, int W>
 GSB_HD inline void scatter_matrix(const Vec (&x)[H][W], float* rows, int64_t i, int n) {
-    float copy[LANES * H * W];
-    float* p = n == LANES ? rows + i * (H * W) : copy;
-    GSB_UNROLL for (int k = 0; k < H * W; ++k) scatter(x[k / W][k % W], p + k, H * W);
-    keep_rows(copy, H * W, rows, i, n);
+    Vec flat[H * W];
+    GSB_UNROLL for (int k = 0; k < H * W; ++k) flat[k] = x[k / W][k % W];
+    scatter_row(flat, rows, i, n);
 }
 
 // Columns `first` to first + W of rows of any width.
@@ -67,8 +74,10 @@ GSB_HD inline void gather_columns(const float* rows, int width, int first, int64
 }
 
 template <int W>
-GSB_HD inline void scatter_columns(const Vec (&x)[W], float* rows, int width, int first, int64_t i, int n) {
-    GSB_UNROLL for (int k = 0; k < W; ++k) scatter(x[k], rows + i * width + first + k, width, n);
+GSB_HD inline void add_columns(const Vec (&x)[W], float* rows, int width, int first, int64_t i, int n) {
+    Vec sum[W];
+    gather_columns(rows, width, first, i, n, sum);
+    GSB_UNROLL for (int k = 0; k < W; ++k) scatter(sum[k] + rounded(x[k]), rows + i * width + first + k, width, n);
 }
 
 // Whether rows i to i + n - 1 of `width` floats hold nothing but zeros: where no gradient comes in, none goes out.

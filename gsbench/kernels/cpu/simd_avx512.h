@@ -178,6 +178,79 @@ GSB_HD inline void transpose(Vec (&x)[LANES]) {
     }
 }
 
+GSB_HD inline Vec load_some(const float* p, int n);
+GSB_HD inline void store_first(Vec x, float* p, int n);
+
+// For rows of W floats, W at most 4: lane l of column k is float l W + k of W registers, and float l of register k is
+// lane (16 k + l) / W of column (16 k + l) % W.
+template <int W>
+struct Interleaved {
+    alignas(64) int32_t float_of[W][LANES], lane_of[W][LANES];
+    __mmask16 of_register[W][W], of_column[W][W];
+
+    constexpr Interleaved() : float_of(), lane_of(), of_register(), of_column() {
+        for (int k = 0; k < W; ++k) {
+            for (int l = 0; l < LANES; ++l) {
+                const int at = l * W + k, place = LANES * k + l;
+                float_of[k][l] = at % LANES;
+                of_register[k][at / LANES] |= static_cast<__mmask16>(1 << l);
+                lane_of[k][l] = place / W;
+                of_column[k][place % W] |= static_cast<__mmask16>(1 << l);
+            }
+        }
+    }
+};
+template <int W>
+constexpr Interleaved<W> INTERLEAVED{};
+
+// Sixteen rows of W floats, one after the other, as W columns; and back.
+template <int W>
+GSB_HD inline void load_columns(const float* p, Vec (&out)[W]) {
+    if constexpr (W <= 4) {
+        constexpr auto& to = INTERLEAVED<W>;
+        Vec x[W];
+        GSB_UNROLL for (int k = 0; k < W; ++k) x[k] = Vec::load(p + k * LANES);
+        GSB_UNROLL for (int k = 0; k < W; ++k) {
+            const __m512i at = _mm512_load_si512(to.float_of[k]);
+            out[k] = _mm512_permutexvar_ps(at, x[0].v);
+            GSB_UNROLL for (int j = 1; j < W; ++j) {
+                out[k] = _mm512_mask_permutexvar_ps(out[k].v, to.of_register[k][j], at, x[j].v);
+            }
+        }
+    } else {
+        static_assert(W <= LANES);
+        Vec x[LANES];
+        GSB_UNROLL for (int i = 0; i < LANES; ++i) {
+            x[i] = i * W + LANES <= LANES * W ? Vec::load(p + i * W) : load_some(p + i * W, W);
+        }
+        transpose(x);
+        GSB_UNROLL for (int k = 0; k < W; ++k) out[k] = x[k];
+    }
+}
+template <int W>
+GSB_HD inline void store_columns(const Vec (&x)[W], float* p) {
+    if constexpr (W <= 4) {
+        constexpr auto& to = INTERLEAVED<W>;
+        GSB_UNROLL for (int k = 0; k < W; ++k) {
+            const __m512i at = _mm512_load_si512(to.lane_of[k]);
+            __m512 out = _mm512_permutexvar_ps(at, x[0].v);
+            GSB_UNROLL for (int j = 1; j < W; ++j) {
+                out = _mm512_mask_permutexvar_ps(out, to.of_column[k][j], at, x[j].v);
+            }
+            Vec(out).store(p + k * LANES);
+        }
+    } else {
+        static_assert(W <= LANES);
+        Vec rows[LANES];
+        GSB_UNROLL for (int k = 0; k < LANES; ++k) rows[k] = k < W ? x[k] : Vec(0.0f);
+        transpose(rows);
+        // A row's last lanes are written over by the next row.
+        GSB_UNROLL for (int i = 0; i < LANES; ++i) {
+            i * W + LANES <= LANES * W ? rows[i].store(p + i * W) : store_first(rows[i], p + i * W, W);
+        }
+    }
+}
+
 // The first n floats of p, zero in the other lanes.
 GSB_HD inline Vec load_some(const float* p, int n) { return _mm512_maskz_loadu_ps(first(n), p); }
 

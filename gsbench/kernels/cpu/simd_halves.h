@@ -181,6 +181,16 @@ GSB_HD inline void scatter(Vec x, float* p, int stride, int n = LANES) {
     for (int i = 0; i < n; ++i) p[i * stride] = lane[i];
 }
 
+// Sixteen rows of W floats, one after the other, as W columns; and back.
+template <int W>
+GSB_HD inline void load_columns(const float* p, Vec (&out)[W]) {
+    GSB_UNROLL for (int k = 0; k < W; ++k) out[k] = gather(p + k, W);
+}
+template <int W>
+GSB_HD inline void store_columns(const Vec (&x)[W], float* p) {
+    GSB_UNROLL for (int k = 0; k < W; ++k) scatter(x[k], p + k, W);
+}
+
 // p[offsets[lane]] of the first n lanes, zero in the others; and back.
 GSB_HD inline Vec gather_rows(const float* p, const int32_t* offsets, int n) {
     alignas(64) float lane[LANES];

@@ -34,14 +34,15 @@ void observe_static_backward(const StaticArgs& a, const StaticSliceGrads& grads,
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > FEW)
     for (int64_t i = 0; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
+        if (all_zero(grads.opacities, 1, i, n) && all_zero(grads.factors, 9, i, n)) continue;
         StaticParameters<Vec> raw, g;
         Vec g_factor[3][3];
         load(a, i, n, raw);
         gather_matrix(grads.factors, i, n, g_factor);
         StaticGaussian<Vec>(raw).vjp(g_factor, load_first(grads.opacities + i, n), g);
-        scatter_row(g.scales, out.scales, i, n);
-        scatter_row(g.quat, out.quats, i, n);
-        store_first(g.opacity, out.opacities + i, n);
+        add_row(g.scales, out.scales, i, n);
+        add_row(g.quat, out.quats, i, n);
+        add_first(g.opacity, out.opacities + i, n);
     }
 }
 

@@ -57,20 +57,6 @@ void observe(const TriangularArgs& a, const Observation& out) {
     }
 }
 
-// The gradient of rows that the view does not show.
-template <Query Q>
-GSB_HD inline void store_zero(const TriangularGrads& out, int64_t i, int n) {
-    using P = TriangularParameters<Vec, Q>;
-    fill_zero(out.means, 3, i, i + n);
-    if constexpr (P::DIRECTION) fill_zero(out.directions, 3, i, i + n);
-    if constexpr (P::TIME) fill_zero(out.times, 1, i, i + n);
-    fill_zero(out.log_diagonal, P::N, i, i + n);
-    fill_zero(out.shape, 3, i, i + n);
-    fill_zero(out.motion, 3 * P::K, i, i + n);
-    if constexpr (P::COUPLED) fill_zero(out.coupling, P::K * (P::K - 1) / 2, i, i + n);
-    fill_zero(out.opacities, 1, i, i + n);
-}
-
 template <Query Q, template <class, int> class Reduction>
 void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     const TriangularModel model = model_of(a);
@@ -82,10 +68,7 @@ void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, co
         Vec lambda_d(0.0f), lambda_t(0.0f);
         for (int64_t i = chunk * CHUNK; i < end; i += LANES) {
             const int n = lanes_from(i, end);
-            if (is_zero(grads, i, n)) {
-                store_zero<Q>(out, i, n);
-                continue;
-            }
+            if (is_zero(grads, i, n)) continue;
             TriangularParameters<Vec, Q> raw, g;
             Observed<Vec> given;
             load<Q>(a, i, n, raw);
@@ -93,14 +76,14 @@ void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, co
             TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
             gaussian.observe();
             gaussian.vjp(given, g);
-            scatter_row(g.mean, out.means, i, n);
-            if constexpr (g.DIRECTION) scatter_row(g.direction, out.directions, i, n);
-            if constexpr (g.TIME) store_first(g.time, out.times + i, n);
-            scatter_row(g.log_diagonal, out.log_diagonal, i, n);
-            scatter_row(g.shape, out.shape, i, n);
-            scatter_row(g.motion, out.motion, i, n);
-            if constexpr (g.COUPLED) scatter_row(g.coupling, out.coupling, i, n);
-            store_first(g.opacity, out.opacities + i, n);
+            add_row(g.mean, out.means, i, n);
+            if constexpr (g.DIRECTION) add_row(g.direction, out.directions, i, n);
+            if constexpr (g.TIME) add_first(g.time, out.times + i, n);
+            add_row(g.log_diagonal, out.log_diagonal, i, n);
+            add_row(g.shape, out.shape, i, n);
+            add_row(g.motion, out.motion, i, n);
+            if constexpr (g.COUPLED) add_row(g.coupling, out.coupling, i, n);
+            add_first(g.opacity, out.opacities + i, n);
             lambda_d += g.lambda_d;  // lanes past the end were given zero
             lambda_t += g.lambda_t;
         }
@@ -154,24 +137,20 @@ void observe_static_rows(const TriangularArgs& a, const Observation& out) {
 
 void observe_static_rows_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     const StaticRows rows(a);
-    const int k = rows.width - 3;
     rows.each_chunk([&](int64_t first, int64_t end) {
-        copy_rows(grads.means, out.means, 3, first, end);
-        if (a.directions) fill_zero(out.directions, 3, first, end);
-        if (a.times) fill_zero(out.times, 1, first, end);
-        fill_zero(out.log_diagonal, rows.width, first, end);
-        fill_zero(out.motion, 3 * k, first, end);
-        fill_zero(out.coupling, k * (k - 1) / 2, first, end);
         for (int64_t i = first; i < end; i += LANES) {
             const int n = lanes_from(i, end);
+            if (is_zero(grads, i, n)) continue;
             StaticTriangularParameters<Vec> raw, g;
-            Vec g_factor[3][3];
+            Vec g_mean[3], g_factor[3][3];
             rows.load(i, n, raw);
+            gather_row(grads.means, i, n, g_mean);
             gather_matrix(grads.factors, i, n, g_factor);
             StaticTriangularGaussian<Vec>(raw, a.form).vjp(g_factor, load_first(grads.opacities + i, n), g);
-            scatter_columns(g.log_diagonal, out.log_diagonal, rows.width, rows.space, i, n);
-            scatter_row(g.shape, out.shape, i, n);
-            store_first(g.opacity, out.opacities + i, n);
+            add_row(g_mean, out.means, i, n);
+            add_columns(g.log_diagonal, out.log_diagonal, rows.width, rows.space, i, n);
+            add_row(g.shape, out.shape, i, n);
+            add_first(g.opacity, out.opacities + i, n);
         }
     });
 }

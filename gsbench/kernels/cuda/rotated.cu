@@ -63,12 +63,12 @@ __global__ void observe_backward_kernel(RotatedArgs a, ObservationGrads grads, R
         gaussian.vjp(load_observed(grads, i), g);
     }
     if (i < a.N) {
-        store_row(g.mean, out.means, i);
-        out.times[i] = g.time * *a.clock;
-        store_row(g.scales, out.scales, i);
-        store_row(g.left, out.left_quats, i);
-        store_row(g.right, out.right_quats, i);
-        out.opacities[i] = g.opacity;
+        add_row(g.mean, out.means, i);
+        out.times[i] += g.time * *a.clock;
+        add_row(g.scales, out.scales, i);
+        add_row(g.left, out.left_quats, i);
+        add_row(g.right, out.right_quats, i);
+        out.opacities[i] += g.opacity;
     }
     const float lambda_t = warp_sum(g.lambda_t);
     if (threadIdx.x % WARP == 0) atomicAdd(out.log_lambda_t, lambda_t * expf(*a.log_lambda_t));

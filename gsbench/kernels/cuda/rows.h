@@ -17,6 +17,11 @@ __device__ inline void store_row(const float (&row)[COUNT], float* rows, int64_t
     GSB_UNROLL for (int k = 0; k < COUNT; ++k) rows[i * COUNT + k] = row[k];
 }
 
+template <int COUNT>
+__device__ inline void add_row(const float (&row)[COUNT], float* rows, int64_t i) {
+    GSB_UNROLL for (int k = 0; k < COUNT; ++k) rows[i * COUNT + k] += row[k];
+}
+
 template <int ROWS, int COUNT>
 __device__ inline void load_matrix(const float* rows, int64_t i, float (&out)[ROWS][COUNT]) {
     GSB_UNROLL for (int row = 0; row < ROWS; ++row) load_row(rows, i * ROWS + row, out[row]);

@@ -31,9 +31,9 @@ __global__ void static_backward_kernel(StaticArgs a, StaticSliceGrads grads, Sta
     float g_factor[3][3];
     load_matrix(grads.factors, i, g_factor);
     StaticGaussian<float>(raw).vjp(g_factor, grads.opacities[i], g);
-    store_row(g.scales, out.scales, i);
-    store_row(g.quat, out.quats, i);
-    out.opacities[i] = g.opacity;
+    add_row(g.scales, out.scales, i);
+    add_row(g.quat, out.quats, i);
+    out.opacities[i] += g.opacity;
 }
 
 }  // namespace

@@ -85,14 +85,14 @@ __global__ void observe_backward_kernel(TriangularArgs a, ObservationGrads grads
         gaussian.vjp(load_observed(grads, i), g);
     }
     if (i < a.N) {
-        store_row(g.mean, out.means, i);
-        if constexpr (g.DIRECTION) store_row(g.direction, out.directions, i);
-        if constexpr (g.TIME) out.times[i] = g.time;
-        store_row(g.log_diagonal, out.log_diagonal, i);
-        store_row(g.shape, out.shape, i);
-        store_row(g.motion, out.motion, i);
-        if constexpr (g.COUPLED) store_row(g.coupling, out.coupling, i);
-        out.opacities[i] = g.opacity;
+        add_row(g.mean, out.means, i);
+        if constexpr (g.DIRECTION) add_row(g.direction, out.directions, i);
+        if constexpr (g.TIME) out.times[i] += g.time;
+        add_row(g.log_diagonal, out.log_diagonal, i);
+        add_row(g.shape, out.shape, i);
+        add_row(g.motion, out.motion, i);
+        if constexpr (g.COUPLED) add_row(g.coupling, out.coupling, i);
+        out.opacities[i] += g.opacity;
     }
     const float lambda_d = warp_sum(g.lambda_d), lambda_t = warp_sum(g.lambda_t);
     if (threadIdx.x % WARP == 0) {
