@@ -1,9 +1,12 @@
-"""Adam on the rows of a parameter that were drawn, in place: the others cost a look at a mask."""
+"""Update parameters by Adam in place: the rows of one that were drawn, or all of several in one call."""
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.headers import MAX_ADAM
 from gsbench.kernels.library import library_of
 from gsbench.kernels.operation import address, in_rows
 from gsbench.kernels.tensors import check_number, check_tensor
@@ -67,3 +70,51 @@ def adam(
              "rate": rate, "beta1": betas[0], "beta2": betas[1], "eps": eps, "step": address(step),
              "out.parameter": address(parameter), "out.mean": address(mean), "out.square": address(square)}  # fmt: skip
     library_of(parameter.device.type).call("adam", slots, parameter)
+
+
+@torch.no_grad()
+def adam_all(
+    parameters: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    means: Sequence[Tensor],
+    squares: Sequence[Tensor],
+    steps: Sequence[Tensor],  # of []
+    rates: Sequence[float],
+    betas: list[float],
+    eps: float,
+) -> None:
+    """Update parameters on the CPU, each at a rate of its own, as `torch.optim.Adam` does.
+
+    One call instead of one for each parameter: a small model has a dozen parameters, and a call of torch costs as much
+    as their update.
+
+    Args:
+        parameters: what is moved, of any shapes.
+        gradients: of the loss by them.
+        means: the running means of the gradients.
+        squares: those of their squares.
+        steps: the numbers of this update, from 1.
+        rates: the learning rates.
+        betas: how much of the two means is kept.
+        eps: added to the root of the mean square.
+
+    Raises:
+        InputError: not float32 on the CPU, row by row in memory, or shapes that do not fit.
+    """
+    gradients = in_rows(list(gradients))
+    for name, listed in {"parameter": parameters, "gradient": gradients, "mean": means, "square": squares}.items():
+        for x, parameter in zip(listed, parameters, strict=True):
+            if not (x.shape == parameter.shape and x.dtype == torch.float32 and x.is_cpu and x.is_contiguous()):
+                raise InputError(f"adam_all: expected {name} as contiguous float32 of shape {list(parameter.shape)} on "
+                                 f"the CPU, got {x.dtype} of shape {list(x.shape)} on {x.device}")  # fmt: skip
+    for first in range(0, len(parameters), MAX_ADAM):
+        part = slice(first, first + MAX_ADAM)
+        slots = {"count": len(parameters[part]), "numbers": tuple([x.numel() for x in parameters[part]]),
+                 "gradients": _addresses(gradients[part]), "steps": _addresses(steps[part]),
+                 "rates": tuple(rates[part]), "beta1": betas[0], "beta2": betas[1], "eps": eps,
+                 "out.parameters": _addresses(parameters[part]), "out.means": _addresses(means[part]), "out.squares": _addresses(squares[part])}  # fmt: skip
+        library_of("cpu").call("adam_all", slots, parameters[0])
+
+
+def _addresses(tensors: Sequence[Tensor]) -> tuple[int, ...]:
+    return tuple([x.data_ptr() for x in tensors])

@@ -112,7 +112,7 @@ class GaussianModel(nn.Module, ABC):
         return None
 
     def durations(self) -> Tensor | None:
-        """Return each Gaussian's standard deviation in time, [N] clips; None for a model without `times` and lambda_t."""
+        """Return each Gaussian's standard deviation in time, [N] clips; None unless it has `times` and lambda_t."""
         return None
 
     def hold_sizes(self, least: Tensor) -> None:
@@ -265,8 +265,8 @@ class GaussianModel(nn.Module, ABC):
     def visible_intervals(self) -> Tensor | None:
         """Return the first and the last time at which each Gaussian can be visible, [N, 2] clips; None without time.
 
-        The opacity in a slice, o exp(-lambda_t (t - mu_t)^2 / (2 S_t)) at most, is then at least ALPHA_MIN. AGR may move
-        a Gaussian out of its interval, so this is for the order of rows only. (inf, inf) is never.
+        The opacity in a slice, o exp(-lambda_t (t - mu_t)^2 / (2 S_t)) at most, is then at least ALPHA_MIN. AGR may
+        move a Gaussian out of its interval, so this is for the order of rows only. (inf, inf) is never.
         """
         deviations = self.durations()
         if deviations is None:

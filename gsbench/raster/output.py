@@ -15,6 +15,11 @@ class RasterInfo:
     pairs: int  # (tile, Gaussian) pairs blended
 
     @property
+    def drawn(self) -> Tensor:
+        """Tell which Gaussians reach a pixel at an alpha of 1/255 or more, [C, N] bool."""
+        return self.half_sizes.detach()[..., 0] > 0
+
+    @property
     def radii(self) -> Tensor:
         """Half the side of the square that holds every pixel drawn, [C, N] int32, pixels; 0: not drawn."""
         return self.half_sizes.detach().amax(-1).ceil_().int()

@@ -6,10 +6,10 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gsbench.errors import InputError, did_you_mean
-from gsbench.kernels.adam import adam
+from gsbench.kernels.adam import adam, adam_all
 from gsbench.models import GaussianModel
 from gsbench.train.checkpoint import tensor
 
@@ -60,7 +60,7 @@ class Optimizer:
     def step(
         self,
         step: int,
-        drawn: Tensor,  # [N] bool
+        drawn: Tensor | None,  # [N] bool
         slowed: float = 1.0,
     ) -> None:
         """Update the parameters that have a gradient, at the rates of this step, and drop the gradients.
@@ -69,32 +69,62 @@ class Optimizer:
 
         Args:
             step: counted from 0.
-            drawn: the Gaussians that some view of the batch sees; the others have no gradient.
+            drawn: the Gaussians that some view of the batch sees, which `sparse_adam` needs; the others have no
+                gradient.
             slowed: a factor of AGR's rate.
         """
-        skip: Tensor | None = getattr(self.adam, "found_inf", None)
-        if skip is not None:  # used as a mask: reading its value would wait for the GPU
-            drawn = drawn & (skip == 0)
-        counts = 1 if skip is None else 1 - skip
+        by_kernel = []
         for group in self.adam.param_groups:
             group["lr"] = rate_at(self.rates[group["name"]], step, self.train, self.extent)
             if group["name"] == "refinement":
                 group["lr"] *= slowed
             if self.is_sparse and group["name"] in self.model.splats:
-                self._step_rows(group, drawn, counts)
-        self.adam.step()
+                assert drawn is not None
+                self._step_rows(group, drawn)
+            by_kernel += [(p, group["lr"]) for p in group["params"] if p.grad is not None and self._is_native(p)]
+        if by_kernel:
+            self._step_all(by_kernel)
+        self.adam.step()  # what is left: parameters on a GPU, or those of the reference
         self.adam.zero_grad(set_to_none=True)
 
-    def _step_rows(self, group: dict[str, Any], drawn: Tensor, counts: int | Tensor) -> None:
-        """Update the rows `drawn`; `counts` is 0 where the step is skipped."""
+    def _is_native(self, parameter: Tensor) -> bool:
+        """Tell whether the kernel of the CPU updates a parameter."""
+        return parameter.device.type == "cpu" and self.model.backend.serves(parameter) and self._skip is None
+
+    @property
+    def _skip(self) -> Tensor | None:
+        """Return a GPU's finite check, [] 1 where nothing is to be updated; reading it would wait for the GPU."""
+        return getattr(self.adam, "found_inf", None)
+
+    def _state_of(self, parameter: Tensor) -> dict[str, Tensor]:
+        """Return the moments of a parameter, zero at first, in the layout of torch.optim.Adam."""
+        state: dict[str, Tensor] = self.adam.state[parameter]
+        if not state:
+            state["step"] = torch.zeros((), device=parameter.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        return state
+
+    def _step_all(self, rated: list[tuple[nn.Parameter, float]]) -> None:
+        """Update parameters, each at its rate, in one call of the kernel."""
+        parameters, rates = [p.data for p, _ in rated], [rate for _, rate in rated]
+        gradients = [p.grad for p, _ in rated if p.grad is not None]
+        states = [self._state_of(p) for p, _ in rated]
+        steps, means, squares = ([state[key] for state in states] for key in ("step", "exp_avg", "exp_avg_sq"))
+        torch._foreach_add_(steps, 1)
+        betas, eps = self.adam.defaults["betas"], self.adam.defaults["eps"]
+        adam_all(parameters, gradients, means, squares, steps, rates, list(betas), eps)
+        for parameter, _ in rated:
+            parameter.grad = None
+
+    def _step_rows(self, group: dict[str, Any], drawn: Tensor) -> None:
+        """Update the rows `drawn`, unless the step is to be skipped."""
         (parameter,) = group["params"]
         if parameter.grad is None:
             return
-        state = self.adam.state[parameter]
-        if not state:  # in the layout of torch.optim.Adam
-            state["step"] = torch.zeros((), device=parameter.device)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        state["step"] += counts
+        if self._skip is not None:
+            drawn = drawn & (self._skip == 0)
+        state = self._state_of(parameter)
+        state["step"] += 1 if self._skip is None else 1 - self._skip
         update = adam if self.model.backend.serves(parameter) else adam_reference
         moments = state["exp_avg"], state["exp_avg_sq"]
         with torch.no_grad():

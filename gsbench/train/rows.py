@@ -7,7 +7,6 @@ from torch import Tensor
 
 from gsbench.models import GaussianModel
 
-
 START_BINS = 16  # of a clip, by which rows are sorted
 
 

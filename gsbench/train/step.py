@@ -1,7 +1,7 @@
 """Compute the gradients of one training step: the views of a batch side by side, each on a tape of its own.
 
-Threads share the views, not the kernels: a batch has few views and each of them many small kernels. Every view's
-gradient is added in the order of the views, so that any number of threads gives the same bits.
+Threads share the views, not the kernels: a batch has few views and each of them many small kernels. Gradients are added
+in an order that depends on the views alone, so that any number of threads gives the same bits.
 """
 
 import time
@@ -43,11 +43,51 @@ def fitting_threads(gaussians: int, pixels: int) -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
+def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
+    """Choose what each view's gradients are added to, so that few are held at once and any number of threads agrees.
+
+    The first half of the views has one sum and the second half another; the two are added at the end. Views of a
+    worker that begins within a half have a sum each, which `add_up` adds to that half's: to the last bit it makes no
+    difference whether a view adds to a sum or is added to it (`gsbench.kernels.tape`).
+
+    Args:
+        views: in the batch.
+        bounds: worker i sees the views from bounds[i] to bounds[i + 1].
+    """
+    halves = {0, (views + 1) // 2}
+    sums: list[Sums] = []
+    begins = 0  # of the half or the worker that the view belongs to
+    for i in range(views):
+        if i in halves or i in bounds:
+            begins = i
+        sums.append(sums[-1] if i > begins and begins in halves else {})
+    return sums
+
+
+def add_up(sums: Sequence[Sums]) -> Sums:
+    """Add the sums that `deal` chose: each half's in the order of the views, then the second half's to the first's."""
+    middle = (len(sums) + 1) // 2
+    parts = [_in_order(half) for half in (sums[:middle], sums[middle:]) if half]
+    return _in_order(parts)
+
+
+def _in_order(parts: Sequence[Sums]) -> Sums:
+    """Add dictionaries of sums to the first; one that occurs again is added once."""
+    total = parts[0]
+    done = {id(total)}
+    for part in parts[1:]:
+        if id(part) not in done:
+            done.add(id(part))
+            for key, gradient in part.items():
+                add_to(total, key, gradient)
+    return total
+
+
 class Seen(NamedTuple):
     """What a step learns from one view."""
 
     loss: Tensor  # []
-    radii: Tensor  # [1, N] int32, pixels
+    drawn: Tensor  # [1, N] bool, see `gsbench.raster.RasterInfo`
     g_means2d: Tensor  # [1, N, 2] of the batch's loss, by pixels
 
 
@@ -75,21 +115,26 @@ class Step:
         self.penalties = penalties
         sources = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
         workers = min(len(views), self.model.backend.workers(self.model.splats["means"]))
-        total: Sums = {}
+        bounds = [len(views) * worker // workers for worker in range(workers + 1)]
+        sums = deal(len(views), bounds)
         if workers == 1:
-            seen = [self._see(view, sources, total, len(views), self.stages) for view in views]
+            seen = [
+                self._see(view, sources, own, len(views), self.stages) for view, own in zip(views, sums, strict=True)
+            ]
         else:
-            seen = self._by_workers(views, sources, total, workers)
+            seen = self._by_workers(views, sources, sums, bounds)
         with self.stages("backward"):
+            total = add_up(sums)
             for parameter in sources:
                 parameter.grad = total.get(id(parameter))
         return seen
 
-    def _by_workers(self, views: Sequence[View], sources: list[nn.Parameter], total: Sums, workers: int) -> list[Seen]:
-        """Deal the views to workers: those of the first worker go into `total`, each other into sums of its own."""
+    def _by_workers(
+        self, views: Sequence[View], sources: list[nn.Parameter], sums: list[Sums], bounds: list[int]
+    ) -> list[Seen]:
+        """Let each worker see the views between its two `bounds`."""
         started = time.perf_counter()
-        bounds = [len(views) * worker // workers for worker in range(workers + 1)]
-        sums = [total if i < bounds[1] else {} for i in range(len(views))]
+        workers = len(bounds) - 1
         clocks = [StageClock() for _ in range(workers)]
 
         def run(worker: int) -> list[Seen]:
@@ -97,9 +142,6 @@ class Step:
                     for i in range(bounds[worker], bounds[worker + 1])]  # fmt: skip
 
         seen = [one for part in side_by_side(run, range(workers), workers) for one in part]
-        for own in sums[bounds[1] :]:
-            for key, gradient in own.items():
-                add_to(total, key, gradient)
         self.stages.share([clock.seconds for clock in clocks], time.perf_counter() - started)
         return seen
 
@@ -128,4 +170,4 @@ class Step:
             g_means2d = sums.pop(id(means2d), None)
         if g_means2d is None:
             g_means2d = torch.zeros_like(means2d)
-        return Seen(loss.detach() / views, output.info.radii, g_means2d)
+        return Seen(loss.detach() / views, output.info.drawn, g_means2d)

@@ -83,9 +83,9 @@ def test_rates_and_parameters_must_match() -> None:
 
 
 def drawn_with(gradients: torch.Tensor, drawn: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-    """Radii [1, N] and gradients of 2D means [1, N, 2] of one view."""
-    radii = torch.ones(1, len(gradients), dtype=torch.int32) if drawn is None else drawn[None].int()
-    return radii, gradients[None]
+    """Which are drawn [1, N] and gradients of 2D means [1, N, 2] of one view."""
+    drawn = torch.ones(len(gradients)) if drawn is None else drawn
+    return drawn[None].bool(), gradients[None]
 
 
 def test_density_control_clones_small_splits_large_prunes_faint() -> None:

@@ -64,7 +64,7 @@ def test_density_gradients_are_of_one_view_in_half_images() -> None:
     density = trainer("3dgs").density
     N = len(density.model)
     gradient = torch.tensor([3e-3, 4e-3]).expand(1, N, 2).clone()
-    density.accumulate(torch.ones(1, N, dtype=torch.int32), gradient, width=20, height=20, views=4)
+    density.accumulate(torch.ones(1, N, dtype=torch.bool), gradient, width=20, height=20, views=4)
     torch.testing.assert_close(density.gradient, torch.full((N,), 5e-3 * 4 * 10))
 
 
@@ -112,12 +112,12 @@ def test_a_point_of_the_curve_is_measured_before_a_reset() -> None:
 
 def test_what_any_view_of_the_batch_saw_is_moved() -> None:
     """Catches sparse_adam that moves what the last view saw alone, or the first."""
-    fitted = trainer("3dgs", "train.batch_size=3")
+    fitted = trainer("3dgs", "train.batch_size=3", "optim=sparse_adam")
     N = len(fitted.model)
-    radii = torch.zeros(3, 1, N, dtype=torch.int32)
+    drawn = torch.zeros(3, 1, N, dtype=torch.bool)
     for view in range(3):
-        radii[view, 0, view] = 5  # each view sees the Gaussian of its number
-    seen = [Seen(torch.ones(()), one, torch.zeros(1, N, 2)) for one in radii]
+        drawn[view, 0, view] = True  # each view sees the Gaussian of its number
+    seen = [Seen(torch.ones(()), one, torch.zeros(1, N, 2)) for one in drawn]
     fitted.gradients = lambda *_: seen  # type: ignore[assignment]
     moved = []
     fitted.optimizer.step = lambda _, drawn, **__: moved.append(drawn)  # type: ignore[method-assign]

@@ -1,4 +1,4 @@
-// Adam on some rows of a parameter: those that are not drawn are neither read nor written.
+// Adam on some rows of a parameter, where those that are not drawn are neither read nor written; and on parameters whole.
 #include "../math/adam.h"
 
 #include "isa.h"
@@ -7,14 +7,19 @@ namespace gsb {
 inline namespace GSB_ISA {
 namespace {
 
-constexpr int64_t CHUNK = 256;  // rows a thread takes at a time
+constexpr int64_t CHUNK = 256;     // rows a thread takes at a time
+constexpr int64_t MANY = 1 << 16;  // numbers that are worth a second thread
+
+AdamRule rule_of(double rate, double beta1, double beta2, double eps, double step) {
+    const auto f = [](double x) { return static_cast<float>(x); };
+    const double left1 = 1.0 - ::pow(beta1, step), left2 = 1.0 - ::pow(beta2, step);
+    return {f(rate), f(beta1), f(beta2), f(eps), f(1.0 / left1), f(1.0 / ::sqrt(left2))};
+}
 
 }  // namespace
 
 void adam(const AdamArgs& a, const AdamState& state) {
-    const double left1 = 1.0 - ::pow(a.beta1, *a.step), left2 = 1.0 - ::pow(a.beta2, *a.step);
-    const auto f = [](double x) { return static_cast<float>(x); };
-    const AdamRule rule{f(a.rate), f(a.beta1), f(a.beta2), f(a.eps), f(1.0 / left1), f(1.0 / ::sqrt(left2))};
+    const AdamRule rule = rule_of(a.rate, a.beta1, a.beta2, a.eps, *a.step);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
     for (int64_t chunk = 0; chunk < a.N; chunk += CHUNK) {
         const int64_t end = chunk + CHUNK < a.N ? chunk + CHUNK : a.N;
@@ -30,6 +35,19 @@ void adam(const AdamArgs& a, const AdamState& state) {
                 adam_update(rule, a.gradient[k], state.parameter[k], state.mean[k], state.square[k]);
             }
         }
+    }
+}
+
+void adam_all(const AdamAllArgs& a, const AdamAllState& state) {
+    int64_t total = 0;
+    for (int i = 0; i < a.count; ++i) total += a.numbers[i];
+#pragma omp parallel num_threads(a.threads) if (total > MANY)
+    for (int i = 0; i < a.count; ++i) {
+        const AdamRule rule = rule_of(a.rates[i], a.beta1, a.beta2, a.eps, *a.steps[i]);
+        const float* g = a.gradients[i];
+        float *p = state.parameters[i], *m = state.means[i], *v = state.squares[i];
+#pragma omp for simd schedule(static) nowait
+        for (int64_t k = 0; k < a.numbers[i]; ++k) adam_update(rule, g[k], p[k], m[k], v[k]);
     }
 }
 

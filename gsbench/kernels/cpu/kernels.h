@@ -29,12 +29,28 @@ struct TileLists {
 };
 GSB_FIELDS(TileLists, OUTPUTS, offsets, ids)
 
+// Adam on all numbers of several parameters; a GPU has torch's own.
+struct AdamAllArgs {
+    int count;
+    int64_t numbers[MAX_ADAM];
+    const float *gradients[MAX_ADAM], *steps[MAX_ADAM];  // of [numbers]; of [], from 1
+    double rates[MAX_ADAM], beta1, beta2, eps;
+    int threads;
+};
+GSB_FIELDS(AdamAllArgs, INPUTS, count, numbers, gradients, steps, rates, beta1, beta2, eps, threads)
+
+struct AdamAllState {
+    float *parameters[MAX_ADAM], *means[MAX_ADAM], *squares[MAX_ADAM];
+};
+GSB_FIELDS(AdamAllState, OUTPUTS, parameters, means, squares)
+
 }  // namespace gsb
 
 #define GSB_CPU_KERNELS(kernel)                    \
     GSB_KERNELS(kernel)                            \
     kernel(count_tiles, BinArgs, TileOffsets)      \
-    kernel(fill_tiles, BinArgs, TileLists)
+    kernel(fill_tiles, BinArgs, TileLists)         \
+    kernel(adam_all, AdamAllArgs, AdamAllState)
 
 namespace gsb {
 

@@ -12,7 +12,7 @@ namespace gsb {
 inline namespace GSB_ISA {
 namespace {
 
-constexpr int BLOCK = 128;             // Gaussians
+constexpr int BLOCK = 128;            // Gaussians
 constexpr int64_t TASK = 8 * BLOCK;    // of the forward pass
 constexpr int64_t CHUNK = 32 * BLOCK;  // a task of the backward pass; the weights' gradients are summed by chunks
 // Tiles of `product` and `outer`: as many sums as registers hold.
@@ -127,26 +127,71 @@ struct Block {
     int64_t first;
     const int32_t* rows;
     int count;
+
+    GSB_HD int64_t at(int i) const { return first + rows[i]; }
+    // Whether sixteen rows from the i-th on follow one another.
+    GSB_HD bool is_whole(int i) const { return i + LANES <= count && rows[i + LANES - 1] - rows[i] == LANES - 1; }
 };
 
-// The block's rows of an array [N, width] as `width` rows of BLOCK; zero past the block's end.
-void load_block(const Block& block, const float* array, int width, float* out) {
-    for (int i = 0; i < block.count; ++i) {
-        const float* row = array + (block.first + block.rows[i]) * width;
-        for (int k = 0; k < width; ++k) out[k * BLOCK + i] = row[k];
-    }
-    for (int k = 0; k < width; ++k) {
-        for (int i = block.count; i < BLOCK; ++i) out[k * BLOCK + i] = 0.0f;
+// Calls f<W>() for the width of an array; the widths that models have are known to the compiler.
+template <class F>
+GSB_HD inline void with_width(int width, F f) {
+    switch (width) {
+        case 1: return f.template operator()<1>();
+        case 3: return f.template operator()<3>();
+        case 4: return f.template operator()<4>();
+        case 6: return f.template operator()<6>();
+        case 7: return f.template operator()<7>();
+        case 9: return f.template operator()<9>();
+        case 12: return f.template operator()<12>();
+        default: return f.template operator()<0>();
     }
 }
 
-// What load_block reads, plus the `width` rows at `moved`, to another array. Both go number by number: rows are so short
-// that gathers and scatters take longer.
-void store_block(const Block& block, const float* moved, const float* array, int width, float* out) {
-    for (int i = 0; i < block.count; ++i) {
-        const int64_t at = (block.first + block.rows[i]) * width;
-        for (int k = 0; k < width; ++k) out[at + k] = array[at + k] + moved[k * BLOCK + i];
+// The block's rows of an array [N, width] as `width` rows of BLOCK; zero past the block's end.
+void load_block(const Block& block, const float* array, int width, float* out) {
+    for (int k = 0; k < width; ++k) {
+        for (int i = block.count; i < BLOCK; ++i) out[k * BLOCK + i] = 0.0f;
     }
+    with_width(width, [&]<int W>() {
+        for (int i = 0; i < block.count; i += LANES) {
+            const int n = lanes_from(i, block.count);
+            if constexpr (W > 0) {
+                if (block.is_whole(i)) {
+                    Vec columns[W];
+                    load_columns(array + block.at(i) * W, columns);
+                    GSB_UNROLL for (int k = 0; k < W; ++k) columns[k].store(out + k * BLOCK + i);
+                    continue;
+                }
+            }
+            for (int j = i; j < i + n; ++j) {
+                const float* row = array + block.at(j) * width;
+                for (int k = 0; k < width; ++k) out[k * BLOCK + j] = row[k];
+            }
+        }
+    });
+}
+
+// What load_block reads, plus the `width` rows at `moved`, to another array.
+void store_block(const Block& block, const float* moved, const float* array, int width, float* out) {
+    with_width(width, [&]<int W>() {
+        for (int i = 0; i < block.count; i += LANES) {
+            const int n = lanes_from(i, block.count);
+            if constexpr (W > 0) {
+                if (block.is_whole(i)) {
+                    Vec columns[W];
+                    load_columns(array + block.at(i) * W, columns);
+                    GSB_UNROLL for (int k = 0; k < W; ++k) columns[k] += Vec::load(moved + k * BLOCK + i);
+                    store_columns(columns, out + block.at(i) * W);
+                    continue;
+                }
+            }
+            for (int j = i; j < i + n; ++j) {
+                const int64_t at = block.at(j) * width;
+                for (int k = 0; k < width; ++k) out[at + k] = array[at + k] + moved[k * BLOCK + j];
+            }
+        }
+    });
 }
 
 // The first `count` of several arrays as rows of the block, one array below the other.
@@ -243,8 +288,9 @@ void backward_block(const RefineArgs& a, const Block& block, const WeightLayout&
 bool has_gradient(const RefineArgs& a, const float* const* grads, int64_t i) {
     for (int k = 0; k < a.arrays; ++k) {
         const float* row = grads[k] + i * a.value_widths[k];
-        for (int c = 0; c < a.value_widths[k]; ++c) {
-            if (row[c] != 0.0f) return true;
+        for (int c = 0; c < a.value_widths[k]; c += LANES) {
+            const Vec g = load_some(row + c, lanes_from(c, a.value_widths[k]));
+            if (any(!(g == Vec(0.0f)))) return true;
         }
     }
     return false;

@@ -42,7 +42,7 @@ class Densification(ABC):
     @abstractmethod
     def accumulate(
         self,
-        radii: Tensor,  # [C, N]
+        drawn: Tensor,  # [C, N] bool
         g_means2d: Tensor,  # [C, N, 2] per pixel
         width: int,
         height: int,
@@ -51,7 +51,7 @@ class Densification(ABC):
         """Take in the gradients of one view of a batch.
 
         Args:
-            radii: of the splats in pixels; 0 where the Gaussian was culled.
+            drawn: which Gaussians were not culled.
             g_means2d: gradient of the loss, a mean over `views`, by the 2D means.
             width: of the image, pixels.
             height: of the image, pixels.

@@ -43,7 +43,7 @@ class GradientDensification(Densification):
     @torch.no_grad()
     def accumulate(
         self,
-        radii: Tensor,  # [C, N]
+        drawn: Tensor,  # [C, N] bool
         g_means2d: Tensor,  # [C, N, 2] per pixel
         width: int,
         height: int,
@@ -52,10 +52,9 @@ class GradientDensification(Densification):
         """Add the gradients of one view, in units of half the image (NDC); see `Densification.accumulate`."""
         x, y = g_means2d.unbind(-1)  # scaled separately: making a tensor of the two sizes would wait for the GPU
         self.gradient += torch.hypot(x * (views * width / 2), y * (views * height / 2)).sum(0)
-        drawn = (radii > 0).sum(0)
-        self.seen += drawn
+        self.seen += drawn.sum(0)
         # [N] views since the Gaussian was last visible
-        self.unseen = torch.where(drawn > 0, 0, self.unseen + len(radii))
+        self.unseen = (self.unseen + len(drawn)).masked_fill_(drawn.any(0), 0)
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator, has_reset: bool) -> int:
