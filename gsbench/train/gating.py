@@ -30,11 +30,11 @@ GATES = ("off", "end", "both")
 LOSS_IN_TRAINING = 0.1
 LOSS_WITH_AGR = 0.5
 # A model of fewer Gaussians is not gated in training, for it needs them all: limited to 300 and 600 Gaussians, models
-# of four of five scenes ended 0.2 to 0.5 dB lower on val by that gate (docs/effects.md).
+# of four of five scenes ended 0.2 to 0.5 dB lower on val by that gate (docs/tuning.md).
 LEAST_IN_TRAINING = 1_000
 VIEWS_IN_TRAINING = 30  # that the probe looks at: the gate must cost less than it saves
 # AGR's rate is constant, and fewer Gaussians end farther from where its steps swing around: on trex a gated training
-# ended 0.4 dB lower by that (docs/effects.md).
+# ended 0.4 dB lower by that (docs/results.md).
 LAST_RATE = 0.1
 HELD_OUT = 8  # every so many training views one, to check on where the scene has no val split of its own
 FEW = 12  # training views, of which none is held out
