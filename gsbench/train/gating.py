@@ -34,7 +34,7 @@ LOSS_WITH_AGR = 0.5
 LEAST_IN_TRAINING = 1_000
 VIEWS_IN_TRAINING = 30  # that the probe looks at: the gate must cost less than it saves
 # AGR's rate is constant, and fewer Gaussians end farther from where its steps swing around: on trex a gated training
-# ended 0.4 dB lower by that (docs/results.md).
+# ended 0.4 dB lower by that.
 LAST_RATE = 0.1
 HELD_OUT = 8  # every so many training views one, to check on where the scene has no val split of its own
 FEW = 12  # training views, of which none is held out
