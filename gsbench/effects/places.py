@@ -28,7 +28,7 @@ class Places:
 
     @property
     def loose(self) -> list[int]:
-        """The views that no fixed place has."""
+        """Return the views that no fixed place has."""
         return sorted([v for place in self.held for v in place] + self.other)
 
 

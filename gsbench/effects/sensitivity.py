@@ -125,7 +125,7 @@ class Drawn(NamedTuple):
 
     @property
     def image(self) -> Tensor:
-        """The image [H, W, 3]."""
+        """Return the image [H, W, 3]."""
         return self.images[0].detach()
 
     def products(self, vectors: list[Tensor]) -> Tensor:

@@ -27,12 +27,12 @@ class Source:
 
     @property
     def is_archive(self) -> bool:
-        """Whether it is unpacked."""
+        """Tell whether it is unpacked."""
         return self.file.endswith(".zip")
 
     @property
     def target(self) -> Path:
-        """The file that exists after the download, or the folder of an archive."""
+        """Return the file that exists after the download, or the folder of an archive."""
         return self.folder if self.is_archive else self.folder / self.file
 
     def address(self) -> str:

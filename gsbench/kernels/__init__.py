@@ -17,12 +17,12 @@ if importlib.util.find_spec("gsbench.kernels._native") is not None:  # an extens
 
 
 def available() -> bool:
-    """Whether the compiled kernels are part of this installation."""
+    """Tell whether the compiled kernels are part of this installation."""
     return _native is not None
 
 
 def native() -> ModuleType:
-    """The compiled extension.
+    """Return the compiled extension.
 
     Raises:
         InputError: it was not built.
@@ -34,7 +34,7 @@ def native() -> ModuleType:
 
 
 def instruction_set() -> str | None:
-    """The instruction set that the CPU's kernels run with, such as `v3`; None where they are not built."""
+    """Return the instruction set that the CPU's kernels run with, such as `v3`; None where they are not built."""
     return None if _native is None else str(_native.active())
 
 

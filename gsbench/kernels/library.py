@@ -41,16 +41,16 @@ class Library:
             raise InputError(str(error)) from None
 
     def takes(self, name: str, field: str) -> bool:
-        """Whether a kernel has a field."""
+        """Tell whether a kernel has a field."""
         return field in self._fields[name]
 
     @property
     def needs_scratch(self) -> bool:
-        """Whether kernels are given their scratch memory; those of the CPU get their own."""
+        """Tell whether kernels are given their scratch memory; those of the CPU get their own."""
         return False
 
     def similarity_parts(self, height: int, width: int) -> int:
-        """How many parts `l1_ssim` leaves of its loss."""
+        """Return how many parts `l1_ssim` leaves of its loss."""
         return 1
 
 
@@ -81,7 +81,7 @@ _LIBRARIES: dict[str, Library] = {}  # by kind of device, as they were asked for
 
 
 def library_of(device: str) -> Library:
-    """The kernels for tensors on a kind of device, `cpu` or `cuda`.
+    """Return the kernels for tensors on a kind of device, `cpu` or `cuda`.
 
     Raises:
         InputError: they were not built, or there are none for such a device.

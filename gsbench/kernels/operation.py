@@ -83,7 +83,7 @@ class Operation:
         self._traced = _register(self)
 
     def __call__(self, *arguments: Any) -> Tensors:
-        """The outputs, of tensors (None: left out) and then numbers, in the order of the declaration.
+        """Return the outputs, of tensors (None: left out) and then numbers, in the order of the declaration.
 
         Raises:
             InputError: shapes that do not fit, another type than float32, more than one device, or a gradient wanted
@@ -120,7 +120,7 @@ class Operation:
     # ---- the pair
 
     def forward(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
-        """The outputs; nothing is recorded."""
+        """Return the outputs; nothing is recorded."""
         return self.run(tensors, numbers)[0]
 
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
@@ -133,7 +133,7 @@ class Operation:
         return outputs, slots
 
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
-        """The slots that `run` returned, of what autograd has kept."""
+        """Return the slots that `run` returned, of what autograd has kept."""
         slots = self._slots_of(tensors, numbers)
         slots.update({key: x.data_ptr() for (key, _), x in zip(self._out, outputs, strict=True)})
         return slots
@@ -155,7 +155,7 @@ class Operation:
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
-        """The gradients by the inputs, of those by the outputs (None: zero).
+        """Return the gradients by the inputs, of those by the outputs (None: zero).
 
         Args:
             tensors: as `run` had them.
@@ -203,7 +203,7 @@ class Operation:
     # ---- what follows from the declaration
 
     def match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        """The sizes and numbers of a call; raises InputError unless everything is as declared."""
+        """Return the sizes and numbers of a call; raises InputError unless everything is as declared."""
         call = (*numbers, *[(x.dim() if i in self._lists else x.shape, x.dtype, x.device, x.layout)
                             for i, x in enumerate(tensors)])  # fmt: skip
         slots = self._known.get(call)  # a training asks the same a thousand times, models in turns the same few
@@ -256,7 +256,7 @@ class Operation:
         return InputError(f"{self.name}: expected {key} as {expected}, got {type(x).__name__}")
 
     def _is_left_out(self, i: int, x: Tensor) -> bool:
-        """Whether an input stands for none."""
+        """Tell whether an input stands for none."""
         return i in self._optional and x.shape == _NOTHING
 
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
@@ -281,7 +281,7 @@ def address(x: Tensor | None) -> int:
 
 
 def first_rows(name: str, count: int, x: Tensor) -> int:
-    """How many of a tensor's first rows something is done to; EVERY_ROW stands for all.
+    """Return how many of a tensor's first rows something is done to; EVERY_ROW stands for all.
 
     Raises:
         InputError: there are not so many.
@@ -293,7 +293,7 @@ def first_rows(name: str, count: int, x: Tensor) -> int:
 
 
 def in_rows(tensors: Tensors) -> Tensors:
-    """The same values row by row in memory; a view that torch negates when it reads it is written out."""
+    """Return the same values row by row in memory; a view that torch negates when it reads it is written out."""
     return [x if x.is_contiguous() and not x.is_neg() else x.resolve_neg().contiguous() for x in tensors]
 
 
@@ -307,7 +307,7 @@ def _apart(results: Tensors, inputs: Sequence[Tensor | None]) -> Tensors:
 
 
 def _register(operation: Operation) -> Callable[..., Any]:
-    """The operation as torch.ops.gsbench.NAME, which autograd and torch.compile know."""
+    """Return the operation as torch.ops.gsbench.NAME, which autograd and torch.compile know."""
     name, numbers = operation.name, operation.numbers
     declared = "".join(f", {_SCHEMA[kind]} {key}" for key, kind in numbers.items())
     schema, count = f"(Tensor[] tensors{declared}) -> Tensor[]", len(numbers)

@@ -41,7 +41,7 @@ class _Inputs(NamedTuple):
         return [(name, x) for name, listed in each for x in listed]
 
     def layers(self) -> dict[str, Tensor]:
-        """The weights as the kernels take them: gamma(t) is in the biases, and the units are in the weights."""
+        """Return the weights as the kernels take them: gamma(t) is in the biases, and the units are in the weights."""
         read = self.weight_in.shape[1] - self.gamma.shape[0]
         weight_in = self.weight_in.detach()
         weights = {
@@ -53,7 +53,7 @@ class _Inputs(NamedTuple):
         return dict(zip(weights, in_rows(list(weights.values())), strict=True))
 
     def of_layers(self, g: dict[str, Tensor]) -> Tensors:
-        """The gradients of the layers' own weights, from those of `layers`."""
+        """Return the gradients of the layers' own weights, from those of `layers`."""
         read = g["weight_in"].shape[1]
         g_in = torch.cat([g["weight_in"] / self.units[:read], torch.outer(g["bias_in"], self.gamma)], 1)
         return [g_in, g["bias_in"], g["weight_out"] * self.units[:, None], g["bias_out"] * self.units]

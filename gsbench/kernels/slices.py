@@ -34,12 +34,12 @@ _triangular = Operation(
 
 
 def _conditioned(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
-    """How many rows change with the query."""
+    """Return how many rows change with the query."""
     return {"conditioned": first_rows("conditioned", numbers["conditioned"], given["means"])}
 
 
 def _entries(given: dict[str, Tensor]) -> dict[str, int]:
-    """How many numbers of each kind a factor over p and k conditioned variables has."""
+    """Return how many numbers of each kind a factor over p and k conditioned variables has."""
     k = 3 * ("directions" in given) + ("times" in given)
     if k == 0:
         raise InputError("observe_triangular: expected directions, times or both, got neither")

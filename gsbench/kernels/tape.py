@@ -20,7 +20,7 @@ _in_charge = threading.local()  # each thread has its own
 
 
 def current() -> Tape | None:
-    """The tape in charge of this thread."""
+    """Return the tape in charge of this thread."""
     return getattr(_in_charge, "tape", None)
 
 

@@ -32,12 +32,12 @@ class Curve:
 
     @property
     def last(self) -> Point | None:
-        """The latest point; None before the first."""
+        """Return the latest point; None before the first."""
         return self.points[-1] if self.points else None
 
     @property
     def best(self) -> Point | None:
-        """The earliest of the points with the highest PSNR; None if no PSNR is finite."""
+        """Return the earliest of the points with the highest PSNR; None if no PSNR is finite."""
         finite = [(p.psnr_val, p) for p in self.points if p.psnr_val is not None]
         return max(finite, key=lambda pair: pair[0])[1] if finite else None
 

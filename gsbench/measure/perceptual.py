@@ -62,7 +62,7 @@ class Backbone:
 
     @property
     def trunk_sha256(self) -> tuple[str, ...]:
-        """The first digits of the SHA-256 of the files accepted as trunk weights."""
+        """Return the first digits of the SHA-256 of the files accepted as trunk weights."""
         return (Path(self.file).stem.rsplit("-", 1)[1], *self.other_sha256)
 
 

@@ -155,7 +155,7 @@ class Provenance:
 
     @property
     def machine(self) -> str:
-        """The machine and the threads as text; seconds are comparable only where it is equal."""
+        """Return the machine and the threads as text; seconds are comparable only where it is equal."""
         return named(self.device, self.threads, self.hardware)
 
 
@@ -185,7 +185,7 @@ class Record:
 
     @property
     def path(self) -> Path:
-        """The folder of the run, from that of all results; raises InputError as `run_path`."""
+        """Return the folder of the run, from that of all results; raises InputError as `run_path`."""
         return run_path(Path(), self.experiment, self.scene, self.model, self.seed, variant=self.variant)
 
 

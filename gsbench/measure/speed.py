@@ -153,7 +153,7 @@ class StageClock:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """The sums so far; reading them waits for the device."""
+        """Return the sums so far; reading them waits for the device."""
         while self._ended:
             self._add_one()
         return self._seconds
@@ -196,7 +196,7 @@ class Laps:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """The seconds by stage, in the order in which they first ended; reading them waits for the device."""
+        """Return the seconds by stage, in the order in which they first ended; reading them waits for the device."""
         sums: dict[str, float] = {}
         for name, start, end in self._ended:
             sums[name] = sums.get(name, 0.0) + self._clock.seconds(start, end)
@@ -232,12 +232,12 @@ class Effort:
 
     @property
     def cpu_s(self) -> float | None:
-        """The CPU-seconds of all threads of this process."""
+        """Return the CPU-seconds of all threads of this process."""
         return self._cpu_s if math.isfinite(self._cpu_s) else None
 
     @property
     def load(self) -> float | None:
-        """The mean of `load()` over the seconds."""
+        """Return the mean of `load()` over the seconds."""
         mean = self._load_s / self._seconds if self._seconds else math.nan
         return mean if math.isfinite(mean) else None
 

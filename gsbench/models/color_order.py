@@ -25,7 +25,7 @@ class ColorOrder(Generic[Number]):
 
     @property
     def packed(self) -> Number:
-        """The number degree + 4 (waves - 1)."""
+        """Return the number degree + 4 (waves - 1)."""
         return self.degree + _DEGREES * (self.waves - 1)
 
 

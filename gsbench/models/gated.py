@@ -71,7 +71,7 @@ class GatedModel(GaussianModel):
 
     @property
     def conditioned(self) -> int | None:
-        """How many of the first rows change with the query; None: all that a slice is made of."""
+        """Return how many of the first rows change with the query; None: all that a slice is made of."""
         return None if self.effect_sets is None or not self.observes else self.effect_sets.conditioned
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:

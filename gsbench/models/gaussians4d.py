@@ -128,7 +128,7 @@ class Gaussians4DModel(GatedModel):
         return {"static": static}
 
     def full_order(self) -> int:
-        """The degree in use with all waves."""
+        """Return the degree in use with all waves."""
         return ColorOrder(self.active.sh_degree, self.time_degree + 1).packed
 
     def lower_orders(self) -> list[int]:

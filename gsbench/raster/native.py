@@ -57,7 +57,7 @@ def draw_within(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     background: Tensor, viewport: Viewport, room: int,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """The image [C, H, W, D] without waiting for a GPU, where `room` pairs of a tile and a Gaussian are enough.
+    """Return the image [C, H, W, D] without waiting for a GPU, where `room` pairs of a tile and a Gaussian are enough.
 
     Whether they were is for the caller to see: the second tensor, [2] int64, is how many there were, and not zero where
     a value was out of range.

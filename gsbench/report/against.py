@@ -103,7 +103,7 @@ class Comparison:
 
     @property
     def line(self) -> str:
-        """The result of the comparison in one line."""
+        """Return the result of the comparison in one line."""
         head = f"{self.ours} against {self.theirs}: {self.verdict}."
         if not self.rows:
             return f"{head} No model and scene is in both."

@@ -60,7 +60,7 @@ class Configuration:
 
     @property
     def iterations(self) -> int | None:
-        """The length of training, if all runs have the same."""
+        """Return the length of training, if all runs have the same."""
         lengths = {iterations(r) for runs in self.runs.values() for r in runs}
         return lengths.pop() if len(lengths) == 1 else None
 
@@ -73,27 +73,27 @@ class Group:
 
     @property
     def experiment(self) -> str:
-        """The experiment's name."""
+        """Return the experiment's name."""
         return self.records[0].experiment
 
     @property
     def dataset(self) -> str:
-        """The data set's name."""
+        """Return the data set's name."""
         return self.records[0].dataset
 
     @cached_property
     def finished(self) -> list[Record]:
-        """The runs that are ok."""
+        """Return the runs that are ok."""
         return [r for r in self.records if r.status == "ok"]
 
     @cached_property
     def scenes(self) -> list[str]:
-        """The scenes of all runs, also of those that failed."""
+        """Return the scenes of all runs, also of those that failed."""
         return sorted({r.scene for r in self.records})
 
     @cached_property
     def models(self) -> list[str]:
-        """The models of all runs, also of those that failed."""
+        """Return the models of all runs, also of those that failed."""
         return sorted({r.model for r in self.records})
 
     @cached_property
@@ -127,18 +127,18 @@ class Group:
 
     @cached_property
     def variant(self) -> str:
-        """The variant at which models are compared: the most common one; at a tie, one without ablation."""
+        """Return the variant at which models are compared: the most common one; at a tie, one without ablation."""
         shared = Counter(c.variant for c in self.configurations)
         return min(shared, key=lambda variant: (-shared[variant], is_ablated(variant), variant), default="")
 
     @cached_property
     def main_configurations(self) -> list[Configuration]:
-        """The configuration of every model at the common variant."""
+        """Return the configuration of every model at the common variant."""
         return [c for c in self.configurations if c.variant == self.variant]
 
     @cached_property
     def compared(self) -> list[Configuration]:
-        """The configurations that are compared in pairs.
+        """Return the configurations that are compared in pairs.
 
         Their variants equal the common one, apart from gates and ablations.
         """
@@ -151,13 +151,13 @@ class Group:
 
     @cached_property
     def covered(self) -> list[str]:
-        """The scenes that every model has finished at the common variant, over which averages are taken."""
+        """Return the scenes that every model has finished at the common variant, over which averages are taken."""
         main = self.main_configurations
         return [s for s in self.scenes if main and all(s in c.runs for c in main)]
 
     @cached_property
     def basis(self) -> list[str]:
-        """The scenes over which answers are averaged.
+        """Return the scenes over which answers are averaged.
 
         These are the covered scenes; where there are none, the scene with most configurations.
         """
@@ -167,12 +167,12 @@ class Group:
 
     @cached_property
     def machine(self) -> str:
-        """The machine of most runs; seconds of other machines are left out."""
+        """Return the machine of most runs; seconds of other machines are left out."""
         return Counter(r.provenance.machine for r in self.finished or self.records).most_common(1)[0][0]
 
     @cached_property
     def elsewhere(self) -> int:
-        """The number of finished runs on other machines."""
+        """Return the number of finished runs on other machines."""
         return sum(r.provenance.machine != self.machine for r in self.finished)
 
     def value(self, record: Record, quantity: str) -> float:

@@ -28,7 +28,7 @@ class FrontierPoint:
 
     @property
     def series(self) -> str:
-        """The frontier that the point belongs to: that of a model, or of a gated one."""
+        """Return the frontier that the point belongs to: that of a model, or of a gated one."""
         return self.configuration.series
 
 

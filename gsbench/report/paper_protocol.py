@@ -34,7 +34,7 @@ class Pool:
 
     @property
     def heading(self) -> str:
-        """The data set, the sizes of its images and the length of training."""
+        """Return the data set, the sizes of its images and the length of training."""
         sizes = ", ".join(sorted({_size(r) for r in self.runs}))
         return f"{self.dataset}: experiment {self.experiment}, {sizes}, {self.steps:,} iterations"
 

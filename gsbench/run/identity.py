@@ -39,7 +39,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """The scene, the label, the variant and the seed, as messages show them."""
+        """Return the scene, the label, the variant and the seed, as messages show them."""
         variant = f" {self.variant}" if self.variant else ""
         return f"{self.config.scene.name} {self.label}{variant} seed{self.config.seed}"
 

@@ -19,12 +19,12 @@ if importlib.util.find_spec("gsbench.kernels._cuda") is not None:  # an extensio
 
 
 def built() -> bool:
-    """Whether the CUDA kernels are part of this installation."""
+    """Tell whether the CUDA kernels are part of this installation."""
     return _cuda is not None
 
 
 def available() -> bool:
-    """Whether they are, and there is a device to run them."""
+    """Tell whether they are, and there is a device to run them."""
     return built() and _has_device()
 
 
@@ -34,7 +34,7 @@ def _has_device() -> bool:
 
 
 def cuda() -> ModuleType:
-    """The compiled extension.
+    """Return the compiled extension.
 
     Raises:
         InputError: it was not built.
