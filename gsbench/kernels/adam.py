@@ -1,4 +1,4 @@
-"""Adam on the rows of a parameter that were drawn, in place: the others cost a look at a mask."""
+"""Update by Adam only the rows of a parameter that were rendered, in place; the other rows cost a look at a mask."""
 
 import torch
 from torch import Tensor
@@ -21,16 +21,16 @@ def adam(
     eps: float,
     step: Tensor,  # []
 ) -> None:
-    """One update, the `step`-th from 1, of the rows `drawn` (Kingma & Ba 2015, algorithm 1).
+    """Update the rows `drawn` once, as step number `step` from 1 (Kingma & Ba 2015, algorithm 1).
 
     Args:
-        parameter: what is moved.
-        gradient: of the loss by it.
+        parameter: the tensor that is updated.
+        gradient: of the loss by the parameter.
         mean: the running mean of the gradient.
-        square: that of its square.
-        drawn: which rows are updated.
+        square: the running mean of its square.
+        drawn: the rows that are updated.
         rate: the learning rate.
-        betas: how much of the two means is kept.
+        betas: the share of each running mean that is kept.
         eps: added to the root of the mean square.
         step: the number of this update.
 

@@ -1,7 +1,7 @@
-"""The CUDA kernels: the extension `_cuda`, linked to no torch, and how tensors reach it.
+"""Load the CUDA kernels: the extension `_cuda`, which is not linked to torch.
 
-The extension is optional, and where it was built it imports on machines without a GPU too. Outputs and scratch are
-torch's, so that its caching allocator serves them, and kernels run on torch's current stream.
+The extension is optional. If it was built, it can be imported on machines without a GPU too. Torch's caching allocator
+gives the memory of outputs and scratch, and kernels run on torch's current stream.
 """
 
 import functools
@@ -24,7 +24,7 @@ def built() -> bool:
 
 
 def available() -> bool:
-    """Tell whether they are, and there is a device to run them."""
+    """Tell whether the CUDA kernels were built and there is a GPU to run them."""
     return built() and _has_device()
 
 
