@@ -76,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def prepare(options: argparse.Namespace) -> ExportRequest:
-    """Load what is asked for; raises InputError where it cannot be had."""
+    """Load what is asked for; raises InputError if it cannot be had."""
     if not (options.ply or options.video or options.images):
         raise InputError("expected --ply OUT.ply, --video OUT.mp4 or --images FOLDER, got none of them")
     if options.time is not None and not 0 <= options.time <= 1:
@@ -125,7 +125,7 @@ def slice_place(asked: ExportRequest) -> tuple[Query, bool]:
 
 
 def direction(text: str) -> torch.Tensor:
-    """Read a direction X,Y,Z as a unit vector [3]; raises InputError where it is none."""
+    """Read a direction X,Y,Z as a unit vector [3]; raises InputError if it is none."""
     try:
         found = torch.tensor([float(word) for word in text.split(",")], dtype=torch.float64)
     except ValueError:

@@ -79,7 +79,7 @@ def sources(data: Path) -> dict[str, Source]:
 
 
 def find(name: str, known: dict[str, Source]) -> Source:
-    """Return the source of that name; raises InputError where there is none."""
+    """Return the source of that name; raises InputError if there is none."""
     if name not in known:
         raise InputError(f"'{name}' is not known. {did_you_mean(name, known)}")
     return known[name]

@@ -22,7 +22,7 @@ class Curve:
     points: list[Point] = field(default_factory=list)
 
     def add(self, iteration: int, seconds: float, psnr_val: float) -> None:
-        """Append a point; raises InputError where iteration or seconds go backwards (after a faulty resume)."""
+        """Append a point; raises InputError if iteration or seconds go backwards (after a faulty resume)."""
         if self.points and (iteration <= self.points[-1].iteration or seconds < self.points[-1].seconds):
             raise InputError(
                 f"curve: expected a point after {self.points[-1].iteration} iterations, {self.points[-1].seconds} s; "
@@ -62,7 +62,7 @@ class Curve:
         return [(p.iteration, p.seconds, p.psnr_val) for p in self.points]
 
     def load_state_dict(self, state: list[tuple[int, float, float | None]]) -> None:
-        """Continue from the points of a checkpoint; raises InputError where they do not make a curve."""
+        """Continue from the points of a checkpoint; raises InputError if they do not make a curve."""
         self.points = []
         for iteration, seconds, psnr in state:
             self.add(iteration, float(seconds), math.nan if psnr is None else float(psnr))

@@ -50,7 +50,7 @@ class Effects:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """The quality of one rendered view; None where it is missing or not finite."""
+    """The quality of one rendered view; None if it is missing or not finite."""
 
     name: str
     psnr: float | None = None

@@ -252,7 +252,7 @@ class Effort:
 
 
 def load() -> float:
-    """Return the load average: processes that ran or waited in the last minute; NaN where the system has none."""
+    """Return the load average: processes that ran or waited in the last minute; NaN if the system has none."""
     try:
         return os.getloadavg()[0]
     except (AttributeError, OSError):  # Windows; a container without /proc

@@ -59,7 +59,7 @@ def draw_within(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return the image [C, H, W, D] without waiting for a GPU, where `room` pairs of a tile and a Gaussian are enough.
 
-    Whether they were is for the caller to see: the second tensor, [2] int64, is how many there were, and not zero where
+    Whether they were is for the caller to see: the second tensor, [2] int64, is how many there were, and not zero if
     a value was out of range.
     """
     flags = flag_values(means, factors, opacities, colors, viewmats, Ks, background)

@@ -186,7 +186,7 @@ def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> ComparedRuns:
 
 
 def value(record: Record, quantity: str) -> float:
-    """Read a quantity of LIMITS from a record; NaN where it is missing."""
+    """Read a quantity of LIMITS from a record; NaN if it is missing."""
     if quantity == "gaussians":
         return record.cost.num_gaussians if record.cost else math.nan
     return QUANTITIES[quantity](record)

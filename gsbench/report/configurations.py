@@ -19,7 +19,7 @@ Values = npt.NDArray[np.float64]
 
 
 def psnr_val(record: Record) -> float:
-    """Return the PSNR on val at the end of the run, dB; NaN where it was not measured.
+    """Return the PSNR on val at the end of the run, dB; NaN if it was not measured.
 
     The curve ends before the gate at the end, so the gate's loss on val is subtracted.
     """
@@ -159,7 +159,7 @@ class Group:
     def basis(self) -> list[str]:
         """Return the scenes over which answers are averaged.
 
-        These are the covered scenes; where there are none, the scene with most configurations.
+        These are the covered scenes; if there are none, the scene with most configurations.
         """
         if self.covered or not self.configurations:
             return self.covered
@@ -176,7 +176,7 @@ class Group:
         return sum(r.provenance.machine != self.machine for r in self.finished)
 
     def value(self, record: Record, quantity: str) -> float:
-        """Read one of QUANTITIES from a record; NaN where it is missing or measured on another machine."""
+        """Read one of QUANTITIES from a record; NaN if it is missing or measured on another machine."""
         if quantity in OF_THE_MACHINE and record.provenance.machine != self.machine:
             return math.nan
         return QUANTITIES[quantity](record)
@@ -196,7 +196,7 @@ class Group:
         return [paired for s in scenes if (paired := self._paired(weights, s, quantity)).size]
 
     def _paired(self, weights: list[tuple[float, Configuration]], scene: str, quantity: str) -> Values:
-        """Return the weighted sum on one scene, [seeds, views]; it is empty where no seed or no view is shared."""
+        """Return the weighted sum on one scene, [seeds, views]; it is empty if no seed or no view is shared."""
         by_seed = [{r.seed: s for r in c.runs[scene] if (s := self.scores(r, quantity))} for _, c in weights]
         seeds = sorted(set.intersection(*map(set, by_seed)))
         every = [scores[seed] for scores in by_seed for seed in seeds]

@@ -104,7 +104,7 @@ def contested(of: Sequence[FrontierPoint]) -> list[Weights]:
 
 
 def choose(of: Sequence[FrontierPoint], cost: str, budget: float, family: Family) -> BudgetChoice | None:
-    """Choose the best point that costs at most `budget`; None where there is none.
+    """Choose the best point that costs at most `budget`; None if there is none.
 
     The best point of each other model within the budget is compared with it, paired over seeds and views.
 
@@ -199,5 +199,5 @@ def _ratio(seconds: float, fastest: float) -> float:
 
 
 def _mean(scenes: list[Values]) -> float:
-    """Return the mean over scenes of the mean over seeds; NaN where a scene has none."""
+    """Return the mean over scenes of the mean over seeds; NaN if a scene has none."""
     return float(np.mean([s.mean() for s in scenes])) if all(map(len, scenes)) else math.nan

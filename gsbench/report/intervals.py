@@ -92,7 +92,7 @@ def estimate(scenes: list[Values], *, generalise: bool = True) -> Estimate:
     """Estimate the mean over scenes of the mean over seeds and views.
 
     Args:
-        scenes: for each scene [seeds, views], every seed with the same views; one column where there are no views.
+        scenes: for each scene [seeds, views], every seed with the same views; one column if there are no views.
         generalise: from three scenes on the interval is one of scenes like these, otherwise of these scenes.
     """
     if not scenes:

@@ -141,7 +141,7 @@ def _pixels(size: str) -> int:
 
 
 def _part(config: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return a section of a config, empty where a record lacks it."""
+    """Return a section of a config, empty if a record lacks it."""
     part = config.get(name)
     return part if isinstance(part, dict) else {}
 

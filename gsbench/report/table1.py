@@ -146,7 +146,7 @@ class _Table1Builder:
         return rows
 
     def _paper(self, model: str, scenes: list[str]) -> dict[str, float]:
-        """Return the paper's numbers by column, averaged over `scenes`; empty where it has none of this data."""
+        """Return the paper's numbers by column, averaged over `scenes`; empty if it has none of this data."""
         if self.kind != "paper":
             return {}
         rows = [row for scene in scenes if (row := paper.paper_row(self.dataset, scene, model))]

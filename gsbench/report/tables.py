@@ -109,7 +109,7 @@ def build(records: list[Record], *, train: bool = False, machine: str | None = N
 
 
 def of_one_machine(records: list[Record], machine: str) -> list[str]:
-    """Name the machine whose seconds a table shows, and the runs left out; nothing where all were on one machine.
+    """Name the machine whose seconds a table shows, and the runs left out; nothing if all were on one machine.
 
     Args:
         records: of the table.
@@ -148,7 +148,7 @@ class _TableBuilder:
         self.marks: list[str] = []
 
     def _values(self, column: QuantityColumn, seeds: list[dict[str, Any]]) -> list[float]:
-        """Return a column's value of each run; of seconds those of the table's machine, NaN where it has none."""
+        """Return a column's value of each run; of seconds those of the table's machine, NaN if it has none."""
         counted = [q for q in seeds if column.key not in OF_THE_MACHINE or q["machine"] == self.machine]
         return [math.nan if q[column.key] is None else float(q[column.key]) for q in counted] or [math.nan]
 

@@ -89,7 +89,7 @@ def fit(trainer: Trainer, this: Run, resolved: Resolved, plain: dict[str, Any]) 
 
 
 def _check_fitted(trainer: Trainer) -> None:
-    """Raise DivergedError for a parameter that is not finite, and InputError where no Gaussian is left."""
+    """Raise DivergedError for a parameter that is not finite, and InputError if no Gaussian is left."""
     for name, parameter in trainer.model.named_parameters():  # no image shows a colour of -inf: it is black
         if not parameter.isfinite().all():
             raise DivergedError(f"step {trainer.step}: '{name}' has values that are not finite")

@@ -81,7 +81,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
 
 
 def hash_of(ply: str) -> str:
-    """Compute the SHA-256 of the file that a training starts from; raises InputError where it cannot be read."""
+    """Compute the SHA-256 of the file that a training starts from; raises InputError if it cannot be read."""
     return digest(read_file(Path(ply).expanduser(), f"init.ply={ply!a:.200}", MAX_FILE))
 
 

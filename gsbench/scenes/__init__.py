@@ -89,7 +89,7 @@ def load(
 
 
 def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
-    """Check the first and the last frame that are asked for; raises InputError where the layout has no frames."""
+    """Check the first and the last frame that are asked for; raises InputError if the layout has no frames."""
     if layout.reader != "technicolor":
         raise InputError(f"frames: {layout.marker} lists its own frames and times, got {frames!r:.80}: leave it out")
     if not isinstance(frames, tuple | list) or len(frames) != 2 or not all(type(n) is int for n in frames):
@@ -100,7 +100,7 @@ def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
 
 
 def _folder(path: object) -> Path:
-    """Return `path` as a Path; raises InputError where it is no text that can be shown and looked up."""
+    """Return `path` as a Path; raises InputError if it is no text that can be shown and looked up."""
     if not isinstance(path, str | Path) or not str(path).isprintable():
         raise InputError(f"path: expected the path of a scene's folder, got {path!r:.200}")
     try:

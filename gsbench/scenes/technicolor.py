@@ -178,7 +178,7 @@ def _read_views(
 
 
 def _points(root: Path) -> Points | None:
-    """Read the initial points that the folder has; None where it has none."""
+    """Read the initial points that the folder has; None if it has none."""
     if (root / "sparse" / "0").is_dir():
         return colmap.read_points(root / "sparse" / "0")
     ply = root / "points3d.ply"

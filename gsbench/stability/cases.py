@@ -31,7 +31,7 @@ class Case:
 
     @property
     def stresses(self) -> str:
-        """What the case stresses, and where it was met in practice: the builder's docstring."""
+        """Return what the case stresses, and where it was met in practice: the builder's docstring."""
         return " ".join((self.build.__doc__ or "").split())
 
     def __call__(self, severity: float = 1.0, seed: int = 0, **more: Any) -> Any:

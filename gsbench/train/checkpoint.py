@@ -53,7 +53,7 @@ def save(path: Path, content: Checkpoint) -> None:
 
 
 def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | None:
-    """Read the state at `path`; None where there is no file, or it is of another training or other data.
+    """Read the state at `path`; None if there is no file, or it is of another training or other data.
 
     Raises:
         InputError: the file exists and is not a checkpoint, or is a damaged one.
@@ -172,7 +172,7 @@ def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -
 
 
 def whole_number(name: str, value: object, most: int) -> int:
-    """Take a number from 0 to `most` out of a checkpoint's state; raises InputError where it is none."""
+    """Take a number from 0 to `most` out of a checkpoint's state; raises InputError if it is none."""
     if type(value) is not int or not 0 <= value <= most:
         raise InputError(f"checkpoint: expected '{name}' from 0 to {most}, got {value!r:.80}")
     return value

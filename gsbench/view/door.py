@@ -195,7 +195,7 @@ class Door:
         return address.is_loopback or self._is_open or name in self._hosts
 
     def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the response to a refused request; None where the request is admitted."""
+        """Return the response to a refused request; None if the request is admitted."""
         if not self.admits(request.headers):
             return _answer(HTTPStatus.FORBIDDEN, "a viewer of gsbench answers its own page alone: see --host")
         if request.headers.get_all("Upgrade") and len(connection.server.connections) >= MOST_BROWSERS:

@@ -88,7 +88,7 @@ def _image(caption: str, image: Pixels, quality: int) -> Image:
 
 
 def cut_strip(path: Path) -> list[StripRow]:
-    """Cut a strip into rows of (render, truth, error) at their own resolution; return nothing where it is no strip."""
+    """Cut a strip into rows of (render, truth, error) at their own resolution; return nothing if it is no strip."""
     data = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if data is None:
         return []

@@ -44,7 +44,7 @@ def plain(value: float, digits: int = 2) -> str:
 
 
 def probability(p: float) -> str:
-    """Write a p-value, or a bound where it is too small for three digits."""
+    """Write a p-value, or a bound if it is too small for three digits."""
     return "< 0.001" if p < 0.001 else plain(p, 3)
 
 

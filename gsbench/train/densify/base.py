@@ -84,4 +84,4 @@ class Densification(ABC):
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from the `state_dict` of a checkpoint; raises InputError where it is not of this many Gaussians."""
+        """Continue from the `state_dict` of a checkpoint; raises InputError if it is not of this many Gaussians."""

@@ -114,7 +114,7 @@ class GradientDensification(Densification):
         return {"gradient": self.gradient, "seen": self.seen, "unseen": self.unseen}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from the `state_dict` of a checkpoint; raises InputError where it is not of this many Gaussians."""
+        """Continue from the `state_dict` of a checkpoint; raises InputError if it is not of this many Gaussians."""
         opacities = self.model.splats["opacities"]
         self.gradient, self.seen = (
             tensor(state, name, opacities.shape, opacities.dtype) for name in ("gradient", "seen")

@@ -46,6 +46,6 @@ class MinimumScale:
         return {"least": self.least}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from the `state_dict` of a checkpoint; raises InputError where it is not of this many Gaussians."""
+        """Continue from the `state_dict` of a checkpoint; raises InputError if it is not of this many Gaussians."""
         means = self.model.splats["means"]
         self.least = tensor(state, "least", means.shape[:1], means.dtype)
