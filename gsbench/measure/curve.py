@@ -43,7 +43,7 @@ class Curve:
 
     @property
     def progress(self) -> str:
-        """The latest point as text, with its change since the previous: "12 s of training, val 24.40 dB (+0.31)"."""
+        """Return the latest point as text, with its change: "12 s of training, val 24.40 dB (+0.31)"."""
         if not self.points:
             return "val not measured yet"
         before, now = (self.points[-2] if len(self.points) > 1 else None), self.points[-1]

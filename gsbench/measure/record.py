@@ -41,7 +41,7 @@ METRICS = (
 
 @dataclass(frozen=True)
 class Effects:
-    """The effects that the model simulates."""
+    """The effects that the model has."""
 
     time: bool
     direction: bool
@@ -112,7 +112,7 @@ class Gate:
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return a gate as JSON with the names of now, where an older gsbench wrote it."""
+        """Return a gate as JSON with its present names, also if an older gsbench wrote it."""
         plain = {RENAMED_KEYS.get(key, key): value for key, value in plain.items()}
         if isinstance(rows := plain.get("rows"), dict):
             plain["rows"] = {RENAMED_EFFECT_SETS.get(name, name): count for name, count in rows.items()}
@@ -241,7 +241,7 @@ def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, 
         root: the folder of all results.
         experiment: its name.
         scene: its name.
-        model: the label of the run, the model's name with _agr or _noagr where it is not as published.
+        model: the label of the run: the model's name, with _agr or _noagr if it differs from the published method.
         seed: at least 0 and below 2^63.
         variant: the settings that differ from the experiment's; "" for none.
 

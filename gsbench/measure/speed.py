@@ -31,7 +31,7 @@ class RenderTimes:
 
     @property
     def fps(self) -> float:
-        """Frames per second: FPS = 1000 / p50, the median milliseconds of a render.
+        """Return frames per second: FPS = 1000 / p50, the median milliseconds of a render.
 
         A render is timed from the query to the image, slices and AGR included, between two synchronisations of the
         device, after warm-up renders; the evaluated views take turns.
@@ -70,7 +70,7 @@ def time_renders(
         synchronise: waits for the device.
 
     Raises:
-        InputError: `count` is below 30, where percentiles mean little.
+        InputError: `count` is below 30, so percentiles would mean little.
     """
     if count < LEAST_RENDERS:
         raise InputError(f"time_renders: expected count >= {LEAST_RENDERS}, got {count}")
@@ -206,8 +206,8 @@ class Laps:
 class Effort:
     """Sums the CPU-seconds of this process over blocks, ``with effort: ...``, and averages the load of the machine.
 
-    Beside the seconds of a training they show other work of the machine: the load counts all processes that ran or
-    waited, and CPU-seconds do not grow while another process runs. An unknown value is None.
+    Both show whether the machine did other work: the load counts all processes that ran or waited, and CPU-seconds do
+    not grow while another process runs. An unknown value is None.
     """
 
     def __init__(self) -> None:
@@ -246,7 +246,7 @@ class Effort:
         return {"seconds": self._seconds, "cpu_s": self._cpu_s, "load_s": self._load_s}
 
     def load_state_dict(self, state: dict[str, float] | None) -> None:
-        """Continue from the sums of a checkpoint; where an older checkpoint has none, both values become unknown."""
+        """Continue from the sums of a checkpoint; if an older checkpoint has none, both values become unknown."""
         state = state or dict.fromkeys(("seconds", "cpu_s", "load_s"), math.nan)
         self._seconds, self._cpu_s, self._load_s = (float(state[name]) for name in ("seconds", "cpu_s", "load_s"))
 

@@ -35,8 +35,8 @@ class GraphedFrames:
     """Renders a model on a GPU like `render`, but replays its kernels and waits only at the end of an image.
 
     The first call for an image size records a graph, which fixes the numbers of Gaussians and of pixels. `render` waits
-    for the number of intersections in the middle of an image. A graph has memory for a fixed number, MARGIN times that of
-    the first image. The number is checked at the end; if it is larger, the graph is recorded again.
+    for the number of intersections in the middle of an image. A graph has memory for a fixed number, MARGIN times that
+    of the first image. The number is checked at the end; if it is larger, the graph is recorded again.
     """
 
     def __init__(self, model: GaussianModel, background: Tensor, antialias: bool = False) -> None:

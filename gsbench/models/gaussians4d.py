@@ -138,7 +138,7 @@ class Gaussians4DModel(GatedModel):
         return sorted(orders - {self.full_order()})
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Tell which entries matter: a static row needs no right quaternion, and a time only if its colour has waves."""
+        """Tell which entries matter: a static row has no right quaternion, and a time only if its colour has waves."""
         masks = {}
         if effect_sets.orders is not None:
             stored = coefficients_within(effect_sets.orders, self.sh_degree, self.time_degree + 1)

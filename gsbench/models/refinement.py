@@ -68,8 +68,8 @@ class Refinement(nn.Module):
     ) -> list[Tensor]:  # fmt: skip
         """Move raw parameters [N, c] to a time []; the parameters that are read come first.
 
-        The kernel (float32) writes no hidden layer to memory. `rows` limits this to the first Gaussians, and `intervals`
-        [rows, 2] limits each of them to the times between two.
+        The kernel (float32) writes no hidden layer to memory. With `rows` only the first Gaussians are
+        moved, with `intervals` [rows, 2] each of them only from a first to a last time.
         """
         if by_kernel:
             gamma = encode_time(time, self.octaves)

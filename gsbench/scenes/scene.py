@@ -37,7 +37,7 @@ class View:
 
     @property
     def image(self) -> Tensor:
-        """Return the image, [H, W, 3] of floats in [0, 1]; one of 8 bits is converted each time it is looked at.
+        """Return the image, [H, W, 3] of floats in [0, 1]; an image of 8 bits is converted at each access.
 
         The result has the bits of an image that was composited when it was loaded.
         """
