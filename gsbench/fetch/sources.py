@@ -36,7 +36,7 @@ class Source:
         return self.folder if self.is_archive else self.folder / self.file
 
     def address(self) -> str:
-        """Return the URL of the download, on the mirror where one is set.
+        """Return the URL of the download, on the mirror if one is set.
 
         Raises:
             InputError: there is none, or the mirror's is not one.

@@ -41,7 +41,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Output:
-    """A tensor that an operation returns: its shape, as of `Input`, and whether a gradient goes through it."""
+    """A tensor that an operation returns: its shape, as in `Input`, and whether a gradient goes through it."""
 
     shape: str
     gradient: bool = True

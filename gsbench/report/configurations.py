@@ -55,7 +55,7 @@ class Configuration:
 
     @property
     def on_demand(self) -> bool:
-        """Whether effects were chosen for the scenes or the Gaussians, so that not all Gaussians have all effects."""
+        """Tell whether effects were chosen, so that not all Gaussians have all effects."""
         return any(r.on_demand for runs in self.runs.values() for r in runs)
 
     @property
@@ -98,7 +98,7 @@ class Group:
 
     @cached_property
     def configurations(self) -> list[Configuration]:
-        """The models with their variants that finished on some scene, by name; a model without variant comes first."""
+        """List the configurations that finished on some scene, by name; a model without variant comes first."""
         runs: dict[tuple[str, str], dict[str, list[Record]]] = {}
         for r in self.finished:
             runs.setdefault((r.model, r.variant), {}).setdefault(r.scene, []).append(r)
@@ -109,7 +109,7 @@ class Group:
 
     @cached_property
     def series(self) -> list[str]:
-        """The names of the frontiers, also of runs that failed: one for each model, and one for its gated runs."""
+        """Name the frontiers, also of runs that failed: one for each model, and one for its gated runs."""
         return sorted({self.series_of(r) for r in self.records})
 
     def series_of(self, record: Record) -> str:
@@ -145,7 +145,7 @@ class Group:
         return [c for c in self.configurations if _common(c.variant) == _common(self.variant)]
 
     def label(self, configuration: Configuration) -> str:
-        """Name a compared configuration: its model, and in brackets its variant where it is not the common one."""
+        """Name a compared configuration: its model, and in brackets its variant if it is not the common one."""
         model, variant = configuration.model, configuration.variant
         return model if variant == self.variant else f"{model} ({variant or 'default'})"
 
@@ -223,7 +223,7 @@ def groups(records: list[Record]) -> list[Group]:
 
 
 def gating(record: Record) -> str:
-    """Return when the Gaussians of a run were gated, as a variant writes it; "" where that is its model's default."""
+    """Return when the Gaussians of a run were gated, as a variant writes it; "" if that is its model's default."""
     config = record.provenance.config
     effects, model = (part if isinstance(part := config.get(name), dict) else {} for name in ("effects", "model"))
     gate = effects.get("gate", "off")

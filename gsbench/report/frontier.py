@@ -83,7 +83,7 @@ def has_val(of: Sequence[FrontierPoint]) -> bool:
 
 
 def ranked(of: Sequence[FrontierPoint]) -> list[FrontierPoint]:
-    """Return points by falling PSNR on val, or by that on the evaluated split where `has_val` is false."""
+    """Return points by falling PSNR on val, or by that on the evaluated split if `has_val` is false."""
     on_val = has_val(of)
     return sorted(of, key=lambda p: -(p.val if on_val else p.psnr.mean))
 
@@ -171,7 +171,7 @@ def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, fl
 def round_numbers(low: float, high: float) -> list[float]:
     """Return the multiples of the widest of STEPS of which FEWEST_TARGETS lie above `low` and up to `high`.
 
-    No configuration's own PSNR is a target, so none is favoured. Where the range holds fewer multiples of the finest
+    No configuration's own PSNR is a target, so none is favoured. If the range holds fewer multiples of the finest
     step, those are returned.
     """
     found: list[float] = []

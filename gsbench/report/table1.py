@@ -156,7 +156,7 @@ class _Table1Builder:
         return {key: math.nan if None in given else fmean(given) for key, given in values.items()}
 
     def _label(self, one: ModelRecipe) -> str:
-        """Name a row by its model, its recipe, and its experiment where experiments differ."""
+        """Name a row by its model, its recipe, and its experiment if experiments differ."""
         return " ".join(filter(None, [one.model, one.recipe, f"({one.experiment})" * self.names_experiment]))
 
     def _mark(self, text: str) -> str:

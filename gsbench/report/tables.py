@@ -113,7 +113,7 @@ def of_one_machine(records: list[Record], machine: str) -> list[str]:
 
     Args:
         records: of the table.
-        machine: as of `build`.
+        machine: as in `build`.
     """
     others = Counter(r.provenance.machine for r in records if r.status == "ok" and r.provenance.machine != machine)
     if not others:
@@ -153,7 +153,7 @@ class _TableBuilder:
         return [math.nan if q[column.key] is None else float(q[column.key]) for q in counted] or [math.nan]
 
     def _name(self, record: Record) -> str:
-        """Name the row of a run by its model, and by its variant where it is not the common one."""
+        """Name the row of a run by its model, and by its variant if it is not the common one."""
         return f"{record.model} {record.variant}" if record.variant != self.common else record.model
 
     def table(self) -> Table:

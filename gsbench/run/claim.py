@@ -57,7 +57,7 @@ def release(folder: Path, mine: Progress) -> None:
 
 
 def _read(path: Path) -> Progress | str:
-    """Read a claim; return NOTHING if there is none, DAMAGED where three attempts to read it fail.
+    """Read a claim; return NOTHING if there is none, DAMAGED if three attempts to read it fail.
 
     Without locks another process may create the claim during the first attempt, which is no damage.
     """

@@ -119,7 +119,7 @@ def _storable(value: Any) -> Any:
 
 
 def _printed(value: Any) -> str:
-    """Format a value for the name of a folder; return a hash where it has characters that are unsafe there.
+    """Format a value for the name of a folder; return a hash if it has characters that are unsafe there.
 
     A SHA-256 is shortened to its first eight digits.
     """
@@ -131,7 +131,7 @@ def _printed(value: Any) -> str:
 
 
 def _cut(words: list[str]) -> str:
-    """Join words by commas; where the result is too long, keep the first words and a hash of all."""
+    """Join words by commas; if the result is too long, keep the first words and a hash of all."""
     whole = ",".join(words)
     if len(whole) <= LONGEST_VARIANT:
         return whole

@@ -38,7 +38,7 @@ StripRow = tuple[Pixels, Pixels, Pixels]  # render, truth, error
 def gallery(records: list[Record], folder: Path) -> list[GalleryView]:
     """Return the views that have images, of the first seed of each model, in less than BUDGET bytes.
 
-    Where images do not fit, they are compressed more, then made smaller, then reduced to one view for each scene, and
+    If images do not fit, they are compressed more, then made smaller, then reduced to one view for each scene, and
     at last left out.
     """
     strips = _strips(records, folder)
