@@ -89,7 +89,7 @@ class SceneNodeClickMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True
     owner: str = ""
 
     def is_usable(self) -> bool:
-        """Tell whether it can be used: it always can, as only its name is read."""
+        """Return True: only the name of the message is read."""
         return True
 
 

@@ -24,7 +24,7 @@ class StageWatch(Tape):
     """
 
     def __init__(self, device: str) -> None:
-        """Begin."""
+        """Begin without stages."""
         super().__init__()
         self._laps = Laps(device)
 
