@@ -42,7 +42,7 @@ def _steps(record: Record) -> list[tuple[int, str]]:
 
 
 def _rates(record: Record) -> dict[str, Any]:
-    """Return the learning rates of the run's model; of model=auto those of the candidate chosen (run/auto.py)."""
+    """Return the learning rates of the run's model; of model=auto those of the chosen candidate (run/resolve.py)."""
     model = record.provenance.config["model"]
     if model.get("candidates"):
         model = model["candidates"]["moving" if record.effects.time else "static"]
