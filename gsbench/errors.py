@@ -21,12 +21,12 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or its type where it has no message, as it can be printed."""
+    """Return the first line of an error's message, or its type if it has no message, in printable form."""
     return printable((str(error) or type(error).__name__).splitlines()[0])
 
 
 def printable(value: object) -> str:
-    """Return a value as text on one line; characters that a terminal would obey are written as escapes."""
+    """Return a value as text on one line; control characters are written as escapes."""
     text = str(value)
     if text.isprintable():
         return text

@@ -24,7 +24,7 @@ MOST_FRAMES = 100_000
 
 
 class ExportRequest(NamedTuple):
-    """What a command line asks for, checked."""
+    """A checked command line."""
 
     run: LoadedRun
     scene: Scene | None  # None where nothing asks for the data set
@@ -32,7 +32,7 @@ class ExportRequest(NamedTuple):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write what is asked for; return 0, or 2 with one line on stderr."""
+    """Write the requested files; return 0, or 2 with one line on stderr."""
     try:
         asked = prepare(parser().parse_args(arguments))
         if asked.options.ply:
@@ -76,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def prepare(options: argparse.Namespace) -> ExportRequest:
-    """Load what is asked for; raises InputError where it cannot be had."""
+    """Load the requested run and data; raises InputError if that is not possible."""
     if not (options.ply or options.video or options.images):
         raise InputError("expected --ply OUT.ply, --video OUT.mp4 or --images FOLDER, got none of them")
     if options.time is not None and not 0 <= options.time <= 1:
@@ -111,7 +111,7 @@ def write_ply(asked: ExportRequest, path: Path) -> None:
 
 
 def slice_place(asked: ExportRequest) -> tuple[Query, bool]:
-    """Return the query of the slice, and whether its colours stay harmonics: where no place is asked for."""
+    """Return the query of the slice, and whether its colours stay harmonics, which they do without a given place."""
     run, options = asked.run, asked.options
     time = options.time
     if asked.scene is not None and options.camera is not None:
@@ -125,7 +125,7 @@ def slice_place(asked: ExportRequest) -> tuple[Query, bool]:
 
 
 def direction(text: str) -> torch.Tensor:
-    """Read a direction X,Y,Z as a unit vector [3]; raises InputError where it is none."""
+    """Read a direction X,Y,Z as a unit vector [3]; raises InputError if it is none."""
     try:
         found = torch.tensor([float(word) for word in text.split(",")], dtype=torch.float64)
     except ValueError:

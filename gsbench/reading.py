@@ -1,6 +1,6 @@
 """Read files that may be damaged or hostile: regular files of a limited size, and JSON without keys that appear twice.
 
-Needs no torch.
+This module needs no torch.
 """
 
 import json
@@ -21,7 +21,7 @@ def read_file(
 ) -> bytes:
     """Return the bytes of the regular file `path`, which are at most `most`.
 
-    A pipe or a device is refused, as reading it could wait or go on for ever.
+    A pipe or a device is refused, because reading it could never end.
 
     Raises:
         InputError: there is no such file, it is no regular file, is too large, or cannot be read.
@@ -50,7 +50,7 @@ def parse_json(
     """Parse JSON, in which no object has two equal keys: it is not defined which of them counts.
 
     Raises:
-        InputError: it is no such JSON.
+        InputError: the text is not such JSON.
     """
     try:
         return json.loads(data, object_pairs_hook=_unique)
@@ -59,7 +59,7 @@ def parse_json(
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Make an object of its pairs of key and value; raises ValueError where a key appears twice."""
+    """Make an object of its pairs of key and value; raises ValueError if a key appears twice."""
     unique: dict[str, Any] = {}
     for key, value in pairs:
         if key in unique:

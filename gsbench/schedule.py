@@ -1,6 +1,6 @@
 """Schedule a training: scale the steps of the recipe to a run of any length.
 
-This module needs no torch, so that the page of a report can mark what a schedule did.
+This module needs no torch, so that a report can mark the events of a schedule.
 """
 
 from __future__ import annotations
@@ -74,11 +74,11 @@ class Schedule:
         return step + 1 in self.resets_after
 
     def has_reset(self, step: int) -> bool:
-        """Tell whether there was an opacity reset; from then on Gaussians that are too large are pruned."""
+        """Tell whether there was an opacity reset; after it Gaussians that are too large are pruned."""
         return step + 1 > self.reset_every
 
     def resolution(self, step: int) -> int:
-        """Return the factor by which the images of a step are smaller: 1, or that of the first window that holds it."""
+        """Return the factor by which the images of a step are smaller: that of the first window with the step, or 1."""
         coarse = self.config.coarse or []
         return next((factor for factor, until in coarse if step < self.scaled(until)), 1)
 
@@ -91,7 +91,7 @@ class Schedule:
         return self.config.densify.thin_to is not None and step + 1 == max(self.scaled(THIN), self.densify_stop)
 
     def gates(self, step: int) -> bool:
-        """Tell whether the model is gated after a step: once densification is over, while steps are left to recover."""
+        """Tell whether the model is gated after a step: after densification, if enough steps are left."""
         at = max(self.scaled(GATE), self.densify_stop)
         return step + 1 == at and self.config.iterations - at >= STEPS_TO_RECOVER
 

@@ -1,1 +1,1 @@
-"""Choose the effects that a scene, and each of its Gaussians, calls for: time, direction, AGR, harmonics."""
+"""Choose the effects that a scene and each of its Gaussians need: time, direction, AGR, harmonics."""

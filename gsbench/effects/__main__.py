@@ -1,4 +1,4 @@
-"""Look which effects a scene calls for, without a training; gate the model of a finished run, or draw its effect_sets.
+"""Test without a training whether a scene needs time; gate the model of a finished run, or draw its effect sets.
 
 python -m gsbench.effects SCENE_FOLDER [--json]
 python -m gsbench.effects --checkpoint RUN_FOLDER [--budget-db 0.05] [--data-root PATH]
@@ -20,7 +20,7 @@ from gsbench.models.registry import import_models
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Return 0, or 2 where there is nothing to look at."""
+    """Run one command; return 0, or 2 with one line on stderr."""
     parser = argparse.ArgumentParser(prog="python -m gsbench.effects", description=__doc__.partition("\n")[0])
     parser.add_argument("scene", type=Path, nargs="?", metavar="SCENE_FOLDER", help="of a data set that gsbench reads")
     parser.add_argument("--json", action="store_true", help="the answer as JSON")
@@ -63,7 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _whole(text: str) -> int:
-    """Read a whole number; one of more digits than int() takes is out of any range, too."""
+    """Read a whole number; refuse one that has more digits than int() takes."""
     try:
         return int(text[:40])
     except ValueError:

@@ -1,4 +1,4 @@
-"""Gate a model as far as its loss, measured and not only predicted, stays within a budget."""
+"""Gate a model as long as its measured loss stays within a budget."""
 
 import copy
 import math
@@ -36,16 +36,16 @@ def gate_within(
     measure: Callable[[GaussianModel], float],
     intervals: Tensor | None = None,  # [N, 2]
 ) -> Gated | None:
-    """Apply the largest of SHARES whose measured loss is within the budget; None where none is.
+    """Apply the largest of SHARES whose measured loss is within the budget; None if none is.
 
     The model itself is not changed.
 
     Args:
-        model: trained, or on its way.
+        model: trained, or in training.
         sensitivity: of its simplifications.
-        budget_db: dB that `measure` may fall by.
-        measure: the PSNR of a model, dB, on views that the probe did not look at.
-        intervals: when each Gaussian can be seen, for AGR to rest at other times.
+        budget_db: the most dB by which `measure` may fall.
+        measure: returns the PSNR of a model, dB, on views that the probe did not use.
+        intervals: the times at which each Gaussian can be seen; AGR does not move it at others.
     """
     before = measure(model)
     for share in SHARES:
@@ -70,7 +70,7 @@ def gate_within(
 
 
 def orders_of(model: GaussianModel) -> dict[str, int]:
-    """Count the Gaussians by the degree of their harmonics, and by frequencies of time where there are several."""
+    """Count the Gaussians by the degree of their harmonics, and by frequencies of time if there are several."""
     if model.effect_sets is None or model.effect_sets.orders is None:
         return {}
     values, counts = torch.unique(model.effect_sets.orders, return_counts=True)

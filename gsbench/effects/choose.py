@@ -1,14 +1,13 @@
-"""Decide whether a scene changes with time, before any training of the model that would simulate it.
+"""Decide before a training whether a scene changes with time.
 
-Where a camera place has several images, they are compared with one another (gsbench.effects.rig): nothing need be
-fitted. Elsewhere a static 3DGS is fitted for a moment. If the scene moves, what the fit leaves over depends on time:
-the gradients of the squared errors of the training views by the Gaussians' means follow slow waves of time. The test
-compares their energy in those waves with that under random permutations of time (Freedman and Lane 1983), so it needs
-no threshold that depends on the scene. What the camera's place explains is taken out of both first: where the camera
-moves along with time, as on an orbit, little of the waves is left, and the answer is that nothing can be decided.
+If a camera place has several images, they are compared with one another (gsbench.effects.rig). For other views a static
+3DGS is fitted in a few steps. If the scene moves, its residuals depend on time: the gradients of the squared errors of
+the training views by the Gaussians' means follow slow waves of time. The test compares their energy in those waves with
+that under random permutations of time (Freedman and Lane 1983), so it needs no threshold that depends on the scene.
+What the camera's place explains is removed from both first. If the camera moves along with time, as on an orbit,
+little of the waves is left, and the answer is undecided.
 
-Direction and AGR have no such test: docs/effects.md says why. They are admitted, and gsbench.effects.gate keeps them
-where they pay.
+Direction and AGR have no such test (docs/effects.md says why). gsbench.effects.gate keeps them where they are needed.
 """
 
 import math
@@ -35,7 +34,7 @@ ON, OFF, UNDECIDED = "on", "off", "undecided"
 
 @dataclass(frozen=True)
 class ScreenResult:
-    """What one test says."""
+    """The answer of one test."""
 
     decision: str
     reason: str
@@ -48,7 +47,7 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
     """Decide from its training views whether a scene changes with time.
 
     Args:
-        scene: its training views are looked at, much reduced.
+        scene: its training views are used, much reduced.
         seed: of the points and the permutations.
         backend: renders the static fit; see `gsbench.kernels.backends.resolve`.
 
@@ -64,15 +63,16 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
 
 
 def import_compiler() -> None:
-    """Let torch import its compiler, as the first optimizer of a process does, before a clock starts.
+    """Make torch import its compiler before a clock starts, which its first optimizer would do.
 
-    It takes a second that is not the screen's: a training makes its optimizer before its clock starts, too.
+    The import takes a second that would count as time of the screen. A training makes its optimizer before its clock
+    starts, too.
     """
     torch.optim.Adam([torch.zeros(1)])
 
 
 def _answer(scene: Scene, seed: int, backend: str) -> ScreenResult:
-    """Ask the tests that the scene's cameras allow."""
+    """Run the tests that the scene's cameras allow, and combine their answers."""
     views = scene.train
     if not scene.has_time:
         return ScreenResult(OFF, "the views have no times")
@@ -110,7 +110,7 @@ def _percent(share: float) -> str:
 
 
 def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> ScreenResult:
-    """Look at what a static fit leaves over of the views that no fixed camera place has."""
+    """Test the residuals of a static fit to the views that no fixed camera place has."""
     numbers = [*(v for place in places.held for v in place)] if places.held else places.other
     views = [smaller(scene.train[v]) for v in numbers]
     times = np.array([view.time for view in views], dtype=np.float64)
@@ -146,7 +146,7 @@ def _dummies(places: list[list[int]]) -> Array:  # [V, P]
 def _both(fixed: ScreenResult, loose: ScreenResult) -> ScreenResult:
     """Combine the tests of fixed places and of other views, which share no view, by Fisher's method (1925).
 
-    With two tests its p is q (1 - ln q) of the product q of theirs.
+    The combined p is q (1 - ln q), with q the product of both p-values.
     """
     reason = f"{fixed.reason}; of the other views, {loose.reason}"
     if OFF == fixed.decision == loose.decision:

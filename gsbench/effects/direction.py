@@ -1,4 +1,4 @@
-"""Freeze direction in every Gaussian of a model, to measure what it is worth: that it is there cannot be detected."""
+"""Freeze direction in every Gaussian of a trained model, to measure how much the model uses it."""
 
 import copy
 from collections.abc import Sequence
@@ -19,8 +19,8 @@ from gsbench.scenes import View
 def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianModel | None:
     """Return a copy whose slices do not change with the direction of view.
 
-    It is None where the model's slices never do, and where the model cannot freeze what it observes. AGR goes on, as do
-    time and the harmonics of the colours.
+    It is None if the model's slices never do, or if the model cannot freeze what it observes. AGR, time and the
+    harmonics of the colours stay.
 
     Args:
         model: trained.

@@ -1,4 +1,4 @@
-"""Take exposure out of the images of one camera place, so that what is left is noise or something that changes.
+"""Remove the exposure from the images of one camera place: what is left is noise or a change.
 
 An image of a static scene is y = clip(a x + b) of what the place sees, x, with a gain a and an offset b for each image
 and channel. Both are fitted by least absolute deviations (iteratively reweighted: Schlossmacher 1973), so that what
@@ -24,9 +24,9 @@ Mask = NDArray[np.bool_]
 def changes(
     images: Array,  # [n, H, W, 3] of one camera place, in [0, 1]
 ) -> Array:  # [n, H, W, 3]
-    """Return how each image differs from the place's mean once its gain and offset are taken out.
+    """Return how each image differs from the place's mean, without its gain and offset.
 
-    Where a saturated value is expected, a difference as small as three standard deviations of noise counts as none.
+    If the expected value is saturated, a difference of at most three standard deviations of noise counts as none.
     """
     n, height, width, channels = images.shape
     y = np.ascontiguousarray(images.transpose(0, 3, 1, 2), np.float32).reshape(n, channels, -1)
@@ -53,7 +53,7 @@ def changes(
 def _telling(
     saturated: Mask,  # [n, 3, P]
 ) -> NDArray[np.int64]:
-    """Choose at most twice FIT_PIXELS pixels, evenly spaced, half of them such as no image saturates."""
+    """Choose at most twice FIT_PIXELS pixels, evenly spaced; half of them are not saturated in any image."""
     inside = np.flatnonzero((~saturated.any(0)).any(0))
     spaced = [every[:: max(1, -(-len(every) // FIT_PIXELS))] for every in (inside, np.arange(saturated.shape[2]))]
     return np.unique(np.concatenate(spaced))
@@ -86,7 +86,7 @@ def _shared(
     enough: Mask,  # [n, 3, 1]
     otherwise: float,
 ) -> Array:
-    """Replace what too few pixels say by what the image's other channels say on average."""
+    """Replace a fit to too few pixels by the mean of the fits to the image's other channels."""
     number = enough.sum(1, keepdims=True)
     mean = (values * enough).sum(1, keepdims=True) / np.maximum(number, 1)
     return np.where(enough, values, np.where(number > 0, mean, otherwise)).astype(np.float32)
@@ -97,7 +97,7 @@ def _seen(
     saturated: Mask,  # [n, 3, P]
     full: Mask,  # [3, P] where the first image is saturated, whether it is white and not black
 ) -> Array:  # [3, P]
-    """Return the median of what is not saturated; where all is, the least that makes every image so."""
+    """Return the median of unsaturated values; if all are saturated, the least value that saturates every image."""
     ordered = np.sort(np.where(saturated, np.float32(np.inf), values), 0)
     number = (~saturated).sum(0)
     middle = np.take_along_axis(ordered, np.maximum(number - 1, 0)[None] // 2, 0)[0]

@@ -1,8 +1,8 @@
-"""Keep each effect of each Gaussian only where it pays: choose simplifications under a budget of error, and apply them.
+"""Remove effects that Gaussians do not need: choose simplifications within a budget of error, and apply them.
 
-For every Gaussian the simplification is chosen that minimises time + lambda error, its frame time and the error that
-gsbench.effects.sensitivity predicts for it; lambda is such that the errors add up to the budget. One rule decides about
-time, direction, AGR, harmonics and existence, and its unit is error for milliseconds.
+Every Gaussian takes the simplification that minimises time + lambda error: its frame time, and the error that
+gsbench.effects.sensitivity predicts. lambda is such that the errors add up to the budget. The same rule decides about
+time, direction, AGR, harmonics and removal.
 """
 
 from dataclasses import dataclass
@@ -44,13 +44,13 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
 
         cost(i, s) + lambda error(i, s)
 
-    with its nanoseconds of a frame (COSTS, COLORING) and its predicted squared error (`Sensitivity.errors`). lambda is
-    the smallest, found by bisection, for which the errors add up to at most `budget` x `sensitivity.total`.
+    with its nanoseconds of a frame (COSTS, COLORING) and its predicted squared error (`Sensitivity.errors`). Bisection
+    finds the smallest lambda for which the errors add up to at most `budget` x `sensitivity.total`.
 
     Args:
         sensitivity: of the model's simplifications.
-        model: whose they are; it may have effect sets already.
-        budget: a share, such as 0.01, which is 0.043 dB.
+        model: the model of `sensitivity`; it may have effect sets already.
+        budget: a share of the model's squared error, such as 0.01, which is 0.043 dB.
     """
     now = effect_sets_of(model)
     live = _live_cost(model, now)
@@ -67,7 +67,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     shading = _shading(orders)
 
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Choose for a price of error; return both choices, and the error of each Gaussian."""
+        """Choose for one lambda; return the choices of geometry and colour, and the error of each Gaussian."""
         shade, hue = (shading + price * hues).min(0)
         _, form = (costs + price * forms + torch.where(removes, 0.0, shade)).min(0)  # argmin takes 8 to 30 times longer
         error = forms.gather(0, form[None])[0] + hues.gather(0, hue[None])[0] * ~removes[form, 0]
@@ -86,7 +86,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
 
 
 def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
-    """Return the nanoseconds that each Gaussian takes as it is, colours not counted, [N]."""
+    """Return the nanoseconds of each Gaussian as it is, without its colour, [N]."""
     like = model.splats["opacities"].detach()
     cost = torch.full_like(like, COSTS[STATIC])
     cost[: now.conditioned] = SLICING
@@ -97,25 +97,25 @@ def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
 
 
 def cost_of(model: GaussianModel) -> Tensor:
-    """Return the nanoseconds that each Gaussian adds to a frame before it is rasterized, colours counted, [N]."""
+    """Return the nanoseconds of each Gaussian before it is rasterized, with its colour, [N]."""
     now = effect_sets_of(model)
     assert now.orders is not None
     return _live_cost(model, now) + _shading(now.orders)
 
 
 def most_cost(model: GaussianModel) -> float:
-    """Return the nanoseconds of a Gaussian that pays for everything that this model can have."""
+    """Return the nanoseconds of a Gaussian that has every effect of this model."""
     return REFINING + SLICING + float(_shading(torch.tensor(model.full_order())))
 
 
 def _shading(orders: Tensor) -> Tensor:
-    """Return the cost, ns, of evaluating colours of some orders, packed."""
+    """Return the nanoseconds of evaluating colours of the given packed orders."""
     order = order_of(orders)
     return torch.tensor(COLORING, device=orders.device)[order.degree] * order.waves
 
 
 def effect_sets_of(model: GaussianModel) -> EffectSets:
-    """Return the effect sets of a model, or those that say what each row of one without effect sets pays for."""
+    """Return the effect sets of a model; if it has none, make them from the effects that its rows have."""
     if model.effect_sets is not None:
         return model.effect_sets
     rows = model.count_by_effects()
@@ -137,11 +137,11 @@ def apply(
     Args:
         model: becomes the gated one.
         sensitivity: of its simplifications.
-        choice: one of them for each Gaussian.
-        intervals: when each Gaussian can be seen, see `EffectSets.intervals`.
+        choice: one simplification for each Gaussian.
+        intervals: the times at which each Gaussian can be seen, see `EffectSets.intervals`.
 
     Returns:
-        The rows [M] that the Gaussians which are left had before, and which of them were changed, [M] bool.
+        The former rows [M] of the Gaussians that are left, and whether each of them was changed, [M] bool.
     """
     now = effect_sets_of(model)
     assert now.orders is not None

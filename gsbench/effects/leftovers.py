@@ -1,4 +1,4 @@
-"""Fit 3DGS for a moment and say what it leaves over of each view: the gradients of the squared errors by the means."""
+"""Fit 3DGS in a few steps and compute the residuals of each view: the gradients of the squared error by the means."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -71,7 +71,7 @@ def _gradients(model: Gaussians3DModel, by: list[nn.Parameter], background: Tens
 
 
 def smaller(view: View) -> View:
-    """Return a view whose longer side has LONG_SIDE pixels or a few more."""
+    """Return a reduced view whose longer side has LONG_SIDE pixels or a few more."""
     camera = view.camera
     factor = max(1, max(camera.width, camera.height) // LONG_SIDE)
     height, width = camera.height // factor, camera.width // factor
@@ -86,7 +86,7 @@ def smaller(view: View) -> View:
 
 
 def scene_points(views: Sequence[View], scene: Scene, random: torch.Generator) -> Points:
-    """Choose POINTS points to start a fit from: of those given with the scene, else where the cameras look."""
+    """Choose POINTS points from which a fit starts: some of the scene's, or points where the cameras look."""
     if scene.points is not None:
         chosen = torch.randperm(len(scene.points.means), generator=random)[:POINTS]
         return Points(scene.points.means[chosen], scene.points.colors[chosen])
@@ -99,7 +99,7 @@ def scene_points(views: Sequence[View], scene: Scene, random: torch.Generator) -
 
 
 def center_of(views: Sequence[View]) -> Tensor | None:
-    """Return the point nearest to all optical axes, [3]; None where they do not meet before the cameras."""
+    """Return the point nearest to all optical axes, [3]; None if they do not meet before the cameras."""
     centers = torch.stack([view.camera.center for view in views]).cpu().double()
     axes = torch.stack([view.camera.viewmat[2, :3] for view in views]).cpu().double()
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
@@ -113,7 +113,7 @@ def center_of(views: Sequence[View]) -> Tensor | None:
 
 
 def camera_basis(views: Sequence[View]) -> Array:
-    """Compute harmonics [V, 9] of the direction in which each camera lies from the middle of what they look at."""
+    """Compute harmonics [V, 9] of the direction of each camera from the centre of the scene."""
     center = center_of(views)
     centers = torch.stack([view.camera.center for view in views]).cpu()
     if center is None:  # cameras side by side: seen from so far in front of them that all lie close together

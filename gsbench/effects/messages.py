@@ -1,4 +1,4 @@
-"""Say in words what was decided about the effects of a scene and of its Gaussians; needs no torch."""
+"""Write the sentences about the chosen effects of a scene and its Gaussians; this module needs no torch."""
 
 from gsbench.measure.record import Direction, Gate, OnDemand, TimeScreen
 
@@ -29,7 +29,7 @@ def of_screen(screen: TimeScreen) -> str:
 
 
 def of_gate(gate: Gate) -> str:
-    """Say what a gate left of the model, and what that cost."""
+    """Say how many Gaussians and effects a gate left, and how many dB that cost."""
     left = sum(number for name, number in gate.rows.items() if name != "removed")
     when = "at the end" if gate.step is None else f"after step {gate.step}"
     kept = ", ".join(f"{gate.rows[name]} {words}" for name, words in _KEEP.items() if gate.rows.get(name))
@@ -53,6 +53,6 @@ def of_direction(found: Direction) -> str:
 
 
 def lines(found: OnDemand) -> list[str]:
-    """Say what the gates decided, a sentence a line; `of_screen` says what the screen did, before the training."""
+    """Return a sentence on each line about what the gates decided; `of_screen` has that of the screen."""
     said = [of_gate(gate) for gate in found.gates]
     return said + ([of_direction(found.direction)] if found.direction else []) + found.notes

@@ -1,4 +1,4 @@
-"""Draw a model's image beside the same Gaussians in the colours of their effect sets, and what a pixel pays for.
+"""Draw a model's image, the same Gaussians in the colours of their effect sets, and the cost of each pixel.
 
 The third panel is the cost of the Gaussians that a pixel shows, weighted as their colours are: nanoseconds of a frame
 by the constants of gsbench.effects.gate, black for none, bright yellow for a Gaussian with AGR and all harmonics.
@@ -39,14 +39,14 @@ def draw(
     """Draw the three panels with their titles and a legend: uint8 [H', W', 3] RGB.
 
     Args:
-        model: initialised; one without effect sets is refined, conditioned or static everywhere.
-        camera: sees it.
-        time: in [0, 1]; None where the scene has no time.
-        background: colour [3] of the image; that of the effect sets is white.
+        model: initialised; without effect sets all its Gaussians have the same one.
+        camera: of the image.
+        time: in [0, 1]; None if the scene has no time.
+        background: colour [3] of the image; the second panel has white.
         antialias: see `gsbench.raster.rasterize`.
 
     Raises:
-        InputError: the model observes time and there is none.
+        InputError: the model observes time and `time` is None.
     """
     seen = model.slice(Query.of(camera, time))
     layers = (
@@ -74,7 +74,7 @@ def cost_colors(model: GaussianModel, most: float) -> Tensor:
 
 
 def kinds_of(model: GaussianModel) -> Tensor:
-    """Return the effect set of each Gaussian as its place among NAMES, [N] int64."""
+    """Return the effect set of each Gaussian as its index in NAMES, [N] int64."""
     effect_sets = effect_sets_of(model)
     assert effect_sets.frozen is not None
     place = torch.arange(len(model), device=effect_sets.frozen.device)
@@ -88,7 +88,7 @@ def kinds_of(model: GaussianModel) -> Tensor:
 
 
 def _arranged(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixels:
-    """Put panels side by side, titles above and the legend below."""
+    """Put panels side by side, with titles above and the legend below."""
     height, width = panels[0].shape[:2]
     factor = max(1, -(-LEAST_WIDTH // width))
     if width > MOST_WIDTH:

@@ -1,4 +1,4 @@
-"""Find the views that one camera took from one place, by how far the image moves from one of them to the other."""
+"""Find the views from each camera place, by how far the image moves between two views."""
 
 import math
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Places:
-    """The numbers of the views, dealt to places."""
+    """The numbers of the views of each place."""
 
     fixed: list[list[int]]  # at least two of each place
     held: list[list[int]]  # places of cameras that move a little; empty, or most of the views that no fixed place has
@@ -28,16 +28,16 @@ class Places:
 
     @property
     def loose(self) -> list[int]:
-        """The views that no fixed place has."""
+        """Return the views that no fixed place has."""
         return sorted([v for place in self.held for v in place] + self.other)
 
 
 def find_places(views: Sequence[View], extent: float) -> Places:
-    """Deal the views to places.
+    """Group the views by camera place.
 
     Args:
         views: with times.
-        extent: the scene's, which stands for its distance where the cameras look at no common point.
+        extent: of the scene; it is used as the distance if the cameras look at no common point.
     """
     poses = _poses(views, extent)
     exact = _groups(list(range(len(views))), poses, SAME)
@@ -53,7 +53,7 @@ def find_places(views: Sequence[View], extent: float) -> Places:
 
 
 def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
-    """Put each camera in numbers whose distance is about that by which its image moves, in longer sides."""
+    """Return a vector for each camera; distances between vectors are about the shift of the image, in longer sides."""
     center = center_of(views)
     rows = []
     for view in views:
@@ -75,7 +75,7 @@ def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
 
 
 def _groups(numbers: list[int], poses: Array, tolerance: float) -> list[list[int]]:
-    """Group views around the first of each group, so that none is farther from it than the tolerance."""
+    """Group views so that none is farther from the first view of its group than the tolerance."""
     groups: list[list[int]] = []
     left = np.array(numbers, dtype=np.int64)
     while len(left):

@@ -1,16 +1,15 @@
-"""Test whether the images of one camera place change with time: no fit, and no camera to take out.
+"""Test whether the images of one camera place change with time, without a fitted model.
 
 Two questions are asked of all places together, after each image's exposure is taken out (gsbench.effects.exposure).
 
-- Does anything change? Noise is white over pixels, a change is not. The pixels of a block are dealt to two halves like
-  the squares of a chess board: the product of their means is zero on average for noise, whatever its size, and the
-  change's energy where there is one. One block in which that is far above the noise is enough.
-- Does it change slowly? The share of the energy of each place's block means that goes with slow waves of time,
-  |W^T M|^2 / |M|^2, is summed over places and compared with that of images dealt anew within their places (a kernel
-  test of independence, Gretton et al. 2005, with permutations within strata), so that what distinguishes places is no
-  part of it. Each moment has a random number, and a place's images are dealt in the order of their moments' numbers:
-  what cameras that fire together see at one moment stays together, and the level holds for a light that flickers for
-  all.
+- Does anything change? Noise is white over pixels, a change is not. The pixels of a block form two halves like the
+  squares of a chess board. The product of the means of the halves is zero on average for noise of any size, and the
+  energy of a change otherwise. One block in which it is far above the noise is enough.
+- Does it change slowly? The share of the energy of each place's block means that follows slow waves of time,
+  |W^T M|^2 / |M|^2, is summed over places. It is compared with that of images permuted within their places (a kernel
+  test of independence, Gretton et al. 2005, with permutations within strata), so differences between places do not
+  count. Each moment has a random number, and a place's images are permuted in the order of these numbers. So the images
+  of one moment stay together, and the level holds for a light that flickers for all cameras.
 """
 
 from collections.abc import Sequence
@@ -35,7 +34,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlaceComparison:
-    """What the images of the places say."""
+    """The result of comparing the images of the places."""
 
     changed: float  # share of the blocks, over all places
     p: float | None  # of slow waves; None: nothing changes, or no place has images enough
@@ -47,7 +46,7 @@ def compare_places(views: Sequence[View], places: Sequence[Sequence[int]], seed:
 
     Args:
         views: with times.
-        places: numbers of the views of each place, at least two a place.
+        places: numbers of the views of each place, at least two for each.
         seed: of the permutations.
     """
     most = max(4, MOST_VIEWS // len(places))
@@ -83,7 +82,7 @@ def _pixels(view: View) -> NDArray[np.float32]:
 def _halves(
     images: NDArray[np.float32],  # [n, H, W, 3]
 ) -> NDArray[np.float32]:  # [2, n, B, 3]
-    """Average the two halves of the pixels of each block, dealt like the squares of a chess board."""
+    """Average the two halves of the pixels of each block, which are like the squares of a chess board."""
     n, height, width, channels = images.shape
     side = min(max(2, max(height, width) // BLOCKS), height, width)
     rows, columns = height // side, width // side

@@ -1,22 +1,22 @@
-"""Predict what every simplification of every Gaussian would cost, all of them at once, from a few renders.
+"""Predict the error of every simplification of every Gaussian, all at once, from a few renders.
 
 A simplification of a Gaussian (AGR baked in, time or direction frozen, fewer harmonics, removed) changes its slice in
 view v by delta_v, and the image by x_v. With r the image minus the truth, the squared error of all views grows by
 
     E = sum over v of max(0, 2 <r, x_v>) + <g, x_v>^2,
 
-with random signs g, for <g, x>^2 is |x|^2 on average. The linear term is cut at zero: what would improve the training
-views is not counted on. Products of r and g with J, the derivative of the image by slices, have <r, x> and <g, x> for
-all Gaussians at once:
+with random signs g, because <g, x>^2 is |x|^2 on average. The maximum ignores improvements of the training
+views. Products of r and g with J, the derivative of the image by slices, have <r, x> and <g, x> for all Gaussians at
+once:
 
 - The image is linear in a Gaussian's colour and in its opacity, so x = J delta for fewer harmonics and for a removal.
-- A simplification that moves a Gaussian by less than its size has x = (J + J') delta / 2, with J' at the
-  simplification. For that the simplifications are drawn beside the model's own Gaussians, so thin that they hide
-  nothing of one another; what the model's own one hides of its simplification is added.
-- One that moves it farther is missed in one place and seen in another: |x|^2 is the sum of both squares.
+- If a simplification moves a Gaussian by less than its size, x = (J + J') delta / 2, with J' at the simplification. To
+  compute J' the simplified Gaussians are rendered beside the model's own, so thin that they do not hide each other.
+  What the own Gaussian hides of its simplification is added.
+- If it moves the Gaussian farther, |x|^2 is the sum of the squares at both places.
 
-Two equal Gaussians that are d standard deviations apart overlap by exp(-d^2 / 4); by so much the second case counts,
-and the third by the rest.
+Two equal Gaussians that are d standard deviations apart overlap by exp(-d^2 / 4). This is the weight of the second
+case, and the rest is that of the third.
 """
 
 import math
@@ -75,11 +75,11 @@ def probe(
         views: training views.
         background: colour [3].
         seed: of the random signs.
-        most: this many views, evenly spaced, stand for more.
-        draws: of g for each view; of a Gaussian that few views show, one says little.
+        most: the number of views, evenly spaced, that are used.
+        draws: random g for each view; one draw says little about a Gaussian that few views show.
         antialias: see `gsbench.raster.rasterize`.
         by_halves: whether time or direction alone may be frozen.
-        hidden: Gaussians that none of all the views shows.
+        hidden: Gaussians that no view shows.
     """
     looked_at = evenly(views, most)
     queries = [Query.of(view.camera, view.time) for view in looked_at]
@@ -115,7 +115,7 @@ def probe(
 
 
 class Drawn(NamedTuple):
-    """A slice that was drawn."""
+    """A rendered slice."""
 
     at: Gaussians3D
     tape: Tape  # how
@@ -125,7 +125,7 @@ class Drawn(NamedTuple):
 
     @property
     def image(self) -> Tensor:
-        """The image [H, W, 3]."""
+        """Return the image [H, W, 3]."""
         return self.images[0].detach()
 
     def products(self, vectors: list[Tensor]) -> Tensor:
@@ -156,7 +156,7 @@ class ViewRasterizer(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A model as one view shows it."""
+    """A model seen by one view."""
 
     model: GaussianModel
     query: Query

@@ -1,4 +1,4 @@
-"""Find when each Gaussian can be seen: at other times AGR need not move it."""
+"""Find the times at which each Gaussian can be seen; at other times AGR need not move it."""
 
 import itertools
 import math
@@ -17,8 +17,8 @@ from gsbench.scenes import View
 def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
     """Return the first and the last time at which a view can show each Gaussian, clips; (inf, -inf) where none can.
 
-    It can where the opacity in the slice, moved by AGR or not, reaches ALPHA_MIN: below, nothing is drawn. Both times
-    are the largest gap between the times of neighbouring views apart from those of the views, for what lies between.
+    A view can show a Gaussian if its opacity in the slice, with or without AGR, reaches ALPHA_MIN. The interval is
+    extended on both sides by the largest gap between the times of neighbouring views.
 
     Args:
         model: trained.

@@ -1,4 +1,4 @@
-"""Compare what follows slow waves of time with what does so when times are dealt at random."""
+"""Test whether a share of energy follows slow waves of time more than after random permutations of time."""
 
 import math
 from collections.abc import Sequence
@@ -35,9 +35,9 @@ def evidence(
     Args:
         leftovers: g_v . g_w for all pairs of views.
         times: of the views.
-        camera: functions of the camera; their span is taken out of gradients and waves.
+        camera: functions of the camera; their span is removed from gradients and waves.
         seed: of the permutations.
-        places: groups of views among which times are dealt; all views are one by default.
+        places: groups of views within which times are permuted; by default all views are one group.
     """
     waves = slow_waves(times)
     known = _range(camera)
@@ -50,7 +50,7 @@ def evidence(
     random = np.random.default_rng(seed)
 
     def share(rows: NDArray[np.int64]) -> float:
-        """Share of energy in the slow waves, of what is left once the camera is taken out of permuted leftovers too."""
+        """Return the share of energy in the slow waves, after the camera is removed from the permuted residuals too."""
         turned = np.concatenate([slow, known], 1)[rows]
         energies = np.einsum("vk,vk->k", turned, gram @ turned)
         left = total - energies[slow.shape[1] :].sum()
@@ -73,7 +73,7 @@ def compare(
     actual: float,
     null: Array,  # [PERMUTATIONS] the same of times that were dealt at random
 ) -> tuple[float, float]:
-    """Return p, the share of deals that reach the actual value, itself counted, and z, its distance from their mean."""
+    """Return p, the share of permutations (with the actual one) that reach the actual value, and its z."""
     p = (1 + int((null >= actual - TIE * abs(actual)).sum())) / (1 + len(null))
     spread = float(null.std())
     return p, (actual - float(null.mean())) / spread if spread > TIE * abs(actual) else 0.0

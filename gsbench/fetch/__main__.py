@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def folder_of(path: Path) -> Path:
-    """Return the folder that a user named; raises InputError where no folder can have that name."""
+    """Return the folder that a user named; raises InputError if no folder can have that name."""
     try:
         if "\0" not in str(path):
             return path.expanduser()

@@ -58,7 +58,7 @@ def by_hand(source: Source, path: Path) -> str:
 
 
 def check(path: Path, source: Source, advice: str) -> None:
-    """Raise InputError where the source has a SHA-256 and that of the file begins otherwise."""
+    """Raise InputError if the source has a SHA-256 and that of the file begins otherwise."""
     found = sha256_of(path)
     if source.sha256 and not found.startswith(source.sha256):
         raise InputError(f"{source.name}: expected {source.file} with SHA-256 {source.sha256}.., got {found[:8]}..: "

@@ -27,16 +27,16 @@ class Source:
 
     @property
     def is_archive(self) -> bool:
-        """Whether it is unpacked."""
+        """Tell whether it is unpacked."""
         return self.file.endswith(".zip")
 
     @property
     def target(self) -> Path:
-        """The file that exists after the download, or the folder of an archive."""
+        """Return the file that exists after the download, or the folder of an archive."""
         return self.folder if self.is_archive else self.folder / self.file
 
     def address(self) -> str:
-        """Return the URL of the download, on the mirror where one is set.
+        """Return the URL of the download, on the mirror if one is set.
 
         Raises:
             InputError: there is none, or the mirror's is not one.
@@ -79,7 +79,7 @@ def sources(data: Path) -> dict[str, Source]:
 
 
 def find(name: str, known: dict[str, Source]) -> Source:
-    """Return the source of that name; raises InputError where there is none."""
+    """Return the source of that name; raises InputError if there is none."""
     if name not in known:
         raise InputError(f"'{name}' is not known. {did_you_mean(name, known)}")
     return known[name]

@@ -44,7 +44,7 @@ def unpack(archive: Path, folder: Path) -> None:
 
 
 def check(member: zipfile.ZipInfo, archive: Path) -> None:
-    """Raise InputError where a member of a zip has no name, would lie outside the folder, or is a link or a device."""
+    """Raise InputError if a member of a zip has no name, would lie outside the folder, or is a link or a device."""
     name = member.filename
     path = PurePosixPath(name.replace("\\", "/"))
     if path.is_absolute() or ".." in path.parts or ":" in name or not name.isprintable():

@@ -1,7 +1,7 @@
-"""The machine room: compiled kernels, and the operations on tensors that are made of them.
+"""Compute slices, images and losses by compiled kernels, and offer them as operations on tensors.
 
-The extension `_native` is optional. Where it was not built, importing this package still works, `available()` is False
-and every operation raises `InputError`; the reference backend does the same work in torch.
+The extension `_native` is optional. If it was not built, this package can still be imported, `available()` is False and
+every operation raises `InputError`. The reference backend then does the same work in torch.
 """
 
 import importlib
@@ -17,12 +17,12 @@ if importlib.util.find_spec("gsbench.kernels._native") is not None:  # an extens
 
 
 def available() -> bool:
-    """Whether the compiled kernels are part of this installation."""
+    """Tell whether the compiled kernels are part of this installation."""
     return _native is not None
 
 
 def native() -> ModuleType:
-    """The compiled extension.
+    """Return the compiled extension.
 
     Raises:
         InputError: it was not built.
@@ -34,7 +34,7 @@ def native() -> ModuleType:
 
 
 def instruction_set() -> str | None:
-    """The instruction set that the CPU's kernels run with, such as `v3`; None where they are not built."""
+    """Return the instruction set that the CPU's kernels run with, such as `v3`; None if they are not built."""
     return None if _native is None else str(_native.active())
 
 

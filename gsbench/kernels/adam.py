@@ -24,16 +24,16 @@ def adam(
     eps: float,
     step: Tensor,  # []
 ) -> None:
-    """One update, the `step`-th from 1, of the rows `drawn` (Kingma & Ba 2015, algorithm 1).
+    """Update the rows `drawn` once, as step number `step` from 1 (Kingma & Ba 2015, algorithm 1).
 
     Args:
-        parameter: what is moved.
-        gradient: of the loss by it.
+        parameter: the tensor that is updated.
+        gradient: of the loss by the parameter.
         mean: the running mean of the gradient.
-        square: that of its square.
-        drawn: which rows are updated.
+        square: the running mean of its square.
+        drawn: the rows that are updated.
         rate: the learning rate.
-        betas: how much of the two means is kept.
+        betas: the share of each running mean that is kept.
         eps: added to the root of the mean square.
         step: the number of this update.
 
@@ -109,10 +109,19 @@ def adam_all(
                                  f"the CPU, got {x.dtype} of shape {list(x.shape)} on {x.device}")  # fmt: skip
     for first in range(0, len(parameters), MAX_ADAM):
         part = slice(first, first + MAX_ADAM)
-        slots = {"count": len(parameters[part]), "numbers": tuple([x.numel() for x in parameters[part]]),
-                 "gradients": _addresses(gradients[part]), "steps": _addresses(steps[part]),
-                 "rates": tuple(rates[part]), "beta1": betas[0], "beta2": betas[1], "eps": eps,
-                 "out.parameters": _addresses(parameters[part]), "out.means": _addresses(means[part]), "out.squares": _addresses(squares[part])}  # fmt: skip
+        slots = {
+            "count": len(parameters[part]),
+            "numbers": tuple([x.numel() for x in parameters[part]]),
+            "gradients": _addresses(gradients[part]),
+            "steps": _addresses(steps[part]),
+            "rates": tuple(rates[part]),
+            "beta1": betas[0],
+            "beta2": betas[1],
+            "eps": eps,
+            "out.parameters": _addresses(parameters[part]),
+            "out.means": _addresses(means[part]),
+            "out.squares": _addresses(squares[part]),
+        }
         library_of("cpu").call("adam_all", slots, parameters[0])
 
 

@@ -14,7 +14,7 @@ from gsbench.kernels import cuda
 
 @dataclass(frozen=True)
 class Backend:
-    """A backend. Models, the rasterizer, the loss and the optimizer are given one, and ask it whether it `serves`."""
+    """Decides whether kernels or torch compute: models, rasterizer, loss and optimizer ask it whether it `serves`."""
 
     name: str
     devices: tuple[str, ...]  # the kinds of device on which it uses kernels
@@ -25,9 +25,9 @@ class Backend:
         return tensor.dtype == torch.float32 and device in self.devices and _built(device)
 
     def workers(self, tensor: Tensor) -> int:
-        """Tell how many independent pieces of work on such tensors are worth threads of Python's, side by side.
+        """Return how many Python threads should share independent pieces of work on such tensors.
 
-        Only the time of the CPU's kernels is: torch holds Python's lock between its operations, and a GPU does one
+        Only the CPU's kernels gain by threads: torch holds Python's lock between its operations, and a GPU does one
         thing after the other anyway.
         """
         return torch.get_num_threads() if tensor.device.type == "cpu" and self.serves(tensor) else 1
@@ -68,7 +68,7 @@ def _built(device: str) -> bool:
 
 
 def _warn(device: str) -> None:
-    """Warn where `auto` falls back to a slower backend."""
+    """Warn if `auto` falls back to a slower backend."""
     if cuda.built() and not cuda.available():
         _warn_once("no CUDA device was found: the CUDA kernels of this installation are idle, the CPU renders")
     if device == "cpu" and not kernels.available():

@@ -1,6 +1,6 @@
 """Colour Gaussians by spherical harmonics and waves of time.
 
-What cannot be drawn (an opacity below 1/255 after f_temp and f_dir) is left out, which changes no image.
+Gaussians that cannot be seen (opacity below 1/255 after f_temp and f_dir) are left out; no image changes by that.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ from gsbench.kernels.operation import Operation
 
 
 def _bases(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
-    """Harmonics stored for each frequency."""
+    """Return the number of harmonics that are stored for each frequency."""
     shN, degree, waves = given["shN"], numbers["degree"], numbers["waves"]
     stored = shN.shape[1] + 1 if shN.dim() == 3 else 0
     if stored % waves or stored // waves < (degree + 1) ** 2:
@@ -57,23 +57,23 @@ def show_colors(
     waves: int = 1,
     orders: Tensor | None = None,  # [N] int32
 ) -> Tensor:  # [N, 3]
-    """Colours max(0, sum beta_nlm cos(2 pi n (t - mu_t)) Y_lm(d) + 0.5), d the direction from `center` to the mean.
+    """Return colours max(0, sum beta_nlm cos(2 pi n (t - mu_t)) Y_lm(d) + 0.5), d from `center` to the mean.
 
-    The same as `gsbench.models.appearance.sh_colors` (waves = 1) and `sh_time_colors`, and zero for Gaussians whose
-    opacity is below 1/255.
+    Colours are those of `gsbench.models.appearance.sh_colors` (waves = 1) and `sh_time_colors`, and zero for Gaussians
+    whose opacity is below 1/255.
 
     Args:
         sh0: the constant coefficient.
-        shN: the others: K harmonics a frequency, of which (degree + 1)^2 are used.
+        shN: the other coefficients: K harmonics for each frequency, of which (degree + 1)^2 are used.
         means: world units.
-        opacities: of the slice, in [0, 1]; they have no gradient by colours.
+        opacities: of the slice, in [0, 1]; colours give them no gradient.
         center: the camera's, world units.
         degree: of the harmonics, 0 to 3.
-        times: mu_t, where colours change with time.
+        times: mu_t, if colours change with time.
         time: clips.
         waves: frequencies of time, the constant one included.
-        orders: what each colour has at most, its degree + 4 (waves - 1); the coefficients above that are not read, and
-            their gradient is zero. None: all colours have `degree` and `waves`.
+        orders: the order of each colour, degree + 4 (waves - 1); coefficients above it are not read, and their
+            gradient is zero. None: all colours have `degree` and `waves`.
 
     Raises:
         InputError: not float32 on one device, or shapes that do not fit.

@@ -1,4 +1,4 @@
-"""Describe one tensor that an operation takes or returns: its shape, its type and what gradient goes through it."""
+"""Describe one tensor that an operation takes or returns: its shape, its type and its gradient."""
 
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -9,7 +9,7 @@ Shape = tuple[int | str, ...]
 
 
 class Gradient(Enum):
-    """What the backward kernel does about the gradient by an input."""
+    """What the backward kernel does with the gradient of an input."""
 
     WRITTEN = auto()  # writes every entry
     ADDED = auto()  # adds to every entry, so that the views of a batch share one memory
@@ -26,10 +26,10 @@ class Input:
     Args:
         shape: sizes such as "N 3" or "C height width D". A size is a number, or a name that means one size wherever it
             stands in the operation. A first size that may be left out has a question mark.
-        gradient: what backward does about it.
+        gradient: what backward does with its gradient.
         dtype: float32, or int32 for indices.
-        left_out_with: an input with such a name may be left out; of those that share the name, all are or none.
-        is_list: the tensor is [n], and n differs from call to call and is the size of nothing else.
+        left_out_with: makes the input optional; inputs with the same name are left out together.
+        is_list: the tensor is [n]; n differs from call to call and is no other size.
     """
 
     shape: str
@@ -41,7 +41,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Output:
-    """A tensor that an operation returns: its shape, as of `Input`, and whether a gradient goes through it."""
+    """A tensor that an operation returns: its shape, as in `Input`, and whether a gradient goes through it."""
 
     shape: str
     gradient: bool = True

@@ -1,4 +1,4 @@
-"""Read the constants of the kernels' headers: one source for the kernels and for what torch and Python do with them."""
+"""Read the constants of the kernels' headers, so that kernels, torch and Python use the same ones."""
 
 import re
 from importlib import resources

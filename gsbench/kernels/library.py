@@ -1,4 +1,4 @@
-"""Call the compiled kernels of one kind of device: the fields of their argument structures are filled by name."""
+"""Call the compiled kernels of one kind of device, and fill the fields of their argument structures by name."""
 
 import functools
 from types import ModuleType
@@ -21,15 +21,15 @@ class Library:
     """The kernels for tensors on the CPU."""
 
     def __init__(self, extension: ModuleType) -> None:
-        """Take the extension that holds them."""
+        """Take the extension that has the kernels."""
         self.extension = extension
         self._fields = {name: _fields(signature) for name, signature in extension.SIGNATURES.items()}
 
     def call(self, name: str, slots: Slots, like: Tensor) -> None:
-        """Run a kernel on memory of the same device as `like`; `slots` holds a value for each of its fields.
+        """Run a kernel on the device of `like`; `slots` has a value for each of its fields.
 
         Raises:
-            InputError: the kernel has no room for such sizes, or none of such an option.
+            InputError: the kernel does not support such sizes or options.
         """
         slots["threads"] = torch.get_num_threads()
         self._run(name, *[slots[field] for field in self._fields[name]])
@@ -41,16 +41,16 @@ class Library:
             raise InputError(str(error)) from None
 
     def takes(self, name: str, field: str) -> bool:
-        """Whether a kernel has a field."""
+        """Tell whether a kernel has a field."""
         return field in self._fields[name]
 
     @property
     def needs_scratch(self) -> bool:
-        """Whether kernels are given their scratch memory; those of the CPU get their own."""
+        """Tell whether kernels need scratch memory from torch; kernels of the CPU allocate their own."""
         return False
 
     def similarity_parts(self, height: int, width: int) -> int:
-        """How many parts `l1_ssim` leaves of its loss."""
+        """Return into how many parts `l1_ssim` divides its loss."""
         return 1
 
 
@@ -69,11 +69,11 @@ class CudaLibrary(Library):
 
     @property
     def needs_scratch(self) -> bool:
-        """On a GPU memory comes from torch's caching allocator, scratch too."""
+        """Return True: on a GPU torch's caching allocator gives scratch memory too."""
         return True
 
     def similarity_parts(self, height: int, width: int) -> int:
-        """One of each block of threads."""
+        """Return one part for each block of threads."""
         return int(self.extension.similarity_parts(height, width))
 
 
@@ -81,10 +81,10 @@ _LIBRARIES: dict[str, Library] = {}  # by kind of device, as they were asked for
 
 
 def library_of(device: str) -> Library:
-    """The kernels for tensors on a kind of device, `cpu` or `cuda`.
+    """Return the kernels for tensors on a kind of device, `cpu` or `cuda`.
 
     Raises:
-        InputError: they were not built, or there are none for such a device.
+        InputError: the kernels were not built, or there are none for such a device.
     """
     if device not in _LIBRARIES:
         if device not in ("cpu", "cuda"):
@@ -94,10 +94,10 @@ def library_of(device: str) -> Library:
 
 
 def allocate(what: str, like: Tensor, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Tensor:
-    """An uninitialised tensor on the device of another, for `what`.
+    """Allocate an uninitialised tensor on the device of `like`; `what` names it in a message.
 
     Raises:
-        torch.OutOfMemoryError: in one line, with what it was for, its size and what to lower.
+        torch.OutOfMemoryError: one line that has `what`, the size, and what to lower.
     """
     try:
         return like.new_empty(shape, dtype=dtype)

@@ -1,4 +1,4 @@
-"""The training loss (1 - w) L1 + w (1 - SSIM) of two images, its gradient computed along with it."""
+"""Compute the training loss (1 - w) L1 + w (1 - SSIM) of two images, together with its gradient."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from gsbench.kernels.tensors import check_number, check_tensor
 
 
 class _Similarity(Operation):
-    """Its gradient comes with its value, so backward is a product."""
+    """The loss: forward computes its gradient too, so backward is a product."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -58,12 +58,12 @@ def l1_ssim(
     target: Tensor,  # the same
     ssim_weight: float,
 ) -> Tensor:  # []
-    """The loss 3DGS trains with (eq. 7), differentiable in `image`: 11 x 11 Gaussian window, sigma 1.5, zero padded.
+    """Return the loss of 3DGS (eq. 7), differentiable by `image`: 11 x 11 Gaussian window, sigma 1.5, zero padded.
 
-    Same value as `gsbench.train.losses.photometric`.
+    The value is that of `gsbench.train.losses.photometric`.
 
     Raises:
-        InputError: not two float32 images of one size on one device, or a gradient by `target` is asked for.
+        InputError: not two float32 images of one size on one device, or `target` requires a gradient.
     """
     check_tensor(image, "l1_ssim: image", (torch.float32,))
     check_tensor(target, "l1_ssim: target", (torch.float32,))

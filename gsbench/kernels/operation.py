@@ -1,7 +1,7 @@
-"""Declare an operation of the kernels once; its check, calls, gradient, fake and place on a tape all follow from that.
+"""Declare an operation of the kernels once: its check, calls, gradient, fake and place on a tape follow from that.
 
-An operation is a pair of plain functions on tensors, `forward` and `backward`. Called, it is recorded by the tape in
-charge (gsbench.kernels.tape), or else by torch's autograd, for which it is registered as `torch.ops.gsbench.NAME`.
+An operation is a pair of functions on tensors, `forward` and `backward`. If a tape (gsbench.kernels.tape) is active, it
+records each call. Otherwise torch's autograd does, which knows the operation as `torch.ops.gsbench.NAME`.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ MOST_KNOWN = 64  # calls whose shapes an operation remembers; density control ma
 
 
 class Operation:
-    """One operation: its name is that of its kernel, NAME_backward that of the kernel of its gradient."""
+    """An operation; its kernel has the same name, and the kernel of its gradient is NAME_backward."""
 
     def __init__(
         self,
@@ -43,16 +43,16 @@ class Operation:
         scratch: str | None = None,
         memory: str = "results",
     ) -> None:
-        """Declare it.
+        """Declare the operation.
 
         Args:
             name: of the operation and its kernel.
             inputs: the tensors it takes, by the names of the kernel's fields.
             outputs: the tensors it returns.
-            numbers: what is no tensor, by type; an int is a size too.
-            derive: sizes that are no input's own, from the tensors given and the numbers.
+            numbers: the type of each argument that is no tensor; an int may be a size too.
+            derive: returns sizes that no input has, from the given tensors and numbers.
             scratch: the shape of memory that backward needs on a GPU, zero on entry.
-            memory: what the outputs are, for a message that there is not enough of it.
+            memory: the name of the outputs in a message about too little memory.
         """
         self.name = name
         self.inputs, self.outputs = inputs, outputs
@@ -83,11 +83,11 @@ class Operation:
         self._traced = _register(self)
 
     def __call__(self, *arguments: Any) -> Tensors:
-        """The outputs, of tensors (None: left out) and then numbers, in the order of the declaration.
+        """Return the outputs for tensors (None: left out) and then numbers, in the order of the declaration.
 
         Raises:
-            InputError: shapes that do not fit, another type than float32, more than one device, or a gradient wanted
-                that there is not.
+            InputError: shapes that do not fit, another type than float32, more than one device, or an input that
+                requires a gradient that the operation does not have.
         """
         tensors, numbers = self.split(arguments)
         for (key, declared), x in zip(self.inputs.items(), tensors, strict=False):
@@ -102,7 +102,7 @@ class Operation:
         return self.forward(tensors, numbers)
 
     def split(self, arguments: Sequence[Any]) -> tuple[Tensors, tuple[Any, ...]]:
-        """Tensors and numbers of a call."""
+        """Split the arguments of a call into tensors and numbers."""
         if not all(map(isinstance, arguments, self._kinds)):
             raise self._wrong_kind(arguments)
         count = len(self.inputs)
@@ -110,21 +110,21 @@ class Operation:
         return [like.new_empty(0) if x is None else x for x in arguments[:count]], tuple(arguments[count:])
 
     def differentiable(self, tensors: Tensors) -> list[bool]:
-        """By which inputs there is a gradient."""
+        """Tell for each input whether it has a gradient."""
         return self._differentiable
 
     def carries_gradient(self, outputs: Tensors) -> list[bool]:
-        """Through which outputs there is one."""
+        """Tell for each output whether a gradient goes through it."""
         return self._carries
 
     # ---- the pair
 
     def forward(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
-        """The outputs; nothing is recorded."""
+        """Return the outputs without recording the call."""
         return self.run(tensors, numbers)[0]
 
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
-        """`forward`, and what backward can use again: sizes, numbers, and the inputs' memory in `rows`."""
+        """Return the outputs, and slots for backward: sizes, numbers, and the inputs' memory in `rows`."""
         slots, like, outputs = self._slots_of(tensors, numbers), tensors[0], []
         for key, shape in self._out:
             outputs.append(allocate(self._memory, like, tuple([slots[x] if isinstance(x, str) else x for x in shape])))
@@ -133,13 +133,13 @@ class Operation:
         return outputs, slots
 
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
-        """The slots that `run` returned, of what autograd has kept."""
+        """Return the slots that `run` returned, from the tensors that autograd has kept."""
         slots = self._slots_of(tensors, numbers)
         slots.update({key: x.data_ptr() for (key, _), x in zip(self._out, outputs, strict=True)})
         return slots
 
     def _slots_of(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        """Sizes, numbers and the addresses of the inputs, whose memory `rows` keeps alive."""
+        """Return sizes, numbers and the addresses of the inputs, whose memory `rows` keeps alive."""
         slots = self.match(tensors, numbers).copy()
         rows = slots["rows"] = in_rows(tensors)
         for key, x in zip(self.inputs, rows, strict=True):
@@ -155,15 +155,15 @@ class Operation:
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
-        """The gradients by the inputs, of those by the outputs (None: zero).
+        """Return the gradients of the inputs, given those of the outputs (None: zero).
 
         Args:
-            tensors: as `run` had them.
-            slots: what it returned beside the outputs.
-            outputs: which it returned.
-            given: one for each output.
-            wanted: one for each input; only inputs with a gradient ON_REQUEST heed it.
-            sums: by an input's number: memory to which its gradient is added, for inputs whose gradient is ADDED.
+            tensors: the arguments of `run`.
+            slots: as `run` returned them.
+            outputs: as `run` returned them.
+            given: the gradient of each output.
+            wanted: whether each input needs its gradient; it matters only for gradients ON_REQUEST.
+            sums: the memory to which an ADDED gradient is added, by the number of its input.
         """
         like = tensors[0]
         library = library_of(like.device.type)
@@ -203,7 +203,7 @@ class Operation:
     # ---- what follows from the declaration
 
     def match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        """The sizes and numbers of a call; raises InputError unless everything is as declared."""
+        """Return the sizes and numbers of a call; raise InputError unless all arguments are as declared."""
         call = (*numbers, *[(x.dim() if i in self._lists else x.shape, x.dtype, x.device, x.layout)
                             for i, x in enumerate(tensors)])  # fmt: skip
         slots = self._known.get(call)  # a training asks the same a thousand times, models in turns the same few
@@ -249,24 +249,24 @@ class Operation:
         return slots
 
     def _wrong_kind(self, arguments: Sequence[Any]) -> InputError:
-        """Say which argument is neither a tensor nor a number, where it should be one."""
+        """Name the argument that is not a tensor or a number although it should be."""
         named = zip([*self.inputs, *self.numbers], arguments, self._kinds, strict=True)
         key, x, kinds = next((key, x, kinds) for key, x, kinds in named if not isinstance(x, kinds))
         expected = "a tensor" if Tensor in kinds else kinds[0].__name__
         return InputError(f"{self.name}: expected {key} as {expected}, got {type(x).__name__}")
 
     def _is_left_out(self, i: int, x: Tensor) -> bool:
-        """Whether an input stands for none."""
+        """Tell whether input number `i` is left out."""
         return i in self._optional and x.shape == _NOTHING
 
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
-        """Outputs of the right shapes, for torch.compile."""
+        """Return empty outputs of the right shapes, for torch.compile."""
         slots = self._match(tensors, numbers)
         shapes = [[slots[x] if isinstance(x, str) else x for x in shape] for _, shape in self._out]
         return [tensors[0].new_empty(shape) for shape in shapes]
 
     def fake_backward(self, tensors: Tensors) -> Tensors:
-        """Gradients of the right shapes."""
+        """Return empty gradients of the right shapes, for torch.compile."""
         return [x.new_empty(x.shape) for x in tensors]
 
 
@@ -276,15 +276,15 @@ _NOTHING = torch.Size([0])
 
 
 def address(x: Tensor | None) -> int:
-    """Of a tensor's first number; 0 for None. The tensor must live until the call that it is passed to returns."""
+    """Return the address of a tensor's first number; 0 for None. The tensor must outlive the call that uses it."""
     return 0 if x is None else x.data_ptr()
 
 
 def first_rows(name: str, count: int, x: Tensor) -> int:
-    """How many of a tensor's first rows something is done to; EVERY_ROW stands for all.
+    """Return the number of first rows that an operation changes; `count` may be EVERY_ROW, which means all.
 
     Raises:
-        InputError: there are not so many.
+        InputError: the tensor has fewer rows.
     """
     N = x.shape[0] if x.dim() else 0
     if count != EVERY_ROW and not 0 <= count <= N:
@@ -293,12 +293,12 @@ def first_rows(name: str, count: int, x: Tensor) -> int:
 
 
 def in_rows(tensors: Tensors) -> Tensors:
-    """The same values row by row in memory; a view that torch negates when it reads it is written out."""
+    """Return the same values row by row in memory, also those of a view that torch negates when it reads it."""
     return [x if x.is_contiguous() and not x.is_neg() else x.resolve_neg().contiguous() for x in tensors]
 
 
 def _apart(results: Tensors, inputs: Sequence[Tensor | None]) -> Tensors:
-    """Results none of which shares memory with an input or another: torch asks that of what it is told of."""
+    """Return results that share no memory with an input or each other, as torch requires of custom operations."""
     taken, apart = {x.untyped_storage().data_ptr() for x in inputs if x is not None}, []
     for x in results:
         apart.append(x.clone() if x.untyped_storage().data_ptr() in taken else x)
@@ -307,7 +307,7 @@ def _apart(results: Tensors, inputs: Sequence[Tensor | None]) -> Tensors:
 
 
 def _register(operation: Operation) -> Callable[..., Any]:
-    """The operation as torch.ops.gsbench.NAME, which autograd and torch.compile know."""
+    """Register the operation as torch.ops.gsbench.NAME, for autograd and torch.compile, and return it."""
     name, numbers = operation.name, operation.numbers
     declared = "".join(f", {_SCHEMA[kind]} {key}" for key, kind in numbers.items())
     schema, count = f"(Tensor[] tensors{declared}) -> Tensor[]", len(numbers)

@@ -1,4 +1,4 @@
-"""The rasterizer's operations: project Gaussians to splats, list each tile's splats, blend them into images."""
+"""Rasterize by kernels: project Gaussians to splats, list the splats of each tile, blend them into images."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,7 +21,7 @@ LOWER = "use a smaller image, fewer cameras at once or fewer Gaussians"  # where
 
 
 class Viewport(NamedTuple):
-    """How Gaussians are looked at: what `rasterize` is told beside the tensors."""
+    """The settings of `rasterize` that are not tensors: image size, planes and filters."""
 
     width: int
     height: int
@@ -32,7 +32,7 @@ class Viewport(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """Gaussians as C cameras see them."""
+    """The projected Gaussians of C cameras."""
 
     means2d: Tensor  # [C, N, 2] pixels
     roots: Tensor  # [C, N, 4]: p, q, r of the inverse 2D covariance's triangular root (math/projection.h); the opacity
@@ -41,14 +41,14 @@ class Splats(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """Each tile's splats, front to back."""
+    """The splats of each tile, front to back."""
 
     offsets: Tensor  # [C * tiles + 1] int32: tile t's list is ids[offsets[t] : offsets[t + 1]]
     ids: Tensor  # [pairs] int32
 
 
 def count_tiles(width: int, height: int) -> int:
-    """Tiles of one image."""
+    """Count the tiles of one image."""
     return -(-width // TILE) * -(-height // TILE)
 
 
@@ -75,7 +75,7 @@ _project = Operation(
 def project(
     means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, viewport: Viewport
 ) -> Splats:
-    """Project Gaussians (EWA splatting, eq. 29), differentiable but by Ks; shapes as of `gsbench.raster.rasterize`."""
+    """Project Gaussians (EWA splatting, eq. 29), differentiable except by Ks; see `gsbench.raster.rasterize`."""
     return Splats(*_project(means, factors, opacities, viewmats, Ks, *viewport))
 
 
@@ -125,9 +125,9 @@ def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewpo
 
 @contextmanager
 def backward_by_splat() -> Iterator[None]:
-    """On a GPU, differentiate what is blended by the kernel with a splat a lane, not with a pixel a lane.
+    """Let the block differentiate blending on a GPU by the kernel with a lane for each splat, not for each pixel.
 
-    The gradients are the same; docs/gpu.md says why it is the latter that runs.
+    The gradients are the same. docs/gpu.md says why the default is a lane for each pixel.
     """
     before, _blend.backward_kernel = _blend.backward_kernel, "blend_backward_by_splat"
     try:
@@ -137,9 +137,9 @@ def backward_by_splat() -> Iterator[None]:
 
 
 def flag_values(*values: Tensor) -> Tensor:
-    """Not zero where a value is not finite or out of range, [1] int64: found on the device, and not waited for.
+    """Return [1] int64, not zero if a value is not finite or out of range; the device finds it, and nothing waits.
 
-    `values` are means, factors, opacities, colours, viewmats, Ks, background, as of `rasterize`.
+    `values` are means, factors, opacities, colours, viewmats, Ks and background, as in `rasterize`.
     """
     means, _, _, colors, viewmats, *_ = values
     flags, rows = torch.zeros(1, dtype=torch.int64, device=means.device), in_rows(list(values))
@@ -152,12 +152,12 @@ def flag_values(*values: Tensor) -> Tensor:
 
 @torch.no_grad()
 def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, int]:
-    """Sort splats by depth and list each tile's, ties by index. Returns `flags` [1] int64 as an int, too.
+    """Sort splats by depth, ties by index, and list those of each tile; return `flags` [1] int64 as an int too.
 
-    On a GPU this waits for the device, once, for the number of pairs; `flags` comes along.
+    On a GPU this waits once for the device, to read the number of intersections and `flags`.
 
     Raises:
-        InputError: more pairs than int32 counts, or than memory holds.
+        InputError: more intersections than int32 can count or memory can hold.
     """
     library = library_of(splats.depths.device.type)
     if not library.needs_scratch:
@@ -170,9 +170,9 @@ def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, 
 
 @torch.no_grad()
 def bin_within(splats: Splats, viewport: Viewport, flags: Tensor, room: int) -> tuple[Bins, Tensor]:
-    """`bin_tiles` on a GPU that waits for nothing, where there is room for a number of pairs; others are left out.
+    """Do `bin_tiles` on a GPU without waiting, with room for a number of intersections; others are left out.
 
-    Returns how many there were, if there are Gaussians, and `flags`: [2] int64.
+    Returns the number of intersections, if there are Gaussians, and `flags`: [2] int64.
     """
     library = library_of(splats.depths.device.type)
     order, ends = _sort_on_gpu(library, splats, viewport, flags)
@@ -211,7 +211,7 @@ PAIRS = "lists of each tile's Gaussians"
 
 
 def _sort_on_gpu(library: Library, splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Tensor, Tensor]:
-    """Splats by depth [C * N] int32; the running sum of the tiles they reach, then `flags`, [C * N + 1] int64."""
+    """Return splats by depth, [C * N] int32, and the running sum of their tiles, then `flags`, [C * N + 1] int64."""
     like, count = splats.depths, splats.depths.numel()
     keys, indices, sorted_keys, order = allocate("depths to sort", like, (4, count), torch.int32).unbind()
     ends = allocate("numbers of tiles", like, (count + 1,), torch.int64)
@@ -225,7 +225,7 @@ def _sort_on_gpu(library: Library, splats: Splats, viewport: Viewport, flags: Te
 
 
 def _room(splats: Splats, pairs: int) -> tuple[Tensor, ...]:
-    """For tiles, splats, sorted tiles, sorted splats: [pairs] int32. The last, of its own, lives until backward."""
+    """Allocate tiles, splats, sorted tiles, sorted splats, each [pairs] int32; the last lives until backward."""
     rows = allocate(PAIRS, splats.depths, (3, pairs), torch.int32)
     return *rows.unbind(), allocate(PAIRS, splats.depths, (pairs,), torch.int32)
 
@@ -233,7 +233,7 @@ def _room(splats: Splats, pairs: int) -> tuple[Tensor, ...]:
 def _list_on_gpu(
     library: Library, splats: Splats, viewport: Viewport, by_depth: tuple[Tensor, Tensor], lists: tuple[Tensor, ...]
 ) -> Bins:
-    """List and sort the pairs that `lists` have room for."""
+    """List and sort the intersections for which `lists` have room."""
     like, ids = splats.depths, lists[-1]
     tiles = len(like) * count_tiles(viewport.width, viewport.height)
     offsets = allocate("lists of tiles", like, (tiles + 1,), torch.int32)
@@ -248,5 +248,5 @@ def _list_on_gpu(
 
 
 def _scratch(library: Library, items: int, like: Tensor) -> Tensor:
-    """What sorting and summing so many items need."""
+    """Allocate the memory that sorting and summing so many items need."""
     return allocate("scratch space to sort", like, (library.extension.scratch_bytes(items),), torch.uint8)

@@ -1,4 +1,4 @@
-"""Move Gaussians by AGR's perceptrons: hidden layers stay in cache, and backward computes them again."""
+"""Move Gaussians by AGR's perceptrons; hidden layers stay in cache, and backward computes them again."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from gsbench.kernels.tensors import check_tensor
 
 
 class _Inputs(NamedTuple):
-    """The inputs of the operation, which is given one list of tensors."""
+    """The inputs of the operation, by name; the operation itself takes one list of tensors."""
 
     values: Tensors
     weight_in: Tensor
@@ -29,19 +29,19 @@ class _Inputs(NamedTuple):
 
     @classmethod
     def of(cls, tensors: Tensors) -> "_Inputs":
-        """Take the list apart; intervals and time are empty where they are left out."""
+        """Name the tensors of the list; intervals and time are empty if they are left out."""
         *values, weight_in, bias_in, weight_out, bias_out, units, gamma, intervals, time = tensors
         left_out = intervals.shape == time.shape == (0,)
         return cls(values, weight_in, bias_in, weight_out, bias_out, units, gamma,
                    None if left_out else intervals, None if left_out else time)  # fmt: skip
 
     def named(self) -> list[tuple[str, Tensor]]:
-        """Every tensor that is there, in order, with the name that messages have for it."""
+        """List every given tensor in order, with its name for messages."""
         each = [(name, x if isinstance(x, list) else [x]) for name, x in self._asdict().items() if x is not None]
         return [(name, x) for name, listed in each for x in listed]
 
     def layers(self) -> dict[str, Tensor]:
-        """The weights as the kernels take them: gamma(t) is in the biases, and the units are in the weights."""
+        """Return the weights as the kernels take them: gamma(t) is in the biases, and the units are in the weights."""
         read = self.weight_in.shape[1] - self.gamma.shape[0]
         weight_in = self.weight_in.detach()
         weights = {
@@ -53,17 +53,17 @@ class _Inputs(NamedTuple):
         return dict(zip(weights, in_rows(list(weights.values())), strict=True))
 
     def of_layers(self, g: dict[str, Tensor]) -> Tensors:
-        """The gradients of the layers' own weights, from those of `layers`."""
+        """Return the gradients of the layers' own weights, from those of `layers`."""
         read = g["weight_in"].shape[1]
         g_in = torch.cat([g["weight_in"] / self.units[:read], torch.outer(g["bias_in"], self.gamma)], 1)
         return [g_in, g["bias_in"], g["weight_out"] * self.units[:, None], g["bias_out"] * self.units]
 
 
 class _Refine(Operation):
-    """The one operation on a list of tensors, the fields of `_Inputs` in their order.
+    """The operation on a list of tensors, the fields of `_Inputs` in their order.
 
-    What all Gaussians have in common is done here, on the weights: gamma(t) is part of the first layers' biases, and
-    the units are part of their columns and of the last layers' rows.
+    What is equal for all Gaussians is computed here, on the weights. gamma(t) becomes part of the first layers' biases,
+    and the units become part of their columns and of the last layers' rows.
     """
 
     def __init__(self) -> None:
@@ -113,7 +113,7 @@ class _Refine(Operation):
         return [*moved, *dense[features:], *own, None, None, None, None]
 
     def _slots(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        """What the kernels take, and what must live as long: the arrays, the layers and the intervals."""
+        """Return what the kernels take, and what must live as long: the arrays, the layers and the intervals."""
         slots = self.match(tensors, numbers).copy()
         given = _Inputs.of(tensors)
         values, weights = in_rows(given.values), given.layers()
@@ -177,19 +177,19 @@ def refine(
     intervals: Tensor | None = None,  # [rows, 2] clips
     time: Tensor | None = None,  # []
 ) -> Tensors:  # of [N, c], as `values`
-    """Values moved by P perceptrons (F + G) x 64 x c with ReLU, x + phi(features, gamma) (7DGS eq. 14 and 15).
+    """Move values by P perceptrons (F + G) x 64 x c with ReLU: x + phi(features, gamma) (7DGS eq. 14 and 15).
 
-    Perceptron i moves values i; the last one all that are left, in their order.
+    Perceptron i moves values i. The last one moves all values that are left, in their order.
 
     Args:
         values: raw parameters, those that are read first.
         weight_in: the first layers of all perceptrons, 64 rows each.
-        bias_in: theirs.
+        bias_in: the biases of the first layers.
         weight_out: the second layers, a row for each number that is moved.
-        bias_out: theirs.
-        units: what the perceptrons measure each number in.
-        gamma: what is the same for all Gaussians, the encoded time.
-        rows: how many of the first are moved, all by default; the others are copied.
+        bias_out: the biases of the second layers.
+        units: the unit of each number that the perceptrons read or move.
+        gamma: the encoded time, equal for all Gaussians.
+        rows: how many of the first rows are moved, by default all; the others are copied.
         intervals: the first and the last time at which each of these rows is moved; always, by default.
         time: needed with intervals.
 

@@ -1,4 +1,4 @@
-"""Slice the geometry of a model: Gaussians with triangular and with rotated factors, or none to condition on."""
+"""Slice the geometry of a model: Gaussians with triangular factors, with rotated factors, or without a query."""
 
 from typing import Any
 
@@ -34,12 +34,12 @@ _triangular = Operation(
 
 
 def _conditioned(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
-    """How many rows change with the query."""
+    """Return how many rows change with the query."""
     return {"conditioned": first_rows("conditioned", numbers["conditioned"], given["means"])}
 
 
 def _entries(given: dict[str, Tensor]) -> dict[str, int]:
-    """How many numbers of each kind a factor over p and k conditioned variables has."""
+    """Return how many numbers of each kind a factor over p and k conditioned variables has."""
     k = 3 * ("directions" in given) + ("times" in given)
     if k == 0:
         raise InputError("observe_triangular: expected directions, times or both, got neither")
@@ -68,31 +68,30 @@ def observe_triangular(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Slice Gaussians over p and d, t or both at a query: means [N, 3], factors [N, 3, 3], opacities [N].
 
-    The square-root scheme of `gsbench.models.slicing` for the parameters of `gsbench.models.triangular`, with
-    f_temp and f_dir (7DGS eq. 9 to 12) in the opacities. With `subtracts` by the scheme `cholesky` instead, which is
-    there on the CPU only.
+    The scheme is `square_root` of `gsbench.models.slicing`, for the parameters of `gsbench.models.triangular`.
+    Opacities include f_temp and f_dir (7DGS eq. 9 to 12). With `subtracts` the scheme is `cholesky`, on the CPU only.
 
     Rows from `conditioned` on are static: no query changes their mean, their factor is L_pp alone, and their opacity
-    has no f_temp and no f_dir. By all that they do not depend on their gradient is zero.
+    has no f_temp and no f_dir. The gradient of all other parameters is zero.
 
     Args:
         means: mu_p, world units.
         directions: mu_d.
         times: mu_t, clips.
-        log_diagonal: logarithms of the factor's diagonal.
-        shape: its entries within p.
-        motion: those of p by d and t, world units.
-        coupling: those within d and t.
+        log_diagonal: the logarithms of the factor's diagonal.
+        shape: the factor's entries within p.
+        motion: its entries of p by d and t, world units.
+        coupling: its entries within d and t.
         opacities: before the sigmoid.
         center: the camera's, world units.
         time: clips.
-        log_lambda_d: ln lambda_d, the sensitivity of f_dir.
-        log_lambda_t: ln lambda_t, that of f_temp.
+        log_lambda_d: ln lambda_d, the coefficient of f_dir.
+        log_lambda_t: ln lambda_t, the coefficient of f_temp.
         conditioned_first: whether the factor's rows are ordered (d, t, p), else (p, t, d).
-        form: what entries below the diagonal are, a place in `gsbench.models.factors.OFF_DIAGONALS`.
+        form: the form of entries below the diagonal, an index of `gsbench.models.factors.OFF_DIAGONALS`.
         directional_half: whether f_dir has the 1/2 of 7DGS eq. 12.
-        subtracts: by the scheme that forms S.
-        conditioned: how many rows change with the query; all by default.
+        subtracts: whether the scheme is `cholesky`, which forms S.
+        conditioned: how many rows change with the query, by default all.
 
     Raises:
         InputError: not float32 on one device, shapes that do not fit, nothing is observed, a gradient by `center` or
@@ -141,24 +140,24 @@ def observe_rotated(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Slice 4D Gaussians F = M_left M_right diag(exp scales) at `time`: means [N, 3], factors [N, 3, 3], opacities [N].
 
-    The square-root scheme of `gsbench.models.slicing` for the parameters of `gsbench.models.gaussians4d`, with f_temp
-    in the opacities, zero where it is not above 0.05 (4DGS).
+    The scheme is `square_root` of `gsbench.models.slicing`, for the parameters of `gsbench.models.gaussians4d`.
+    Opacities include f_temp, and are zero if it is not above 0.05 (4DGS).
 
     Rows from `conditioned` on are static: their factor is R diag(exp scales) over (x, y, z) as in 3DGS, with the
-    rotation of `gsbench.models.factors.turn_of_space`, and their opacity has no f_temp. Their gradient by all else is
-    zero.
+    rotation of `gsbench.models.factors.turn_of_space`, and their opacity has no f_temp. The gradient of all other
+    parameters is zero.
 
     Args:
         means: world units.
         times: mu_t, clips.
-        scales: logarithms of world units, that of time too.
+        scales: logarithms of world units, also that of time.
         left_quats: any length but zero.
-        right_quats: the same.
+        right_quats: any length but zero.
         opacities: before the sigmoid.
-        clock: world units a clip.
+        clock: world units for each clip.
         time: clips.
-        log_lambda_t: ln lambda_t, the sensitivity of f_temp.
-        conditioned: how many rows change with the time; all by default.
+        log_lambda_t: ln lambda_t, the coefficient of f_temp.
+        conditioned: how many rows change with the time, by default all.
 
     Raises:
         InputError: not float32 on one device, shapes that do not fit, or more rows are conditioned than there are.
@@ -185,7 +184,7 @@ def observe_static(
     quats: Tensor,  # [N, 4] wxyz
     opacities: Tensor,  # [N] logits
 ) -> tuple[Tensor, Tensor]:
-    """Factors F = R diag(exp scales) [N, 3, 3] (3DGS eq. 6) and opacities [N] of Gaussians that are their own slice.
+    """Return factors F = R diag(exp scales) [N, 3, 3] (3DGS eq. 6) and opacities [N] of 3D Gaussians, their own slices.
 
     Raises:
         InputError: not float32 on one device, or shapes that do not fit.

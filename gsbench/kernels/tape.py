@@ -1,8 +1,8 @@
-"""Differentiate a chain of operations without autograd: they are noted as they run, and run backwards in turn.
+"""Differentiate a chain of operations without autograd: record them as they run, then run them backwards.
 
-A training step is a few dozen calls of kernels on small tensors; autograd's graph and torch's dispatch cost more than
-they do. What is no operation of the kernels stays autograd's: where a tensor of its graph enters an operation, the tape
-hands the gradient over. So a model written in torch is trained by the same code.
+A training step is a few dozen calls of kernels on small tensors. Autograd's graph and torch's dispatch would cost more
+than the kernels. Autograd differentiates everything else: if a tensor of its graph enters an operation, the tape gives
+it the gradient. So the same code trains a model that is written in torch.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _in_charge = threading.local()  # each thread has its own
 
 
 def current() -> Tape | None:
-    """The tape in charge of this thread."""
+    """Return the tape that records in this thread, if there is one."""
     return getattr(_in_charge, "tape", None)
 
 
@@ -33,19 +33,19 @@ def add_to(sums: dict[int, Tensor], key: int, gradient: Tensor) -> None:
 
 
 class Differentiable(Protocol):
-    """What a tape asks of an operation: to run, and to run backwards; `gsbench.kernels.operation.Operation` does."""
+    """What a tape needs of an operation: to run it forward and backward (`gsbench.kernels.operation.Operation`)."""
 
     name: str
     adds: set[int]  # inputs to whose gradient the backward kernel adds
 
     def run(self, tensors: list[Tensor], numbers: Sequence[Any]) -> tuple[list[Tensor], dict[str, Any]]:
-        """Return the outputs, and what backward can use again."""
+        """Return the outputs, and the slots that backward needs."""
 
     def differentiable(self, tensors: list[Tensor]) -> list[bool]:
-        """Tell by which inputs there is a gradient."""
+        """Tell for each input whether it has a gradient."""
 
     def carries_gradient(self, outputs: list[Tensor]) -> list[bool]:
-        """Tell through which outputs there is one."""
+        """Tell for each output whether a gradient goes through it."""
 
     def backward(
         self,
@@ -56,7 +56,7 @@ class Differentiable(Protocol):
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
-        """Return the gradients by the inputs, of those by the outputs."""
+        """Return the gradients of the inputs, given those of the outputs."""
 
 
 class _Note(NamedTuple):
@@ -68,10 +68,10 @@ class _Note(NamedTuple):
 
 
 class Tape:
-    """Notes the operations that run in ``with Tape() as tape: ...``, for ``tape.backward(loss, ...)``."""
+    """Records the operations that run in ``with Tape() as tape: ...``, for ``tape.backward(loss, ...)``."""
 
     def __init__(self) -> None:
-        """An empty one."""
+        """Start without operations."""
         self._notes: list[_Note] = []
 
     def __enter__(self) -> Self:
@@ -83,7 +83,7 @@ class Tape:
         _in_charge.tape = self._outer
 
     def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
-        """Run an operation, and note it where a gradient goes through it."""
+        """Run an operation, and record it if a gradient goes through it."""
         outputs, slots = operation.run(tensors, numbers)
         if not torch.is_grad_enabled():
             return outputs
@@ -97,10 +97,10 @@ class Tape:
         return outputs
 
     def backward(self, loss: Tensor, seed: Tensor, sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
-        """Add the gradients of `loss` times `seed` by `sources` to `sums`, which holds them by the tensors' id.
+        """Add the gradients of `seed` times `loss` by `sources` to `sums`, whose keys are the ids of the sources.
 
-        What is added is the same to the last bit whether `sums` holds other views' already or not. The tape may run
-        backwards again, for another seed.
+        The added bits do not depend on what `sums` holds already. The tape may run backwards again, for another
+        seed.
         """
         at = _Gradients(self._notes, sources, sums)
         at.give(loss, seed)
@@ -110,7 +110,7 @@ class Tape:
 
 
 class _Gradients:
-    """The gradients of one pass backwards."""
+    """The gradients of one backward pass."""
 
     def __init__(self, notes: list[_Note], sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
         self.notes = notes
@@ -158,7 +158,7 @@ class _Gradients:
                 self.give(x, gradient)
 
     def finish(self) -> None:
-        """Add what was found by each source."""
+        """Add the gradient of each source to the sums."""
         for key in self.sources:
             gradient = self.found.get(key)
             if gradient is not None:

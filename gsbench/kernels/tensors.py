@@ -1,4 +1,4 @@
-"""Check tensors and numbers that a public function is given."""
+"""Check the tensors and numbers that are given to a public function."""
 
 import torch
 from torch import Tensor

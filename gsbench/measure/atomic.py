@@ -42,9 +42,9 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
 
 
 def create_atomically(path: Path, data: bytes) -> bool:
-    """Create the file `path` with all of `data`, in an existing folder; return False where the file exists already.
+    """Create the file `path` with all of `data`, in an existing folder; return False if the file exists already.
 
-    Where several processes create one file, also across hosts, only one succeeds: a hard link to an existing name
+    If several processes create one file, also across hosts, only one succeeds: a hard link to an existing name
     fails.
     """
     temporary = _beside(path)

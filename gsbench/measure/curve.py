@@ -22,7 +22,7 @@ class Curve:
     points: list[Point] = field(default_factory=list)
 
     def add(self, iteration: int, seconds: float, psnr_val: float) -> None:
-        """Append a point; raises InputError where iteration or seconds go backwards (after a faulty resume)."""
+        """Append a point; raises InputError if iteration or seconds go backwards (after a faulty resume)."""
         if self.points and (iteration <= self.points[-1].iteration or seconds < self.points[-1].seconds):
             raise InputError(
                 f"curve: expected a point after {self.points[-1].iteration} iterations, {self.points[-1].seconds} s; "
@@ -32,18 +32,18 @@ class Curve:
 
     @property
     def last(self) -> Point | None:
-        """The latest point; None before the first."""
+        """Return the latest point; None before the first."""
         return self.points[-1] if self.points else None
 
     @property
     def best(self) -> Point | None:
-        """The earliest of the points with the highest PSNR; None if no PSNR is finite."""
+        """Return the earliest of the points with the highest PSNR; None if no PSNR is finite."""
         finite = [(p.psnr_val, p) for p in self.points if p.psnr_val is not None]
         return max(finite, key=lambda pair: pair[0])[1] if finite else None
 
     @property
     def progress(self) -> str:
-        """The latest point as text, with its change since the previous: "12 s of training, val 24.40 dB (+0.31)"."""
+        """Return the latest point as text, with its change: "12 s of training, val 24.40 dB (+0.31)"."""
         if not self.points:
             return "val not measured yet"
         before, now = (self.points[-2] if len(self.points) > 1 else None), self.points[-1]
@@ -62,7 +62,7 @@ class Curve:
         return [(p.iteration, p.seconds, p.psnr_val) for p in self.points]
 
     def load_state_dict(self, state: list[tuple[int, float, float | None]]) -> None:
-        """Continue from the points of a checkpoint; raises InputError where they do not make a curve."""
+        """Continue from the points of a checkpoint; raises InputError if they do not make a curve."""
         self.points = []
         for iteration, seconds, psnr in state:
             self.add(iteration, float(seconds), math.nan if psnr is None else float(psnr))

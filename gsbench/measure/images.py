@@ -67,7 +67,7 @@ def inferno(values: npt.NDArray[np.floating]) -> Pixels:  # [H, W]
 
 
 def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB
-    """Write `image` to `path` as PNG, atomically; raises InputError where OpenCV cannot encode it."""
+    """Write `image` to `path` as PNG, atomically; raises InputError if OpenCV cannot encode it."""
     done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not done:
         raise InputError(f"{path}: expected an image that PNG can hold, got {image.shape} of {image.dtype}")

@@ -72,7 +72,7 @@ def processor_name() -> str:
 
 
 def _facts(path: Path) -> dict[str, str]:
-    """Read the first value of each key of a file with lines `key : value`; nothing where there is no such file."""
+    """Read the first value of each key of a file with lines `key : value`; nothing if there is no such file."""
     try:
         lines = path.read_text().splitlines()
     except OSError:

@@ -62,7 +62,7 @@ class Backbone:
 
     @property
     def trunk_sha256(self) -> tuple[str, ...]:
-        """The first digits of the SHA-256 of the files accepted as trunk weights."""
+        """Return the first digits of the SHA-256 of the files accepted as trunk weights."""
         return (Path(self.file).stem.rsplit("-", 1)[1], *self.other_sha256)
 
 
@@ -154,7 +154,7 @@ def load(backbone: str = "alex", weights: Path | None = None, device: str = "cpu
 
 
 def is_here(backbone: str, weights: Path | None = None) -> bool:
-    """Tell whether the weights of a backbone are on this machine; arguments as of `load`, which also checks them."""
+    """Tell whether the weights of a backbone are on this machine; arguments as in `load`, which also checks them."""
     return importlib.util.find_spec("lpips") is not None and (weights or _trunk(backbone)).is_file()
 
 

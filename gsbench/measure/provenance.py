@@ -70,7 +70,7 @@ NO_CODE = ("results", "docs", "*.md")
 def git_commit() -> str | None:
     """Return the commit of the checkout that this file belongs to, with "-dirty" if tracked code differs from it.
 
-    Changed results and texts do not count, as they change no number. The commit is None where git does not track this
+    Changed results and texts do not count, as they change no number. The commit is None if git does not track this
     file, as in a wheel that is installed inside another repository.
     """
     here = Path(__file__)

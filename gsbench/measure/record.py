@@ -41,7 +41,7 @@ METRICS = (
 
 @dataclass(frozen=True)
 class Effects:
-    """The effects that the model simulates."""
+    """The effects that the model has."""
 
     time: bool
     direction: bool
@@ -50,7 +50,7 @@ class Effects:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """The quality of one rendered view; None where it is missing or not finite."""
+    """The quality of one rendered view; None if it is missing or not finite."""
 
     name: str
     psnr: float | None = None
@@ -112,7 +112,7 @@ class Gate:
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return a gate as JSON with the names of now, where an older gsbench wrote it."""
+        """Return a gate as JSON with its present names, also if an older gsbench wrote it."""
         plain = {RENAMED_KEYS.get(key, key): value for key, value in plain.items()}
         if isinstance(rows := plain.get("rows"), dict):
             plain["rows"] = {RENAMED_EFFECT_SETS.get(name, name): count for name, count in rows.items()}
@@ -155,7 +155,7 @@ class Provenance:
 
     @property
     def machine(self) -> str:
-        """The machine and the threads as text; seconds are comparable only where it is equal."""
+        """Return the machine and the threads as text; seconds are comparable only where it is equal."""
         return named(self.device, self.threads, self.hardware)
 
 
@@ -185,7 +185,7 @@ class Record:
 
     @property
     def path(self) -> Path:
-        """The folder of the run, from that of all results; raises InputError as `run_path`."""
+        """Return the folder of the run, from that of all results; raises InputError as `run_path`."""
         return run_path(Path(), self.experiment, self.scene, self.model, self.seed, variant=self.variant)
 
 
@@ -241,7 +241,7 @@ def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, 
         root: the folder of all results.
         experiment: its name.
         scene: its name.
-        model: the label of the run, the model's name with _agr or _noagr where it is not as published.
+        model: the label of the run: the model's name, with _agr or _noagr if it differs from the published method.
         seed: at least 0 and below 2^63.
         variant: the settings that differ from the experiment's; "" for none.
 

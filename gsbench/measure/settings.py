@@ -52,7 +52,7 @@ def training_hash(plain: Plain) -> str:
 
 
 def given(plain: Plain) -> Plain:
-    """Flatten a config without keys that are null or as they always were, so that a new key changes no older run."""
+    """Flatten a config without keys that are null or have the value of ALWAYS, so that a new key changes no old run."""
     return {key: value for key, value in flat(plain) if value is not None and ALWAYS.get(key) != value}
 
 
@@ -80,7 +80,7 @@ def measuring_differences(theirs: Plain, mine: Plain) -> list[str]:
 
 
 def listed(differences: list[str]) -> str:
-    """Join differences in a line that names the first few."""
+    """Join differences to one line that names the first few."""
     more = len(differences) - _MOST_NAMED
     return "; ".join(differences[:_MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
 
@@ -96,5 +96,5 @@ def _shown(config: Plain, key: str) -> str:
 
 
 def _is_of(key: str, settings: Collection[str]) -> bool:
-    """Tell whether a dotted key is one of some settings, or of a group among them."""
+    """Tell whether a dotted key is among some settings, or in a group among them."""
     return any(key == one or key.startswith(f"{one}.") for one in settings)

@@ -31,7 +31,7 @@ class RenderTimes:
 
     @property
     def fps(self) -> float:
-        """Frames per second: FPS = 1000 / p50, the median milliseconds of a render.
+        """Return frames per second: FPS = 1000 / p50, the median milliseconds of a render.
 
         A render is timed from the query to the image, slices and AGR included, between two synchronisations of the
         device, after warm-up renders; the evaluated views take turns.
@@ -70,7 +70,7 @@ def time_renders(
         synchronise: waits for the device.
 
     Raises:
-        InputError: `count` is below 30, where percentiles mean little.
+        InputError: `count` is below 30, so percentiles would mean little.
     """
     if count < LEAST_RENDERS:
         raise InputError(f"time_renders: expected count >= {LEAST_RENDERS}, got {count}")
@@ -153,7 +153,7 @@ class StageClock:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """The sums so far; reading them waits for the device."""
+        """Return the sums so far; reading them waits for the device."""
         while self._ended:
             self._add_one()
         return self._seconds
@@ -196,7 +196,7 @@ class Laps:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """The seconds by stage, in the order in which they first ended; reading them waits for the device."""
+        """Return the seconds by stage, in the order in which they first ended; reading them waits for the device."""
         sums: dict[str, float] = {}
         for name, start, end in self._ended:
             sums[name] = sums.get(name, 0.0) + self._clock.seconds(start, end)
@@ -206,8 +206,8 @@ class Laps:
 class Effort:
     """Sums the CPU-seconds of this process over blocks, ``with effort: ...``, and averages the load of the machine.
 
-    Beside the seconds of a training they show other work of the machine: the load counts all processes that ran or
-    waited, and CPU-seconds do not grow while another process runs. An unknown value is None.
+    Both show whether the machine did other work: the load counts all processes that ran or waited, and CPU-seconds do
+    not grow while another process runs. An unknown value is None.
     """
 
     def __init__(self) -> None:
@@ -232,12 +232,12 @@ class Effort:
 
     @property
     def cpu_s(self) -> float | None:
-        """The CPU-seconds of all threads of this process."""
+        """Return the CPU-seconds of all threads of this process."""
         return self._cpu_s if math.isfinite(self._cpu_s) else None
 
     @property
     def load(self) -> float | None:
-        """The mean of `load()` over the seconds."""
+        """Return the mean of `load()` over the seconds."""
         mean = self._load_s / self._seconds if self._seconds else math.nan
         return mean if math.isfinite(mean) else None
 
@@ -246,13 +246,13 @@ class Effort:
         return {"seconds": self._seconds, "cpu_s": self._cpu_s, "load_s": self._load_s}
 
     def load_state_dict(self, state: dict[str, float] | None) -> None:
-        """Continue from the sums of a checkpoint; where an older checkpoint has none, both values become unknown."""
+        """Continue from the sums of a checkpoint; if an older checkpoint has none, both values become unknown."""
         state = state or dict.fromkeys(("seconds", "cpu_s", "load_s"), math.nan)
         self._seconds, self._cpu_s, self._load_s = (float(state[name]) for name in ("seconds", "cpu_s", "load_s"))
 
 
 def load() -> float:
-    """Return the load average: processes that ran or waited in the last minute; NaN where the system has none."""
+    """Return the load average: processes that ran or waited in the last minute; NaN if the system has none."""
     try:
         return os.getloadavg()[0]
     except (AttributeError, OSError):  # Windows; a container without /proc

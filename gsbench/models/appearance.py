@@ -36,7 +36,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 def sh_colors(coefficients: Tensor, directions: Tensor, degree: int, orders: Tensor | None = None) -> Tensor:
     """Compute colours max(0, sum beta_lm Y_lm + 0.5), [N, K, 3] and [N, 3] -> [N, 3] (3DGS; 7DGS eq. 2).
 
-    Orders [N] int32 leave out what is above a row's own degree, as `gsbench.models.base.EffectSets` has it.
+    Orders [N] int32 leave out coefficients above the degree of a row, see `gsbench.models.effect_sets.EffectSets`.
     """
     basis = _basis_within(directions, degree, orders)
     used = coefficients[:, : basis.shape[-1]]
@@ -53,7 +53,7 @@ def sh_time_colors(
         directions: [N, 3] unit vectors.
         degree: of the spherical harmonics in use.
         time_offset: [N] t - mu_t.
-        orders: [N] int32, the most that each row has, packed as by `ColorOrder`.
+        orders: [N] int32, the order of each row, packed as by `ColorOrder`.
     """
     frequencies = torch.arange(coefficients.shape[1], device=time_offset.device, dtype=time_offset.dtype)
     waves = torch.cos(2 * math.pi * frequencies * time_offset[:, None])  # [N, M]

@@ -1,6 +1,6 @@
-"""Say how much of a colour there is: spherical harmonics up to a degree, and frequencies of time.
+"""Define the order of a colour: the degree of its spherical harmonics and its number of frequencies of time.
 
-Kernels, checkpoints and `EffectSets` hold an order as one number, degree + 4 (waves - 1), as math/harmonics.h reads it.
+Kernels, checkpoints and `EffectSets` store an order as one number, degree + 4 (waves - 1) (math/harmonics.h).
 """
 
 import math
@@ -25,7 +25,7 @@ class ColorOrder(Generic[Number]):
 
     @property
     def packed(self) -> Number:
-        """The number degree + 4 (waves - 1)."""
+        """Return the number degree + 4 (waves - 1)."""
         return self.degree + _DEGREES * (self.waves - 1)
 
 
@@ -35,7 +35,7 @@ def order_of(packed: Number) -> ColorOrder[Number]:
 
 
 def at_most(packed: Tensor, limit: int) -> Tensor:
-    """Lower each order, packed [N], to at most the degree and at most the waves of another one."""
+    """Limit each packed order [N] to the degree and the waves of another one."""
     own, most = order_of(packed), order_of(limit)
     return ColorOrder(own.degree.clamp(max=most.degree), own.waves.clamp(max=most.waves)).packed
 
@@ -45,7 +45,7 @@ def coefficients_within(
     degree: int,
     waves: int = 1,
 ) -> Tensor:  # [N, waves, (degree + 1)^2] bool
-    """Tell which coefficients of a colour of this degree and so many waves each Gaussian's order reaches.
+    """Tell which of the stored coefficients are within each Gaussian's order.
 
     Args:
         packed: the Gaussians' orders.

@@ -32,11 +32,11 @@ class _Recording(NamedTuple):
 
 
 class GraphedFrames:
-    """`render` of a model on a GPU that launches no kernels by itself and waits only at the end of an image.
+    """Renders a model on a GPU like `render`, but replays its kernels and waits only at the end of an image.
 
     The first call for an image size records a graph, which fixes the numbers of Gaussians and of pixels. `render` waits
-    for the number of intersections in the middle of an image. A graph has room for a fixed number instead, MARGIN times
-    that of the first image, and the number is checked at the end; a larger one records the graph again.
+    for the number of intersections in the middle of an image. A graph has memory for a fixed number, MARGIN times that
+    of the first image. The number is checked at the end; if it is larger, the graph is recorded again.
     """
 
     def __init__(self, model: GaussianModel, background: Tensor, antialias: bool = False) -> None:
@@ -59,7 +59,7 @@ class GraphedFrames:
         """Render the model for a camera at a time; the next call overwrites the image.
 
         Raises:
-            InputError: the model observes time and there is none, or a value is out of range.
+            InputError: the model observes time and `time` is None, or a value is out of range.
             RuntimeError: CUDA cannot record this model.
         """
         size = camera.width, camera.height, time is None
@@ -96,7 +96,7 @@ class GraphedFrames:
 
 
 def capture(call: Callable[[], T]) -> tuple[Callable[[], None], T]:
-    """Record the work of a call on the current GPU; return its replay and its results, which a replay overwrites."""
+    """Record a call on the current GPU; return the function that replays it, and the results that it overwrites."""
     call()  # the first call loads modules, which cannot be recorded
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):

@@ -1,7 +1,7 @@
-"""Sort the Gaussians of a model into effect sets: which effects each of them pays for.
+"""Sort the Gaussians of a model into effect sets: the effects that each of them has.
 
-A Gaussian without an effect has entries among its parameters that change no image: the motion of a static one, the
-harmonics above its order. They are constant, learn nothing, and are not stored.
+If a Gaussian lacks an effect, some of its parameters change no image: the motion of a static one, the harmonics above
+its order. They are constant, do not learn, and are not stored.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,7 @@ NAMES = ("refined", "conditioned", "time", "direction", "static")  # by what AGR
 
 
 class EffectSets(NamedTuple):
-    """Which rows of a model pay for which effect: rows are ordered refined (AGR) | conditioned | static."""
+    """The effects of each row of a model; rows are ordered refined (AGR) | conditioned | static."""
 
     refined: int  # this many first rows are moved by AGR
     conditioned: int  # this many first rows (refined <= conditioned) change with the query; the others are static
@@ -22,7 +22,7 @@ class EffectSets(NamedTuple):
     intervals: Tensor | None = None  # [refined, 2] clips: AGR moves a row from a first to a last time; None: always
 
     def by_name(self, rows: int) -> dict[str, int]:
-        """Count the Gaussians of each effect set, by the names of NAMES, among so many rows."""
+        """Count the Gaussians of each effect set of NAMES, among the given number of rows."""
         frozen = [0, 0] if self.frozen is None else [int((self.frozen == bit).sum()) for bit in (TIME, DIRECTION)]
         conditioned = self.conditioned - self.refined - sum(frozen)
         return dict(zip(NAMES, (self.refined, conditioned, *frozen, rows - self.conditioned), strict=True))

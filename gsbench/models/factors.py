@@ -19,7 +19,7 @@ def sizes(logs: Tensor) -> Tensor:
 
 
 class Triangle:
-    """The layout of a triangular factor over p, t and d: which of its entries are shape, motion and coupling.
+    """The layout of a triangular factor over p, t and d: which entries are shape, motion and coupling.
 
     Below the diagonal of L there are three kinds of entries. Each has its own unit and so its own learning rate.
     `shape`, in the rows and columns of p, is the skew of a slice relative to the Gaussian's size. `motion`, in the rows
@@ -57,7 +57,7 @@ class Triangle:
         self.is_relative = torch.tensor([place in relative for place in range(len(below))])
 
     def pair(self, place: int) -> tuple[str, str]:
-        """Return the variables of the row and of the column of an entry below the diagonal."""
+        """Return the variables of the row and the column of an entry below the diagonal."""
         row = self.rows[place]
         return self.letters[row], self.letters[place - row * (row - 1) // 2]
 
@@ -116,16 +116,16 @@ def rotation(quaternions: Tensor) -> Tensor:
 def turn_of_space(quaternions: Tensor) -> Tensor:
     """Compute the quaternion of the rotation of space that a left one makes with its partner, [N, 4] -> [N, 4].
 
-    M_left(l) M_right(r) keeps the axis of t where it is for r = (l0, -l1, -l2, l3) alone, up to its length, and then
-    rotates space as `rotation` does by (l0, l3, -l2, l1): in these matrices x comes first and t last. Twice, nothing is
-    changed, so this computes the left quaternion of a rotation of space too.
+    M_left(l) M_right(r) keeps the axis of t only for r = (l0, -l1, -l2, l3), up to its length. It then rotates space as
+    `rotation` does by (l0, l3, -l2, l1), because x comes first and t last in these matrices. The function is its own
+    inverse, so it also computes the left quaternion of a rotation of space.
     """
     w, x, y, z = quaternions.unbind(-1)
     return torch.stack([w, z, -y, x], -1)
 
 
 def partner(left: Tensor) -> Tensor:
-    """Return the right quaternion with which a left one rotates space alone, [N, 4]; see `turn_of_space`."""
+    """Return the right quaternions with which left ones rotate space only, [N, 4]; see `turn_of_space`."""
     return left * left.new_tensor([1, -1, -1, 1])
 
 

@@ -1,6 +1,6 @@
-"""Define what a model needs so that gates can simplify its Gaussians: frozen effects, fewer harmonics.
+"""Define the methods that a model needs for gates to simplify its Gaussians: frozen effects, fewer harmonics.
 
-A model that gates shall not touch derives from `GaussianModel` instead, and does without all of this.
+A model without gates derives from `GaussianModel` instead, and needs none of these methods.
 """
 
 from abc import abstractmethod
@@ -21,7 +21,7 @@ _STATE = "effect_sets."  # in front of a name in a checkpoint
 
 
 class GatedModel(GaussianModel):
-    """N Gaussians of which each may pay for a part of the effects: `effect_sets` says which rows pay for what."""
+    """N Gaussians, each of which may have only some effects; `effect_sets` says which."""
 
     # ---- what a subclass provides
 
@@ -29,27 +29,27 @@ class GatedModel(GaussianModel):
     def static(self, raw: Raw) -> Conditioned:
         """Return Gaussians that no query changes, with an opacity factor of one.
 
-        They are what `condition` tends to where Gaussians grow long in all that is observed, and move with none of it.
+        They are the limit of `condition` for Gaussians that are long in all observed variables and move with none.
         """
 
     @abstractmethod
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
         """Freeze effects at their weighted mean over queries; return the raw parameters that each changes.
 
-        The last, `static`, changes with no query. A model whose slice never changes has nothing to freeze.
+        The last one, `static`, does not change with the query. A model whose slice never changes has nothing to freeze.
 
         Args:
             raw: parameters without AGR.
             queries: V of them.
-            weights: [V, N], of which each Gaussian's sum to 1.
+            weights: [V, N]; those of each Gaussian sum to 1.
         """
 
     def lower_orders(self) -> list[int]:
-        """List the orders of colour below the one in use, packed."""
+        """List the packed orders of colour below the one in use."""
         return [ColorOrder(degree, 1).packed for degree in range(self.active.sh_degree)]
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Tell which entries of the parameters matter to rows of these effect sets; those not named matter all.
+        """Tell which entries of parameters matter to rows of these effect sets; parameters without a mask matter fully.
 
         The masks are bool, broadcastable to the parameters. Entries that do not matter have the constants of `fill`.
         """
@@ -58,7 +58,7 @@ class GatedModel(GaussianModel):
         return {"shN": coefficients_within(effect_sets.orders, self.sh_degree).flatten(1)[:, 1:, None]}
 
     def constant(self, name: str) -> float:
-        """Return what the entries of a parameter are that do not matter."""
+        """Return the constant of a parameter's entries that do not matter."""
         return 0.0
 
     @torch.no_grad()
@@ -71,7 +71,7 @@ class GatedModel(GaussianModel):
 
     @property
     def conditioned(self) -> int | None:
-        """How many of the first rows change with the query; None: all that a slice is made of."""
+        """Return how many of the first rows change with the query; None: all rows of the slice."""
         return None if self.effect_sets is None or not self.observes else self.effect_sets.conditioned
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
@@ -85,7 +85,7 @@ class GatedModel(GaussianModel):
         return means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor
 
     def pack(self) -> dict[str, Tensor]:
-        """Return the state for a checkpoint: of rows with effect sets only the entries that matter, as [entries]."""
+        """Return the state for a checkpoint; with effect sets it has only the entries that matter, as [entries]."""
         state, effect_sets = super().pack(), self.effect_sets
         if effect_sets is None:
             return state
@@ -103,7 +103,7 @@ class GatedModel(GaussianModel):
         """Load what `pack` returned, of any number of Gaussians.
 
         Raises:
-            InputError: the state is that of another model, or the effect sets are none of this one.
+            InputError: the state is of another model, or its effect sets do not fit this model.
         """
         effect_sets = effect_sets_in(state)
         super().load_state(state if effect_sets is None else self._unpacked(state, effect_sets))
@@ -112,7 +112,7 @@ class GatedModel(GaussianModel):
             self.fill(effect_sets)
 
     def _unpacked(self, state: dict[str, Any], effect_sets: EffectSets) -> dict[str, Any]:
-        """Return the whole state that `pack` made smaller."""
+        """Return the whole state from the entries that `pack` kept."""
         assert effect_sets.orders is not None
         whole = {key: value for key, value in state.items() if not key.startswith(_STATE)}
         for name, mask in self.kept(effect_sets).items():
@@ -129,7 +129,7 @@ class GatedModel(GaussianModel):
 
 
 def as_gated(model: GaussianModel) -> GatedModel:
-    """Return the model as one that gates can simplify; raises InputError where it is none."""
+    """Return the model as a `GatedModel`; raises InputError if gates cannot simplify it."""
     if not isinstance(model, GatedModel):
         raise InputError(f"effects.gate: expected a model that gates can simplify, {type(model).__name__} is no "
                          f"GatedModel: make it one (docs/adding_a_model.md), or use effects.gate=off")  # fmt: skip
@@ -137,7 +137,7 @@ def as_gated(model: GaussianModel) -> GatedModel:
 
 
 def effect_sets_in(state: dict[str, Any]) -> EffectSets | None:
-    """Return the effect sets of the rows in a checkpoint's state; None where it has none.
+    """Return the effect sets of the rows in a checkpoint's state; None if it has none.
 
     Raises:
         InputError: they are damaged.

@@ -50,7 +50,7 @@ class Gaussians3DModel(GatedModel):
         return {}
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
-        """Slice by the kernel where the backend has one."""
+        """Slice by the kernel if the backend has one."""
         if not self.backend.serves(raw["means"]):
             return super().observe(raw, query)
         return raw["means"], *observe_static(raw["scales"], raw["quats"], raw["opacities"])

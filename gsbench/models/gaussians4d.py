@@ -32,7 +32,7 @@ class Gaussians4DModel(GatedModel):
     """Means and times, four log scales and two quaternions: F = M_left(l) M_right(r) S over (x, y, z, t).
 
     A rotation of space and time needs one unit for both. With `clock` the clip is as long as the scene is large, so
-    that a scene in metres and the same scene in centimetres train alike. The fourth scale is in that unit; `times` are
+    training does not depend on the scene's unit of length. The fourth scale is in that unit; `times` are
     in clips.
     """
 
@@ -50,7 +50,7 @@ class Gaussians4DModel(GatedModel):
         Args:
             time_degree: frequencies of the colour's Fourier series besides the constant one; 0: constant colours.
             scheme: of `slice_gaussians`.
-            lambda_t: sensitivity of the temporal opacity.
+            lambda_t: coefficient of f_temp.
             options: as `GatedModel`.
 
         Raises:
@@ -92,19 +92,19 @@ class Gaussians4DModel(GatedModel):
         return Conditioned(means, factors, torch.where(seen, opacity_factor, 0.0))
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return Gaussians that the left quaternion rotates in space only, whatever their times and sizes in time."""
+        """Return Gaussians that the left quaternion rotates in space only; times and sizes in time do not matter."""
         factors = rotation(turn_of_space(raw["left_quats"])) * sizes(raw["scales"][:, :3])[:, None, :]
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
-        """Return a factor whose block of space is the trained one; its size in time is the initial one."""
+        """Return the trained shape in space and the initial size in time."""
         left, right = quaternions_in_space(trained.quats)
         scales = torch.cat([trained.log_scales, raw["scales"][:, 3:]], 1)
         return {"scales": scales, "left_quats": left, "right_quats": right}
 
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Freeze t: the mean stays where it is on average, the opacity keeps f_temp's mean, the factor the slice's."""
+        """Freeze t: mean and f_temp become their averages, and the factor becomes that of the slice."""
         factor = self.factors(raw).double()
         blocks = reduce(factor)
         shift, opacity = torch.zeros_like(factor[:, 3:, 0]), torch.zeros_like(factor[:, 0, 0])
@@ -128,7 +128,7 @@ class Gaussians4DModel(GatedModel):
         return {"static": static}
 
     def full_order(self) -> int:
-        """The degree in use with all waves."""
+        """Return the degree in use with all waves."""
         return ColorOrder(self.active.sh_degree, self.time_degree + 1).packed
 
     def lower_orders(self) -> list[int]:
@@ -138,7 +138,7 @@ class Gaussians4DModel(GatedModel):
         return sorted(orders - {self.full_order()})
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Tell which entries matter: a static row has no right quaternion, and a time where its colour has waves."""
+        """Tell which entries matter: a static row has no right quaternion, and a time only if its colour has waves."""
         masks = {}
         if effect_sets.orders is not None:
             stored = coefficients_within(effect_sets.orders, self.sh_degree, self.time_degree + 1)
@@ -155,7 +155,7 @@ class Gaussians4DModel(GatedModel):
         return masks
 
     def constant(self, name: str) -> float:
-        """A static row is as long in time as it can be."""
+        """Return the largest size in time for a static row."""
         return LOG_SIZE_MAX if name == "scales" else 0.0
 
     @torch.no_grad()
@@ -166,7 +166,7 @@ class Gaussians4DModel(GatedModel):
         self.splats["right_quats"].data[effect_sets.conditioned :] = partner(left)
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
-        """Slice by the kernel where the backend has one, in the square-root scheme."""
+        """Slice by the kernel if the backend has one, in the square-root scheme."""
         if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
             return super().observe(raw, query)
         assert query.time is not None
@@ -184,7 +184,7 @@ class Gaussians4DModel(GatedModel):
         )
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
-        """Compute 4DSH, by the kernel where the backend has one for so many waves."""
+        """Compute 4DSH, by the kernel if the backend has one for so many waves."""
         assert query.time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.active.sh_degree, self.time_degree + 1
         if waves <= MAX_WAVES and self.backend.serves(means):
@@ -195,7 +195,7 @@ class Gaussians4DModel(GatedModel):
         return sh_time_colors(coefficients, directions, degree, query.time - raw["times"][:, 0], self.orders)
 
     def initial_colors(self, dc: Tensor) -> Raw:
-        """Return 4DSH coefficients [N, time_degree + 1, K, 3], of which only the constant one is not zero."""
+        """Return 4DSH coefficients [N, time_degree + 1, K, 3]; all but the constant one are zero."""
         K = (self.sh_degree + 1) ** 2
         waves = dc.new_zeros(len(dc), self.time_degree + 1, K, 3)
         return {"sh0": dc[:, None, None], "shN": waves.flatten(1, 2)[:, 1:]}

@@ -1,7 +1,7 @@
 """Model a moving scene by 7DGS less direction: Gaussians over position and time, to measure what direction is worth.
 
-4DGS is over the same variables, but has another factor and colours that change with time, and learns at other rates.
-This model differs from 7DGS in nothing but direction.
+4DGS has the same variables, but another factor, colours that change with time, and other rates. This model differs from
+7DGS only in direction.
 """
 
 from gsbench.models.registry import register

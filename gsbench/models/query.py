@@ -15,10 +15,10 @@ from gsbench.scenes.scene import Camera
 class Query(NamedTuple):
     """The place and the time at which slicing, colours and AGR are evaluated.
 
-    `Query.of` makes one of a camera, `Query.at` of a place; both check what they are given.
+    `Query.of` takes a camera and `Query.at` a place; both check their arguments.
 
     Args:
-        center: where the camera is [3], world units.
+        center: the camera's position [3], world units.
         time: in [0, 1], clips, []; None: the scene has no time.
 
     Example:
@@ -42,7 +42,7 @@ class Query(NamedTuple):
 
     @classmethod
     def at(cls, center: Tensor, time: float | Tensor | None) -> Query:
-        """Make the query of a place at a time. A time that is a tensor stays one, so a CUDA graph can read it.
+        """Make the query of a place at a time. If the time is a tensor, it stays one, so that a CUDA graph can read it.
 
         Args:
             center: the place [3], world units.

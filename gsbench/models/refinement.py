@@ -14,7 +14,7 @@ OCTAVES = 10  # K of the time encoding in the 7DGS paper
 
 
 def encode_time(time: Tensor, octaves: int = OCTAVES) -> Tensor:
-    """gamma(t) = (sin 2^0 pi t, cos 2^0 pi t, .., sin 2^(K-1) pi t, cos 2^(K-1) pi t), [] -> [2 K]."""
+    """Return gamma(t) = (sin 2^0 pi t, cos 2^0 pi t, .., sin 2^(K-1) pi t, cos 2^(K-1) pi t), [] -> [2 K]."""
     angles = time * _frequencies(octaves, time.device, time.dtype)
     return torch.stack([angles.sin(), angles.cos()], -1).flatten()
 
@@ -26,7 +26,7 @@ def _frequencies(octaves: int, device: torch.device, dtype: torch.dtype) -> Tens
 
 
 class Refinement(nn.Module):
-    """Perceptrons f x 64 x c, one for each mean and one for the rest, that read f = (means, gamma(t)).
+    """Perceptrons f x 64 x c that read f = (means, gamma(t)): one for each mean, one for all other parameters.
 
     See 7DGS eq. 14 and 15. The output layers start at zero, so that switching AGR on changes nothing. f does not depend
     on the view.
@@ -37,14 +37,14 @@ class Refinement(nn.Module):
     def __init__(
         self, outputs: list[int], generator: torch.Generator, octaves: int = OCTAVES, units: Tensor | None = None
     ) -> None:
-        """Make the networks, their output layers zero.
+        """Make the networks with output layers of zero.
 
         Args:
-            outputs: the width of each network; the last one moves what is not a mean.
+            outputs: the width of each network; the last one moves all that is not a mean.
             generator: samples the first layers.
             octaves: K of gamma(t). With many octaves and few frames the networks memorise each frame.
-            units: [sum of outputs] in which the networks see each number, so that the size of the scene does not
-                matter; ones by default.
+            units: [sum of outputs], the unit of each number for the networks, so that the size of the scene does not
+                matter; by default ones.
         """
         super().__init__()
         self.features = sum(outputs[:-1])
@@ -66,10 +66,10 @@ class Refinement(nn.Module):
         self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False, rows: int | None = None,
         intervals: Tensor | None = None,
     ) -> list[Tensor]:  # fmt: skip
-        """Move raw parameters [N, c], those that are read and then the others, to a time [].
+        """Move raw parameters [N, c] to a time []; the parameters that are read come first.
 
-        The kernel (float32) writes no hidden layer to memory. With `rows` only so many first Gaussians are moved, with
-        `intervals` [rows, 2] each of them only from a first to a last time.
+        The kernel (float32) writes no hidden layer to memory. With `rows` only the first Gaussians are
+        moved, with `intervals` [rows, 2] each of them only from a first to a last time.
         """
         if by_kernel:
             gamma = encode_time(time, self.octaves)

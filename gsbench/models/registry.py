@@ -1,4 +1,4 @@
-"""Register models by name, those of other packages too, and build them."""
+"""Register models by name, also those of other packages, and build them."""
 
 import importlib
 import inspect
@@ -18,7 +18,7 @@ M = TypeVar("M", bound=type[GaussianModel])
 
 
 def register(name: str) -> Callable[[M], M]:
-    """Decorate a class so that `build` finds it by this name; raises InputError where another class has the name."""
+    """Decorate a class so that `build` finds it by this name; raises InputError if another class has the name."""
 
     def enter(model: M) -> M:
         other = _REGISTRY.get(name, model)
@@ -38,7 +38,7 @@ def find(name: str, module: str | None = None) -> type[GaussianModel]:
 
     Args:
         name: of the model.
-        module: a Python module that registers it, imported first: what the user names, never what a file says.
+        module: a Python module that registers it, imported first; the user names it, never a file.
 
     Raises:
         InputError: the model is unknown, or a module cannot be imported.
@@ -51,7 +51,7 @@ def find(name: str, module: str | None = None) -> type[GaussianModel]:
 
 
 def is_registered(name: str) -> bool:
-    """Tell whether gsbench, an installed package or a module that was imported before has a model of this name.
+    """Tell whether gsbench, an installed package or an imported module has a model of this name.
 
     Raises:
         InputError: the models of an installed package cannot be imported.
@@ -61,7 +61,7 @@ def is_registered(name: str) -> bool:
 
 
 def _import_all() -> None:
-    """Import every module of `gsbench.models` and every entry point; what is imported already costs nothing."""
+    """Import every module of `gsbench.models` and every entry point, if that was not done before."""
     package = importlib.import_module("gsbench.models")
     for own in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"gsbench.models.{own.name}")
@@ -70,11 +70,11 @@ def _import_all() -> None:
 
 
 def import_models(module: str | None, named_by: str = "--model-module") -> None:
-    """Import a module that registers models; raises InputError that says in one line where it fails.
+    """Import a module that registers models; raises InputError with one line that says where it fails.
 
     Args:
         module: its name, such as package.module; None for nothing.
-        named_by: what named it, for the message.
+        named_by: the option that named it, for the message.
     """
     if module is None:
         return
@@ -94,11 +94,11 @@ def build(name: str, *, module: str | None = None, **options: Any) -> GaussianMo
 
     Args:
         name: such as `3dgs`, `4dgs`, `6dgs`, `7dgs`.
-        module: a Python module that registers it, as of `find`.
+        module: a Python module that registers it, as in `find`.
         options: of the model's class and of `GaussianModel`, such as `agr`, `sh_degree`, `lambda_t`.
 
     Returns:
-        The model. `initialise` gives it Gaussians, `load_state` those of a checkpoint; `load_run` does all of it.
+        The model. `initialise` or `load_state` gives it Gaussians. `load_run` builds and loads a trained one.
 
     Raises:
         InputError: the model is unknown, does not have an option, needs an option that is missing, or the option has

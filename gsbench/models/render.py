@@ -41,7 +41,7 @@ def render(
     Args:
         model: initialised.
         camera: sees it.
-        time: in [0, 1]; None where the scene has no time.
+        time: in [0, 1]; None if the scene has no time.
         background: colour [3].
         antialias: see `gsbench.raster.rasterize`.
     """

@@ -1,7 +1,7 @@
-"""Simplify the Gaussians of a model: bake AGR in, freeze time or direction, cut harmonics.
+"""Simplify the Gaussians of a model: bake AGR in, freeze time or direction, remove harmonics.
 
-A simplified Gaussian is an ordinary row of the model's parameters, so every model, backend and checkpoint takes it.
-What is frozen stays at its mean over given queries, weighted by the Gaussian's opacity at each of them.
+A simplified Gaussian is an ordinary row of the model's parameters, so every model, backend and checkpoint can use it.
+A frozen value is the mean over given queries, weighted by the Gaussian's opacity at each of them.
 """
 
 import functools
@@ -39,7 +39,7 @@ def simplifications_of(
 
     Args:
         model: as it is.
-        queries: of the views over which what is frozen is averaged.
+        queries: of the views over which frozen values are averaged.
         slices: of the model at the queries; their opacities are the weights.
         by_halves: whether time or direction alone may be frozen.
     """
@@ -82,7 +82,7 @@ def _averages(
     model: GaussianModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], weights: Tensor,
     names: Sequence[str], fewer: Sequence[Raw],
 ) -> tuple[Raw, list[Tensor]]:  # fmt: skip
-    """Average over the queries what AGR makes of the raw parameters, and the colour [N, 3] that fewer harmonics lose.
+    """Average over the queries the raw parameters after AGR, and the colour [N, 3] that fewer harmonics lose.
 
     Args:
         model: as it is.

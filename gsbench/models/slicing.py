@@ -2,7 +2,7 @@
 
     K = S_pq S_qq^-1        mean = mu_p + K (q - mu_q)        cov = S_pp - K S_pq^T
 
-A Gaussian is given by a factor F of S = F F^T, whose rows are ordered (p, q). Forming S squares the condition number,
+A factor F of S = F F^T, with rows ordered (p, q), gives a Gaussian. Forming S squares the condition number,
 so the default scheme never forms it. It turns the rows of F by reflections until
 F = [T_pq T_pp; T_qq 0] with T_qq lower triangular (square-root Kalman filters: Kailath, Sayed, Hassibi, chapter 12),
 
@@ -23,7 +23,7 @@ SCHEMES = ("square_root", "schur", "cholesky")
 
 
 class Slice(NamedTuple):
-    """The conditional Gaussian that is left of a joint one when q is observed."""
+    """The conditional Gaussian of a joint one, given q."""
 
     mean: Tensor  # [N, 3]
     factor: Tensor  # [N, 3, 3] F of cov = F F^T
@@ -31,7 +31,7 @@ class Slice(NamedTuple):
 
 
 class Reduced(NamedTuple):
-    """A factor turned to [T_qq 0; T_pq T_pp]: conditioned variables first, T_qq lower triangular."""
+    """A factor in the form [T_qq 0; T_pq T_pp]: conditioned variables first, T_qq lower triangular."""
 
     T_qq: Tensor  # [N, k, k]
     T_pq: Tensor  # [N, 3, k]
@@ -45,7 +45,7 @@ def slice_gaussians(
     *,
     scheme: str = "square_root",
 ) -> Slice:
-    """Condition N joint Gaussians on q = query: slice them (7DGS eq. 9 and 10).
+    """Slice N joint Gaussians: condition them on q = query (7DGS eq. 9 and 10).
 
         mean = mu_p + S_pq S_qq^-1 (q - mu_q)        cov = S_pp - S_pq S_qq^-1 S_qp
 
@@ -188,7 +188,7 @@ def gain_of(T_pq: Tensor, T_qq: Tensor) -> Tensor:
 
 
 def _cholesky3(S: Tensor) -> Tensor:
-    """Compute a lower triangular factor of S [N, 3, 3]; negative pivots, where S is indefinite, become zero."""
+    """Compute a lower triangular factor of S [N, 3, 3]; if S is indefinite, negative pivots become zero."""
 
     def root(x: Tensor) -> Tensor:
         return torch.where(x > 0, torch.where(x > 0, x, 1.0).sqrt(), 0.0)

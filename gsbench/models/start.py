@@ -1,4 +1,4 @@
-"""Start a model from trained 3D Gaussians: their means, shapes, opacities and colours become its own."""
+"""Start a model from trained 3D Gaussians, with their means, shapes, opacities and colours."""
 
 import torch
 
@@ -10,10 +10,10 @@ from gsbench.scenes.trained import TrainedGaussians
 
 @torch.no_grad()
 def start_from(model: GaussianModel, trained: TrainedGaussians, extent: float, generator: torch.Generator) -> None:
-    """Initialise a model at trained 3D Gaussians.
+    """Initialise a model with trained 3D Gaussians.
 
-    What they do not know, such as times and directions, starts as it does at points. Harmonics of a higher degree than
-    the model's are left out.
+    Other parameters, such as times and directions, start as they do from points. Harmonics above the model's degree
+    are left out.
 
     Args:
         model: without Gaussians yet.

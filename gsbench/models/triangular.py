@@ -1,4 +1,4 @@
-"""Slice Gaussians over position and direction, time or both by their triangular factor, for 6DGS and 7DGS."""
+"""Slice Gaussians over position and direction, time or both, by their triangular factor (6DGS and 7DGS)."""
 
 import math
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ TIME_SCALE = 0.25  # .. and sqrt(S_t) above this part of the clip (7DGS, section
 
 
 class TriangularModel(GatedModel):
-    """Gaussians with means of p and d, t or both, and one lower triangular factor of their covariance.
+    """Gaussians over p and d, t or both, with a lower triangular factor of their covariance.
 
     For slicing, the rows of a factor are ordered (p, d, t): with d before t, the leading block of the reduced factor is
     the marginal of d.
@@ -118,7 +118,7 @@ class TriangularModel(GatedModel):
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
     def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
-        """Slice by the kernel where there is one: in the square-root scheme, and on the CPU also for `cholesky`."""
+        """Slice by the kernel if there is one: in the square-root scheme, and on the CPU also for `cholesky`."""
         has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
         if not has_kernel or not self.backend.serves(raw["means"]):
             return super().observe(raw, query)
@@ -165,7 +165,7 @@ class TriangularModel(GatedModel):
         self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=least.log()[:, None])
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Sample children along the parent's path where it is long in time, else from its slice.
+        """Sample children along the parent's path if it is long in time, else from its slice.
 
         In the reduced factor [T_qq 0; K T_qq T_pp] a child's shape is T_pp / 1.6 (space), or T_qq with its last row,
         that of t, divided by 1.6 (time). K does not change: a child moves as its parent did.
@@ -191,7 +191,7 @@ class TriangularModel(GatedModel):
         return children | self.triangle.parameters(factor)
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Tell which entries matter: none of a variable that is frozen, or of any where the row is static."""
+        """Tell which entries matter: none of a frozen variable, and none of t and d in a static row."""
         masks = super().kept(effect_sets)
         if effect_sets.frozen is None:
             return masks
@@ -209,7 +209,7 @@ class TriangularModel(GatedModel):
         return masks
 
     def constant(self, name: str) -> float:
-        """A frozen variable is as long as it can be, and moves nothing."""
+        """Return constants of a frozen variable: the largest size, and no motion."""
         return LOG_SIZE_MAX if name == "log_diagonal" else 0.0
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
@@ -225,7 +225,7 @@ class TriangularModel(GatedModel):
 
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Freeze t, d and both, as far as they are observed, at their weighted means over queries.
+        """Freeze t, d and both, if they are observed, at their weighted means over queries.
 
         The slice of (T_qq, K, T_pp) is mu_p + K (q - mu_q) with the factor T_pp. Freezing a variable zeroes its column
         of K; the mean keeps what the column did to it on average, and the opacity what f_temp or f_dir did. Its
@@ -287,7 +287,7 @@ class TriangularModel(GatedModel):
     def exponents(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> dict[str, Tensor]:
         """Compute lambda_d |white_d|^2 / 2 = -ln f_dir and lambda_t (t - mu_t)^2 / (2 S_t) = -ln f_temp, [N] each.
 
-        By the name of the variable (7DGS eq. 11 and 12), of delta = q - mu_q and white = T_qq^-1 delta.
+        The keys are the names of the variables (7DGS eq. 11 and 12); delta = q - mu_q and white = T_qq^-1 delta.
         """
         found = {}
         if "direction" in self.observes:
@@ -303,7 +303,7 @@ class TriangularModel(GatedModel):
         return torch.stack(list(self.exponents(T_qq, delta, white).values())).sum(0)
 
     def _blocks(self, factor: Tensor) -> Reduced:
-        """Cut a factor of `conditioned_first` into its blocks; it is already reduced, with the columns of q first."""
+        """Split a factor of `conditioned_first` into its blocks; it is already reduced, with the columns of q first."""
         k = factor.shape[-1] - 3
         return Reduced(factor[:, 3:, :k], factor[:, :3, :k], factor[:, :3, k:])
 
@@ -321,7 +321,7 @@ class TriangularModel(GatedModel):
 
     @torch.no_grad()
     def long_in_time(self) -> Tensor:
-        """Test |S_pt| > 0.05 extent and sqrt(S_t) > 0.25 T (7DGS, section 4.4)."""
+        """Tell whether |S_pt| > 0.05 extent and sqrt(S_t) > 0.25 T (7DGS, section 4.4)."""
         return self.moves_long(self.factors(dict(self.splats.items())))
 
 
@@ -332,7 +332,7 @@ class TimedModel(TriangularModel):
         """Make an empty model.
 
         Args:
-            lambda_t: initial sensitivity of f_temp.
+            lambda_t: initial coefficient of f_temp.
             options: as `TriangularModel`.
 
         Raises:
@@ -349,7 +349,7 @@ class DirectionalModel(TriangularModel):
         """Make an empty model.
 
         Args:
-            lambda_d: initial sensitivity of f_dir.
+            lambda_d: initial coefficient of f_dir.
             directional_half: whether f_dir has the 1/2 of 7DGS eq. 12, which 6DGS lacks.
             options: as `TriangularModel`.
 

@@ -18,8 +18,8 @@ def keep_freed_memory() -> None:
 
     A step frees some hundred megabytes of gradients and allocates them again, which took a quarter of a step of 4DGS at
     150,000 Gaussians. The heap ("arena") of any thread but the first returns blocks beyond 64 MB to the system whatever
-    the thresholds are. So all workers share the arena of the first thread; docs/cpu.md has the gain. Without glibc
-    nothing is done.
+    the thresholds are. So all workers share the arena of the first thread. Without glibc nothing
+    is done.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None  # musl has none
     if mallopt is None:

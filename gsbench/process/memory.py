@@ -39,7 +39,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def available() -> int | None:
-    """Return the bytes that the system and the control group leave to this process; None where neither is known."""
+    """Return the bytes that the system and the control group leave to this process; None if neither is known."""
     limits = [x for x in (_system(), _control_group()) if x is not None]
     return min(limits, default=None)
 

@@ -1,4 +1,4 @@
-"""How it is drawn: `rasterize`, the one door to every backend, and the checks made at it."""
+"""Rasterize Gaussians: check the arguments of `rasterize` and call the backend."""
 
 from torch import Tensor
 
@@ -32,12 +32,12 @@ def rasterize(
     backend: str | Backend = "auto",
     antialias: bool = False,
 ) -> RasterOutput:
-    """Splat N Gaussians into C images by 3DGS' rules (Kerbl et al. 2023, section 4 and appendix C).
+    """Render N Gaussians to C images by the rules of 3DGS (Kerbl et al. 2023, section 4 and appendix C).
 
-    The covariance of a Gaussian is F F^T for any square `factors` F, so it is semi-definite by construction.
-    Blending is front to back in order of camera depth (ties: lower index first); a Gaussian adds
-    `alpha = min(0.999, opacity * exp(-power))` where that is at least 1/255, until the next one would bring the
-    transmittance below 1e-4.
+    The covariance of a Gaussian is F F^T for any square `factors` F, so it is always semi-definite.
+    Gaussians are blended front to back by camera depth (ties: lower index first). A Gaussian has
+    `alpha = min(0.999, opacity * exp(-power))`, and is skipped if that is below 1/255. The Gaussian that would bring
+    the transmittance below 1e-4 ends the pixel.
 
     Args:
         means: centres [N, 3], world units.
@@ -49,14 +49,14 @@ def rasterize(
         width: of the image, pixels.
         height: of the image, pixels.
         background: colour behind everything [D]; None is black.
-        near: Gaussians whose mean is nearer than this are not drawn.
-        far: nor are those farther than this.
+        near: Gaussians whose mean is nearer are culled.
+        far: Gaussians whose mean is farther are culled.
         eps2d: added to the diagonal of the projected covariance, pixels^2.
-        backend: or its name: `reference` (torch), `cpu`, `cuda` (kernels), `auto` (the fastest there is).
+        backend: or its name: `reference` (torch), `cpu`, `cuda` (kernels), `auto` (the fastest installed one).
         antialias: scale opacities by the area that `eps2d` added (Mip-Splatting's 2D filter).
 
     Returns:
-        The image [C, H, W, D], how much of it is covered [C, H, W, 1], and what density control asks about.
+        The image [C, H, W, D], its alpha [C, H, W, 1], and `RasterInfo` for density control.
 
     Raises:
         InputError: a shape, dtype, device or value is not as above, or the backend is unknown or not installed.

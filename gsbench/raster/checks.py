@@ -1,4 +1,4 @@
-"""Refuse what cannot be drawn, before anything is: shapes, types, devices and values."""
+"""Check the shapes, types, devices and values of everything that is to be rendered."""
 
 import math
 
@@ -18,7 +18,7 @@ def check_arguments(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     width: int, height: int, background: Tensor | None, near: float, far: float, eps2d: float,
 ) -> None:  # fmt: skip
-    """Raise InputError unless everything is as `rasterize` says."""
+    """Raise InputError unless all arguments are as `rasterize` requires."""
     _check_viewport(width, height, near, far, eps2d)
     given = means, factors, opacities, colors, viewmats, Ks, background
     call = width, height, *[(x.shape, x.dtype, x.device, x.layout) if isinstance(x, Tensor) else type(x) for x in given]
@@ -53,7 +53,7 @@ def check_arguments(
 
 
 def _check_viewport(width: int, height: int, near: float, far: float, eps2d: float) -> None:
-    """Raise InputError unless there are pixels, and depths between the planes."""
+    """Raise InputError unless the image has pixels and `far` is beyond `near`."""
     if not all(type(size) is int and size >= 1 for size in (width, height)):
         raise InputError(f"expected an image of at least 1x1 whole pixels, got width={width!r:.40}, "
                          f"height={height!r:.40}")  # fmt: skip

@@ -1,4 +1,4 @@
-"""The rasterizer by kernels, on the CPU and on a GPU: the image of `reference`, in float32 and much faster."""
+"""Rasterize by kernels on the CPU and on a GPU: the images of `reference`, in float32 and much faster."""
 
 from torch import Tensor
 
@@ -26,13 +26,13 @@ def draw(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     background: Tensor, viewport: Viewport,
 ) -> RasterOutput:  # fmt: skip
-    """Draw every camera; arguments as `gsbench.raster.rasterize`. Intrinsics have no gradient here.
+    """Render every camera; arguments as in `gsbench.raster.rasterize`. Intrinsics have no gradient here.
 
-    On the CPU the same inputs give the same bits, for any number of threads. On a GPU gradients are sums in the order
-    that threads come by, and the device is waited for once, for the number of pairs to sort.
+    On the CPU the same inputs give the same bits, for any number of threads. On a GPU threads add gradients in any
+    order, and the call waits once for the device, to read the number of intersections.
 
     Raises:
-        InputError: a gradient by `Ks` is asked for, a value is out of range, or memory would not suffice.
+        InputError: `Ks` requires a gradient, a value is out of range, or memory does not suffice.
         torch.OutOfMemoryError: on a GPU, naming the buffer, its size and what to lower.
     """
     device = means.device.type
@@ -57,10 +57,10 @@ def draw_within(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     background: Tensor, viewport: Viewport, room: int,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """The image [C, H, W, D] without waiting for a GPU, where `room` pairs of a tile and a Gaussian are enough.
+    """Return the image [C, H, W, D] without waiting for a GPU, with memory for `room` intersections.
 
-    Whether they were is for the caller to see: the second tensor, [2] int64, is how many there were, and not zero where
-    a value was out of range.
+    The second result, [2] int64, has the number of intersections, and a flag that is not zero if a value was out of
+    range. The caller must compare the number with `room`.
     """
     flags = flag_values(means, factors, opacities, colors, viewmats, Ks, background)
     splats = project(means, factors, opacities, viewmats, Ks, viewport)
@@ -69,7 +69,7 @@ def draw_within(
 
 
 def _check_room(C: int, N: int, D: int, viewport: Viewport) -> None:
-    """Raise InputError for more Gaussians than are counted, and where memory would not suffice."""
+    """Raise InputError if there are too many Gaussians to count, or if memory does not suffice."""
     if N >= MAX_GAUSSIANS:
         raise InputError(f"raster backend 'cpu': expected fewer than {MAX_GAUSSIANS} Gaussians, got {N}")
     pixels = C * count_tiles(viewport.width, viewport.height) * TILE_PIXELS

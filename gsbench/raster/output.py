@@ -1,4 +1,4 @@
-"""What the rasterizer returns."""
+"""Define the results of the rasterizer."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class RasterInfo:
-    """What the rasterizer knows beside the image."""
+    """The results of the rasterizer for density control."""
 
     half_sizes: Tensor  # [C, N, 2] pixels: half the sides of the rectangle that holds every pixel drawn; 0: not drawn
     means2d: Tensor  # [C, N, 2] pixels, in the autograd graph: its gradient drives densification
@@ -21,13 +21,13 @@ class RasterInfo:
 
     @property
     def radii(self) -> Tensor:
-        """Half the side of the square that holds every pixel drawn, [C, N] int32, pixels; 0: not drawn."""
+        """Return half the side of the square around each splat, [C, N] int32, pixels; 0 if the Gaussian is culled."""
         return self.half_sizes.detach().amax(-1).ceil_().int()
 
 
 @dataclass(frozen=True)
 class RasterOutput:
-    """An image, how much of it is covered, and `RasterInfo`."""
+    """An image, its alpha, and `RasterInfo`."""
 
     image: Tensor  # [C, H, W, D]
     alpha: Tensor  # [C, H, W, 1]

@@ -1,4 +1,4 @@
-"""The rasterizer in plain torch: any dtype and device, differentiable in every input, the truth for other backends.
+"""Rasterize in torch: any dtype and device, differentiable by every input, the reference of other backends.
 
 Read it beside Kerbl et al. 2023 ("3DGS") and Zwicker et al. 2001 ("EWA splatting"):
 project -> bin into tiles -> blend.
@@ -18,7 +18,7 @@ CHUNK = 1 << 21  # (Gaussian, pixel) products blended at a time: bounds memory, 
 
 
 class CameraSplats(NamedTuple):
-    """Gaussians on the image plane of one camera."""
+    """The splats of one camera."""
 
     means2d: Tensor  # [N, 2] pixels
     conics: Tensor  # [N, 3] a, b, c: the inverse of the 2D covariance is U^T U with U = [a b; 0 c]
@@ -31,7 +31,7 @@ def draw(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     background: Tensor, viewport: Viewport,
 ) -> RasterOutput:  # fmt: skip
-    """Draw every camera in turn; arguments as `gsbench.raster.rasterize`."""
+    """Render every camera in turn; arguments as in `gsbench.raster.rasterize`."""
     if colors.dim() == 2:
         colors = colors.expand(len(viewmats), *colors.shape)
     splats = [
@@ -115,7 +115,7 @@ def project(
 
 @torch.no_grad()
 def bin_tiles(splats: CameraSplats, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """List (tile, Gaussian) pairs sorted by tile, then by depth, then by index: tiles [P], gaussians [P]."""
+    """List intersections sorted by tile, then by depth, then by index: tiles [P], gaussians [P]."""
     order = torch.argsort(splats.depths, stable=True)
     order = order[splats.half_sizes[order].amax(-1) > 0]
     center, half = splats.means2d[order], splats.half_sizes[order]

@@ -4,7 +4,7 @@ Runs are compared where model, variant, scene, data, training and measuring are 
 set rounds differently, and a training with other rounding ends like a training with another seed. So the runs of a
 model on a scene are two samples, and their means are compared by the spread over seeds (Student's t, Holm over all
 rows). A few seeds do not give a reliable spread. So it is pooled over the models and scenes of an experiment, and the
-row's own spread counts where it is larger. Thus one run can be compared with three.
+row's own spread counts if it is larger. Thus one run can be compared with three.
 """
 
 import math
@@ -27,7 +27,7 @@ SAME_LOAD = 0.5  # mean loads further apart than this make seconds of two runs i
 class Limit:
     """The difference up to which two means are equal, and the widest interval that shows that they are.
 
-    Both are parts of the other folder's mean where the limit is relative.
+    Both are parts of the other folder's mean if the limit is relative.
     """
 
     equal: float
@@ -96,14 +96,14 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Differs where PSNR does in any row, and agrees where it does in every one."""
+        """Return the verdict of the whole: it differs if PSNR differs in any row, and agrees if it agrees in all."""
         if self.of("psnr", DIFFERS):
             return DIFFERS
         return AGREES if self.rows and len(self.of("psnr", AGREES)) == len(self.rows) else UNTOLD
 
     @property
     def line(self) -> str:
-        """The result of the comparison in one line."""
+        """Return the result of the comparison in one line."""
         head = f"{self.ours} against {self.theirs}: {self.verdict}."
         if not self.rows:
             return f"{head} No model and scene is in both."
@@ -170,7 +170,7 @@ def _missing(of: RunsByConfiguration, other: RunsByConfiguration) -> list[str]:
 
 
 def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> ComparedRuns:
-    """Pair the runs of a model on a scene in both folders, with each quantity's values or why it does not compare."""
+    """Pair the runs of a model on a scene in both folders: each quantity's values, or why it cannot be compared."""
     first = next(iter(ours.values()))
     mine, other = ([r for r in runs.values() if r.status == "ok"] for runs in (ours, theirs))
     why = _incomparable(mine, other)
@@ -186,7 +186,7 @@ def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> ComparedRuns:
 
 
 def value(record: Record, quantity: str) -> float:
-    """Read a quantity of LIMITS from a record; NaN where it is missing."""
+    """Read a quantity of LIMITS from a record; NaN if it is missing."""
     if quantity == "gaussians":
         return record.cost.num_gaussians if record.cost else math.nan
     return QUANTITIES[quantity](record)
@@ -216,7 +216,7 @@ def _squares(*samples: list[float]) -> tuple[float, int]:
 
 
 def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
-    """Return why no quantity of two samples of runs compares; "" where all compare."""
+    """Return why no quantity of two samples of runs can be compared; "" if all compare."""
     if not ours or not theirs:
         return f"no run finished {'here' if not ours else 'there'}"
     first = theirs[0]
@@ -235,7 +235,7 @@ def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
 
 
 def _other_machine(ours: list[Record], theirs: list[Record]) -> str:
-    """Return why seconds do not compare; "" where all were measured on one machine under one load."""
+    """Return why seconds cannot be compared; "" if all were measured on one machine under one load."""
     here, there = ({r.provenance.machine for r in runs} for runs in (ours, theirs))
     if here != there or len(here) > 1:
         named = [printable("; ".join(sorted(machines)))[:200] for machines in (here, there)]

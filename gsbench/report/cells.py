@@ -8,7 +8,7 @@ _FORMULA = "=+-@"  # a spreadsheet computes a text that begins with one of these
 
 
 def cell(value: Any) -> Any:
-    """Return a value for CSV: a text is put on one line, escaped, and quoted by ' where it begins like a formula.
+    """Return a value for CSV: a text is put on one line, escaped, and quoted by ' if it begins like a formula.
 
     Numbers, which may be negative, and other values are unchanged.
     """

@@ -62,7 +62,7 @@ def improvement(group: Group, a: Configuration, b: Configuration) -> float:
     """Return the probability that a run of `a` has a higher PSNR than one of `b` on the same view of the same scene.
 
     Every run of `a` is compared with every run of `b`; a tie counts half; scenes count equally. Agarwal et al. 2021
-    (arXiv 2108.13264) compare runs so; here it is done for each view. NaN where they share no view.
+    (arXiv 2108.13264) compare runs so; here it is done for each view. NaN if they share no view.
     """
     shares = []
     for scene in sorted(set(a.runs) & set(b.runs)):
@@ -202,7 +202,7 @@ def _weights(
 
 
 def _price(family: Family, cells: dict[Cell, Configuration], name: str, weights: dict[Cell, float]) -> Price | None:
-    """Read a contrast in each unit; None where a cell is missing or no scene has all of them."""
+    """Read a contrast in each unit; None if a cell is missing or no scene has all of them."""
     if not weights.keys() <= cells.keys():
         return None
     sums = _sum(cells, weights)

@@ -1,4 +1,4 @@
-"""State the conditions under which the rows of a table were measured, and warn where they differ."""
+"""State the conditions under which the rows of a table were measured, and warn if they differ."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -26,7 +26,7 @@ def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:
     """List footnotes on protocol, data, machine, commit, versions and seeds; warnings come first.
 
     They describe the finished runs, as only these have numbers: a failed run may have stopped before it knew its
-    backend or its data. Where no run finished, there is no warning, as nothing is compared.
+    backend or its data. If no run finished, there is no warning, as nothing is compared.
 
     Args:
         records: of one table.
@@ -84,7 +84,7 @@ def _machine(record: Record) -> str:
 
 
 def _load(records: list[Record]) -> list[str]:
-    """Describe the load of the machine of most runs, where the records have it."""
+    """Describe the load of the machine of most runs, if the records have it."""
     machine = Counter(r.provenance.machine for r in records).most_common(1)[0][0]
     costs = [r.cost for r in records if r.cost and r.provenance.machine == machine]
     loads = [cost.load for cost in costs if cost.load is not None]

@@ -19,7 +19,7 @@ Values = npt.NDArray[np.float64]
 
 
 def psnr_val(record: Record) -> float:
-    """Return the PSNR on val at the end of the run, dB; NaN where it was not measured.
+    """Return the PSNR on val at the end of the run, dB; NaN if it was not measured.
 
     The curve ends before the gate at the end, so the gate's loss on val is subtracted.
     """
@@ -55,12 +55,12 @@ class Configuration:
 
     @property
     def on_demand(self) -> bool:
-        """Whether effects were chosen for the scenes or the Gaussians, so that not all Gaussians have all effects."""
+        """Tell whether effects were chosen, so that not all Gaussians have all effects."""
         return any(r.on_demand for runs in self.runs.values() for r in runs)
 
     @property
     def iterations(self) -> int | None:
-        """The length of training, if all runs have the same."""
+        """Return the length of training, if all runs have the same."""
         lengths = {iterations(r) for runs in self.runs.values() for r in runs}
         return lengths.pop() if len(lengths) == 1 else None
 
@@ -73,32 +73,32 @@ class Group:
 
     @property
     def experiment(self) -> str:
-        """The experiment's name."""
+        """Return the experiment's name."""
         return self.records[0].experiment
 
     @property
     def dataset(self) -> str:
-        """The data set's name."""
+        """Return the data set's name."""
         return self.records[0].dataset
 
     @cached_property
     def finished(self) -> list[Record]:
-        """The runs that are ok."""
+        """Return the runs that are ok."""
         return [r for r in self.records if r.status == "ok"]
 
     @cached_property
     def scenes(self) -> list[str]:
-        """The scenes of all runs, also of those that failed."""
+        """Return the scenes of all runs, also of those that failed."""
         return sorted({r.scene for r in self.records})
 
     @cached_property
     def models(self) -> list[str]:
-        """The models of all runs, also of those that failed."""
+        """Return the models of all runs, also of those that failed."""
         return sorted({r.model for r in self.records})
 
     @cached_property
     def configurations(self) -> list[Configuration]:
-        """The models with their variants that finished on some scene, by name; a model without variant comes first."""
+        """List the configurations that finished on some scene, by name; a model without variant comes first."""
         runs: dict[tuple[str, str], dict[str, list[Record]]] = {}
         for r in self.finished:
             runs.setdefault((r.model, r.variant), {}).setdefault(r.scene, []).append(r)
@@ -109,7 +109,7 @@ class Group:
 
     @cached_property
     def series(self) -> list[str]:
-        """The names of the frontiers, also of runs that failed: one for each model, and one for its gated runs."""
+        """Name the frontiers, also of runs that failed: one for each model, and one for its gated runs."""
         return sorted({self.series_of(r) for r in self.records})
 
     def series_of(self, record: Record) -> str:
@@ -127,39 +127,39 @@ class Group:
 
     @cached_property
     def variant(self) -> str:
-        """The variant at which models are compared: the most common one; at a tie, one without ablation."""
+        """Return the variant at which models are compared: the most common one; at a tie, one without ablation."""
         shared = Counter(c.variant for c in self.configurations)
         return min(shared, key=lambda variant: (-shared[variant], is_ablated(variant), variant), default="")
 
     @cached_property
     def main_configurations(self) -> list[Configuration]:
-        """The configuration of every model at the common variant."""
+        """Return the configuration of every model at the common variant."""
         return [c for c in self.configurations if c.variant == self.variant]
 
     @cached_property
     def compared(self) -> list[Configuration]:
-        """The configurations that are compared in pairs.
+        """Return the configurations that are compared in pairs.
 
         Their variants equal the common one, apart from gates and ablations.
         """
         return [c for c in self.configurations if _common(c.variant) == _common(self.variant)]
 
     def label(self, configuration: Configuration) -> str:
-        """Name a compared configuration: its model, and in brackets its variant where it is not the common one."""
+        """Name a compared configuration: its model, and in brackets its variant if it is not the common one."""
         model, variant = configuration.model, configuration.variant
         return model if variant == self.variant else f"{model} ({variant or 'default'})"
 
     @cached_property
     def covered(self) -> list[str]:
-        """The scenes that every model has finished at the common variant, over which averages are taken."""
+        """Return the scenes that every model has finished at the common variant, over which averages are taken."""
         main = self.main_configurations
         return [s for s in self.scenes if main and all(s in c.runs for c in main)]
 
     @cached_property
     def basis(self) -> list[str]:
-        """The scenes over which answers are averaged.
+        """Return the scenes over which answers are averaged.
 
-        These are the covered scenes; where there are none, the scene with most configurations.
+        These are the covered scenes; if there are none, the scene with most configurations.
         """
         if self.covered or not self.configurations:
             return self.covered
@@ -167,16 +167,16 @@ class Group:
 
     @cached_property
     def machine(self) -> str:
-        """The machine of most runs; seconds of other machines are left out."""
+        """Return the machine of most runs; seconds of other machines are left out."""
         return Counter(r.provenance.machine for r in self.finished or self.records).most_common(1)[0][0]
 
     @cached_property
     def elsewhere(self) -> int:
-        """The number of finished runs on other machines."""
+        """Return the number of finished runs on other machines."""
         return sum(r.provenance.machine != self.machine for r in self.finished)
 
     def value(self, record: Record, quantity: str) -> float:
-        """Read one of QUANTITIES from a record; NaN where it is missing or measured on another machine."""
+        """Read one of QUANTITIES from a record; NaN if it is missing or measured on another machine."""
         if quantity in OF_THE_MACHINE and record.provenance.machine != self.machine:
             return math.nan
         return QUANTITIES[quantity](record)
@@ -196,7 +196,7 @@ class Group:
         return [paired for s in scenes if (paired := self._paired(weights, s, quantity)).size]
 
     def _paired(self, weights: list[tuple[float, Configuration]], scene: str, quantity: str) -> Values:
-        """Return the weighted sum on one scene, [seeds, views]; it is empty where no seed or no view is shared."""
+        """Return the weighted sum on one scene, [seeds, views]; it is empty if no seed or no view is shared."""
         by_seed = [{r.seed: s for r in c.runs[scene] if (s := self.scores(r, quantity))} for _, c in weights]
         seeds = sorted(set.intersection(*map(set, by_seed)))
         every = [scores[seed] for scores in by_seed for seed in seeds]
@@ -223,7 +223,7 @@ def groups(records: list[Record]) -> list[Group]:
 
 
 def gating(record: Record) -> str:
-    """Return when the Gaussians of a run were gated, as a variant writes it; "" where that is its model's default."""
+    """Return when the Gaussians of a run were gated, as a variant writes it; "" if that is its model's default."""
     config = record.provenance.config
     effects, model = (part if isinstance(part := config.get(name), dict) else {} for name in ("effects", "model"))
     gate = effects.get("gate", "off")

@@ -20,12 +20,12 @@ class Tested:
 
     @property
     def known(self) -> bool:
-        """Whether a spread is known, so that a difference can be tested."""
+        """Tell whether a spread is known, so that a difference can be tested."""
         return not math.isnan(self.p)
 
     @property
     def told(self) -> bool:
-        """Whether the difference is significant: the rule behind "told apart" and "ahead"."""
+        """Tell whether the difference is significant: the rule behind "told apart" and "ahead"."""
         return self.p < 1 - LEVEL
 
 

@@ -28,7 +28,7 @@ class FrontierPoint:
 
     @property
     def series(self) -> str:
-        """The frontier that the point belongs to: that of a model, or of a gated one."""
+        """Return the frontier that the point belongs to: that of a model, or of a gated one."""
         return self.configuration.series
 
 
@@ -83,7 +83,7 @@ def has_val(of: Sequence[FrontierPoint]) -> bool:
 
 
 def ranked(of: Sequence[FrontierPoint]) -> list[FrontierPoint]:
-    """Return points by falling PSNR on val, or by that on the evaluated split where `has_val` is false."""
+    """Return points by falling PSNR on val, or by that on the evaluated split if `has_val` is false."""
     on_val = has_val(of)
     return sorted(of, key=lambda p: -(p.val if on_val else p.psnr.mean))
 
@@ -104,7 +104,7 @@ def contested(of: Sequence[FrontierPoint]) -> list[Weights]:
 
 
 def choose(of: Sequence[FrontierPoint], cost: str, budget: float, family: Family) -> BudgetChoice | None:
-    """Choose the best point that costs at most `budget`; None where there is none.
+    """Choose the best point that costs at most `budget`; None if there is none.
 
     The best point of each other model within the budget is compared with it, paired over seeds and views.
 
@@ -171,7 +171,7 @@ def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, fl
 def round_numbers(low: float, high: float) -> list[float]:
     """Return the multiples of the widest of STEPS of which FEWEST_TARGETS lie above `low` and up to `high`.
 
-    No configuration's own PSNR is a target, so none is favoured. Where the range holds fewer multiples of the finest
+    No configuration's own PSNR is a target, so none is favoured. If the range holds fewer multiples of the finest
     step, those are returned.
     """
     found: list[float] = []
@@ -199,5 +199,5 @@ def _ratio(seconds: float, fastest: float) -> float:
 
 
 def _mean(scenes: list[Values]) -> float:
-    """Return the mean over scenes of the mean over seeds; NaN where a scene has none."""
+    """Return the mean over scenes of the mean over seeds; NaN if a scene has none."""
     return float(np.mean([s.mean() for s in scenes])) if all(map(len, scenes)) else math.nan

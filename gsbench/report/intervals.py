@@ -1,15 +1,15 @@
-"""Estimate a mean over scenes, seeds and views with a 95 % interval that keeps its coverage from three seeds on.
+"""Estimate a mean over scenes, seeds and views with a 95 % interval that holds from three seeds on.
 
 With three seeds a percentile bootstrap of any hierarchy covers far less than it claims: resampling three values finds
 two thirds of their variance, and its quantiles are those of a normal distribution where Student's t has 4.3 instead of
 2. So the spread of each level is estimated and has its own quantile of t (docs/statistics.md has the simulations):
 
-- three scenes and more: the means of the scenes are a sample of scenes like these, and hold the spread of seeds and
-  views already; t with (scenes - 1) degrees of freedom is exact for normal means.
-- one or two scenes say nothing of others. On these, seeds and views are crossed (each seed sees the same views): the
-  half widths of seeds and of views, each with its own t, add in squares (MOVER: Zou and Donner 2008), what seeds and
-  views share is taken from the seeds once, and the interval is at least that of the seeds alone.
-- one seed: no spread is known, and there is no interval.
+- Three scenes and more: the means of the scenes are a sample of scenes like these, and include the spread of seeds and
+  views. t with (scenes - 1) degrees of freedom is exact for normal means.
+- One or two scenes say nothing about others. Seeds and views are crossed: each seed sees the same views. The half
+  widths of seeds and of views, each with its own t, add in squares (MOVER: Zou and Donner 2008). The variance that
+  seeds and views share is subtracted from the seeds once. The interval is at least that of the seeds alone.
+- One seed: no spread is known, and there is no interval.
 """
 
 import math
@@ -29,7 +29,7 @@ LEAST_P = 1e-12
 
 @dataclass(frozen=True)
 class Spread:
-    """The variance of a mean that one level brings, and its degrees of freedom."""
+    """The variance of a mean over one level, and its degrees of freedom."""
 
     variance: float
     freedom: float
@@ -43,7 +43,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over scenes with its interval; without one where no spread is known."""
+    """A mean over scenes with its interval; without one if no spread is known."""
 
     mean: float  # NaN: nothing was measured
     scenes: int
@@ -54,22 +54,22 @@ class Estimate:
 
     @cached_property
     def half(self) -> float:
-        """Half the width of the 95 % interval; NaN without one."""
+        """Return half the width of the 95 % interval; NaN without one."""
         return self._half(LEVEL) if self.over else math.nan
 
     @property
     def low(self) -> float:
-        """The lower end of the interval."""
+        """Return the lower end of the interval."""
         return self.mean - self.half
 
     @property
     def high(self) -> float:
-        """The upper end of the interval."""
+        """Return the upper end of the interval."""
         return self.mean + self.half
 
     @cached_property
     def p(self) -> float:
-        """The two-sided p-value of a mean of zero: one less the level whose interval ends at zero; NaN without one."""
+        """Return the two-sided p-value of a mean of zero: one less the level whose interval ends at zero, or NaN."""
         if not self.over:
             return math.nan
         if self._half(LEVEL) == 0:
@@ -92,8 +92,8 @@ def estimate(scenes: list[Values], *, generalise: bool = True) -> Estimate:
     """Estimate the mean over scenes of the mean over seeds and views.
 
     Args:
-        scenes: for each scene [seeds, views], every seed with the same views; one column where there are no views.
-        generalise: from three scenes on the interval is one of scenes like these, otherwise of these scenes.
+        scenes: for each scene [seeds, views], every seed with the same views; one column if there are no views.
+        generalise: from three scenes on the interval is over scenes like these, otherwise over these scenes.
     """
     if not scenes:
         return Estimate(math.nan, 0, 0, "")
@@ -129,7 +129,7 @@ def _combined(scenes: list[Spread]) -> Spread:
 
 
 def _without_rest(scene: Values) -> Spread:
-    """Return the spread that seeds bring beside what varies from view to view in each of them (two-way ANOVA)."""
+    """Return the spread over seeds, without the spread over views in each seed (two-way ANOVA)."""
     seeds, views = scene.shape
     rest = scene - scene.mean(1, keepdims=True) - scene.mean(0, keepdims=True) + scene.mean()
     of_rest = (rest**2).sum() / ((seeds - 1) * (views - 1)) / scene.size

@@ -21,7 +21,7 @@ def watch(folder: Path, *, train: bool = False, every: float = EVERY) -> int:
 
     Args:
         folder: where records are or will be.
-        train: as of `gsbench.report.tables.build`.
+        train: as in `gsbench.report.tables.build`.
         every: seconds between two looks.
     """
     seen, said = State(), ""
@@ -51,7 +51,7 @@ def _state(folder: Path) -> State:
 
 
 def _written(folder: Path, train: bool, reload: int) -> str:
-    """Write all files and return a line that counts the records; where writing fails, return the reason."""
+    """Write all files and return a line that counts the records; if writing fails, return the reason."""
     try:
         records, faults = tables.load(folder)
         if not records:

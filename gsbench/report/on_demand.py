@@ -40,12 +40,12 @@ class Decided:
 
     @property
     def before(self) -> float:
-        """Gaussians before the first gate."""
+        """Return the number of Gaussians before the first gate."""
         return sum(self.rows.values())
 
     @property
     def left(self) -> float:
-        """Gaussians after the last gate."""
+        """Return the number of Gaussians after the last gate."""
         return self.before - self.rows.get(REMOVED, 0.0)
 
 

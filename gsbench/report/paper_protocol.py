@@ -25,7 +25,7 @@ class ModelRecipe(NamedTuple):
 
 @dataclass(frozen=True)
 class Pool:
-    """Runs of one data set that may stand in one table."""
+    """Runs of one data set that may share a table."""
 
     dataset: str
     experiment: str
@@ -34,13 +34,13 @@ class Pool:
 
     @property
     def heading(self) -> str:
-        """The data set, the sizes of its images and the length of training."""
+        """Return the data set, the sizes of its images and the length of training."""
         sizes = ", ".join(sorted({_size(r) for r in self.runs}))
         return f"{self.dataset}: experiment {self.experiment}, {sizes}, {self.steps:,} iterations"
 
     @property
     def effort(self) -> int:
-        """How near the pool is to the paper's protocol: pixels of its largest image times iterations."""
+        """Return pixels of the pool's largest image times iterations: the higher, the nearer to the paper."""
         return self.steps * max(_pixels(_size(r)) for r in self.runs)
 
 
@@ -86,7 +86,7 @@ def sort(records: list[Record]) -> Sorted:
 
 
 def departure(record: Record) -> str:
-    """Name the settings in which a run departs from the paper's protocol; "" where it follows it."""
+    """Name the settings in which a run departs from the paper's protocol; "" if it follows it."""
     protocol = PROTOCOLS.get(record.dataset)
     if protocol is None or record.protocol.get("paper_dataset") != record.dataset:
         return "data"
@@ -120,7 +120,7 @@ def model_recipes(records: list[Record]) -> list[ModelRecipe]:
 def finished(records: list[Record], one: ModelRecipe, scenes: Sequence[str]) -> dict[str, list[Record]]:
     """Return the finished runs of a model and recipe by scene, one for each seed.
 
-    Where two runs of a seed differ in `protocol.best_on_test`, the run that has it counts.
+    If two runs of a seed differ in `protocol.best_on_test`, the run that has it counts.
     """
     found: dict[str, dict[int, Record]] = {}
     for r in sorted(records, key=lambda r: (r.metrics or {}).get("psnr_best_on_test") is not None):
@@ -135,13 +135,13 @@ def _size(record: Record) -> str:
 
 
 def _pixels(size: str) -> int:
-    """Count the pixels of a size; 0 where the text is no size."""
+    """Count the pixels of a size; 0 if the text is no size."""
     numbers = size.split("x")
     return int(numbers[0]) * int(numbers[1]) if re.fullmatch(r"[0-9]{1,6}x[0-9]{1,6}", size) else 0
 
 
 def _part(config: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return a section of a config, empty where a record lacks it."""
+    """Return a section of a config, empty if a record lacks it."""
     part = config.get(name)
     return part if isinstance(part, dict) else {}
 

@@ -14,7 +14,7 @@ SPREAD = conditions.SPREAD  # every table has the same
 
 
 def mean(runs: Mapping[str, Sequence[Record]], key: str) -> Estimate:
-    """Estimate the mean of a quantity over scenes, of its mean over seeds; NaN where it is missing from a run or scene.
+    """Estimate the mean of a quantity over scenes, of its mean over seeds; NaN if it is missing from a run or scene.
 
     Args:
         runs: finished ones, by scene.

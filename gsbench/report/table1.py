@@ -146,7 +146,7 @@ class _Table1Builder:
         return rows
 
     def _paper(self, model: str, scenes: list[str]) -> dict[str, float]:
-        """Return the paper's numbers by column, averaged over `scenes`; empty where it has none of this data."""
+        """Return the paper's numbers by column, averaged over `scenes`; empty if it has none of this data."""
         if self.kind != "paper":
             return {}
         rows = [row for scene in scenes if (row := paper.paper_row(self.dataset, scene, model))]
@@ -156,7 +156,7 @@ class _Table1Builder:
         return {key: math.nan if None in given else fmean(given) for key, given in values.items()}
 
     def _label(self, one: ModelRecipe) -> str:
-        """Name a row by its model, its recipe, and its experiment where experiments differ."""
+        """Name a row by its model, its recipe, and its experiment if experiments differ."""
         return " ".join(filter(None, [one.model, one.recipe, f"({one.experiment})" * self.names_experiment]))
 
     def _mark(self, text: str) -> str:

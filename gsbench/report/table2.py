@@ -51,7 +51,7 @@ def build(found: Sorted) -> tuple[list[Table], list[Line]]:
 
 
 def _published(dataset: str, lines: list[Line], marks: list[str]) -> list[Row]:
-    """Make the rows of the paper's Table 2, or of its Table 1's averages where it has none."""
+    """Make the rows of the paper's Table 2, or of its Table 1's averages if it has none."""
     methods = [
         (m.method, "reproduced" if m.reproduced_by_paper else "quoted", m.psnr, m.ssim, m.lpips)
         for m in paper.table2().get(dataset, [])

@@ -109,11 +109,11 @@ def build(records: list[Record], *, train: bool = False, machine: str | None = N
 
 
 def of_one_machine(records: list[Record], machine: str) -> list[str]:
-    """Name the machine whose seconds a table shows, and the runs left out; nothing where all were on one machine.
+    """Name the machine whose seconds a table shows, and the runs left out; nothing if all were on one machine.
 
     Args:
         records: of the table.
-        machine: as of `build`.
+        machine: as in `build`.
     """
     others = Counter(r.provenance.machine for r in records if r.status == "ok" and r.provenance.machine != machine)
     if not others:
@@ -148,12 +148,12 @@ class _TableBuilder:
         self.marks: list[str] = []
 
     def _values(self, column: QuantityColumn, seeds: list[dict[str, Any]]) -> list[float]:
-        """Return a column's value of each run; of seconds those of the table's machine, NaN where it has none."""
+        """Return a column's value of each run; of seconds those of the table's machine, NaN if it has none."""
         counted = [q for q in seeds if column.key not in OF_THE_MACHINE or q["machine"] == self.machine]
         return [math.nan if q[column.key] is None else float(q[column.key]) for q in counted] or [math.nan]
 
     def _name(self, record: Record) -> str:
-        """Name the row of a run by its model, and by its variant where it is not the common one."""
+        """Name the row of a run by its model, and by its variant if it is not the common one."""
         return f"{record.model} {record.variant}" if record.variant != self.common else record.model
 
     def table(self) -> Table:

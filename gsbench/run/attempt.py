@@ -77,7 +77,7 @@ class Attempt:
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:
-        """Return which effects were chosen; None where the config chooses none."""
+        """Return which effects were chosen; None if the config chooses none."""
         screen, gating = self.resolved.screen, trainer.gating
         if screen is None and self.resolved.config.effects.gate == "off":
             return None
@@ -100,7 +100,7 @@ class Attempt:
 
         Args:
             status: ok, failed or diverged.
-            reason: why it failed or diverged; None where it ended well.
+            reason: why it failed or diverged; None if it ended well.
         """
         config, scene, this = self.resolved.config, self.scene, self.this
         observes = models.find(config.model.name, config.model.module).observes

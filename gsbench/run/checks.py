@@ -96,7 +96,7 @@ def check_values(config: Config) -> None:
 
 
 def trained_start(config: Config) -> TrainedGaussians | None:
-    """Read the trained Gaussians that a training starts from; None where it starts from points.
+    """Read the trained Gaussians that a training starts from; None if it starts from points.
 
     Raises:
         InputError: the file is no PLY of Gaussians, holds fewer than four, or has another SHA-256 than the config says.
@@ -227,13 +227,13 @@ def data_root(root: str) -> Path:
 
 
 def check_gates(model: GaussianModel, config: Config) -> None:
-    """Raise InputError where the config asks for gates and the model cannot be gated."""
+    """Raise InputError if the config asks for gates and the model cannot be gated."""
     if config.effects.gate != "off":
         as_gated(model)
 
 
 def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
-    """Raise InputError where the scene cannot train the model: it has no times, or all cameras are at one place."""
+    """Raise InputError if the scene cannot train the model: it has no times, or all cameras are at one place."""
     if ("time" in model.observes or config.agr) and not scene.has_time:
         what = "agr=true" if config.agr else config.model.name
         raise InputError(f"{what}: expected a scene with times, {scene.name} has none: use 3dgs or 6dgs, agr=false")

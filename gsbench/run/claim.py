@@ -57,7 +57,7 @@ def release(folder: Path, mine: Progress) -> None:
 
 
 def _read(path: Path) -> Progress | str:
-    """Read a claim; return NOTHING where there is none, DAMAGED where three attempts to read it fail.
+    """Read a claim; return NOTHING if there is none, DAMAGED if three attempts to read it fail.
 
     Without locks another process may create the claim during the first attempt, which is no damage.
     """
@@ -105,7 +105,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _locked(path: Path) -> IO[bytes] | None:
-    """Open and lock `path`; return None where its last holder has removed it meanwhile, as others lock another file.
+    """Open and lock `path`; return None if its last holder has removed it meanwhile, as others lock another file.
 
     Raises:
         BlockingIOError: another process holds it.

@@ -23,7 +23,7 @@ STALE = "record.stale.json"  # that of a finished run, kept beside the record of
 def finished(this: Run, scene: Scene) -> Record | None:
     """Read the record of this run if it ended well with the same training, measuring and data; None otherwise.
 
-    Where a record differs, the reason is printed. Where LPIPS weights are new on this machine, the run is measured
+    Where a record differs, the reason is printed. If LPIPS weights are new on this machine, the run is measured
     again from its checkpoint; where the checkpoint is gone, the record is kept without LPIPS.
     """
     if not this.config.resume:
@@ -57,7 +57,7 @@ def where(this: Run, record: Record) -> str:
 
 
 def _outdated(this: Run, scene: Scene, record: Record) -> str:
-    """Return why the record of a finished run does not match this run; "" where it matches."""
+    """Return why the record of a finished run does not match this run; "" if it matches."""
     theirs = record.provenance
     training = training_differences(theirs.config, this.plain)
     if training:
@@ -72,7 +72,7 @@ def _outdated(this: Run, scene: Scene, record: Record) -> str:
 
 
 def _lacks_lpips(this: Run, scene: Scene, record: Record) -> str:
-    """Return why new LPIPS weights make a run be measured again; "" where its record is kept."""
+    """Return why new LPIPS weights make a run be measured again; "" if its record is kept."""
     camera, given = evaluated_views(scene, this.config.scene.eval_split)[0].camera, lpips_weights(this.config)
     new = [name for name, known in perceptual.BACKBONES.items()
            if (record.metrics or {}).get(f"lpips_{name}") is None and perceptual.is_here(name, given.get(name))

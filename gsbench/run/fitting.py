@@ -32,7 +32,7 @@ def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: Traine
 
     Args:
         model: without Gaussians.
-        scene: gives the views, and the points where the data set has some.
+        scene: gives the views, and the points if the data set has some.
         config: of the run.
         start: trained Gaussians to start from; None: points.
     """
@@ -46,7 +46,7 @@ def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: Traine
 
 
 def fit(trainer: Trainer, this: Run, resolved: Resolved, plain: dict[str, Any]) -> None:
-    """Train to the end, starting from this training's checkpoint where the run's folder has one.
+    """Train to the end, starting from this training's checkpoint if the run's folder has one.
 
     Args:
         trainer: at step 0.
@@ -89,7 +89,7 @@ def fit(trainer: Trainer, this: Run, resolved: Resolved, plain: dict[str, Any]) 
 
 
 def _check_fitted(trainer: Trainer) -> None:
-    """Raise DivergedError for a parameter that is not finite, and InputError where no Gaussian is left."""
+    """Raise DivergedError for a parameter that is not finite, and InputError if no Gaussian is left."""
     for name, parameter in trainer.model.named_parameters():  # no image shows a colour of -inf: it is black
         if not parameter.isfinite().all():
             raise DivergedError(f"step {trainer.step}: '{name}' has values that are not finite")
@@ -99,7 +99,7 @@ def _check_fitted(trainer: Trainer) -> None:
 
 
 def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:
-    """Sample points to start from where the data set has none: in a cube, or in the frustum that all cameras share."""
+    """Sample points to start from if the data set has none: in a cube, or in the frustum that all cameras share."""
     if data.initial_half_width is not None:
         return random_points(data.initial_points, data.initial_half_width, random)
     cameras = [view.to("cpu").camera for view in scene.train]

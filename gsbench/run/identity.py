@@ -39,7 +39,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """The scene, the label, the variant and the seed, as messages show them."""
+        """Return the scene, the label, the variant and the seed, as messages show them."""
         variant = f" {self.variant}" if self.variant else ""
         return f"{self.config.scene.name} {self.label}{variant} seed{self.config.seed}"
 
@@ -81,7 +81,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
 
 
 def hash_of(ply: str) -> str:
-    """Compute the SHA-256 of the file that a training starts from; raises InputError where it cannot be read."""
+    """Compute the SHA-256 of the file that a training starts from; raises InputError if it cannot be read."""
     return digest(read_file(Path(ply).expanduser(), f"init.ply={ply!a:.200}", MAX_FILE))
 
 
@@ -119,7 +119,7 @@ def _storable(value: Any) -> Any:
 
 
 def _printed(value: Any) -> str:
-    """Format a value for the name of a folder; return a hash where it has characters that are unsafe there.
+    """Format a value for the name of a folder; return a hash if it has characters that are unsafe there.
 
     A SHA-256 is shortened to its first eight digits.
     """
@@ -131,7 +131,7 @@ def _printed(value: Any) -> str:
 
 
 def _cut(words: list[str]) -> str:
-    """Join words by commas; where the result is too long, keep the first words and a hash of all."""
+    """Join words by commas; if the result is too long, keep the first words and a hash of all."""
     whole = ",".join(words)
     if len(whole) <= LONGEST_VARIANT:
         return whole

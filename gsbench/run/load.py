@@ -112,7 +112,7 @@ def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
 
     Args:
         run: whose config names the scene.
-        data_root: the folder of its data set, where it differs from the one in the config.
+        data_root: the folder of its data set, if it differs from the one in the config.
 
     Raises:
         InputError: the data are gone, have a fault, or differ from those of the training.
@@ -130,7 +130,7 @@ def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
 
 
 def own_root(root: str, where: Path) -> str:
-    """Return the data.root that a checkpoint names, for use where the user names none.
+    """Return the data.root that a checkpoint names, for use if the user names none.
 
     Raises:
         InputError: it is a package other than that of the embedded scenes; finding its files would import it.

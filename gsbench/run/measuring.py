@@ -92,7 +92,7 @@ def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[s
 def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dict[str, str]]:
     """Choose the function whose FPS is measured, and the record's protocol entry on how it makes frames on a GPU.
 
-    Frames are `replayed` from a CUDA graph where CUDA can record the model. Otherwise each frame is `launched` anew.
+    Frames are `replayed` from a CUDA graph if CUDA can record the model. Otherwise each frame is `launched` anew.
     """
     if trainer.model.backend.name != "cuda":
         return trainer.render, {}

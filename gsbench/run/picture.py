@@ -18,7 +18,7 @@ def draw_run(folder: Path, camera: int, time: float | None, data_root: str | Non
         folder: of the run; its checkpoint is read.
         camera: the number of the evaluated view.
         time: in [0, 1]; None: that of the view.
-        data_root: where the data set is now; where it was for the run by default.
+        data_root: the folder of the data set; by default that of the run.
 
     Raises:
         InputError: there is no run, no data or no such view, or the time is none.

@@ -78,7 +78,7 @@ class Reporter:
 
 
 def read(path: Path) -> Progress:
-    """Read a progress.json; raises InputError where it is not one."""
+    """Read a progress.json; raises InputError if it is not one."""
     return parse(Progress, parse_json(read_file(path, str(path), LARGEST), str(path)), str(path))
 
 
@@ -90,7 +90,7 @@ def is_alive(progress: Progress) -> bool:
 
 
 def born(pid: int) -> int | None:
-    """Return when a process of this machine started, in clock ticks since boot; None where there is no such process.
+    """Return when a process of this machine started, in clock ticks since boot; None if there is no such process.
 
     It distinguishes a process from a later one with the same process id.
     """

@@ -22,7 +22,7 @@ def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tu
     Args:
         folder: of the run; it is not changed.
         budget_db: PSNR on val that the gate may cost.
-        data_root: where the data set is now; where it was for the run by default.
+        data_root: the folder of the data set; by default that of the run.
 
     Raises:
         InputError: there is no finished run, it was already gated at its end, or the data are gone or have changed.

@@ -41,7 +41,7 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
         overrides: the overrides of its command line, for the record.
 
     Returns:
-        The record, which is on disk whatever its status is; None where another process does this run.
+        The record, which is on disk whatever its status is; None if another process does this run.
 
     Raises:
         InputError: the run has no name that can be a folder, or its folder cannot be written.
@@ -138,7 +138,7 @@ def reason_of(error: Exception, folder: Path) -> str:
 
 
 def write(record: Record, folder: Path) -> None:
-    """Write the record of a run; where it did not end well, an earlier record that did is kept as STALE."""
+    """Write the record of a run; if it did not end well, an earlier record that did is kept as STALE."""
     path, stale = folder / records.FILE_NAME, folder / STALE
     if record.status == "ok":
         records.write(record, path)

@@ -47,14 +47,14 @@ def load(
     """Load the scene in a folder and detect its layout.
 
     Images are composited over the background once, and then averaged over blocks of pixels, which must tile them
-    exactly. Everything is float32 on the CPU, in OpenCV axes; the images of a large scene stay in 8 bits until they are
-    looked at, with the same result.
+    exactly. Everything is float32 on the CPU, in OpenCV axes. The images of a large scene stay in 8 bits until they are
+    used, with the same result.
 
     Args:
         path: the scene's folder.
         downscale: images become smaller by this whole factor.
         background: RGB in [0, 1].
-        frames: the first and the last one, of a layout that numbers frames; None: all.
+        frames: the first and the last frame, if the layout numbers frames; None: all.
 
     Raises:
         InputError: there is no known layout at `path`, or the data has a fault; the message names file and field.
@@ -89,7 +89,7 @@ def load(
 
 
 def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
-    """Check the first and the last frame that are asked for; raises InputError where the layout has no frames."""
+    """Check the given first and last frame; raises InputError if the layout has no frames."""
     if layout.reader != "technicolor":
         raise InputError(f"frames: {layout.marker} lists its own frames and times, got {frames!r:.80}: leave it out")
     if not isinstance(frames, tuple | list) or len(frames) != 2 or not all(type(n) is int for n in frames):
@@ -100,7 +100,7 @@ def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
 
 
 def _folder(path: object) -> Path:
-    """Return `path` as a Path; raises InputError where it is no text that can be shown and looked up."""
+    """Return `path` as a Path; raises InputError if it is no text that can be shown and looked up."""
     if not isinstance(path, str | Path) or not str(path).isprintable():
         raise InputError(f"path: expected the path of a scene's folder, got {path!r:.200}")
     try:

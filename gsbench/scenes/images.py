@@ -87,9 +87,9 @@ def stays_in_8_bits(
     count: int,
     downscale: int,
 ) -> bool:
-    """Tell whether the images of a scene are kept as they are on disk, and composited when they are looked at.
+    """Tell whether the images of a scene stay in 8 bits, and are composited at each access.
 
-    That is a third of the memory of floats. Images that are reduced are no longer of 8 bits, and are small.
+    This takes less memory than floats. Reduced images do not have 8 bits any more, and are small.
     """
     return downscale == 1 and data[_DEPTH_AT] == 8 and 12 * count * size[0] * size[1] > _MOST_FLOATS
 
@@ -101,10 +101,10 @@ def count_readers(
     where: str,  # the first image's path, for the message
     kept: int = 12,  # bytes a pixel of the reduced image
 ) -> int:
-    """Return how many threads may decode images at once, so that memory suffices for them and for all images.
+    """Return how many threads may decode images at once, within the memory that is left beside all images.
 
     Raises:
-        TooLargeError: it does not suffice for one.
+        TooLargeError: memory does not suffice for one.
     """
     pixels = size[0] * size[1]
     all_kept, decoding = count * kept * pixels // downscale**2, _DECODING * pixels

@@ -17,7 +17,7 @@ class Camera:
 
     @property
     def center(self) -> Tensor:
-        """The camera's position in the world, [3]."""
+        """Return the camera's position in the world, [3]."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def to(self, device: str) -> "Camera":
@@ -37,7 +37,7 @@ class View:
 
     @property
     def image(self) -> Tensor:
-        """The image, [H, W, 3] of floats in [0, 1]; one of 8 bits is converted each time it is looked at.
+        """Return the image, [H, W, 3] of floats in [0, 1]; an image of 8 bits is converted at each access.
 
         The result has the bits of an image that was composited when it was loaded.
         """
@@ -81,7 +81,7 @@ class Scene:
 
     @property
     def has_time(self) -> bool:
-        """Whether every training view has a time."""
+        """Tell whether every training view has a time."""
         return all(view.time is not None for view in self.train)
 
     def to(self, device: str) -> "Scene":

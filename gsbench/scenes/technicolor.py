@@ -36,7 +36,7 @@ class _Image:
 def load(
     root: Path, *, downscale: int, background: tuple[float, float, float], frames: tuple[int, int] | None = None
 ) -> Scene:
-    """Load a scene of the Technicolor light field data (Sabater et al. 2017) as it is released.
+    """Load a scene of the released Technicolor light field data (Sabater et al. 2017).
 
     The folder has `cameras_parameters.txt`, a header and a row for each camera (intrinsics in pixels of the images,
     world to camera in OpenCV axes), and images `<Scene>_undist_<frame>_<camera>.png`. Camera 10 is the test split, all
@@ -47,7 +47,7 @@ def load(
         root: the scene's folder.
         downscale: as `gsbench.scenes.load`; images that are not reduced stay in 8 bits.
         background: of the renders; the images are opaque.
-        frames: the first and the last frame, which is included; None: all that are there.
+        frames: the first and the last frame, which is included; None: all frames.
 
     Raises:
         InputError: something is missing, damaged or contradictory; the message names the file.
@@ -178,7 +178,7 @@ def _read_views(
 
 
 def _points(root: Path) -> Points | None:
-    """Read the initial points that the folder has; None where it has none."""
+    """Read the initial points that the folder has; None if it has none."""
     if (root / "sparse" / "0").is_dir():
         return colmap.read_points(root / "sparse" / "0")
     ply = root / "points3d.ply"

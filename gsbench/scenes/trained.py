@@ -47,7 +47,7 @@ class TrainedGaussians:
 def read_trained(path: Path) -> TrainedGaussians:
     """Read trained Gaussians from a PLY of 3DGS, in any encoding and of any degree from 0 to 4.
 
-    Normals and other columns may be there or not; they are not read.
+    Normals and other columns are not read.
 
     Raises:
         InputError: the file is no such PLY, lacks a column, or has a value that is not finite.
@@ -75,7 +75,7 @@ def read_trained(path: Path) -> TrainedGaussians:
 
 
 def ply_of(trained: TrainedGaussians) -> bytes:
-    """Return the bytes of a little-endian PLY with the columns of 3DGS at degree 3, which its own viewer asks for.
+    """Return the bytes of a little-endian PLY with the columns of 3DGS at degree 3, which the viewer of 3DGS needs.
 
     Raises:
         InputError: a value is not finite, or the harmonics are above degree 3.

@@ -44,7 +44,7 @@ class Audit:
 
     @property
     def broken(self) -> list[Cell]:
-        """The cells where a default breaks its bound."""
+        """Return the cells where a default breaks its bound."""
         return [cell for cell in self.cells if cell.is_default and not cell.holds]
 
 

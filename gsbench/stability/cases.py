@@ -31,7 +31,7 @@ class Case:
 
     @property
     def stresses(self) -> str:
-        """What the case stresses, and where it was met in practice: the builder's docstring."""
+        """Return what the case stresses, and where it was met in practice: the builder's docstring."""
         return " ".join((self.build.__doc__ or "").split())
 
     def __call__(self, severity: float = 1.0, seed: int = 0, **more: Any) -> Any:
@@ -58,12 +58,12 @@ class Cell:
 
     @property
     def is_default(self) -> bool:
-        """Whether it belongs to a default; the other schemes are for comparison."""
+        """Tell whether it belongs to a default; the other schemes are for comparison."""
         return self.scheme in ("square_root", "-")
 
     @property
     def holds(self) -> bool:
-        """Whether it keeps its bound: nothing is bad, and both errors are below their bounds."""
+        """Tell whether it keeps its bound: nothing is bad, and both errors are below their bounds."""
         gradient = math.isnan(self.bound.gradient) or self.gradient <= self.bound.gradient
         return self.bad == 0 and self.forward <= self.bound.forward and gradient
 

@@ -40,13 +40,13 @@ def ordinary(g: Generator, model: str) -> ColorInputs:
 
 @case("colour", "3dgs", "4dgs")
 def ordinary_colors(g: Generator, severity: float, model: str) -> ColorInputs:  # noqa: ARG001
-    """Nothing is stressed: this row is the floor to compare the others with."""
+    """Stress nothing: the other rows are compared with this one."""
     return ordinary(g, model)
 
 
 @case("colour", "3dgs", "4dgs")
 def seen_from_within(g: Generator, severity: float, model: str) -> ColorInputs:
-    """The camera on a mean, and 10^-12 and 10^-6 beside it: the direction is 0/0, by definition 0, and its gradient."""
+    """Put the camera on a mean, and 10^-12 and 10^-6 beside it: d is 0/0, by definition 0 with gradient 0."""
     shown = ordinary(g, model)
     aside = torch.tensor([0.0, 1e-12, 1e-6])[:, None] + 1 - severity
     shown.center, shown.means = torch.zeros(3), aside * torch.tensor([[1.0, -2.0, 0.5]])
@@ -55,7 +55,7 @@ def seen_from_within(g: Generator, severity: float, model: str) -> ColorInputs:
 
 @case("colour", "3dgs", "4dgs")
 def loud_harmonics(g: Generator, severity: float, model: str) -> ColorInputs:
-    """Coefficients of 10^4: harmonics of degree 3 that cancel to a visible colour."""
+    """Make coefficients of 10^4: harmonics of degree 3 cancel to a visible colour."""
     shown = ordinary(g, model)
     shown.sh *= 10 ** (4 * severity)
     return shown
@@ -63,7 +63,7 @@ def loud_harmonics(g: Generator, severity: float, model: str) -> ColorInputs:
 
 @case("colour", "4dgs", forward=1e-3, gradient=1e-2)
 def far_in_time(g: Generator, severity: float, model: str) -> ColorInputs:
-    """t - mu_t = 1000 periods: mu_t itself has an ulp of 6e-5 there, which is 8e-4 in the phase of the second wave."""
+    """Put t 1000 periods from mu_t: mu_t itself has an ulp of 6e-5 there, which is 8e-4 in the second wave's phase."""
     shown = ordinary(g, model)
     shown.times += 1000 * severity
     return shown

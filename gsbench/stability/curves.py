@@ -55,7 +55,7 @@ class SliceTime:
 
 @dataclass(frozen=True)
 class AccuracyPoint:
-    """The accuracy and the time of one way to do a thing."""
+    """The accuracy and the time of one way to slice or render."""
 
     thing: str  # "slicing" or "picture"
     way: str

@@ -46,13 +46,13 @@ def turned(g: Generator, sizes: Tensor) -> Tensor:
 
 @case("projection")
 def ordinary_splats(g: Generator, severity: float) -> list[Arguments]:  # noqa: ARG001
-    """Nothing is stressed: this row is the floor to compare the others with."""
+    """Stress nothing: the other rows are compared with this one."""
     return [ordinary(g) for _ in range(3)]
 
 
 @case("projection")
 def at_the_near_plane(g: Generator, severity: float) -> list[Arguments]:
-    """Means on the near plane, an ulp before and behind it, and behind the camera: 1/z explodes, z < 0 mirrors."""
+    """Put means on the near plane, an ulp before and behind it, and behind the camera: 1/z explodes, z < 0 mirrors."""
     near = 0.25
     just_before, just_behind = near * (1 + 2**-22), near * (1 - 2**-22)
     depths = [near, just_before, just_behind, 0.0, -1.0, -near]
@@ -65,7 +65,7 @@ def at_the_near_plane(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def far_off_axis(g: Generator, severity: float) -> list[Arguments]:
-    """Means up to x/z = 100 that reach into the image: EWA's Jacobian blows up (diff-gaussian-rasterization #75)."""
+    """Put means up to x/z = 100 that reach into the image: EWA's Jacobian grows (diff-gaussian-rasterization #75)."""
     made = []
     for tangent in (1.0, 10.0, 100.0):
         x = DEPTH * tangent**severity
@@ -76,7 +76,7 @@ def far_off_axis(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def needle(g: Generator, severity: float) -> list[Arguments]:
-    """Axes 10^5 : 1 : 1 and 10^5 : 10^5 : 1, which training makes of edges; det = ab - c^2 cancels (UnityGS #14)."""
+    """Make axes 10^5 : 1 : 1 and 10^5 : 10^5 : 1, as training does at edges: det = ab - c^2 cancels (UnityGS #14)."""
     thin = 10 ** (-5 * severity)
     return [
         ordinary(g) | {"factors": turned(g, torch.tensor(sizes))[None]}
@@ -86,14 +86,14 @@ def needle(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def pointlike(g: Generator, severity: float) -> list[Arguments]:
-    """Sizes of 10^-8, and zero: all that is seen is eps2d, and nothing may divide by the size."""
+    """Make sizes of 10^-8 and zero: only eps2d is visible, and nothing may divide by the size."""
     sizes = (10 ** (-8 * severity), 0.0 if severity == 1 else 0.1)
     return [ordinary(g) | {"factors": size * torch.randn(1, 3, 3, generator=g)} for size in sizes]
 
 
 @case("projection")
 def larger_than_the_scene(g: Generator, severity: float) -> list[Arguments]:
-    """Sizes of 10^3 to 10^7, the largest a log size is let to: det of the 2D covariance overflows (UnityGS #196)."""
+    """Make sizes of 10^3 to 10^7, the largest that log sizes allow: det of 2D covariances overflows (UnityGS #196)."""
     made = []
     for power in (3, 5, 7):
         made.append(ordinary(g) | {"factors": 10 ** (power * severity) * torch.randn(1, 3, 3, generator=g)})
@@ -102,7 +102,7 @@ def larger_than_the_scene(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def extreme_focal_lengths(g: Generator, severity: float) -> list[Arguments]:
-    """Focal lengths of 10 and 10^5 pixels: a fisheye's crop, and a telescope's."""
+    """Use focal lengths of 10 and 10^5 pixels, as in crops of a fisheye's or a telescope's image."""
     wide, tele = 24 ** (1 - severity) * 10**severity, 24 ** (1 - severity) * 1e5**severity
     shrink = FOCAL / tele
     far = ordinary(g, 0.2 * shrink)
@@ -112,14 +112,14 @@ def extreme_focal_lengths(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def oblong_pixels(g: Generator, severity: float) -> list[Arguments]:
-    """fx / fy = 100 and 1/100: anamorphic lenses; a renderer with one focal length is wrong."""
+    """Use fx / fy = 100 and 1/100, as anamorphic lenses do: a renderer with one focal length is wrong."""
     stretch = 10**severity
     return [ordinary(g, 0.1) | {"Ks": intrinsics(FOCAL * s, FOCAL / s)} for s in (stretch, 1 / stretch)]
 
 
 @case("projection")
 def principal_point_outside(g: Generator, severity: float) -> list[Arguments]:
-    """The principal point ten widths outside, as in crops; clamps that assume it is centred fail (gsplat #305)."""
+    """Put the principal point ten widths outside the image, as in crops: clamps about the centre fail (gsplat #305)."""
     away = 10 * WIDTH * severity
     made = ordinary(g)
     shift = away / FOCAL * DEPTH
@@ -144,13 +144,13 @@ def crowd(g: Generator, N: int, size: float) -> Arguments:
 
 @case("blending")
 def ordinary_crowd(g: Generator, severity: float) -> list[Arguments]:  # noqa: ARG001
-    """Nothing is stressed: this row is the floor to compare the others with."""
+    """Stress nothing: the other rows are compared with this one."""
     return [crowd(g, 200, 0.15)]
 
 
 @case("blending")
 def faint_crowd(g: Generator, severity: float) -> list[Arguments]:
-    """10^5 Gaussians of opacity 1/100 over each other, all over the image: products and sums of many small terms."""
+    """Put 10^5 Gaussians of opacity 1/100 over each other in the whole image: many small terms are combined."""
     made = crowd(g, max(10, int(CROWD**severity)), 5.0)
     few = {"width": 8, "height": 6, "Ks": intrinsics(cx=4.0, cy=3.0)}  # brute force takes seconds for these
     return [made | few | {"opacities": torch.full((len(made["means"]),), 0.01)}]
@@ -158,14 +158,14 @@ def faint_crowd(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending")
 def opaque_stack(g: Generator, severity: float) -> list[Arguments]:
-    """A thousand opaque ones behind each other: 1 - alpha and what is behind must not become 0/0 in backward."""
+    """Put a thousand opaque Gaussians behind each other: backward must not compute 0/0 from 1 - alpha."""
     made = crowd(g, 1000, 1.0)
     return [made | {"opacities": 1 - 0.4 * (1 - severity) * torch.rand(1000, generator=g)}]
 
 
 @case("blending")
 def equal_depths(g: Generator, severity: float) -> list[Arguments]:
-    """All at one depth, as points of a plane that faces the camera: the lower index is in front, in every backend."""
+    """Put all at one depth, as on a plane that faces the camera: the lower index is in front, in every backend."""
     made = crowd(g, 200, 0.3)
     made["means"][:, 2] = DEPTH + (1 - severity) * (made["means"][:, 2] - DEPTH)
     return [made]
@@ -173,7 +173,7 @@ def equal_depths(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending", forward=1.01 / 255, gradient=NO_GRADIENT)
 def alpha_at_its_limits(g: Generator, severity: float) -> list[Arguments]:
-    """Alpha within an ulp of 1/255 and of 0.999: a Gaussian may be skipped or not, which is worth 1/255 and no more."""
+    """Put alpha within an ulp of 1/255 and of 0.999: a Gaussian may be skipped or not, which changes at most 1/255."""
     made = crowd(g, 3, 1.0)
     made["factors"] = 1e4 * torch.eye(3).repeat(3, 1, 1)  # constant over the image
     faint = torch.tensor([1 / 255]) * torch.tensor([1 - 2**-23, 1.0, 1 + 2**-22]) ** severity
@@ -185,7 +185,7 @@ def alpha_at_its_limits(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending", forward=1e-3, gradient=NO_GRADIENT)
 def transmittance_at_the_stop(g: Generator, severity: float) -> list[Arguments]:
-    """Four of alpha 0.9 leave 1e-4, the stop itself: the fourth may be blended or not, which is worth 9e-4."""
+    """Blend four of alpha 0.9, which leave 1e-4: the fourth may be blended or not, which changes at most 9e-4."""
     made = crowd(g, 6, 1.0)
     made["factors"] = 1e4 * torch.eye(3).repeat(6, 1, 1)
     return [made | {"opacities": torch.full((6,), 0.9 * severity + 0.5 * (1 - severity))}]
@@ -193,14 +193,14 @@ def transmittance_at_the_stop(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending")
 def brilliant_colors(g: Generator, severity: float) -> list[Arguments]:
-    """Colours of 10^4, unbounded above in 3DGS: sums of large terms; errors are relative to the brightest."""
+    """Make colours of 10^4, which 3DGS allows: large terms are added; errors are relative to the brightest colour."""
     made = crowd(g, 200, 0.15)
     return [made | {"colors": made["colors"] * 10 ** (4 * severity)}]
 
 
 @case("blending")
 def no_gaussians(g: Generator, severity: float) -> list[Arguments]:
-    """No Gaussian at all, and all culled: pruning can take the last one; the background remains."""
+    """Render no Gaussian, and only culled ones: pruning can remove the last one, and the background remains."""
     made = crowd(g, 20, 0.1)
     away = made["means"] - torch.tensor([0.0, 0.0, 50.0 * severity])
     return [made | _only(made, slice(0)), made | {"means": away}]

@@ -87,15 +87,15 @@ def entries(observed: Observed, variable: str) -> list[int]:
 
 @case("slicing", *ALL)
 def ordinary_gaussians(g: Generator, severity: float, model: str) -> Observed:  # noqa: ARG001
-    """Nothing is stressed: every scheme must get this right, and the other rows are compared with it."""
+    """Stress nothing: every scheme must compute this correctly, and the other rows are compared with it."""
     return ordinary(g, model)
 
 
 @case("slicing", *ALL)
 def diagonals_over_eight_decades(g: Generator, severity: float, model: str) -> Observed:
-    """Factor diagonals from 1 to 1e-8 under correlations of 1: the condition number is squared wherever S is formed.
+    """Make factor diagonals from 1 to 1e-8 with correlations of 1: forming S squares the condition number.
 
-    The camera is on the means, so that d = 0 has no rounding: what is tested is the factor and not the query.
+    The camera is on the means, so that d = 0 has no rounding: this tests the factor and not the query.
     """
     observed = ordinary(g, model)
     name = "scales" if model == "4dgs" else "log_diagonal"
@@ -114,7 +114,7 @@ def diagonals_over_eight_decades(g: Generator, severity: float, model: str) -> O
 
 @case("slicing", *TRIANGULAR)
 def narrow_in_direction(g: Generator, severity: float, model: str) -> Observed:
-    """A highlight 10^-3 wide: d has an ulp of 6e-8, so float32 cannot place it to better than 6e-5 of its width."""
+    """Make a highlight 10^-3 wide: d has an ulp of 6e-8, so float32 cannot place it better than 6e-5 of its width."""
     observed = ordinary(g, model)
     sizes(observed, "d")[:] = -3 * LN_10 * severity
     values = below(observed)
@@ -128,7 +128,7 @@ def narrow_in_direction(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def nearly_certain(g: Generator, severity: float, model: str) -> Observed:
-    """Position and the conditioned variable correlated to 1 - 1e-12: S_pp - K S_qp is the difference of equals."""
+    """Correlate position and the conditioned variable to 1 - 1e-12: S_pp - K S_qp is a difference of equals."""
     observed = ordinary(g, model)
     thin = -severity * 0.5 * math.log(5e11)  # sqrt(1 - rho^2) = sqrt(2e-12)
     if model == "4dgs":
@@ -146,7 +146,7 @@ def nearly_certain(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *TIME_LIKE)
 def instant(g: Generator, severity: float, model: str) -> Observed:
-    """S_t -> 0, log sigma_t to -80: Gaussians of one frame, as 4DGS grows on video; half are seen at their instant."""
+    """Let S_t -> 0, log sigma_t to -80: Gaussians of one frame, as 4DGS makes on video; half are seen at their time."""
     observed = ordinary(g, model)
     if model == "4dgs":
         upright(observed)
@@ -161,7 +161,7 @@ def instant(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *TIME_LIKE)
 def static(g: Generator, severity: float, model: str) -> Observed:
-    """S_t -> inf, log sigma_t to 80: what does not move has no gradient that ends the growth of its duration."""
+    """Let S_t -> inf, log sigma_t to 80: no gradient ends the growth of S_t of a Gaussian that does not move."""
     observed = ordinary(g, model)
     if model == "4dgs":
         upright(observed)
@@ -171,7 +171,7 @@ def static(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def far_from_the_query(g: Generator, severity: float, model: str) -> Observed:
-    """t and d 10^3 sigma away: f underflows and must be 0 with gradient 0, where 0 x inf is NaN (4DGaussians #35)."""
+    """Put t and d 10^3 sigma away: f underflows and must be 0 with gradient 0, not 0 x inf = NaN (4DGaussians #35)."""
     observed = ordinary(g, model)
     if model == "4dgs":
         upright(observed)
@@ -186,7 +186,7 @@ def far_from_the_query(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def insensitive(g: Generator, severity: float, model: str) -> Observed:
-    """lambda -> 0: f is 1 for every query, and only the mean still moves with it."""
+    """Let lambda -> 0: f is 1 for every query, and only the mean still moves with it."""
     observed = ordinary(g, model)
     observed.log_lambda = dict.fromkeys(observed.log_lambda, -110.0 * severity)  # exp(-110) is 0 in float32
     return observed
@@ -194,7 +194,7 @@ def insensitive(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def oversensitive(g: Generator, severity: float, model: str) -> Observed:
-    """lambda = 10^4: training switched lambda on and ran away; f is 0 or 1."""
+    """Set lambda = 10^4, as after a training in which lambda grew without bound: f is 0 or 1."""
     observed = ordinary(g, model)
     observed.log_lambda = dict.fromkeys(observed.log_lambda, 4 * LN_10 * severity)
     near = 10 ** (-2 * severity)
@@ -208,7 +208,7 @@ def oversensitive(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def camera_on_a_mean(g: Generator, severity: float, model: str) -> Observed:
-    """The camera sits on a mean, or 1e-12, 1e-6 and 1e-3 beside it: d is 0/0, by definition 0 (walk-throughs, SLAM)."""
+    """Put the camera on a mean, or 1e-12, 1e-6 and 1e-3 beside it: d is 0/0, by definition 0 (walk-throughs, SLAM)."""
     observed = ordinary(g, model)
     aside = torch.tensor([0.0, 1e-12, 1e-6, 1e-3])[:, None] + 1 - severity
     observed.center = torch.zeros(3)
@@ -220,7 +220,7 @@ def camera_on_a_mean(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *TRIANGULAR)
 def direction_off_the_sphere(g: Generator, severity: float, model: str) -> Observed:
-    """mu_d 10^4 away from the unit sphere where every d lies: its rate of 2.5e-2 a step has nothing to stop it."""
+    """Put mu_d 10^4 away from the unit sphere of all d: nothing stops its rate of 2.5e-2 for each step."""
     observed = ordinary(g, model)
     observed.raw["directions"] *= 10 ** (4 * severity)
     sizes(observed, "d")[:] += 4 * LN_10 * severity
@@ -229,7 +229,7 @@ def direction_off_the_sphere(g: Generator, severity: float, model: str) -> Obser
 
 @case("slicing", *ALL)
 def refinement_pushes_sizes(g: Generator, severity: float, model: str) -> Observed:
-    """AGR residuals that push log sizes to +-80: exp overflows float32 at 89, and its square at 45."""
+    """Make AGR residuals that push log sizes to +-80: exp overflows float32 at 89, and its square at 45."""
     observed = ordinary(g, model)
     name = "scales" if model == "4dgs" else "log_diagonal"
     sign = torch.where(torch.rand(observed.raw[name].shape, generator=g) < 0.5, -1.0, 1.0)
@@ -239,7 +239,7 @@ def refinement_pushes_sizes(g: Generator, severity: float, model: str) -> Observ
 
 @case("slicing", "4dgs")
 def vanishing_quaternion(g: Generator, severity: float, model: str) -> Observed:
-    """Quaternions of length 1e-6: normalised in the loss but never in the parameters, weight decay shrinks them."""
+    """Make quaternions of length 1e-6, as weight decay does: only the loss normalises them, never the parameters."""
     observed = ordinary(g, model)
     for name in ("left_quats", "right_quats"):
         observed.raw[name] *= 10 ** (-6 * severity)

@@ -84,13 +84,13 @@ def faster(config: Config, factor: float) -> Config:
 
 @case("training", *MODELS, forward=0.0, gradient=math.nan)
 def learning_rates_times_30(g: Generator, severity: float, model: str, steps: int = STEPS) -> Training:  # noqa: ARG001
-    """Every learning rate times 30: parameters run to the ends of their ranges; 2,000 steps of it in the long audit."""
+    """Multiply every learning rate by 30: parameters run to the ends of their ranges (long audit: 2,000 steps)."""
     return Training(model, faster(compose(model, steps), 30**severity), moving_square())
 
 
 @case("training", *MODELS, forward=0.0, gradient=math.nan)
 def one_frame(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """A data set of one image: depth, time and direction are all free, and the cameras' extent is zero."""
+    """Train on one image: depth, time and direction are all free, and the cameras' extent is zero."""
     scene = moving_square()
     views = scene.train[: max(1, round(VIEWS * (1 - severity)))]
     return Training(model, compose(model, STEPS), replace(scene, train=views, extent=4.4 * (1 - severity)))
@@ -98,7 +98,7 @@ def one_frame(g: Generator, severity: float, model: str) -> Training:  # noqa: A
 
 @case("training", *MODELS, forward=0.0, gradient=math.nan)
 def all_images_equal(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """Every image is black: there is nothing to show, so opacities sink and all Gaussians may be pruned."""
+    """Make every image black: opacities sink, and all Gaussians may be pruned."""
     scene = moving_square()
     views = [replace(view, pixels=view.image * (1 - severity)) for view in scene.train]
     return Training(model, compose(model, STEPS), replace(scene, train=views))
@@ -106,7 +106,7 @@ def all_images_equal(g: Generator, severity: float, model: str) -> Training:  # 
 
 @case("training", *MODELS, forward=0.0, gradient=math.nan)
 def seen_by_no_view(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """Half of the Gaussians lie where no camera looks: their gradient is 0, and Adam divides it by sqrt(0) + eps."""
+    """Put half of the Gaussians where no camera looks: their gradient is 0, and Adam divides it by sqrt(0) + eps."""
     scene = moving_square()
     assert scene.points is not None
     means: Tensor = scene.points.means.clone()
@@ -116,7 +116,7 @@ def seen_by_no_view(g: Generator, severity: float, model: str) -> Training:  # n
 
 @case("training", "7dgs", forward=0.0, gradient=math.nan)
 def reset_into_refinement(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """Opacities are reset in the step before AGR starts to act, with its learning rate times 100."""
+    """Reset opacities in the step before AGR starts to act, with its learning rate times 100."""
     config = compose(model, 2 * STEPS, "train.recipe_iterations=300", "train.densify.start=20",
                      "train.densify.reset_every=100", "train.densify.stop=500",
                      "train.refine_from=100", "train.batch_size=1")  # fmt: skip
@@ -126,7 +126,7 @@ def reset_into_refinement(g: Generator, severity: float, model: str) -> Training
 
 @case("training", "6dgs", "7dgs", forward=0.0, gradient=math.nan)
 def modulation_switched_on(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """lambda starts to learn in the middle, at 1000 times the usual rate: it runs to 0 or away."""
+    """Let lambda start to learn in the middle, at 1000 times the usual rate: it goes to 0 or grows without bound."""
     config = compose(model, STEPS, "train.modulation_from=15000")
     config.model.lr["modulation"].start = 1e-3 * 1000**severity
     return Training(model, config, moving_square())
@@ -134,7 +134,7 @@ def modulation_switched_on(g: Generator, severity: float, model: str) -> Trainin
 
 @case("training", "3dgs", forward=0.0, gradient=math.nan)
 def poisoned_photograph(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """One pixel of an image is NaN: it must be refused before step 0, not found in every parameter later."""
+    """Make one pixel of an image NaN: it must be refused before step 0, not found in every parameter later."""
     scene = moving_square()
     scene.train[3].image[2, 5, 1] = math.nan
     return Training(model, compose(model, STEPS), scene, refused=True)
@@ -144,7 +144,7 @@ def poisoned_photograph(g: Generator, severity: float, model: str) -> Training: 
 def single_against_double(
     g: Generator, severity: float, model: str, run_seed: int = 0, steps: int = DRIFT_STEPS,  # noqa: ARG001
 ) -> Training:  # fmt: skip
-    """150 steps of suzanne at 40 x 40 in float32 and float64: rounding decides what splits; the error is dB on test."""
+    """Train 150 steps of suzanne at 40 x 40 in float32 and float64: rounding decides what splits; errors are dB."""
     config = compose(model, steps, "scene=suzanne", "scene.downscale=4", f"seed={run_seed}", "train.batch_size=1",
                      f"train.densify.every={steps // 3}")  # fmt: skip
     points = random_points(DRIFT_POINTS, 1.0, generator(run_seed))

@@ -56,7 +56,7 @@ def _check_group(name: str, choices: str) -> None:
 
 
 def scenes_of(overrides: list[str]) -> list[str] | None:
-    """Return the scenes of an experiment and make each one a choice of the group `scene`; None where Hydra fails."""
+    """Return the scenes of an experiment and make each one a choice of the group `scene`; None if Hydra fails."""
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             scenes: list[str] = list(compose("config", overrides).data.scenes)

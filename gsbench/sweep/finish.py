@@ -23,7 +23,7 @@ def see_through(launch: Callable[[], Any], started: Sequence[Path]) -> list[RunS
 
     Args:
         launch: starts the runs and waits for them; an error of its library may end the wait.
-        started: the folders of the plans that `launch` wrote, read after it returns; empty where nothing was swept.
+        started: the folders of the plans that `launch` wrote, read after it returns; empty if nothing was swept.
 
     Raises:
         InputError: not one job could be submitted.

@@ -36,7 +36,7 @@ def queue(jobs: Iterable[str]) -> Queue:
 
 
 def endings(jobs: Iterable[str]) -> dict[str, str]:
-    """Ask sacct once how jobs ended, such as `OUT_OF_MEMORY` or `FAILED 9:0`; empty where there is no accounting."""
+    """Ask sacct once how jobs ended, such as `OUT_OF_MEMORY` or `FAILED 9:0`; empty if there is no accounting."""
     asked = set(jobs)
     arrays = ",".join(sorted({job.partition("_")[0] for job in asked}))
     if not arrays:

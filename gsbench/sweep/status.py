@@ -132,7 +132,7 @@ def _kept(experiment: Experiment, requested: RequestedRun | None) -> Outcome | N
 
 
 def _alive(progress: Progress, queue: Queue) -> str | None:
-    """Return the state of a run with a progress file: `RUNNING`, or `PENDING` with a reason; None where it ended."""
+    """Return the state of a run with a progress file: `RUNNING`, or `PENDING` with a reason; None if it ended."""
     if progress.job is None:
         return "RUNNING" if is_alive(progress) else None
     if queue.silent:

@@ -35,7 +35,7 @@ RENAMED_IN_MODEL = {
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Everything that goes on from where a training was, and that draws its model without the data set."""
+    """The state of a training, and all that is needed to render its model without the data set."""
 
     training: str  # hash of what the training reads: gsbench.measure.settings.training_hash
     data: str  # Scene.fingerprint
@@ -53,7 +53,7 @@ def save(path: Path, content: Checkpoint) -> None:
 
 
 def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | None:
-    """Read the state at `path`; None where there is no file, or it is of another training or other data.
+    """Read the state at `path`; None if there is no file, or it is of another training or other data.
 
     Raises:
         InputError: the file exists and is not a checkpoint, or is a damaged one.
@@ -65,10 +65,10 @@ def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | 
 
 
 def read(path: Path, device: str = "cpu") -> Checkpoint:
-    """Read the checkpoint at `path`, whatever training it is of.
+    """Read the checkpoint at `path`, of any training.
 
     Raises:
-        InputError: there is no file, or it is not a checkpoint, or not every bit is as it was written.
+        InputError: there is no file, it is not a checkpoint, or it was changed after it was written.
     """
     try:
         if not stat.S_ISREG(path.stat().st_mode):
@@ -98,7 +98,7 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
 
 
 def with_present_names(state: dict[str, Any]) -> dict[str, Any]:
-    """Return a training's state with the keys that it has now, where an older version wrote it."""
+    """Return a training's state with its present keys, also if an older version wrote it."""
     state = {RENAMED.get(key, key): value for key, value in state.items()}
     if isinstance(model := state.get("model"), dict):
         state["model"] = {_in_model(key): value for key, value in model.items()}
@@ -106,7 +106,7 @@ def with_present_names(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def _in_model(key: Any) -> Any:
-    """Return the name that a key of a model's state has now."""
+    """Return the present name of a key of a model's state."""
     for old, new in RENAMED_IN_MODEL.items():
         if isinstance(key, str) and key.startswith(old):
             return new + key.removeprefix(old)
@@ -114,15 +114,15 @@ def _in_model(key: Any) -> Any:
 
 
 def check_plain(value: object, most: int) -> None:
-    """Check that a loaded state is made of containers, numbers, text and tensors that hold what they claim.
+    """Check that a loaded state has only containers, numbers, text, and tensors of the size that they claim.
 
     Args:
         value: the state.
-        most: bytes of the file, which no tensor in it can exceed.
+        most: bytes of the file; no tensor may be larger.
 
     Raises:
         InputError: it holds something else, or a tensor without memory of its own.
-        RecursionError: a container is in itself.
+        RecursionError: a container contains itself.
     """
     if isinstance(value, Tensor):
         kind = "a sparse one" if value.layout != torch.strided else f"one on '{value.device.type}'"
@@ -144,7 +144,7 @@ def check_plain(value: object, most: int) -> None:
 
 
 def without_times(state: Any) -> Any:
-    """Return a training's state without its TIMES: two trainings of one seed are equal to the bit in what is left."""
+    """Return a training's state without its TIMES: the rest has the same bits in two trainings of one seed."""
     if isinstance(state, dict):
         return {key: without_times(value) for key, value in state.items() if key not in TIMES}
     return [without_times(value) for value in state] if isinstance(state, (list, tuple)) else state
@@ -156,8 +156,8 @@ def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -
     Args:
         state: the dict that should hold it.
         name: its key.
-        shape: that it must have.
-        dtype: that it must have.
+        shape: its required shape.
+        dtype: its required type.
 
     Raises:
         InputError: it is missing, or its shape or type is not that of this training.
@@ -172,7 +172,7 @@ def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -
 
 
 def whole_number(name: str, value: object, most: int) -> int:
-    """Take a number from 0 to `most` out of a checkpoint's state; raises InputError where it is none."""
+    """Take a whole number from 0 to `most` out of a checkpoint's state; raises InputError if it is something else."""
     if type(value) is not int or not 0 <= value <= most:
         raise InputError(f"checkpoint: expected '{name}' from 0 to {most}, got {value!r:.80}")
     return value

@@ -14,7 +14,7 @@ LOUD = 1e3  # size of a colour coefficient
 
 
 def explain(model: GaussianModel) -> str:
-    """Describe in one line which gradients of a model are not finite; the line follows the report that one is not."""
+    """Describe in one line which gradients of a model are not finite."""
     for name, parameter in model.splats.items():
         if parameter.grad is None:
             continue

@@ -1,4 +1,4 @@
-"""Gate the model of a training: once when its densification is over, so that it trains on for less, and at the end."""
+"""Gate the model of a training: once after its densification, so that the rest is faster, and at the end."""
 
 import copy
 import time
@@ -30,11 +30,11 @@ GATES = ("off", "end", "both")
 LOSS_IN_TRAINING = 0.1
 LOSS_WITH_AGR = 0.5
 # A model of fewer Gaussians is not gated in training, for it needs them all: limited to 300 and 600 Gaussians, models
-# of four of five scenes ended 0.2 to 0.5 dB lower on val by that gate (docs/effects.md).
+# of four of five scenes ended 0.2 to 0.5 dB lower on val by that gate (docs/tuning.md).
 LEAST_IN_TRAINING = 1_000
 VIEWS_IN_TRAINING = 30  # that the probe looks at: the gate must cost less than it saves
 # AGR's rate is constant, and fewer Gaussians end farther from where its steps swing around: on trex a gated training
-# ended 0.4 dB lower by that (docs/effects.md).
+# ended 0.4 dB lower by that.
 LAST_RATE = 0.1
 HELD_OUT = 8  # every so many training views one, to check on where the scene has no val split of its own
 FEW = 12  # training views, of which none is held out
@@ -59,13 +59,13 @@ class Gating:
     """The gates of one training."""
 
     def __init__(self, rows: Rows, scene: Scene, renderer: Renderer, config: Config) -> None:
-        """Gate the model of `rows`; what follows its rows follows the gate.
+        """Gate the model of `rows`; all followers of its rows follow the gate.
 
         Args:
             rows: of the training.
-            scene: gives the views that are probed and those that the loss is measured on.
+            scene: its views are used to predict errors and to measure losses.
             renderer: of the training.
-            config: says by which gates, and what they may cost.
+            config: says which gates run, and what they may cost.
         """
         self.rows = rows
         self.model = rows.model
@@ -87,7 +87,7 @@ class Gating:
                 self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
 
     def in_training(self, step: int) -> bool:
-        """Gate before a step, and tell whether it was done; its loss on val at once is bounded (LOSS_IN_TRAINING)."""
+        """Gate before a step, and tell whether that was done; LOSS_IN_TRAINING bounds the immediate loss."""
         if len(self.model) < LEAST_IN_TRAINING:
             self.notes.append(f"at step {step} the model has {len(self.model)} Gaussians: of fewer than "
                               f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
@@ -104,7 +104,7 @@ class Gating:
         return float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))
 
     def at_end(self, by_halves: bool) -> bool:
-        """Gate the finished model within `effects.budget_db`, and tell whether it was."""
+        """Gate the finished model within `effects.budget_db`, and tell whether that was done."""
         return self._gate(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
 
     def now(self) -> Shape:
@@ -124,7 +124,7 @@ class Gating:
             self.direction = Direction(share_with_direction(self.model), loss, *times)
 
     def _beside(self, one: GaussianModel, other: GaussianModel, views: list[View]) -> tuple[float, list[float]]:
-        """Return the PSNR that the other model has less on views, and the median milliseconds of frames of both."""
+        """Return by how much the other model's PSNR on views is lower, and the median frame times of both in ms."""
         count = max(self.config.protocol.renders, len(views))
         frames = [lambda i, model=model: self.renderer.image(model, views[i % len(views)]) for model in (one, other)]
         times = time_in_turns(frames, count, synchroniser(self.config.device))
@@ -133,7 +133,7 @@ class Gating:
 
     @torch.no_grad()
     def _gate(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> bool:
-        """Probe, choose and apply, and tell whether that was done; where nothing is within the budget, note that."""
+        """Choose and apply simplifications, and tell whether that was done; note if none was within the budget."""
         started = time.perf_counter()
         model, at_end = as_gated(self.model), step is None
         # In training AGR does not rest: when a Gaussian can be seen still changes.
@@ -159,12 +159,12 @@ class Gating:
         self.rows.moved(found.rows, found.changed)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what was decided, for the checkpoint; the effect sets are the model's."""
+        """Return the decisions, for the checkpoint; the effect sets are part of the model's state."""
         direction = asdict(self.direction) if self.direction else None
         return {"gates": [asdict(gate) for gate in self.gates], "notes": list(self.notes), "direction": direction}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from the `state_dict` of a checkpoint, once the model is loaded; raises InputError if it is none."""
+        """Continue from the `state_dict` of a checkpoint after its model; raises InputError if it is damaged."""
         if not isinstance(state, dict):
             raise InputError(f"checkpoint: expected 'gating' as a dict, got {type(state).__name__}")
         gates, notes = state["gates"], state["notes"]

@@ -7,7 +7,7 @@ from gsbench.scenes import Camera, View
 
 
 class Pyramid:
-    """The training views, and each at the resolutions that were asked for; reduced once and kept."""
+    """The training views at every resolution that was requested; each is reduced once and kept."""
 
     def __init__(self, views: list[View]) -> None:
         """Start with the views as they are."""
@@ -24,13 +24,13 @@ class Pyramid:
         return self._reduced[key]
 
     def keep_only(self, factor: int) -> None:
-        """Forget the views of other factors, which no later step needs."""
+        """Forget the views of other factors."""
         self._reduced = {key: view for key, view in self._reduced.items() if key[1] == factor}
 
 
 @torch.no_grad()
 def reduced(view: View, factor: int) -> View:
-    """Average every factor x factor block of a view's image; what is left over at the right and below is dropped.
+    """Average every factor x factor block of a view's image; incomplete blocks at the right and below are dropped.
 
     Pixel centres are at +0.5, so the first two rows of K are divided by the factor.
     """

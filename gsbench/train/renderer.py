@@ -1,4 +1,4 @@
-"""Render views of a model as its run is configured to, and measure their PSNR."""
+"""Render views of a model by the config of its run, and measure their PSNR."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from gsbench.scenes import View
 
 @dataclass(frozen=True)
 class Renderer:
-    """What the images of a run have in common."""
+    """The settings of rendering that all images of a run share."""
 
     background: Tensor  # [3]
     antialias: bool  # see `gsbench.raster.rasterize`

@@ -1,4 +1,4 @@
-"""Keep all that has one entry for each Gaussian in step with the model: moments, counts and minimum scales."""
+"""Keep values that have one entry for each Gaussian in step with the model: moments, counts and minimum scales."""
 
 from typing import Protocol
 
@@ -11,10 +11,10 @@ START_BINS = 16  # of a clip, by which rows are sorted
 
 
 class Follower(Protocol):
-    """Part of a training that has one entry for each Gaussian."""
+    """A part of a training that has one entry for each Gaussian."""
 
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Keep the entries of `rows` [M], in their order; those where `fresh` [M] bool start anew."""
+        """Keep the entries of `rows` [M], in their order; entries that are `fresh` [M] bool start anew."""
 
 
 class Moments(Follower, Protocol):
@@ -25,13 +25,13 @@ class Moments(Follower, Protocol):
 
 
 class Rows:
-    """The rows of a model, one for each Gaussian, and all that follows them.
+    """The rows of a model, one for each Gaussian, and the followers of their changes.
 
-    Densification, thinning and gates change rows here and nowhere else, so that nothing is left behind.
+    Densification, thinning and gates change rows only here, so that every follower learns of each change.
     """
 
     def __init__(self, model: GaussianModel, moments: Moments) -> None:
-        """Start with a model that its optimizer's moments follow, and nothing else."""
+        """Start with a model; only its optimizer's moments follow it."""
         self.model = model
         self._moments = moments
         self._followers: list[Follower] = [moments]
@@ -48,7 +48,7 @@ class Rows:
 
         Args:
             rows: indices of the rows before.
-            fresh: which of them are new Gaussians, [M] bool; none by default.
+            fresh: which of them are new Gaussians, [M] bool; by default none.
         """
         self.model.select(rows)
         self.moved(rows, fresh)
@@ -70,7 +70,7 @@ class Rows:
         self._moments.forget(self.model.splats[name])
 
     def moved(self, rows: Tensor, fresh: Tensor | None = None) -> None:
-        """Let all followers know of rows [M] that the model has taken already."""
+        """Tell all followers about rows [M] that the model has taken already."""
         fresh = torch.zeros(len(rows), dtype=torch.bool, device=rows.device) if fresh is None else fresh
         for follower in self._followers:
             follower.follow(rows, fresh)

@@ -1,4 +1,4 @@
-"""Draw what a training draws by chance from the seed of its run: the order of the views, and every generator."""
+"""Derive every random draw of a training from the seed of its run: the order of views, and the generators."""
 
 import torch
 
@@ -6,7 +6,7 @@ import torch
 def batch(step: int, views: int, batch_size: int, seed: int) -> list[int]:
     """List the views of a step: every view appears once an epoch, in an order drawn from (seed, epoch).
 
-    The result depends on the arguments alone, so that a resumed run sees the same views as an uninterrupted one.
+    The result depends only on the arguments, so a resumed run sees the same views as an uninterrupted one.
 
     Args:
         step: counted from 0.

@@ -1,7 +1,7 @@
-"""Drop the Gaussians that earn little: those of the smallest summed blend weight over the training views.
+"""Drop the Gaussians of the smallest blend weight, summed over the training views.
 
 The blend weight of a Gaussian in a pixel is its alpha times the transmittance before it, so the sum over all pixels of
-all views says how much of the training images it makes up (the weight w_i of 3DGS eq. 3, summed).
+all views says how much it adds to the training images (the weight w_i of 3DGS eq. 3, summed).
 """
 
 from collections.abc import Sequence
@@ -33,6 +33,6 @@ def blend_weights(model: GaussianModel, views: Sequence[View], antialias: bool) 
 
 
 def heaviest(weights: Tensor, share: float) -> Tensor:
-    """Return the rows of the `share` of Gaussians of the largest weights, in their order; of equals the first."""
+    """Return the rows of the `share` of Gaussians with the largest weights, in their order; the first of equal ones."""
     keep = max(1, round(share * len(weights)))
     return weights.argsort(descending=True, stable=True)[:keep].sort().values

@@ -160,17 +160,17 @@ class Controls:
 
     @property
     def now(self) -> float:
-        """The time of the slider, in [0, 1]."""
+        """Return the time of the slider, in [0, 1]."""
         return _within(self.time.value, 0.0, 1.0)
 
     @property
     def wiped(self) -> float:
-        """The part of the width that the first image has in a wipe, in [0, 1]."""
+        """Return the part of the width that the first image has in a wipe, in [0, 1]."""
         return _within(self.wipe.value, 0.0, 1.0)
 
     @property
     def layout(self) -> str:
-        """The arrangement of the images: ONE, SIDE or WIPE."""
+        """Return the arrangement of the images: ONE, SIDE or WIPE."""
         return self.mode.value if self.mode.value in (SIDE, WIPE) else ONE
 
     def shown(self) -> list[ShownImage]:

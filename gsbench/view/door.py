@@ -50,7 +50,7 @@ class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
     up_direction: Three
 
     def is_usable(self) -> bool:
-        """Whether an image can be rendered from there."""
+        """Tell whether an image can be rendered from there."""
         lengths = (*self.position, *self.look_at, *self.up_direction)
         return (
             all(abs(length) <= FURTHEST for length in lengths)  # which NaN is not
@@ -73,7 +73,7 @@ class GuiUpdateMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
     updates: Values
 
     def is_usable(self) -> bool:
-        """Whether the value is text or a finite number."""
+        """Tell whether the value is text or a finite number."""
         return isinstance(self.updates.value, str) or math.isfinite(self.updates.value)
 
 
@@ -89,7 +89,7 @@ class SceneNodeClickMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True
     owner: str = ""
 
     def is_usable(self) -> bool:
-        """Whether it can be used: it always can, as only its name is read."""
+        """Return True: only the name of the message is read."""
         return True
 
 
@@ -97,7 +97,7 @@ KNOWN = msgspec.msgpack.Decoder(ViewerCameraMessage | GuiUpdateMessage | SceneNo
 
 
 def is_known(message: object) -> bool:
-    """Whether a message is one that the viewer's page sends, with usable values."""
+    """Tell whether a message is one that the viewer's page sends, with usable values."""
     if not isinstance(message, bytes):
         return False
     try:
@@ -168,7 +168,7 @@ class Door:
             raise InputError("expected a viser that the viewer can guard, such as 1.1.1, got another one: install that")
 
     def admits(self, headers: Headers) -> bool:
-        """Whether a request is for this server and from its own page.
+        """Tell whether a request is for this server and from its own page.
 
         A page of another site has another `Origin`. A page whose host name resolves to this machine's address ("DNS
         rebinding") has that name as `Host`.
@@ -180,7 +180,7 @@ class Door:
         return all(origin.lower() in (f"http://{own}", f"https://{own}") for origin in origins)
 
     def _is_ours(self, host: str) -> bool:
-        """Whether `host`, perhaps with a port, is a name of this server; ports differ behind a tunnel."""
+        """Tell whether `host`, perhaps with a port, is a name of this server; ports differ behind a tunnel."""
         try:
             parts = urlsplit(f"//{host}")
             name = parts.hostname or ""
@@ -195,7 +195,7 @@ class Door:
         return address.is_loopback or self._is_open or name in self._hosts
 
     def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the response to a refused request; None where the request is admitted."""
+        """Return the response to a refused request; None if the request is admitted."""
         if not self.admits(request.headers):
             return _answer(HTTPStatus.FORBIDDEN, "a viewer of gsbench answers its own page alone: see --host")
         if request.headers.get_all("Upgrade") and len(connection.server.connections) >= MOST_BROWSERS:

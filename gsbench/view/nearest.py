@@ -50,7 +50,7 @@ class TrainingViews:
 
         Args:
             camera: that looks at the scene.
-            time: in [0, 1]; None where the scene has none.
+            time: in [0, 1]; None if the scene has none.
         """
         distances = (self._centers - camera.center).norm(dim=-1)
         angles = torch.arccos((self._forwards @ camera.viewmat[2, :3]).clamp(-1, 1))

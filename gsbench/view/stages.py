@@ -24,7 +24,7 @@ class StageWatch(Tape):
     """
 
     def __init__(self, device: str) -> None:
-        """Begin."""
+        """Begin without stages."""
         super().__init__()
         self._laps = Laps(device)
 
@@ -44,7 +44,7 @@ class StageWatch(Tape):
 
     @property
     def ms(self) -> dict[str, float]:
-        """The milliseconds by stage."""
+        """Return the milliseconds by stage."""
         return {name: 1000 * seconds for name, seconds in self._laps.seconds.items()}
 
 

@@ -1,7 +1,7 @@
-"""The CUDA kernels: the extension `_cuda`, linked to no torch, and how tensors reach it.
+"""Load the CUDA kernels: the extension `_cuda`, which is not linked to torch.
 
-The extension is optional, and where it was built it imports on machines without a GPU too. Outputs and scratch are
-torch's, so that its caching allocator serves them, and kernels run on torch's current stream.
+The extension is optional. If it was built, it can be imported on machines without a GPU too. Torch's caching allocator
+gives the memory of outputs and scratch, and kernels run on torch's current stream.
 """
 
 import functools
@@ -19,12 +19,12 @@ if importlib.util.find_spec("gsbench.kernels._cuda") is not None:  # an extensio
 
 
 def built() -> bool:
-    """Whether the CUDA kernels are part of this installation."""
+    """Tell whether the CUDA kernels are part of this installation."""
     return _cuda is not None
 
 
 def available() -> bool:
-    """Whether they are, and there is a device to run them."""
+    """Tell whether the CUDA kernels were built and there is a GPU to run them."""
     return built() and _has_device()
 
 
@@ -34,7 +34,7 @@ def _has_device() -> bool:
 
 
 def cuda() -> ModuleType:
-    """The compiled extension.
+    """Return the compiled extension.
 
     Raises:
         InputError: it was not built.

@@ -73,7 +73,7 @@ def render(
     reload: int = 0,
     against: Comparison | None = None,
 ) -> str:
-    """Return the page as HTML; arguments as of `write`."""
+    """Return the page as HTML; arguments as in `write`."""
     found = groups(records)
     look = styles(sorted({name for group in found for name in group.series}))
     runs, scenes = Runs(), MOST_SCENES // len(found)

@@ -33,7 +33,7 @@ class DataTable:
 
     @property
     def shown(self) -> list[list[str]]:
-        """The first rows as text."""
+        """Return the first rows as text."""
         return [
             [show(value, column) for value, column in zip(row, self.columns, strict=True)]
             for row in self.rows[:MOST_ROWS]
@@ -41,12 +41,12 @@ class DataTable:
 
     @property
     def hidden(self) -> int:
-        """The number of rows that only the file has."""
+        """Return the number of rows that only the file has."""
         return max(0, len(self.rows) - MOST_ROWS)
 
     @property
     def href(self) -> str:
-        """The whole table as CSV in a data address."""
+        """Return the whole table as CSV in a data address."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([cell(c.title) for c in self.columns])

@@ -18,7 +18,7 @@ MOST_RESETS = 4  # that are marked
 
 
 def of(record: Record) -> list[tuple[int, str]]:
-    """Return steps and the letters of their events, by rising step; nothing where the config cannot be read."""
+    """Return steps and the letters of their events, by rising step; nothing if the config cannot be read."""
     try:
         steps = _steps(record)
     except (InputError, KeyError, TypeError, AttributeError, ArithmeticError):
@@ -42,7 +42,7 @@ def _steps(record: Record) -> list[tuple[int, str]]:
 
 
 def _rates(record: Record) -> dict[str, Any]:
-    """Return the learning rates of the run's model; of model=auto those of the candidate chosen (run/auto.py)."""
+    """Return the learning rates of the run's model; of model=auto those of the chosen candidate (run/resolve.py)."""
     model = record.provenance.config["model"]
     if model.get("candidates"):
         model = model["candidates"]["moving" if record.effects.time else "static"]

@@ -16,7 +16,7 @@ def paper_tables(group: Group) -> list[layout.Table]:
 
 
 def _compared(group: Group) -> list[Record]:
-    """Return the runs at the common variant; all where none has finished."""
+    """Return the runs at the common variant; all if none has finished."""
     return [r for r in group.records if r.variant == group.variant] or group.records
 
 

@@ -38,7 +38,7 @@ StripRow = tuple[Pixels, Pixels, Pixels]  # render, truth, error
 def gallery(records: list[Record], folder: Path) -> list[GalleryView]:
     """Return the views that have images, of the first seed of each model, in less than BUDGET bytes.
 
-    Where images do not fit, they are compressed more, then made smaller, then reduced to one view for each scene, and
+    If images do not fit, they are compressed more, then made smaller, then reduced to one view for each scene, and
     at last left out.
     """
     strips = _strips(records, folder)
@@ -88,7 +88,7 @@ def _image(caption: str, image: Pixels, quality: int) -> Image:
 
 
 def cut_strip(path: Path) -> list[StripRow]:
-    """Cut a strip into rows of (render, truth, error) at their own resolution; return nothing where it is no strip."""
+    """Cut a strip into rows of (render, truth, error) at their own resolution; return nothing if it is no strip."""
     data = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if data is None:
         return []

@@ -44,7 +44,7 @@ def plain(value: float, digits: int = 2) -> str:
 
 
 def probability(p: float) -> str:
-    """Write a p-value, or a bound where it is too small for three digits."""
+    """Write a p-value, or a bound if it is too small for three digits."""
     return "< 0.001" if p < 0.001 else plain(p, 3)
 
 
@@ -57,7 +57,7 @@ def signed(value: float, digits: int = 2) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Write a time in the unit that suits it: 8.3 s, 12 min, 2.5 h; "never" where it is infinite."""
+    """Write a time in the unit that suits it: 8.3 s, 12 min, 2.5 h; "never" if it is infinite."""
     if math.isnan(seconds):
         return "–"
     if math.isinf(seconds):
@@ -99,7 +99,7 @@ def run_name(record: Record) -> str:
 
 
 def command(records: list[Record]) -> str:
-    """Return the command that repeats the runs, or the first of them where they differ in more than the seed."""
+    """Return the command that repeats the runs, or the first of them if they differ in more than the seed."""
     if not all(r.overrides for r in records):
         return ""
     rest = {tuple(o for o in r.overrides if not o.startswith("seed=")) for r in records}

@@ -1,7 +1,7 @@
-"""Define what a rule of densification must have.
+"""Define the interface of a rule of densification.
 
 A rule sees every view's gradients (`accumulate`), and changes rows in rounds (`densify`). It edits Gaussians by
-`Rows.select` and the model's own `split`, so it knows no parameter of a model.
+`Rows.select` and the model's own `split`, so it does not depend on the parameters of a model.
 """
 
 from abc import ABC, abstractmethod
@@ -19,7 +19,7 @@ MOST_GAUSSIANS = 2_000_000
 
 
 class Densification(ABC):
-    """A rule by which Gaussians are added and removed during a training."""
+    """A rule that adds and removes Gaussians during a training."""
 
     kind: ClassVar[str]  # its name in train.densify.kind
 
@@ -29,7 +29,7 @@ class Densification(ABC):
         Args:
             rows: of the model, which is initialised.
             config: thresholds.
-            min_opacity: a Gaussian below it is of no use.
+            min_opacity: Gaussians of lower opacity may be pruned.
             views: the number of training views, an epoch.
         """
         self.rows = rows
@@ -48,7 +48,7 @@ class Densification(ABC):
         height: int,
         views: int,
     ) -> None:
-        """Take in the gradients of one view of a batch.
+        """Accumulate the gradients of one view of a batch.
 
         Args:
             drawn: which Gaussians were not culled.
@@ -76,12 +76,12 @@ class Densification(ABC):
 
     @abstractmethod
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Keep what was accumulated for `rows`; see `gsbench.train.rows.Follower`."""
+        """Keep the accumulated values of `rows`; see `gsbench.train.rows.Follower`."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """Return what was accumulated, for the checkpoint."""
+        """Return the accumulated values, for the checkpoint."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from the `state_dict` of a checkpoint; raises InputError where it is not of this many Gaussians."""
+        """Continue from the `state_dict` of a checkpoint; raises InputError if it is not of this many Gaussians."""

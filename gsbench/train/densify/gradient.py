@@ -15,9 +15,9 @@ class GradientDensification(Densification):
 
     Defaults of `train.densify`, whose steps are those of a run of 30,000:
 
-    - every 100 steps (and at most 36 rounds) from 500 to 15,000: where the mean gradient of the 2D mean, in units of
-      half the image, is above 2e-4, a Gaussian is cloned if its largest scale is at most 0.01 of the scene's extent and
-      it is not long in time, and otherwise split into two that are 1.6 times smaller;
+    - every 100 steps (and at most 36 rounds) from 500 to 15,000, Gaussians are chosen whose 2D mean has a mean gradient
+      above 2e-4, in units of half the image. Such a Gaussian is cloned if its largest scale is at most 0.01 of the
+      scene's extent and it is not long in time. Otherwise it is split into two that are 1.6 times smaller;
     - in the same round a Gaussian is pruned whose opacity is below 0.005, that no view of an epoch has seen, or, after
       the first reset of opacities, whose largest scale is above 0.1 of the extent;
     - every 3,000 steps opacities are lowered to at most twice the pruning threshold.
@@ -61,7 +61,7 @@ class GradientDensification(Densification):
         """Clone, split and prune Gaussians; the children of a split are sampled with `generator`.
 
         Returns:
-            How many were neither cloned nor split, though their gradient asks for it, since there would be too many.
+            How many Gaussians of large gradient were neither cloned nor split, because there would be too many.
         """
         model, config = self.model, self.config
         scales = model.scales()
@@ -85,9 +85,9 @@ class GradientDensification(Densification):
         return refused
 
     def _wanted(self) -> tuple[Tensor, int]:
-        """Tell which Gaussians to clone or split, as [N] bool, each of which makes one more, and how many are refused.
+        """Tell which Gaussians to clone or split, [N] bool, and how many are refused; each makes one more Gaussian.
 
-        Where there is no room for all, those of the largest gradients are taken, and of equal ones the first.
+        If there is no room for all, those of the largest gradients are taken, and the first of equal ones.
         """
         gradient = self.gradient / self.seen.clamp(min=1)
         wanted = gradient > self.config.grad_threshold
@@ -104,7 +104,7 @@ class GradientDensification(Densification):
         self.rows.forget("opacities")
 
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Keep since when the given rows are unseen; gradients begin anew with every change of the rows."""
+        """Keep for how many views the given rows are unseen; gradients begin anew with every change of the rows."""
         self.unseen = self.unseen[rows]
         self.forget()
 
@@ -113,7 +113,7 @@ class GradientDensification(Densification):
         return {"gradient": self.gradient, "seen": self.seen, "unseen": self.unseen}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from the `state_dict` of a checkpoint; raises InputError where it is not of this many Gaussians."""
+        """Continue from the `state_dict` of a checkpoint; raises InputError if it is not of this many Gaussians."""
         opacities = self.model.splats["opacities"]
         self.gradient, self.seen = (
             tensor(state, name, opacities.shape, opacities.dtype) for name in ("gradient", "seen")

@@ -25,7 +25,7 @@ class MinimumScale:
 
     @torch.no_grad()
     def update(self) -> None:
-        """Measure them again, after Gaussians were moved, added or removed."""
+        """Measure the minimum scales again, after Gaussians were moved, added or removed."""
         means = self.model.splats["means"]
         pixel = means.new_full((len(means),), torch.inf)  # [N] width of a pixel at the Gaussian's distance, world units
         for center, focal in zip(self.centers, self.focal, strict=True):
@@ -33,12 +33,12 @@ class MinimumScale:
         self.least = LEAST_PIXELS * pixel
 
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Keep the minimum scales of the given rows, until they are measured again."""
+        """Keep the minimum scales of the given rows until they are measured again."""
         self.least = self.least[rows]
 
     @torch.no_grad()
     def hold(self) -> None:
-        """Raise sizes that are below."""
+        """Raise sizes that are below the minimum scales."""
         self.model.hold_sizes(self.least)
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -46,6 +46,6 @@ class MinimumScale:
         return {"least": self.least}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from the `state_dict` of a checkpoint; raises InputError where it is not of this many Gaussians."""
+        """Continue from the `state_dict` of a checkpoint; raises InputError if it is not of this many Gaussians."""
         means = self.model.splats["means"]
         self.least = tensor(state, "least", means.shape[:1], means.dtype)
