@@ -1,5 +1,6 @@
 """Define cameras, views (a camera, a time and an image) and scenes (views by split, background, extent)."""
 
+import functools
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,7 +16,7 @@ class Camera:
     width: int
     height: int
 
-    @property
+    @functools.cached_property
     def center(self) -> Tensor:
         """Return the camera's position in the world, [3]."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]

@@ -84,8 +84,9 @@ class Optimizer:
             by_kernel += [(p, group["lr"]) for p in group["params"] if p.grad is not None and self._is_native(p)]
         if by_kernel:
             self._step_all(by_kernel)
-        self.adam.step()  # what is left: parameters on a GPU, or those of the reference
-        self.adam.zero_grad(set_to_none=True)
+        if any(p.grad is not None for group in self.adam.param_groups for p in group["params"]):
+            self.adam.step()  # parameters on a GPU, or those of the reference
+            self.adam.zero_grad(set_to_none=True)
 
     def _is_native(self, parameter: Tensor) -> bool:
         """Tell whether the kernel of the CPU updates a parameter."""

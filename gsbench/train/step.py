@@ -18,6 +18,7 @@ from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
 from gsbench.process.workers import side_by_side
+from gsbench.raster import RasterInfo
 from gsbench.scenes import View
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.losses import photometric
@@ -87,7 +88,7 @@ class Seen(NamedTuple):
     """What a step learns from one view."""
 
     loss: Tensor  # []
-    drawn: Tensor  # [1, N] bool, see `gsbench.raster.RasterInfo`
+    info: RasterInfo
     g_means2d: Tensor  # [1, N, 2] of the batch's loss, by pixels
 
 
@@ -170,4 +171,4 @@ class Step:
             g_means2d = sums.pop(id(means2d), None)
         if g_means2d is None:
             g_means2d = torch.zeros_like(means2d)
-        return Seen(loss.detach() / views, output.info.drawn, g_means2d)
+        return Seen(loss.detach() / views, output.info, g_means2d)

@@ -2,7 +2,7 @@
 //
 // A row of pixels is filtered along x when it is read, and along y, four rows at a time, when the rows about them have
 // been; the derivatives of SSIM go through the same filter once more on their way to the gradient. Only the last few
-// rows of each are kept, so everything stays in cache.
+// rows of each are kept, of so many columns at a time that everything stays in cache.
 #include "../math/similarity.h"
 
 #include "buffer.h"
@@ -25,6 +25,9 @@ constexpr int GROUP = 1;  // too few registers to keep those in
 constexpr int SPAN = GROUP + SSIM_WINDOW - 1;  // rows that a group reads
 constexpr int KEPT = SPAN + GROUP - 1;         // the last of them may come with others, which the next group reads
 constexpr int PADDED = GROUP * DERIVATIVES > MOMENTS ? GROUP * DERIVATIVES : MOMENTS;
+constexpr int COLUMNS = 448;  // pixels of a row at most: the rows that are kept then fit into 1 MiB
+constexpr int HALO = 16;      // pixels beside them, whose derivatives reach them: 2 SSIM_RADIUS, in whole vectors
+static_assert(HALO >= 2 * SSIM_RADIUS && HALO * CHANNELS % LANES == 0);
 static_assert(MARGIN == LANES && MARGIN >= SSIM_RADIUS * CHANNELS);
 
 struct Window {
@@ -63,18 +66,21 @@ GSB_HD inline Vec first_of(Vec x, int n) {
     return Vec::load(lanes);
 }
 
-// A horizontal strip of the picture, rows [begin, end), with memory of its own.
+// Columns `first` to last - 1 of a horizontal strip of the picture, rows [begin, end), with memory of its own. Beside
+// them HALO columns are read: what is wrong at a cut does not reach farther.
 struct Strip {
     const SimilarityArgs& args;
     float* gradient;  // null: not wanted
     const Window& window;
-    int begin, end, width, stride;  // width: floats of a row
+    int begin, end, left, width, from, to, stride;  // floats of a row: those read begin at left, and [from, to) count
     Ring moments, derivatives;
     Buffer<float> padded;  // rows before the filter along x; what is outside of the picture stays zero
 
-    Strip(const SimilarityArgs& a, float* gradient, const Window& window, int begin, int end)
-        : args(a), gradient(gradient), window(window), begin(begin), end(end), width(a.width * CHANNELS),
-          stride((width + LANES - 1) / LANES * LANES), moments(MOMENTS, stride, a.height),
+    Strip(const SimilarityArgs& a, float* gradient, const Window& window, int begin, int end, int first, int last)
+        : args(a), gradient(gradient), window(window), begin(begin), end(end),
+          left((first < HALO ? 0 : first - HALO) * CHANNELS),
+          width((last + HALO < a.width ? last + HALO : a.width) * CHANNELS - left), from(first * CHANNELS - left),
+          to(last * CHANNELS - left), stride((width + LANES - 1) / LANES * LANES), moments(MOMENTS, stride, a.height),
           derivatives(gradient ? DERIVATIVES : 0, stride, a.height),
           padded(static_cast<size_t>(PADDED) * (stride + 2 * MARGIN)) {
         padded.zero();
@@ -131,8 +137,11 @@ struct Strip {
         }
     }
 
+    // Of the first float that is read of a row.
+    int64_t place(int y) const { return static_cast<int64_t>(y) * args.width * CHANNELS + left; }
+
     void read_row(int y) {
-        const int64_t row = static_cast<int64_t>(y) * width;
+        const int64_t row = place(y);
         const float *a = args.image + row, *b = args.target + row;
         for (int x = 0; x < width; x += LANES) {
             const int n = width - x < LANES ? width - x : LANES;
@@ -154,7 +163,7 @@ struct Strip {
             const int n = width - x < LANES ? width - x : LANES;
             for (int j = 0; j < count; ++j) {
                 const Similarity<Vec> s(m[j][0], m[j][1], m[j][2], Vec(0.0f), m[j][3]);
-                totals[j] += first_of(s.value, n);
+                if (x >= from && x < to) totals[j] += first_of(s.value, n);
                 if (!gradient) continue;
                 const Vec values[DERIVATIVES] = {s.g_mean, s.g_square, s.g_product};
                 for (int k = 0; k < DERIVATIVES; ++k) first_of(values[k], n).store(padded_row(j * DERIVATIVES + k) + x);
@@ -162,23 +171,23 @@ struct Strip {
         }
         for (int j = 0; j < count; ++j) {
             if (gradient) filter_along_x(j * DERIVATIVES, derivatives, y + j);
-            if (y + j >= begin && y + j < end) row_sums[(y + j) * 2] = sum(totals[j]);
+            if (y + j >= begin && y + j < end) row_sums[(y + j) * 2] += sum(totals[j]);
         }
     }
 
     // The gradient of `count` rows from y on; each row's sum of |a - b| to row_sums[row][1].
     void finish_rows(int y, int count, float* row_sums) {
-        const float pixels = static_cast<float>(args.height) * static_cast<float>(width);
+        const float pixels = static_cast<float>(args.height) * static_cast<float>(args.width * CHANNELS);
         const Vec l1((1.0f - args.ssim_weight) / pixels), ssim(-args.ssim_weight / pixels), zero(0.0f);
         const Rows rows(derivatives, y);
         Vec totals[GROUP];
         for (auto& total : totals) total = zero;
-        for (int x = 0; x < width; x += LANES) {
-            const int n = width - x < LANES ? width - x : LANES;
+        for (int x = from; x < to; x += LANES) {
+            const int n = to - x < LANES ? to - x : LANES;
             Vec g[GROUP][DERIVATIVES];
             if (gradient) filter_along_y(rows, x, g);
             for (int j = 0; j < count; ++j) {
-                const int64_t at = static_cast<int64_t>(y + j) * width + x;
+                const int64_t at = place(y + j) + x;
                 const Vec a = load_first(args.image + at, n), b = load_first(args.target + at, n), difference = a - b;
                 totals[j] += max(difference, -difference);
                 if (!gradient) continue;
@@ -186,10 +195,10 @@ struct Strip {
                 store_first(sign + ssim * (g[j][0] + a * g[j][1] * 2.0f + b * g[j][2]), gradient + at, n);
             }
         }
-        for (int j = 0; j < count; ++j) row_sums[(y + j) * 2 + 1] = sum(totals[j]);
+        for (int j = 0; j < count; ++j) row_sums[(y + j) * 2 + 1] += sum(totals[j]);
     }
 
-    // row_sums [height][2]: of SSIM and of |a - b|.
+    // Adds to row_sums [height][2]: of SSIM and of |a - b|.
     void run(float* row_sums) {
         const int reach = gradient ? SSIM_RADIUS : 0;
         const auto within = [&](int y) { return y < 0 ? 0 : y > args.height ? args.height : y; };
@@ -215,12 +224,18 @@ struct Strip {
 void l1_ssim(const SimilarityArgs& a, const SimilarityLoss& out) {
     const Window window;
     Buffer<float> row_sums(static_cast<size_t>(a.height) * 2);
+    row_sums.zero();
+    const int blocks = (a.width + COLUMNS - 1) / COLUMNS;
+    const int columns = (a.width + blocks * HALO - 1) / (blocks * HALO) * HALO;
     const int strips = a.threads < a.height ? a.threads : a.height;
 #pragma omp parallel for num_threads(a.threads) schedule(static, 1)
     for (int i = 0; i < strips; ++i) {
-        Strip strip(a, out.gradient, window, static_cast<int>(static_cast<int64_t>(a.height) * i / strips),
-                    static_cast<int>(static_cast<int64_t>(a.height) * (i + 1) / strips));
-        strip.run(row_sums.data());
+        const int begin = static_cast<int>(static_cast<int64_t>(a.height) * i / strips);
+        const int end = static_cast<int>(static_cast<int64_t>(a.height) * (i + 1) / strips);
+        for (int first = 0; first < a.width; first += columns) {
+            const int last = first + columns < a.width ? first + columns : a.width;
+            Strip(a, out.gradient, window, begin, end, first, last).run(row_sums.data());
+        }
     }
     double similarity = 0.0, difference = 0.0;
     for (int y = 0; y < a.height; ++y) {
