@@ -24,7 +24,7 @@ class DataConfig:
     published: str = ""  # where to get the data, for the error message when it is missing
     scenes: list[str] = field(default_factory=list)  # the scenes of scene=all
     background: str = "black"  # or white: the colour behind the images and the renders
-    modulation: float = 0.5  # the initial lambda_t and lambda_d of 7DGS here (7DGS, implementation details)
+    initial_lambda: float = 0.5  # the lambda_t and lambda_d of 7DGS at the start (7DGS, implementation details)
     initial_points: int = 100_000  # drawn at random where the data set gives none ..
     initial_half_width: float | None = 1.3  # .. in the cube [-w, w]^3; None: in the frustum that all cameras share
 
@@ -119,7 +119,7 @@ class TrainConfig:
     ssim_weight: float = 0.2  # loss = (1 - w) L1 + w (1 - SSIM)
     sh_every: int = 1_000  # steps after which the spherical harmonics gain a degree
     refine_from: int = 3_000  # the step from which AGR acts and learns
-    modulation_from: int = 15_000  # the step from which lambda_t and lambda_d learn
+    lambda_from: int = 15_000  # the step from which lambda_t and lambda_d learn
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     coarse: list[list[int]] | None = None  # [[4, 3000]]: a quarter of the width until step 3,000
     penalties: PenaltiesConfig = field(default_factory=PenaltiesConfig)

@@ -251,7 +251,7 @@ class GaussianModel(nn.Module, ABC):
         if self.refinement is not None:
             groups["refinement"] = list(self.refinement.parameters())
         if len(self.log_lambda):
-            groups["modulation"] = list(self.log_lambda.parameters())
+            groups["lambda"] = list(self.log_lambda.parameters())
         return groups
 
     # ---- density control: keep, copy and split rows
