@@ -46,7 +46,7 @@ def _entries(given: dict[str, Tensor]) -> dict[str, int]:
     return {"rows": k + 3, "moves": 3 * k, "couplings": k * (k - 1) // 2}
 
 
-def observe_triangular(
+def slice_triangular(
     means: Tensor,  # [N, 3]
     directions: Tensor | None,  # [N, 3], None: direction is not observed
     times: Tensor | None,  # [N, 1], None: time is not observed
@@ -126,7 +126,7 @@ _rotated = Operation(
 )
 
 
-def observe_rotated(
+def slice_rotated(
     means: Tensor,  # [N, 3]
     times: Tensor,  # [N, 1]
     scales: Tensor,  # [N, 4] log scales of x, y, z, t
@@ -176,7 +176,7 @@ _static = Operation(
 )
 
 
-def observe_static(
+def slice_static(
     scales: Tensor,  # [N, 3] log scales
     quats: Tensor,  # [N, 4] wxyz
     opacities: Tensor,  # [N] logits
