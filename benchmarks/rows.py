@@ -12,6 +12,7 @@ from gsbench.kernels.backends import BACKENDS, CPU, REFERENCE
 from gsbench.kernels.loss import l1_ssim
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
+from gsbench.models.base import tensors_of
 from gsbench.raster import rasterize
 from gsbench.scenes import Camera, View
 from gsbench.train.losses import photometric
@@ -78,7 +79,7 @@ def observing() -> Iterator[Row]:
             time = 0.4 if "time" in observed.observes else None
             parameters = [p for p in observed.parameters() if p.requires_grad]
             query = Query.at(center, time)
-            out = observed.slice(query)
+            out = tensors_of(observed.slice(query))
             upstream = [torch.ones_like(x) for x in out]
             targets = (15.0, 25.0) if name == "7dgs" and not agr and backend == "cpu" else (None, None)
             title = f"{name}{'+agr' if agr else ''} 100k slice and colours, {backend}"
@@ -161,7 +162,9 @@ def instruction_sets() -> Iterator[Row]:
     image.requires_grad_()
     inputs, (viewmats, Ks) = [x.requires_grad_() for x in gaussians(10_000)], camera(400)
     calls: dict[str, Callable[[], Any]] = {
-        f"{name} 50k slice and colours": lambda made=made: sum(x.sum() for x in made.slice(query)).backward()
+        f"{name} 50k slice and colours": lambda made=made: sum(
+            x.sum() for x in tensors_of(made.slice(query))
+        ).backward()
         for name, made in ((name, model(name, 50_000, agr=name == "7dgs")) for name in ("3dgs", "4dgs", "6dgs", "7dgs"))
     }
     calls["raster 10k / 400x400"] = lambda: rasterize(*inputs, viewmats, Ks, 400, 400).image.sum().backward()

@@ -24,7 +24,7 @@ class DataConfig:
     published: str = ""  # where to get the data; shown if it is missing
     scenes: list[str] = field(default_factory=list)  # scenes of scene=all
     background: str = "black"  # or white: colour behind images and renders
-    modulation: float = 0.5  # initial lambda_t and lambda_d of 7DGS
+    initial_lambda: float = 0.5  # initial lambda_t and lambda_d of 7DGS
     initial_points: int = 100_000  # random points, if the data set has no points
     initial_half_width: float | None = 1.3  # w of their cube [-w, w]^3; None: the frustum that all cameras share
 
@@ -119,7 +119,7 @@ class TrainConfig:
     ssim_weight: float = 0.2  # loss = (1 - w) L1 + w (1 - SSIM)
     sh_every: int = 1_000  # steps after which the SH degree rises by one
     refine_from: int = 3_000  # step from which AGR acts and learns
-    modulation_from: int = 15_000  # step from which lambda_t and lambda_d learn
+    lambda_from: int = 15_000  # step from which lambda_t and lambda_d learn
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     coarse: list[list[int]] | None = None  # [[4, 3000]]: a quarter of the width until step 3,000
     penalties: PenaltiesConfig = field(default_factory=PenaltiesConfig)

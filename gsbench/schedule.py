@@ -61,7 +61,7 @@ class Schedule:
         return ActiveComponents(
             sh_degree=min(self.sh_degree, step // self.scaled(self.config.sh_every)),
             refine=self.agr and step >= self.scaled(self.config.refine_from),
-            tunes_lambda=step >= self.scaled(self.config.modulation_from),
+            tunes_lambda=step >= self.scaled(self.config.lambda_from),
         )
 
     def densifies(self, step: int) -> bool:

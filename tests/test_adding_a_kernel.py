@@ -16,19 +16,19 @@ CHECK = """
 import sys
 sys.meta_path[:] = [finder for finder in sys.meta_path if 'Redirecting' not in type(finder).__name__]
 import torch
-from gsbench.kernels.balls import observe_ball
+from gsbench.kernels.balls import slice_ball
 from gsbench.kernels.tape import Tape
 g = torch.Generator().manual_seed(0)
 raw = [torch.randn(shape, generator=g).requires_grad_() for shape in ((37, 1), (37,))]
 weights = torch.randn(37, 3, 3, generator=g), torch.randn(37, generator=g)
 exact = [x.detach().double().requires_grad_() for x in raw]
 expected = exact[0].exp()[:, :, None] * torch.eye(3, dtype=torch.float64), torch.sigmoid(exact[1])
-for seen, wanted in zip(observe_ball(*raw), expected, strict=True):
+for seen, wanted in zip(slice_ball(*raw), expected, strict=True):
     torch.testing.assert_close(seen.double(), wanted, rtol=1e-5, atol=1e-6)
 def loss(seen): return sum((x * w).sum() for x, w in zip(seen, weights, strict=True))
 want = torch.autograd.grad(loss(expected), exact)
-got = torch.autograd.grad(loss(observe_ball(*raw)), raw)
-with Tape() as tape: value = loss(observe_ball(*raw))
+got = torch.autograd.grad(loss(slice_ball(*raw)), raw)
+with Tape() as tape: value = loss(slice_ball(*raw))
 sums = {}
 tape.backward(value, torch.ones(()), raw, sums)
 for x, a, b in zip(raw, got, want, strict=True):

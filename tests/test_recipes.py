@@ -50,7 +50,7 @@ def test_rates_of_the_authors_code() -> None:
     """Catches AGR, which that code does not have, a lambda that learns, and entries that are not row-scaled."""
     config = composed("model=7dgs", "+recipe=authors")
     found = rates(config, 0.5)
-    assert (found["log_diagonal"], found["shape"], found["motion"], found["modulation"]) == (5e-3, 1e-3, 1e-3, 0)
+    assert (found["log_diagonal"], found["shape"], found["motion"], found["lambda"]) == (5e-3, 1e-3, 1e-3, 0)
     assert not config.agr
     assert Schedule(composed("+recipe=authors", "train.iterations=30000").train, 3, agr=False).densify_every == 100
     assert config.model.options["lambda_t"] == config.model.options["lambda_d"] == 0.01
@@ -71,7 +71,7 @@ def test_every_model_goes_as_far_in_a_short_run() -> None:
     """Catches a model whose geometry keeps the rates of 30,000 steps at 300: all are ten times faster, colours not."""
     for model in ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_nodir"):
         short, long = (rates(composed(f"model={model}", f"train.iterations={n}"), 0.0) for n in (300, 30_000))
-        for name in long.keys() - {"modulation"}:
+        for name in long.keys() - {"lambda"}:
             expected = 1 if name in ("opacities", "sh0", "shN", "refinement") else 10
             assert abs(short[name] / long[name] - expected) < 1e-9, f"{model}: {name}"
 

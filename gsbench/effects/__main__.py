@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
         if (asked.picture is None) != (asked.out is None):
             raise InputError("expected --picture RUN_FOLDER and --out FILE.png together")
         if asked.out is not None and (not asked.out.name or "\0" in str(asked.out)):
-            raise InputError(f"--out: expected a file such as classes.png, got {str(asked.out)!a:.200}")
+            raise InputError(f"--out: expected a file such as effect_sets.png, got {str(asked.out)!a:.200}")
         if not 0 <= asked.seed < 2**63:
             raise InputError(f"--seed: expected 0 to 2^63 - 1, got {str(asked.seed)[:30]}")
         if not math.isfinite(asked.budget_db) or not 0 <= asked.budget_db <= 10:

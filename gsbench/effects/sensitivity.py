@@ -31,7 +31,7 @@ from torch import Tensor
 from gsbench.kernels.tape import Tape
 from gsbench.measure.quality import evenly
 from gsbench.models import GaussianModel, Query
-from gsbench.models.base import Gaussians3D
+from gsbench.models.base import Gaussians3D, tensors_of
 from gsbench.models.gated import GatedModel
 from gsbench.models.render import rasterize_slice
 from gsbench.models.simplifications import REMOVED, Simplification, simplifications_of
@@ -133,8 +133,8 @@ class Drawn(NamedTuple):
         found = []
         for vector in vectors:
             sums: dict[int, Tensor] = {}
-            self.tape.backward(self.images, vector[None], self.at, sums)
-            found.append(_rows_of(Gaussians3D(*(sums[id(x)] for x in self.at))))
+            self.tape.backward(self.images, vector[None], tensors_of(self.at), sums)
+            found.append(_rows_of(Gaussians3D(*(sums[id(x)] for x in tensors_of(self.at)))))
         return torch.stack(found)
 
 
@@ -149,7 +149,7 @@ class ViewRasterizer(NamedTuple):
     @torch.enable_grad()
     def __call__(self, gaussians: Gaussians3D) -> Drawn:
         """Draw a slice."""
-        at = Gaussians3D(*(x.detach().requires_grad_() for x in gaussians))
+        at = Gaussians3D(*(x.detach().requires_grad_() for x in tensors_of(gaussians)))
         with Tape() as tape:
             output = rasterize_slice(at, self.camera, self.background, self.model.backend, self.antialias)
         return Drawn(at, tape, output.image, output.info.means2d[0].detach(), output.info.radii[0])
@@ -177,12 +177,12 @@ def _error(simplification: Simplification, here: Place, draw: ViewRasterizer) ->
     if simplification.order is not None:
         colors = model.shade(raw, live.means, live.opacities, here.query)
         return _grown((here.products[..., COLOR] * (colors - live.colors)).sum(-1))
-    means, factors, opacities = model.observe(raw, here.query)
-    whole = Gaussians3D(means, factors, opacities, model.shade(raw, means, opacities, here.query))
+    whole = model.colored(model.slice_geometry(raw, here.query), raw, here.query)
     N, n = len(live.means), simplification.rows
-    changed = Gaussians3D(*(x[:n] for x in whole))
+    changed = Gaussians3D(*(x[:n] for x in tensors_of(whole)))
     thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))
-    both = draw(Gaussians3D(*(torch.cat(pair) for pair in zip(live, thin, strict=True))))
+    pairs = zip(tensors_of(live), tensors_of(thin), strict=True)
+    both = draw(Gaussians3D(*(torch.cat(pair) for pair in pairs)))
     size = torch.maximum(here.drawn.radii[:n], both.radii[N:]).clamp(min=1) / 3
     distance = (both.means2d[N:] - here.drawn.means2d[:n]) / (2 * size[:, None])
     overlap = torch.exp(-distance.square().sum(-1))
@@ -198,9 +198,8 @@ def _error(simplification: Simplification, here: Place, draw: ViewRasterizer) ->
 
 
 def _rows_of(gaussians: Gaussians3D) -> Tensor:
-    """Put the mean, the factor, the opacity and the colour of each Gaussian in a row, [N, 16]."""
-    means, factors, opacities, colors = gaussians
-    return torch.cat([means, factors.flatten(1), opacities[:, None], colors], 1)
+    """Put the mean, the factor, the opacity and the colour of each Gaussian in a row, [N, 16]; then its shape."""
+    return torch.cat([x[:, None].flatten(1) for x in tensors_of(gaussians)], 1)
 
 
 def _grown(*changes: Tensor) -> Tensor:

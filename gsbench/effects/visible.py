@@ -29,9 +29,9 @@ def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
     def shown(view: View) -> Tensor:
         query = Query.of(view.camera, view.time)
         moved = model.refined(query)
-        opacities = model.observe(moved, query)[2]
+        opacities = model.slice_geometry(moved, query).opacities
         if model.refines:
-            opacities = torch.maximum(opacities, model.observe(own, query)[2])
+            opacities = torch.maximum(opacities, model.slice_geometry(own, query).opacities)
         return opacities >= ALPHA_MIN
 
     times = [view.time or 0.0 for view in views]

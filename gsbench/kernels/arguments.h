@@ -290,12 +290,12 @@ GSB_FIELDS(AdamState, OUTPUTS, parameter, mean, square)
 
 // kernel(name, the structures it takes)
 #define GSB_KERNELS(kernel)                                                                        \
-    kernel(observe_triangular, TriangularArgs, Observation)                                        \
-    kernel(observe_triangular_backward, TriangularArgs, ObservationGrads, TriangularGrads)         \
-    kernel(observe_rotated, RotatedArgs, Observation)                                              \
-    kernel(observe_rotated_backward, RotatedArgs, ObservationGrads, RotatedGrads)                  \
-    kernel(observe_static, StaticArgs, StaticSlice)                                                   \
-    kernel(observe_static_backward, StaticArgs, StaticSliceGrads, StaticGrads)                         \
+    kernel(slice_triangular, TriangularArgs, Observation)                                        \
+    kernel(slice_triangular_backward, TriangularArgs, ObservationGrads, TriangularGrads)         \
+    kernel(slice_rotated, RotatedArgs, Observation)                                              \
+    kernel(slice_rotated_backward, RotatedArgs, ObservationGrads, RotatedGrads)                  \
+    kernel(slice_static, StaticArgs, StaticSlice)                                                   \
+    kernel(slice_static_backward, StaticArgs, StaticSliceGrads, StaticGrads)                         \
     kernel(show_colors, ColorArgs, Colors)                                                         \
     kernel(show_colors_backward, ColorArgs, ShownColors, GivenColors, ColorGrads)                  \
     kernel(refine, RefineArgs, Refined)                                                            \

@@ -11,7 +11,7 @@ from gsbench.kernels.operation import EVERY_ROW, Operation, first_rows
 _SLICE = {"means": Output("N 3"), "factors": Output("N 3 3"), "opacities": Output("N")}
 
 _triangular = Operation(
-    "observe_triangular",
+    "slice_triangular",
     inputs={
         "means": Input("N 3", Gradient.ADDED),
         "directions": Input("N 3", Gradient.ADDED, left_out_with="direction"),
@@ -42,11 +42,11 @@ def _entries(given: dict[str, Tensor]) -> dict[str, int]:
     """Return how many numbers of each kind a factor over p and k conditioned variables has."""
     k = 3 * ("directions" in given) + ("times" in given)
     if k == 0:
-        raise InputError("observe_triangular: expected directions, times or both, got neither")
+        raise InputError("slice_triangular: expected directions, times or both, got neither")
     return {"rows": k + 3, "moves": 3 * k, "couplings": k * (k - 1) // 2}
 
 
-def observe_triangular(
+def slice_triangular(
     means: Tensor,  # [N, 3]
     directions: Tensor | None,  # [N, 3], None: direction is not observed
     times: Tensor | None,  # [N, 1], None: time is not observed
@@ -106,7 +106,7 @@ def observe_triangular(
 
 
 _rotated = Operation(
-    "observe_rotated",
+    "slice_rotated",
     inputs={
         "means": Input("N 3", Gradient.ADDED),
         "times": Input("N 1", Gradient.ADDED),
@@ -125,7 +125,7 @@ _rotated = Operation(
 )
 
 
-def observe_rotated(
+def slice_rotated(
     means: Tensor,  # [N, 3]
     times: Tensor,  # [N, 1]
     scales: Tensor,  # [N, 4] log scales of x, y, z, t
@@ -168,7 +168,7 @@ def observe_rotated(
 
 
 _static = Operation(
-    "observe_static",
+    "slice_static",
     inputs={
         "scales": Input("N 3", Gradient.ADDED),
         "quats": Input("N 4", Gradient.ADDED),
@@ -179,7 +179,7 @@ _static = Operation(
 )
 
 
-def observe_static(
+def slice_static(
     scales: Tensor,  # [N, 3] log scales
     quats: Tensor,  # [N, 4] wxyz
     opacities: Tensor,  # [N] logits

@@ -17,6 +17,7 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
 from gsbench.measure.machine import Hardware, named
+from gsbench.measure.renamed import with_present_keys
 from gsbench.measure.schema import parse
 from gsbench.measure.speed import RenderTimes
 from gsbench.reading import MAX_JSON, parse_json, read_file
@@ -152,6 +153,12 @@ class Provenance:
     data_hash: str  # Scene.fingerprint
     time: str  # UTC, ISO 8601
     hardware: Hardware | None = None  # None in older records, which tell machines apart by `device` alone
+
+    @staticmethod
+    def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
+        """Return provenance as JSON whose config has the names of now, where an older gsbench wrote it."""
+        config = plain.get("config")
+        return plain | {"config": with_present_keys(config)} if isinstance(config, dict) else plain
 
     @property
     def machine(self) -> str:

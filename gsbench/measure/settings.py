@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator
 from typing import Any
 
 from gsbench.measure.provenance import config_hash
+from gsbench.measure.renamed import old_key
 
 Plain = dict[str, Any]  # a resolved config in plain JSON
 
@@ -48,7 +49,7 @@ def training_part(plain: Plain) -> Plain:
 
 def training_hash(plain: Plain) -> str:
     """Compute the SHA-256 of the settings that a training reads; runs with equal hashes can exchange checkpoints."""
-    return config_hash(given(training_part(plain)))
+    return config_hash({old_key(key): value for key, value in given(training_part(plain)).items()})
 
 
 def given(plain: Plain) -> Plain:

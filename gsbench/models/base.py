@@ -5,6 +5,7 @@ What a model may have beside that, so that gates can simplify its Gaussians, is 
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -37,14 +38,44 @@ class Gaussians3D(NamedTuple):
     factors: Tensor  # [N, 3, 3]
     opacities: Tensor  # [N]
     colors: Tensor  # [N, 3]
+    shapes: Tensor | None = None  # [N] b of the profile (see `gsbench.raster.rasterize`); None: every one is a Gaussian
 
 
 class Conditioned(NamedTuple):
-    """The geometry of one slice."""
+    """The geometry of one slice, with the part of the opacities that is left."""
 
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
     opacity_factor: Tensor  # [N] f_temp f_dir in [0, 1]
+    shapes: Tensor | None = None  # [N], as in `Gaussians3D`
+
+
+class Geometry(NamedTuple):
+    """One slice without its colours."""
+
+    means: Tensor  # [N, 3]
+    factors: Tensor  # [N, 3, 3]
+    opacities: Tensor  # [N]
+    shapes: Tensor | None = None  # [N], as in `Gaussians3D`
+
+
+def tensors_of(parts: Iterable[Tensor | None]) -> list[Tensor]:
+    """Return the tensors of a slice or of its geometry in their order, without shapes that are None."""
+    return [part for part in parts if part is not None]
+
+
+def joined_shapes(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    """Return the shapes of some rows and then those of others; None where neither have any.
+
+    Raises:
+        InputError: only one of them has shapes.
+    """
+    if first is None and second is None:
+        return None
+    if first is None or second is None:
+        raise InputError("shapes: expected every row of a slice to have one or none to have one, got some of them: "
+                         "let `condition` and `static` of the model agree")  # fmt: skip
+    return torch.cat([first, second])
 
 
 class GaussianModel(nn.Module, ABC):
@@ -188,13 +219,17 @@ class GaussianModel(nn.Module, ABC):
         if query.time is None and ("time" in self.observes or self.agr):
             raise InputError(f"{type(self).__name__}: expected a time in [0, 1], got none: this model observes time")
         raw = self.refined(query)
-        means, factors, opacities = self.observe(raw, query)
-        return Gaussians3D(means, factors, opacities, self.shade(raw, means, opacities, query))
+        return self.colored(self.slice_geometry(raw, query), raw, query)
 
-    def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute the means, factors and opacities of a slice; models that have a kernel for it call the kernel."""
-        means, factors, opacity_factor = self.condition(raw, query)
-        return means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor
+    def colored(self, geometry: Geometry, raw: Raw, query: Query) -> Gaussians3D:
+        """Add the colours to the geometry of a slice."""
+        means, factors, opacities, shapes = geometry
+        return Gaussians3D(means, factors, opacities, self.shade(raw, means, opacities, query), shapes)
+
+    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+        """Compute the geometry of a slice; models that have a kernel for it call the kernel."""
+        means, factors, opacity_factor, shapes = self.condition(raw, query)
+        return Geometry(means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor, shapes)
 
     @property
     def orders(self) -> Tensor | None:
@@ -256,7 +291,7 @@ class GaussianModel(nn.Module, ABC):
         if self.refinement is not None:
             groups["refinement"] = list(self.refinement.parameters())
         if len(self.log_lambda):
-            groups["modulation"] = list(self.log_lambda.parameters())
+            groups["lambda"] = list(self.log_lambda.parameters())
         return groups
 
     # ---- density control: keep, copy and split rows

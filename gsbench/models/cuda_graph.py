@@ -86,7 +86,8 @@ class GraphedFrames:
         view = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, self.antialias)
 
         def frame() -> tuple[Tensor, Tensor]:
-            means, factors, opacities, colors = self.model.slice(Query.of(own, own_time))
+            # The first image was refused if the model has shapes.
+            means, factors, opacities, colors, _ = self.model.slice(Query.of(own, own_time))
             return draw_within(means, factors, opacities, colors[None], own.viewmat[None], own.K[None],
                                 self.background, view, room)  # fmt: skip
 

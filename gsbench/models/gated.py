@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models.base import Conditioned, GaussianModel, Raw
+from gsbench.models.base import Conditioned, GaussianModel, Geometry, Raw, joined_shapes
 from gsbench.models.color_order import MOST_PACKED, ColorOrder, coefficients_within
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
 from gsbench.models.query import Query
@@ -74,15 +74,16 @@ class GatedModel(GaussianModel):
         """Return how many of the first rows change with the query; None: all rows of the slice."""
         return None if self.effect_sets is None or not self.observes else self.effect_sets.conditioned
 
-    def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
+    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
         """Slice the rows that change with the query, and leave the others as they are."""
         if self.conditioned is None:
-            return super().observe(raw, query)
+            return super().slice_geometry(raw, query)
         changing = {name: x[: self.conditioned] for name, x in raw.items()}
         others = {name: x[self.conditioned :] for name, x in raw.items()}
-        parts = zip(self.condition(changing, query), self.static(others), strict=True)
-        means, factors, opacity_factor = map(torch.cat, parts)
-        return means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor
+        first, rest = self.condition(changing, query), self.static(others)
+        opacities = torch.sigmoid(raw["opacities"]) * torch.cat([first.opacity_factor, rest.opacity_factor])
+        means, factors = torch.cat([first.means, rest.means]), torch.cat([first.factors, rest.factors])
+        return Geometry(means, factors, opacities, joined_shapes(first.shapes, rest.shapes))
 
     def pack(self) -> dict[str, Tensor]:
         """Return the state for a checkpoint; with effect sets it has only the entries that matter, as [entries]."""

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsbench.kernels.slices import observe_static
-from gsbench.models.base import SHRINK, Conditioned, Raw
+from gsbench.kernels.slices import slice_static
+from gsbench.models.base import SHRINK, Conditioned, Geometry, Raw
 from gsbench.models.factors import rotation, sizes
 from gsbench.models.gated import GatedModel
 from gsbench.models.query import Query
@@ -49,11 +49,11 @@ class Gaussians3DModel(GatedModel):
         """Return nothing: there is no effect to freeze."""
         return {}
 
-    def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
-        """Slice by the kernel if the backend has one."""
+    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+        """Slice by the kernel where the backend has one."""
         if not self.backend.serves(raw["means"]):
-            return super().observe(raw, query)
-        return raw["means"], *observe_static(raw["scales"], raw["quats"], raw["opacities"])
+            return super().slice_geometry(raw, query)
+        return Geometry(raw["means"], *slice_static(raw["scales"], raw["quats"], raw["opacities"]))
 
     def scales(self) -> Tensor:
         """Return the largest of the three scales."""

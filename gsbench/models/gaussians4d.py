@@ -10,9 +10,9 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import LOG_SIZE_MAX, MAX_WAVES, TIME_OPACITY_FACTOR_MIN
-from gsbench.kernels.slices import observe_rotated
+from gsbench.kernels.slices import slice_rotated
 from gsbench.models.appearance import sh_time_colors
-from gsbench.models.base import SHRINK, Conditioned, Raw
+from gsbench.models.base import SHRINK, Conditioned, Geometry, Raw
 from gsbench.models.color_order import ColorOrder, coefficients_within, order_of
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
@@ -165,12 +165,12 @@ class Gaussians4DModel(GatedModel):
         left = self.splats["left_quats"].data[effect_sets.conditioned :]
         self.splats["right_quats"].data[effect_sets.conditioned :] = partner(left)
 
-    def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
-        """Slice by the kernel if the backend has one, in the square-root scheme."""
+    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+        """Slice by the kernel where the backend has one, in the square-root scheme."""
         if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
-            return super().observe(raw, query)
+            return super().slice_geometry(raw, query)
         assert query.time is not None
-        return observe_rotated(
+        geometry = slice_rotated(
             raw["means"],
             raw["times"],
             raw["scales"],
@@ -182,6 +182,7 @@ class Gaussians4DModel(GatedModel):
             self.log_lambda["time"],
             conditioned=self.conditioned,
         )
+        return Geometry(*geometry)
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
         """Compute 4DSH, by the kernel if the backend has one for so many waves."""

@@ -22,7 +22,10 @@ def rasterize_slice(
         antialias: see `gsbench.raster.rasterize`.
     """
     return rasterize(
-        *gaussians,
+        gaussians.means,
+        gaussians.factors,
+        gaussians.opacities,
+        gaussians.colors,
         camera.viewmat[None],
         camera.K[None],
         camera.width,
@@ -30,6 +33,7 @@ def rasterize_slice(
         background=background,
         backend=backend,
         antialias=antialias,
+        shapes=gaussians.shapes,
     )
 
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
-from gsbench.kernels.slices import observe_triangular
-from gsbench.models.base import SHRINK, Conditioned, Raw
+from gsbench.kernels.slices import slice_triangular
+from gsbench.models.base import SHRINK, Conditioned, Geometry, Raw
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle, rotation, sizes
 from gsbench.models.gated import OPACITY_MARGIN, GatedModel
@@ -117,12 +117,12 @@ class TriangularModel(GatedModel):
         factors = Triangle("ppp", self.triangle.form).factor(raw["log_diagonal"][:, space], raw)
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
-    def observe(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor, Tensor]:
-        """Slice by the kernel if there is one: in the square-root scheme, and on the CPU also for `cholesky`."""
+    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+        """Slice by the kernel where there is one: in the square-root scheme, and on the CPU also for `cholesky`."""
         has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
         if not has_kernel or not self.backend.serves(raw["means"]):
-            return super().observe(raw, query)
-        return observe_triangular(
+            return super().slice_geometry(raw, query)
+        geometry = slice_triangular(
             raw["means"],
             raw["directions"] if "direction" in self.observes else None,
             raw["times"] if "time" in self.observes else None,
@@ -141,6 +141,7 @@ class TriangularModel(GatedModel):
             subtracts=self.scheme == "cholesky",
             conditioned=self.conditioned,
         )
+        return Geometry(*geometry)
 
     def scales(self) -> Tensor:
         """Return the largest standard deviation of the slice, which is the same at every t and d."""

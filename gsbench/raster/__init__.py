@@ -6,7 +6,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.backends import CPU, CUDA, Backend, resolve
 from gsbench.kernels.raster import Viewport
 from gsbench.raster import native, reference
-from gsbench.raster.checks import check_arguments, check_values
+from gsbench.raster.checks import check_arguments, check_shapes, check_values
 from gsbench.raster.output import RasterInfo, RasterOutput
 
 __all__ = ["EPS2D", "FAR", "NEAR", "RasterInfo", "RasterOutput", "rasterize"]
@@ -31,6 +31,7 @@ def rasterize(
     eps2d: float = EPS2D,
     backend: str | Backend = "auto",
     antialias: bool = False,
+    shapes: Tensor | None = None,  # [N]
 ) -> RasterOutput:
     """Render N Gaussians to C images by the rules of 3DGS (Kerbl et al. 2023, section 4 and appendix C).
 
@@ -54,12 +55,16 @@ def rasterize(
         eps2d: added to the diagonal of the projected covariance, pixels^2.
         backend: or its name: `reference` (torch), `cpu`, `cuda` (kernels), `auto` (the fastest installed one).
         antialias: scale opacities by the area that `eps2d` added (Mip-Splatting's 2D filter).
+        shapes: b > 0 of each alpha profile, [N]: alpha = min(0.999, opacity * beta(r; b)) with beta(r; b) = (1 - r^2)^b
+            for r < 1 and zero elsewhere; r^2 = d^T cov2d^-1 d of the pixel's offset d (Universal Beta Splatting). None
+            is the Gaussian, of power r^2 / 2. No backend has built another profile yet: each refuses shapes.
 
     Returns:
         The image [C, H, W, D], its alpha [C, H, W, 1], and `RasterInfo` for density control.
 
     Raises:
-        InputError: a shape, dtype, device or value is not as above, or the backend is unknown or not installed.
+        InputError: a shape, dtype, device or value is not as above, or the backend is unknown, not installed or without
+            what is asked for.
 
     Example:
         A red ball of radius 0.1, two units in front of the camera.
@@ -78,6 +83,7 @@ def rasterize(
     if not isinstance(backend, str | Backend) or not isinstance(antialias, bool):
         raise InputError(f"backend, antialias: expected a name or a Backend, and True or False, got {backend!r:.40} "
                          f"and {antialias!r:.40}")  # fmt: skip
+    check_shapes(shapes, backend if isinstance(backend, str) else backend.name)
     check_arguments(means, factors, opacities, colors, viewmats, Ks, width, height, background, near, far, eps2d)
     if background is None:
         background = colors.new_zeros(colors.shape[-1])

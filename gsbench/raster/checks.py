@@ -52,6 +52,14 @@ def check_arguments(
     _known.add(call)
 
 
+def check_shapes(shapes: Tensor | None, backend: str) -> None:
+    """Raise InputError for shapes: no backend has built a profile other than the Gaussian."""
+    if shapes is not None:
+        got = f"a tensor of shape {list(shapes.shape)}" if isinstance(shapes, Tensor) else type(shapes).__name__
+        raise InputError(f"shapes: expected None, got {got}: raster backend '{backend:.40}' draws Gaussians only: "
+                         f"leave shapes out, or build their profile into it (docs/adding_a_kernel.md)")  # fmt: skip
+
+
 def _check_viewport(width: int, height: int, near: float, far: float, eps2d: float) -> None:
     """Raise InputError unless the image has pixels and `far` is beyond `near`."""
     if not all(type(size) is int and size >= 1 for size in (width, height)):

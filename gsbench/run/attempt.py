@@ -84,7 +84,7 @@ class Attempt:
         return OnDemand(screen, gating.gates, gating.notes, gating.direction)
 
     def draw(self) -> None:
-        """Write pictures.png of the measured views, and classes.png of a model whose effects were chosen.
+        """Write pictures.png of the measured views, and effect_sets.png of a model whose effects were chosen.
 
         It is called after the record is written, so a full disk costs the pictures and not the record.
         """

@@ -4,17 +4,19 @@ import hashlib
 import json
 import math
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.measure import record as records
+from gsbench.measure.renamed import present_key
 from gsbench.measure.settings import Plain, flat, training_part
 from gsbench.reading import read_file
 from gsbench.run.overrides import UNNAMED, deciding
@@ -59,6 +61,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
     for name in (one.name for one in fields(Config)):
         if name not in composed:
             raise InputError(f"config key '{name}': expected a value, it was deleted: leave '~{name}' out")
+    _rename_rates(composed)
     config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
     for key, name in (("experiment", config.experiment), ("scene.name", config.scene.name)):
         if name == records.PUBLISHED:
@@ -78,6 +81,17 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
         del plain[key]
     plain = _storable(plain)
     return Run(config, plain, folder, label, variant, deciding(overrides))
+
+
+def _rename_rates(composed: DictConfig) -> None:
+    """Give learning rates the names that their groups have now: a model's own YAML may be older than this gsbench."""
+    rates = composed.model.lr
+    for name in list(rates):
+        present = present_key(f"model.lr.{name}").rpartition(".")[2]
+        if present != name:
+            warnings.warn(f"model.lr.{name} was renamed, read as model.lr.{present}", stacklevel=1)
+            with open_dict(rates):
+                rates[present] = rates.pop(name)
 
 
 def hash_of(ply: str) -> str:

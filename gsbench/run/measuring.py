@@ -72,7 +72,7 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
     images = {"pictures.png": strip(shown)} if shown else {}
     if shown and with_effect_sets:
         first, renderer = views[0], trainer.renderer
-        images["classes.png"] = picture.draw(
+        images["effect_sets.png"] = picture.draw(
             trainer.model, first.camera, first.time, renderer.background, renderer.antialias
         )
     return Measured(metrics, missing, quality.per_view, cost, made, images)

@@ -3,6 +3,8 @@
 import re
 from collections.abc import Sequence
 
+from gsbench.measure.renamed import present_override
+
 UNNAMED = ("results", "resume", "launch")  # groups and keys that change no number of a run
 _UNNAMED = re.compile(rf"[+~]*({'|'.join(UNNAMED)})\b")
 _LAUNCH = re.compile(r"[+~]*launch\b")
@@ -10,7 +12,7 @@ _LAUNCH = re.compile(r"[+~]*launch\b")
 
 def deciding(overrides: Sequence[str]) -> list[str]:
     """Return the overrides that decide a run's numbers, sorted: equal for two commands of the same run."""
-    return sorted(one for one in overrides if not _UNNAMED.match(one))
+    return sorted(present_override(one) for one in overrides if not _UNNAMED.match(one))
 
 
 def launches(override: str) -> bool:

@@ -21,6 +21,7 @@ from gsbench.scenes.scene import Camera, Scene, View, scene_extent
 _RIGID_TOLERANCE = 1e-4  # D-NeRF writes single precision: its trex is orthonormal to 2.2e-6
 _SMALLEST = 1e-6  # pixels; smaller ones become zero in single precision
 _LARGEST = 1e30  # squares in double and sums in single precision stay finite up to here
+_MASKS = "masks"  # the folder beside images that has object numbers, one PNG an image, of the same name
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # as instant-ngp and nerfstudio write them
 
 
@@ -51,6 +52,7 @@ class _Frame:
     """One checked entry of `frames`, whose image is not read yet."""
 
     path: Path
+    mask: Path | None  # of the image's object numbers
     name: str  # relative to the scene's folder: "train/r_000.png"
     where: str  # the image's path and the field that names it, for messages
     time: float | None
@@ -75,6 +77,10 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float]) 
     `transform_matrix`, camera to world in OpenGL axes. Without transforms_val.json there are no validation views.
     Initial points are never taken from the folder: a points3d.ply there was drawn at random by 3DGS.
 
+    A folder `masks` beside the images has an 8-bit grey PNG for each of them, of the same name, whose values are the
+    numbers of the objects seen; they are the regions of its view. Nothing is fitted to or measured by them, so they do
+    not change the fingerprint.
+
     Raises:
         InputError: something is missing, damaged or contradictory; the message names file and field.
     """
@@ -84,7 +90,7 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float]) 
     if os.path.lexists(root / "transforms_val.json"):  # a broken link is a fault, and not a data set without val
         splits["val"] = _read_split(root, "val")
     _check_times(splits)
-    views, digests = _read_views(splits, downscale, background)
+    views, digests = _read_views(root, splits, downscale, background)
     digests |= {split.source.name: split.digest for split in splits.values()}
     return Scene(
         name=name,
@@ -154,7 +160,8 @@ def _read_frame(root: Path, frame: object, source: Path, index: int) -> _Frame:
             raise InputError(f"{where}.time: expected a time in [0, 1], got {time}")
     viewmat = _viewmat(frame.get("transform_matrix"), f"{where}.transform_matrix")
     named_by = f"{path} ({source.name}, frames[{index}].file_path)"
-    return _Frame(path, path.relative_to(root).as_posix(), named_by, time, viewmat)
+    mask = path.parent / _MASKS / path.name if (path.parent / _MASKS).is_dir() else None
+    return _Frame(path, mask, path.relative_to(root).as_posix(), named_by, time, viewmat)
 
 
 def _viewmat(
@@ -197,7 +204,7 @@ def _check_times(splits: dict[str, _Split]) -> None:
 
 
 def _read_views(
-    splits: dict[str, _Split], downscale: int, background: tuple[float, float, float]
+    root: Path, splits: dict[str, _Split], downscale: int, background: tuple[float, float, float]
 ) -> tuple[dict[str, list[View]], dict[str, str]]:
     """Read all images on threads, in order; return the views by split and the images' digests by name.
 
@@ -219,9 +226,14 @@ def _read_views(
         is_kept = in_8_bits and decoded.dtype.name == "uint8"
         image = torch.from_numpy(decoded) if is_kept else images.composite(decoded, background, downscale, frame.where)
         camera = Camera(frame.viewmat, split.intrinsics.matrix(*expected, downscale), image.shape[1], image.shape[0])
-        return View(frame.name[: -len(".png")], camera, frame.time, image, background), files.digest(data)
+        alpha = None if is_kept else images.alpha_of(decoded, downscale)
+        regions = None if frame.mask is None else _read_mask(root, frame, expected, downscale)
+        name = frame.name[: -len(".png")]
+        return View(name, camera, frame.time, image, background, alpha, regions), files.digest(data)
 
-    threads = images.count_readers(expected, len(listed), downscale, first.where, 4 if in_8_bits else 12)
+    masked = any(frame.mask is not None for _, frame in listed)
+    kept = (4 if in_8_bits else 13) + masked  # an alpha and a region have a byte each
+    threads = images.count_readers(expected, len(listed), downscale, first.where, kept)
     with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
         decoded = pool.map(read, listed)
         digests = {}
@@ -231,6 +243,14 @@ def _read_views(
                 view, digests[frame.name] = next(decoded)
                 views[name].append(view)
     return views, digests
+
+
+def _read_mask(root: Path, frame: _Frame, size: tuple[int, int], downscale: int) -> Tensor:  # [H, W] 8 bits
+    """Read the object numbers of an image whose folder has masks; raises InputError where they cannot be read."""
+    assert frame.mask is not None
+    where = f"{frame.mask} (the mask of {frame.name}; without a folder '{_MASKS}' a scene has no regions)"
+    path = files.find_inside(root, frame.mask.relative_to(root).as_posix(), where)
+    return images.decode_regions(images.read_png(path, where), size, downscale, where)
 
 
 def _check_size(size: tuple[int, int], expected: tuple[int, int], split: _Split, frame: _Frame) -> None:

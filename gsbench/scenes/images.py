@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,7 +20,16 @@ from gsbench.reading import read_file
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
-_DEPTHS = {2: (8, 16), 6: (8, 16), 3: (1, 2, 4, 8)}  # bits, by colour type: RGB, RGBA, and a palette of RGB
+
+class Kind(NamedTuple):
+    """What a PNG may hold."""
+
+    depths: dict[int, tuple[int, ...]]  # bits of a channel, by PNG's colour type
+    words: str  # for messages
+
+
+COLORS = Kind({2: (8, 16), 6: (8, 16), 3: (1, 2, 4, 8)}, "8- or 16-bit RGB or RGBA")  # 3: a palette of RGB
+NUMBERS = Kind({0: (8,)}, "8-bit grey, the number of the object in each pixel")
 _DEPTH_AT = 24  # the byte of a PNG that says how many bits a channel has
 _DECODING = 64  # bytes a pixel while an image is decoded and composited; measured: 48 for 8 bits, 52 for 16
 # Bytes of all images of a scene as floats, up to which they are kept so. To look at 8 bits of 800 x 800 takes 6 ms
@@ -52,13 +61,14 @@ def read_png(
 def png_size(
     data: bytes,
     where: str,  # the file's path, for the message
+    kind: Kind = COLORS,
 ) -> tuple[int, int]:
     """Return width and height of a PNG, without decoding it.
 
     Length and checksum of all chunks are checked, IHDR to IEND (PNG specification, section 5).
 
     Raises:
-        InputError: the file is not a PNG, truncated, damaged, neither RGB nor RGBA, of zero size, or too large.
+        InputError: the file is not a PNG, truncated, damaged, of another kind, of zero size, or too large.
     """
     if not data.startswith(_SIGNATURE):
         raise InputError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
@@ -66,17 +76,17 @@ def png_size(
     at = len(_SIGNATURE)
     while True:
         header = data[at : at + 8]
-        length, kind = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
+        length, name = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
         body, checksum = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
         if len(checksum) < 4:
             raise InputError(f"{where}: truncated PNG, it ends at byte {len(data)} before its IEND: copy it again")
-        if zlib.crc32(kind + body) != int.from_bytes(checksum, "big"):
-            raise InputError(f"{where}: damaged PNG, wrong checksum of chunk {kind!r} at byte {at}: copy it again")
+        if zlib.crc32(name + body) != int.from_bytes(checksum, "big"):
+            raise InputError(f"{where}: damaged PNG, wrong checksum of chunk {name!r} at byte {at}: copy it again")
         if at == len(_SIGNATURE):
-            if kind != b"IHDR" or length != 13:
-                raise InputError(f"{where}: damaged PNG, its first chunk is {kind!r} and not IHDR: copy it again")
-            size = _check_header(body, where)
-        if kind == b"IEND":
+            if name != b"IHDR" or length != 13:
+                raise InputError(f"{where}: damaged PNG, its first chunk is {name!r} and not IHDR: copy it again")
+            size = _check_header(body, where, kind)
+        if name == b"IEND":
             return size
         at += 12 + length
 
@@ -128,18 +138,43 @@ def decode_png(
         InputError: the file is not a PNG, truncated, damaged, of zero size, or neither RGB nor RGBA.
     """
     png_size(data, where)
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        if error.code == cv2.Error.StsNoMem:
-            raise MemoryError(f"{where}: OpenCV has none for its pixels") from None
-        raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again") from error
-    if pixels is None:
-        raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again")
+    pixels = _decode(data, where)
     if pixels.ndim != 3 or pixels.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{where}: expected 8- or 16-bit RGB or RGBA, got {pixels.dtype} of shape {pixels.shape}")
     to_rgb = cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB
     return cv2.cvtColor(pixels, to_rgb)  # type: ignore[return-value]  # OpenCV's stubs do not keep the dtype
+
+
+def decode_regions(
+    data: bytes,
+    size: tuple[int, int],  # width and height of the image that it belongs to
+    downscale: int,  # divides the size
+    where: str,  # the file's path, for the message
+) -> Tensor:  # [H / downscale, W / downscale] 8 bits
+    """Decode a mask, an 8-bit grey PNG whose values are object numbers; of each block a pixel near its middle is taken.
+
+    Raises:
+        InputError: the file is not such a PNG, truncated, damaged, or of another size than its image.
+    """
+    own = png_size(data, where, NUMBERS)
+    if own != size:
+        raise InputError(f"{where}: expected {size[0]}x{size[1]} as the image of this mask, got {own[0]}x{own[1]}")
+    numbers = _decode(data, where)  # [H, W]
+    return torch.from_numpy(numbers[downscale // 2 :: downscale, downscale // 2 :: downscale].copy())
+
+
+def alpha_of(
+    pixels: Pixels,  # [H, W, 3|4] as stored
+    downscale: int,  # divides the size
+) -> Tensor | None:  # [H / downscale, W / downscale] 8 bits
+    """Return the alpha of an image, averaged as its colours are; None where it has none."""
+    if pixels.shape[2] == 3:
+        return None
+    alpha: NDArray[Any] = pixels[..., 3].astype(np.float32) * np.float32(255 / np.iinfo(pixels.dtype).max)
+    if downscale > 1:
+        height, width = alpha.shape
+        alpha = cv2.resize(alpha, (width // downscale, height // downscale), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(np.rint(alpha).astype(np.uint8))
 
 
 def composite(
@@ -172,15 +207,28 @@ def composite(
     return torch.from_numpy(np.clip(image, 0, 1))  # float rounding may leave [0, 1] by an ulp
 
 
-def _check_header(header: bytes, where: str) -> tuple[int, int]:
+def _decode(data: bytes, where: str) -> NDArray[Any]:
+    """Decode a PNG that was checked; raises InputError where OpenCV cannot."""
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryError(f"{where}: OpenCV has none for its pixels") from None
+        raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again") from error
+    if pixels is None:
+        raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again")
+    return pixels
+
+
+def _check_header(header: bytes, where: str, kind: Kind) -> tuple[int, int]:
     """Check the 13 bytes of IHDR (PNG specification, section 11.2.2); return width and height."""
     width, height, depth, color, compression, filtering, interlacing = struct.unpack(">IIBBBBB", header)
     if width == 0 or height == 0:
         raise InputError(f"{where}: expected an image with pixels, its size is {width}x{height}: render it again")
     if width * height > _MAX_PIXELS:
         raise InputError(f"{where}: expected at most {_MAX_PIXELS} pixels, its size is {width}x{height}: resize it")
-    if depth not in _DEPTHS.get(color, ()):
-        raise InputError(f"{where}: expected 8- or 16-bit RGB or RGBA, got PNG's colour type {color} of {depth} bits")
+    if depth not in kind.depths.get(color, ()):
+        raise InputError(f"{where}: expected {kind.words}, got PNG's colour type {color} of {depth} bits")
     if compression or filtering or interlacing > 1:
         raise InputError(f"{where}: damaged PNG, its compression, filter or interlacing is unknown: copy it again")
     return width, height

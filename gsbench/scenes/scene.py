@@ -35,6 +35,13 @@ class View:
     time: float | None  # in [0, 1]; None where the data set has no time
     pixels: Tensor  # [H, W, 3] of floats in [0, 1] or of 8 bits; or [H, W, 4] of 8 bits: straight alpha ..
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # .. which is composited over this when it is looked at
+    composited_alpha: Tensor | None = None  # [H, W] 8 bits, of pixels that were composited when they were loaded
+    regions: Tensor | None = None  # [H, W] 8 bits: the number of the object seen in each pixel, 0 = none; None: unknown
+
+    @property
+    def alpha(self) -> Tensor | None:
+        """The alpha of the image as stored, [H, W] of 8 bits; None where the image has none."""
+        return self.pixels[..., 3] if self.pixels.shape[-1] == 4 else self.composited_alpha
 
     @property
     def image(self) -> Tensor:
@@ -56,7 +63,9 @@ class View:
 
     def to(self, device: str) -> "View":
         """Return the same view with its tensors on `device`."""
-        return replace(self, camera=self.camera.to(device), pixels=self.pixels.to(device))
+        alpha, regions = (x if x is None else x.to(device) for x in (self.composited_alpha, self.regions))
+        camera, pixels = self.camera.to(device), self.pixels.to(device)
+        return replace(self, camera=camera, pixels=pixels, composited_alpha=alpha, regions=regions)
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ class _Splats(NamedTuple):
     colors: Tensor  # [M, D]
 
 
-def paint(
+def render(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     width: int, height: int, *, offsets2d: Tensor | None = None, background: Tensor | None = None, **options: Any,
 ) -> Picture:  # fmt: skip

@@ -13,6 +13,7 @@ from gsbench import kernels
 from gsbench.kernels.backends import BACKENDS
 from gsbench.measure.speed import synchroniser
 from gsbench.models import Query, build
+from gsbench.models.base import tensors_of
 from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS, TriangularModel
 from gsbench.stability import picture_cases, pictures, population, slices
@@ -101,7 +102,7 @@ def _sliced(
     center, moment = torch.zeros(3, device=device, dtype=dtype), torch.zeros((), device=device, dtype=dtype)
 
     def both() -> Tensor:
-        out = model.observe(raw, Query(center, moment))
+        out = tensors_of(model.slice_geometry(raw, Query(center, moment)))
         torch.autograd.grad(out, list(raw.values()), [torch.ones_like(x) for x in out], allow_unused=True)
         synchroniser(device)()
         return out[1].detach().cpu().double()
@@ -166,7 +167,8 @@ def safety(backends: list[str]) -> Iterator[SliceTime]:
                 raw = {k: v.to(device).requires_grad_() for k, v in population.raw_parameters(hard, model).items()}
                 for _ in range(1 if backend == "reference" else REPEATS):
                     start = time.perf_counter()
-                    out = model.observe(raw, Query(torch.zeros(3, device=device), torch.zeros((), device=device)))
+                    query = Query(torch.zeros(3, device=device), torch.zeros((), device=device))
+                    out = tensors_of(model.slice_geometry(raw, query))
                     wait()
                     middle = time.perf_counter()
                     torch.autograd.grad(out, list(raw.values()), [torch.ones_like(x) for x in out], allow_unused=True)

@@ -56,7 +56,7 @@ def together(arguments: Arguments) -> ImageTruth:
     """Render the exact image and gradients by brute force."""
     exact: Arguments = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
     with torch.no_grad():
-        picture = brute.paint(**exact)
+        picture = brute.render(**exact)
     decided = picture.slack > UNDECIDED
     weight, weight_alpha = (w * decided[..., None] for w in weights(arguments))
     gradients = brute.differentiate(exact, weight, weight_alpha)

@@ -233,8 +233,8 @@ def _judge(
     raw = raw_parameters(Hard(*leaves, some.offset), model)
     device = device_of(model.backend.name)
     there = {name: value.to(device) for name, value in raw.items()}
-    out = model.observe(there, Query(torch.zeros(3, device=device), torch.zeros((), device=device)))
-    mean, F = out[0].cpu(), out[1].cpu()
+    out = model.slice_geometry(there, Query(torch.zeros(3, device=device), torch.zeros((), device=device)))
+    mean, F = out.means.cpu(), out.factors.cpu()
     exact_mean, exact_cov = torch.from_numpy(known.mean[rows]), torch.from_numpy(known.cov[rows])
     cov = F.double() @ F.double().mT
     loss = (torch.from_numpy(w[rows]) * mean / exact_mean.norm(dim=1, keepdim=True)).sum()

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from gsbench.kernels.backends import BACKENDS
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import GaussianModel, Query, build
+from gsbench.models.base import tensors_of
 from gsbench.models.slicing import SCHEMES
 from gsbench.stability import oracle
 from gsbench.stability.cases import Case, Cell, backends_with, device_of
@@ -102,8 +103,8 @@ def differentiate(
     device = device_of(model.backend.name)
     moment = torch.tensor(observed.time, device=device) if "time" in model.observes else None
     there = {name: value.to(device) for name, value in raw.items()}
-    seen = model.observe(there, Query(observed.center.to(device), moment))
-    mean, F, opacity = (x.cpu().double() for x in seen)
+    seen = model.slice_geometry(there, Query(observed.center.to(device), moment))
+    mean, F, opacity = (x.cpu().double() for x in tensors_of(seen))
     outputs = torch.cat([mean, (F @ F.mT).flatten(1), opacity[:, None]], 1)
     inputs = list(raw.values())
     gradients = torch.autograd.grad(outputs, inputs, weights, materialize_grads=True)

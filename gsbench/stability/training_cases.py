@@ -125,10 +125,10 @@ def reset_into_refinement(g: Generator, severity: float, model: str) -> Training
 
 
 @case("training", "6dgs", "7dgs", forward=0.0, gradient=math.nan)
-def modulation_switched_on(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
+def lambda_switched_on(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
     """Let lambda start to learn in the middle, at 1000 times the usual rate: it goes to 0 or grows without bound."""
-    config = compose(model, STEPS, "train.modulation_from=15000")
-    config.model.lr["modulation"].start = 1e-3 * 1000**severity
+    config = compose(model, STEPS, "train.lambda_from=15000")
+    config.model.lr["lambda"].start = 1e-3 * 1000**severity
     return Training(model, config, moving_square())
 
 

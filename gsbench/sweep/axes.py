@@ -1,6 +1,7 @@
 """Expand a command line before Hydra reads it: scene=all becomes an axis of the sweep with one run for each scene."""
 
 import re
+import warnings
 from collections.abc import Sequence
 
 from hydra import compose, initialize_config_dir
@@ -10,6 +11,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import CONF
 from gsbench.errors import InputError, did_you_mean
+from gsbench.measure.renamed import present_override
 
 MULTIRUN = ("-m", "--multirun")
 SCENES_DEPEND_ON = ("exp", "data.scenes")  # the overrides that say which scenes there are
@@ -28,7 +30,7 @@ def expand(words: Sequence[str]) -> list[str]:
             experiments.
     """
     multirun = any(word in MULTIRUN for word in words)
-    words = [word for word in words if word not in MULTIRUN]
+    words = [_with_present_names(word) for word in words if word not in MULTIRUN]
     for word in words:
         _check_group(*word.lstrip("+").partition("=")[::2])
     keys = {word.partition("=")[0].lstrip("+"): word.partition("=")[2] for word in words if "=" in word}
@@ -43,6 +45,14 @@ def expand(words: Sequence[str]) -> list[str]:
             words = [*(word for word in words if not word.startswith("scene=")), f"scene={','.join(scenes)}"]
             multirun = True
     return ["--multirun", *words] if multirun else words
+
+
+def _with_present_names(word: str) -> str:
+    """Return a word with the names that keys have now; a warning tells of one that has changed."""
+    present = present_override(word)
+    if present != word:
+        warnings.warn(f"{word}: a key of it was renamed, read as {present}", stacklevel=1)
+    return present
 
 
 def _check_group(name: str, choices: str) -> None:

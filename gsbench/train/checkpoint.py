@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError, TooLargeError, one_line
 from gsbench.measure.atomic import write_atomically
+from gsbench.measure.renamed import with_present_keys
 
 MAGIC = b"gsbench checkpoint 4\n"  # then the SHA-256 of the rest in hex and a line feed, then what torch.save writes
 FILE_NAME = "checkpoint.pt"
@@ -23,8 +24,10 @@ REPRODUCED = frozenset({"step", "model", "optimizer", "density", "minimum_scale"
 TIMES = frozenset({"stages", "effort", "curve", "seconds", "frame_ms_before", "frame_ms", "frame_ms_without"})
 
 
-# Keys of a training's state in checkpoints of older versions, and their names now; and how keys of its model began.
+# Keys of a training's state in checkpoints of older versions, and their names now; and how keys of its model, and of
+# the moments of its parameters, began.
 RENAMED = {"floor": "minimum_scale"}
+RENAMED_IN_OPTIMIZER = {"modulation.": "lambda."}
 RENAMED_IN_MODEL = {
     "log_modulation.": "log_lambda.",
     "classes.levels": "effect_sets.orders",
@@ -94,20 +97,21 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
         expected = str if name in ("training", "data") else dict
         if not isinstance(value, expected):
             raise _fault(path, f"'{name}' as {type(value).__name__}")
-    return replace(found, state=with_present_names(found.state))
+    return replace(found, state=with_present_names(found.state), config=with_present_keys(found.config))
 
 
 def with_present_names(state: dict[str, Any]) -> dict[str, Any]:
     """Return a training's state with its present keys, also if an older version wrote it."""
     state = {RENAMED.get(key, key): value for key, value in state.items()}
-    if isinstance(model := state.get("model"), dict):
-        state["model"] = {_in_model(key): value for key, value in model.items()}
+    for part, names in (("model", RENAMED_IN_MODEL), ("optimizer", RENAMED_IN_OPTIMIZER)):
+        if isinstance(one := state.get(part), dict):
+            state[part] = {_present_key(key, names): value for key, value in one.items()}
     return state
 
 
-def _in_model(key: Any) -> Any:
-    """Return the present name of a key of a model's state."""
-    for old, new in RENAMED_IN_MODEL.items():
+def _present_key(key: Any, names: dict[str, str]) -> Any:
+    """Return the name that a key of a part of the state has now."""
+    for old, new in names.items():
         if isinstance(key, str) and key.startswith(old):
             return new + key.removeprefix(old)
     return key

@@ -46,7 +46,7 @@ class Optimizer:
             if name not in config.lr:
                 raise InputError(f"model.lr: expected a learning rate for each of {sorted(groups)}, '{name}' has none")
         for name in config.lr:
-            if name not in {*groups, "refinement", "modulation"}:
+            if name not in {*groups, "refinement", "lambda"}:
                 raise InputError(f"model.lr: model '{config.name}' has no '{name}'. {did_you_mean(name, groups)}")
         self.rates = {name: config.lr[name] for name in groups}
         self.model = model

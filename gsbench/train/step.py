@@ -158,7 +158,7 @@ class Step:
                         gaussians, view.camera, self.background, self.model.backend, self.antialias
                     )
                 except InputError as error:  # the rasterizer's door is the first to see a slice that is not finite
-                    if all(tensor.isfinite().all() for tensor in gaussians):
+                    if all(tensor.isfinite().all() for tensor in gaussians if tensor is not None):
                         raise
                     raise DivergedError(str(error)) from None
             with stages("loss"):

@@ -55,8 +55,8 @@ def serve(options: argparse.Namespace) -> None:
     import_models(options.model_module)
     runs = [load_run(run, options.device) for run in options.runs]
     viewer = Viewer(runs, options.host, options.port, options.data_root)
-    for painter in viewer.painters:
-        print(f"{painter.run.folder}: {len(painter.run.model)} Gaussians")
+    for renderer in viewer.renderers:
+        print(f"{renderer.run.folder}: {len(renderer.run.model)} Gaussians")
     if isinstance(viewer.scene, str):
         print(f"no training cameras: {viewer.scene}")
     host = f"[{options.host}]" if ":" in options.host else options.host

@@ -13,7 +13,7 @@ from gsbench.errors import InputError
 from gsbench.models.factors import rotation
 from gsbench.scenes import Camera, Scene
 from gsbench.view.controls import SIDE, Controls
-from gsbench.view.frame import Frame, Painter, beside, wiped
+from gsbench.view.frame import Frame, FrameRenderer, beside, wiped
 from gsbench.view.nearest import TrainingViews, compare
 from gsbench.view.panel import comparison, cost_table, legend
 from gsbench.view.resolution import Resolution
@@ -28,18 +28,18 @@ class Client:
     """One browser. It has its own choices; the models are shared."""
 
     def __init__(
-        self, client: viser.ClientHandle, painters: Sequence[Painter], scene: Scene | str, most_cost: float
+        self, client: viser.ClientHandle, renderers: Sequence[FrameRenderer], scene: Scene | str, most_cost: float
     ) -> None:
         """Show the controls and begin to render.
 
         Args:
             client: the browser, as viser has it.
-            painters: of the models that can be shown, one or more of one scene.
+            renderers: of the models that can be shown, one or more of one scene.
             scene: with the training views; or why there are none.
             most_cost: nanoseconds of a Gaussian that have the brightest colour.
         """
         self.client = client
-        self.controls = Controls(client, painters, scene)
+        self.controls = Controls(client, renderers, scene)
         self.changed = self.controls.changed
         self.left = False
         self.rests = True  # whether the last frame has all pixels, and nothing has changed since
@@ -96,7 +96,7 @@ class Client:
         """Render the one or two images that the controls request."""
         shown, mode = self.controls.shown(), self.controls.layout
         camera = self._camera(max(1, width // 2) if mode == SIDE else width, height)
-        first, *others = [painter.paint(camera, self.controls.request(colours)) for painter, colours in shown]
+        first, *others = [renderer.render(camera, self.controls.request(colours)) for renderer, colours in shown]
         if not others:
             return first
         return beside(first, others[0]) if mode == SIDE else wiped(first, others[0], self.controls.wiped)
@@ -107,8 +107,8 @@ class Client:
             return
         nearest = self._views.nearest(self._camera(1, 1), self.controls.now)
         request = self.controls.request_of(nearest.view)
-        painters = dict.fromkeys(painter for painter, _ in self.controls.shown())
-        compared = [compare(painter, nearest.view, request) for painter in painters]
+        renderers = dict.fromkeys(renderer for renderer, _ in self.controls.shown())
+        compared = [compare(renderer, nearest.view, request) for renderer in renderers]
         self.controls.comparison.content = comparison(nearest, compared)
 
     def _camera(self, width: int, height: int) -> Camera:

@@ -12,7 +12,7 @@ import torch
 import viser
 
 from gsbench.scenes import Scene, View
-from gsbench.view.frame import CLASS, COLOURS, IMAGE, FrameRequest, Painter
+from gsbench.view.frame import CLASS, COLOURS, IMAGE, FrameRenderer, FrameRequest
 from gsbench.view.frusta import Frusta
 
 PLAYED_S = 4.0  # a clip takes that long
@@ -24,25 +24,25 @@ PANEL = {"x": 15.0, "y": -15.0, "width": 400.0}  # pixels: where it floats, from
 class ShownImage(NamedTuple):
     """One of the images on the screen."""
 
-    painter: Painter  # of the model
+    renderer: FrameRenderer  # of the model
     colours: str  # the meaning of its Gaussians' colours
 
 
 class Controls:
     """The choices of one browser. The event `changed` is set whenever a choice changes."""
 
-    def __init__(self, client: viser.ClientHandle, painters: Sequence[Painter], scene: Scene | str) -> None:
+    def __init__(self, client: viser.ClientHandle, renderers: Sequence[FrameRenderer], scene: Scene | str) -> None:
         """Show the controls.
 
         Args:
             client: the browser, as viser has it.
-            painters: of the models that can be shown, one or more of one scene.
+            renderers: of the models that can be shown, one or more of one scene.
             scene: with the training views; or why there are none.
         """
         self.client = client
         self.changed = threading.Event()
-        self._painters = {painter.name: painter for painter in painters}
-        self._has_time = painters[0].run.scene.has_time
+        self._renderers = {renderer.name: renderer for renderer in renderers}
+        self._has_time = renderers[0].run.scene.has_time
         self._frozen: torch.Tensor | None = None  # the place that slices are seen from
         self._held: float | None = None  # the time that slices are of
         self._played_at = time.monotonic()
@@ -62,10 +62,10 @@ class Controls:
 
     def _add_effects(self) -> None:
         """Add the controls that switch the effects of the models off, one by one."""
-        gui, painters = self.client.gui, self._painters.values()
-        degree = max(painter.trained_active.sh_degree for painter in painters)
+        gui, renderers = self.client.gui, self._renderers.values()
+        degree = max(renderer.trained_active.sh_degree for renderer in renderers)
         with gui.add_folder("effects"):
-            self.agr = gui.add_checkbox("AGR", True, disabled=not any(painter.has_agr for painter in painters))
+            self.agr = gui.add_checkbox("AGR", True, disabled=not any(renderer.has_agr for renderer in renderers))
             hold = gui.add_checkbox("freeze time", False, disabled=not self._has_time, hint="slices stay those of now")
             freeze = gui.add_checkbox("freeze direction", False, hint="slices stay those seen from here")
             self.degree = gui.add_slider("harmonics", 0, max(degree, 1), 1, degree, disabled=degree == 0,
@@ -77,7 +77,7 @@ class Controls:
 
     def _add_images(self) -> None:
         """Add the controls that choose the models, and the meaning of their Gaussians' colours."""
-        gui, names = self.client.gui, list(self._painters)
+        gui, names = self.client.gui, list(self._renderers)
         several = len(names) > 1
         self.mode = gui.add_dropdown("show", (ONE, SIDE, WIPE))
         first = gui.add_dropdown("model", names, visible=several)
@@ -176,9 +176,11 @@ class Controls:
     def shown(self) -> list[ShownImage]:
         """Return the one or two images that are shown."""
         choices = self._choices[:1] if self.layout == ONE else self._choices
-        first = next(iter(self._painters.values()))
-        return [ShownImage(self._painters.get(model.value, first), colours.value if colours.value in COLOURS else IMAGE)
-                for model, colours in choices]  # fmt: skip
+        first = next(iter(self._renderers.values()))
+        return [
+            ShownImage(self._renderers.get(model.value, first), colours.value if colours.value in COLOURS else IMAGE)
+            for model, colours in choices
+        ]
 
     def request(self, colours: str) -> FrameRequest:
         """Return the request for a frame now, in some colours."""

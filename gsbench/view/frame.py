@@ -53,7 +53,7 @@ class Frame(NamedTuple):
         return sum(cost.of(part) for cost in self.costs)
 
 
-class Painter:
+class FrameRenderer:
     """Renders the frames of one run. It sets the model's effects for each frame, so it renders one frame at a time."""
 
     def __init__(self, run: LoadedRun, most_cost: float) -> None:
@@ -73,17 +73,17 @@ class Painter:
         self._colors = {CLASS: effect_set_colors(run.model), COST: cost_colors(run.model, most_cost)}
         self._lock = threading.Lock()
 
-    def paint(self, camera: Camera, request: FrameRequest) -> Frame:
+    def render(self, camera: Camera, request: FrameRequest) -> Frame:
         """Render the image of a camera; raises InputError for an invalid camera."""
-        image, ms = self._render(camera, request)
+        image, ms = self._timed_image(camera, request)
         shown = inferno(image[..., 0].cpu().numpy()) if request.colours == COST else to_bytes(image.cpu().numpy())
         return Frame(shown, (FrameCost(self.name, ms),))
 
     def image(self, camera: Camera, request: FrameRequest) -> torch.Tensor:
         """Render the image of a camera as floats, [H, W, 3], to be measured."""
-        return self._render(camera, request)[0].cpu()
+        return self._timed_image(camera, request)[0].cpu()
 
-    def _render(self, camera: Camera, request: FrameRequest) -> tuple[torch.Tensor, dict[str, float]]:
+    def _timed_image(self, camera: Camera, request: FrameRequest) -> tuple[torch.Tensor, dict[str, float]]:
         """Render an image; return it with the milliseconds by stage."""
         run, device = self.run, self.run.config.device
         camera = camera.to(device)

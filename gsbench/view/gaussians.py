@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.headers import ALPHA_MIN
-from gsbench.models.base import GaussianModel
+from gsbench.models.base import GaussianModel, tensors_of
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.query import Query
 from gsbench.scenes.points import SH_C0
@@ -28,13 +28,17 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
             viewpoint, as a harmonic of degree 0.
 
     Raises:
-        InputError: harmonics are requested but the model's geometry or colours depend on the viewpoint; or no Gaussian
-            is left, or one is not finite.
+        InputError: harmonics are requested but the model's geometry or colours depend on the viewpoint; the slice has
+            shapes; or no Gaussian is left, or one is not finite.
     """
     if keep_harmonics and not has_harmonics(model):
         raise InputError(f"expected --camera I or --direction X,Y,Z: a slice of {type(model).__name__} depends on it")
     with torch.no_grad():
-        means, factors, opacities, colors = (part.detach().cpu() for part in model.slice(query))
+        seen = model.slice(query)
+        if seen.shapes is not None:
+            raise InputError(f"PLY: expected a slice without shapes, got one of {type(model).__name__} that has them: "
+                             f"3DGS' PLY has no field for them; export images or a video")  # fmt: skip
+        means, factors, opacities, colors = (part.detach().cpu() for part in tensors_of(seen))
         drawn = opacities >= ALPHA_MIN  # the rasterizer skips an alpha below it, and no alpha is above the opacity
         if not drawn.any():
             raise InputError("no Gaussian can be seen at this time and from this place: choose others")

@@ -10,7 +10,7 @@ import torch
 from gsbench.measure.images import Pixels, error_image, to_bytes
 from gsbench.measure.quality import psnr, quantise
 from gsbench.scenes import Camera, Scene, View
-from gsbench.view.frame import FrameRequest, Painter
+from gsbench.view.frame import FrameRenderer, FrameRequest
 
 SAME = 1e-3  # extents and radians: views nearer to each other than this differ only in time
 MOST_WIDTH = 480  # pixels of an image that is shown; larger ones are made smaller
@@ -60,20 +60,20 @@ class TrainingViews:
         return Nearest(self._views[best], float(distances[best]), math.degrees(angles[best]))
 
 
-def compare(painter: Painter, view: View, request: FrameRequest) -> ViewComparison:
+def compare(renderer: FrameRenderer, view: View, request: FrameRequest) -> ViewComparison:
     """Render a view's camera and measure the image as the run was measured.
 
     Args:
-        painter: of the model.
+        renderer: of the model.
         view: to be compared with.
         request: the query and the effects.
     """
     view = view.to("cpu")
-    image = painter.image(view.camera, request)
-    shown = quantise(image) if painter.run.config.protocol.quantise else image
+    image = renderer.image(view.camera, request)
+    shown = quantise(image) if renderer.run.config.protocol.quantise else image
     error = error_image(shown.numpy(), view.image.numpy())
     return ViewComparison(
-        painter.name,
+        renderer.name,
         _small(to_bytes(view.image.cpu().numpy())),
         _small(to_bytes(shown.cpu().numpy())),
         _small(error),

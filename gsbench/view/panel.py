@@ -42,7 +42,7 @@ def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
         most_cost: nanoseconds that have the brightest colour.
     """
     text = ""
-    if by_effect_set := {painter.name: painter.counts for painter, colours in shown if colours == CLASS}:
+    if by_effect_set := {renderer.name: renderer.counts for renderer, colours in shown if colours == CLASS}:
         rows = [_row("Gaussians", list(by_effect_set), bold=True)]
         for name, words in EFFECT_SETS.items():
             counts = [counts[name] for counts in by_effect_set.values()]

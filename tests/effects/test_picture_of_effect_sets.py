@@ -136,7 +136,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_that_chose_effects_leaves_its_picture(folder: Path) -> None:
     """Catches a picture that is not written, or not where the report looks."""
     assert record.read(folder / record.FILE_NAME).on_demand
-    assert cv2.imread(str(folder / "classes.png")).shape[1] == 3 * 304 + 2 * picture.GAP
+    assert cv2.imread(str(folder / "effect_sets.png")).shape[1] == 3 * 304 + 2 * picture.GAP
 
 
 def test_the_command_draws_a_run(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -145,7 +145,7 @@ def test_the_command_draws_a_run(folder: Path, tmp_path: Path, capsys: pytest.Ca
     asked = [[], ["--camera", "1"], ["--camera", "1", "--time", "0.2"]]
     for path, more in zip(out, asked, strict=True):
         assert main(["--picture", str(folder), "--out", str(path), *more]) == 0
-    assert out[0].read_bytes() == (folder / "classes.png").read_bytes()
+    assert out[0].read_bytes() == (folder / "effect_sets.png").read_bytes()
     assert len({path.read_bytes() for path in out}) == 3
     assert str(out[2]) in capsys.readouterr().out
 

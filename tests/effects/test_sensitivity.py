@@ -7,7 +7,7 @@ from worlds import camera
 
 from gsbench.effects.sensitivity import probe
 from gsbench.models import GaussianModel, Query, build
-from gsbench.models.base import Gaussians3D
+from gsbench.models.base import Gaussians3D, tensors_of
 from gsbench.models.render import rasterize_slice
 from gsbench.models.simplifications import Simplification, simplifications_of
 from gsbench.scenes.scene import Points, View
@@ -60,8 +60,7 @@ def slice_of(model: GaussianModel, simplification: Simplification, live: Gaussia
         raw = model.refined(query) | simplification.raw
         return live._replace(colors=model.shade(raw, live.means, live.opacities, query))
     raw = dict(model.splats.items()) | simplification.raw
-    means, factors, opacities = model.observe(raw, query)
-    return Gaussians3D(means, factors, opacities, model.shade(raw, means, opacities, query))
+    return model.colored(model.slice_geometry(raw, query), raw, query)
 
 
 def brute_force(model: GaussianModel, views: list[View], simplification: Simplification) -> Tensor:
@@ -73,8 +72,8 @@ def brute_force(model: GaussianModel, views: list[View], simplification: Simplif
         changed = slice_of(model, simplification, live, query)
         before = rasterize_slice(live, view.camera, BLACK, model.backend).image[0]
         for i in range(len(model)):
-            one = Gaussians3D(*(x.clone() for x in live))
-            for x, y in zip(one, changed, strict=True):
+            one = Gaussians3D(*(x.clone() for x in tensors_of(live)))
+            for x, y in zip(tensors_of(one), tensors_of(changed), strict=True):
                 x[i] = y[i]
             x = rasterize_slice(one, view.camera, BLACK, model.backend).image[0] - before
             errors[i] += (2 * ((before - view.image) * x).sum()).clamp(min=0) + x.square().sum()

@@ -37,7 +37,7 @@ def test_when_a_gaussian_is_seen() -> None:
     for i, view in enumerate(views):
         query = Query.of(view.camera, view.time)
         for raw in (model.refined(query), dict(model.splats.items())):
-            shown[:, i] |= model.observe(raw, query)[2] >= ALPHA_MIN
+            shown[:, i] |= model.slice_geometry(raw, query)[2] >= ALPHA_MIN
     at = torch.tensor([view.time for view in views])
     for row in range(N):
         seen = at[shown[row]]

@@ -12,7 +12,7 @@ from gsbench.kernels.adam import adam
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.refine import HIDDEN, refine
-from gsbench.kernels.slices import observe_rotated, observe_static, observe_triangular
+from gsbench.kernels.slices import slice_rotated, slice_static, slice_triangular
 from gsbench.measure.quality import evaluate, psnr, psnr_channel_mean, quantise, ssim
 from gsbench.models.slicing import slice_gaussians
 from gsbench.raster import rasterize
@@ -62,9 +62,9 @@ def targets() -> dict[str, Target]:
             slice_gaussians, {"mean": rand(N, 7), "factor": rand(N, 7, 7) + 2 * torch.eye(7), "query": rand(N, 4),
                               "scheme": "square_root"}
         ),
-        "observe_static": Target(observe_static, static),
-        "observe_rotated": Target(observe_rotated, rotated, ("clock", "time")),
-        "observe_triangular": Target(observe_triangular, triangular, ("center", "time")),
+        "slice_static": Target(slice_static, static),
+        "slice_rotated": Target(slice_rotated, rotated, ("clock", "time")),
+        "slice_triangular": Target(slice_triangular, triangular, ("center", "time")),
         "show_colors": Target(show_colors, colors, ("center", "opacities")),
         "l1_ssim": Target(l1_ssim, {"image": rand(12, 13, 3), "target": rand(12, 13, 3), "ssim_weight": 0.2},
                           ("target",)),

@@ -15,7 +15,7 @@ from gsbench.kernels.adam import adam
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.raster import backward_by_splat
 from gsbench.raster import rasterize
-from gsbench.stability.brute import paint
+from gsbench.stability.brute import render
 from gsbench.train.losses import photometric
 from gsbench.train.optim import adam_reference
 
@@ -25,7 +25,7 @@ DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "backgr
 def decided(arguments: dict[str, Any]) -> Tensor:
     """Pixels where no rounding can flip a decision of the picture's rules, [C, H, W]."""
     exact = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-    return paint(**exact).slack > 1e-3
+    return render(**exact).slack > 1e-3
 
 
 @pytest.mark.parametrize("name", names())

@@ -106,7 +106,7 @@ def test_too_little_room_is_told(N: int, room: int, device: str) -> None:
     """Catches a pair written past the end of the lists; with too few of them the count alone is right."""
     seen, fitted = camera(device), large("4dgs", device)
     with torch.no_grad():
-        means, factors, opacities, colors = fitted.slice(Query.at(seen.center, 0.4))
+        means, factors, opacities, colors, _ = fitted.slice(Query.at(seen.center, 0.4))
         image, needed = draw_within(
             means[:N], factors[:N], opacities[:N], colors[None, :N], seen.viewmat[None], seen.K[None],
             torch.tensor(BACKGROUND, device=device),

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import test_tape
 import torch
-from test_observe import VARIANTS, assert_same, color_inputs, model_and_raw, rotated, static
 from test_prefixes import SHARES, gradients, intervals_around, kept
+from test_slices import VARIANTS, assert_same, color_inputs, model_and_raw, rotated, static
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -17,7 +17,7 @@ from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.appearance import sh_colors, sh_time_colors
-from gsbench.models.base import EffectSets
+from gsbench.models.base import EffectSets, tensors_of
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement
@@ -39,12 +39,12 @@ def back(tensors: list[Tensor]) -> list[Tensor]:
 def assert_slices_agree(exact: GaussianModel, raw: dict[str, Tensor], move: Move) -> None:
     """The kernels' slice, and its gradients by all parameters, against those of torch in float64."""
     center, time = torch.tensor([0.3, -0.2, -3.0]), torch.tensor(0.4)
-    expected = list(exact.observe(raw, Query(center.double(), time.double())))
+    expected = tensors_of(exact.slice_geometry(raw, Query(center.double(), time.double())))
     lambdas = list(exact.log_lambda.parameters())
     single = {name: move(x) for name, x in raw.items()}
     model = deepcopy(exact).to(single["opacities"])
     model.condition = None  # nothing is left to torch
-    actual = list(model.observe(single, Query(move(center), move(time))))
+    actual = tensors_of(model.slice_geometry(single, Query(move(center), move(time))))
     assert_same(back(actual), expected)
     inputs = [*single.values(), *model.log_lambda.parameters()]
     assert_same(back(gradients(actual, inputs)), gradients(expected, [*raw.values(), *lambdas]))

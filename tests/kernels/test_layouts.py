@@ -12,7 +12,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import HIDDEN
 from gsbench.kernels.refine import refine
-from gsbench.kernels.slices import observe_static, observe_triangular
+from gsbench.kernels.slices import slice_static, slice_triangular
 from gsbench.raster import rasterize
 
 N = 5
@@ -45,7 +45,7 @@ def test_a_negated_view_is_negated() -> None:
     scales, quats, opacities = torch.rand(N, 3), torch.rand(N, 4), torch.rand(N)
     negated = torch._neg_view(-scales)
     assert negated.is_contiguous()
-    for x, y in zip(observe_static(negated, quats, opacities), observe_static(scales, quats, opacities), strict=True):
+    for x, y in zip(slice_static(negated, quats, opacities), slice_static(scales, quats, opacities), strict=True):
         assert torch.equal(x, y)
 
 
@@ -79,9 +79,9 @@ def triangular() -> dict[str, Any]:
 @pytest.mark.parametrize("name", ["times", "time", "log_lambda_t"])
 def test_a_part_of_time_alone_is_refused(name: str, nothing: Tensor | None) -> None:
     """Catches a null address in a kernel, which ended the process by a signal."""
-    observe_triangular(**triangular())
+    slice_triangular(**triangular())
     with pytest.raises(InputError):
-        observe_triangular(**triangular() | {name: nothing})
+        slice_triangular(**triangular() | {name: nothing})
 
 
 def test_waves_without_times_are_refused() -> None:

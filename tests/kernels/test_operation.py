@@ -11,7 +11,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.library import library_of
 from gsbench.kernels.operation import MOST_KNOWN, Operation
-from gsbench.kernels.slices import _static, observe_rotated, observe_static
+from gsbench.kernels.slices import _static, slice_rotated, slice_static
 
 
 def declared() -> list[Operation]:
@@ -55,7 +55,7 @@ def test_every_kernel_is_declared() -> None:
 def test_what_does_not_fit_is_refused(given: tuple[torch.Tensor, ...], said: str) -> None:
     """Catches arrays that a kernel would read past their end."""
     with pytest.raises(InputError, match=said):
-        observe_static(*given)
+        slice_static(*given)
 
 
 def test_coefficients_are_whole_harmonics_of_every_wave() -> None:
@@ -74,12 +74,12 @@ def test_known_calls_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(_static, "_match", lambda tensors, numbers: (matched.append(1), own(tensors, numbers))[1])
     for _ in range(3):
         for N in (1003, 1005):
-            factors, opacities = observe_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
+            factors, opacities = slice_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
             assert factors.shape == (N, 3, 3)
             assert opacities.shape == (N,)
     assert len(matched) <= 2
     for N in range(2 * MOST_KNOWN):
-        observe_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
+        slice_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
     assert len(_static._known) <= MOST_KNOWN
 
 
@@ -87,16 +87,16 @@ def test_columns_are_put_in_rows() -> None:
     """Catches a kernel that is given the address of a transposed tensor."""
     g = torch.Generator().manual_seed(0)
     scales, quats, opacities = (torch.randn(n, 4, generator=g) for n in (3, 4, 1))
-    columns = observe_static(scales.mT, quats.mT, opacities[0])
-    rows = observe_static(scales.mT.contiguous(), quats.mT.contiguous(), opacities[0])
+    columns = slice_static(scales.mT, quats.mT, opacities[0])
+    rows = slice_static(scales.mT.contiguous(), quats.mT.contiguous(), opacities[0])
     assert all(torch.equal(a, b) for a, b in zip(columns, rows, strict=True))
 
 
 def test_no_gradient_is_promised_where_there_is_none() -> None:
     """Catches a gradient by time that would be zero without a word."""
     x = torch.zeros(2, 4)
-    with pytest.raises(InputError, match="observe_rotated has no gradient by time"):
-        observe_rotated(x[:, :3], x[:, :1], x, x + 1, x + 1, x[:, 0], torch.ones(()),
+    with pytest.raises(InputError, match="slice_rotated has no gradient by time"):
+        slice_rotated(x[:, :3], x[:, :1], x, x + 1, x + 1, x[:, 0], torch.ones(()),
                         torch.zeros((), requires_grad=True), torch.zeros(()))  # fmt: skip
 
 
@@ -104,6 +104,6 @@ def test_the_extension_counts_and_types_its_values() -> None:
     """Catches a call that shifts every field by one: the last door looks at number and kind."""
     native = kernels.native()
     with pytest.raises(TypeError, match="expected 7 values"):
-        native.observe_static(1, 2, 3)
+        native.slice_static(1, 2, 3)
     with pytest.raises(TypeError):
-        native.observe_static(0, "means", 0, 0, 1, 0, 0)
+        native.slice_static(0, "means", 0, 0, 1, 0, 0)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_observe import SUBTRACTING, VARIANTS, assert_same, color_inputs, model_and_raw, nan_memory, rotated
+from test_slices import SUBTRACTING, VARIANTS, assert_same, color_inputs, model_and_raw, nan_memory, rotated
 from test_tape import fitted
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -15,10 +15,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gsbench.errors import InputError
 from gsbench.kernels import refine as refining
 from gsbench.kernels.colors import show_colors
-from gsbench.kernels.slices import observe_rotated
+from gsbench.kernels.slices import slice_rotated
 from gsbench.models import Query
 from gsbench.models.appearance import sh_time_colors
-from gsbench.models.base import EffectSets, GaussianModel, Raw
+from gsbench.models.base import EffectSets, GaussianModel, Raw, tensors_of
 from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement
 
@@ -47,10 +47,10 @@ def assert_static_rows(exact: GaussianModel, raw: Raw, model: GaussianModel, sin
     """Slice and gradients with static rows are the reference's, and conditioned rows are as without them."""
     count = round(share * len(raw["means"]))
     query = Query(CENTER, TIME)
-    everything = list(model.observe(single, query))
+    everything = tensors_of(model.slice_geometry(single, query))
     exact.effect_sets = model.effect_sets = EffectSets(0, count, None)
-    expected = list(exact.observe(raw, Query(CENTER.double(), TIME.double())))
-    actual = list(model.observe(single, query))
+    expected = tensors_of(exact.slice_geometry(raw, Query(CENTER.double(), TIME.double())))
+    actual = tensors_of(model.slice_geometry(single, query))
     for x, y in zip(actual, everything, strict=True):
         assert torch.equal(x[:count], y[:count])
     assert count == len(actual[0]) or not torch.equal(actual[0][count:], everything[0][count:])
@@ -83,7 +83,9 @@ def test_a_static_row_has_no_other_gradient() -> None:
     """Catches a gradient by what is a static row's no more, in kernel and reference alike."""
     model, raw = model_and_raw("7dgs", {}, torch.float32)
     model.effect_sets = EffectSets(0, 10, None)
-    got = dict(zip(raw, gradients(list(model.observe(raw, Query(CENTER, TIME))), list(raw.values())), strict=True))
+    got = dict(
+        zip(raw, gradients(tensors_of(model.slice_geometry(raw, Query(CENTER, TIME))), list(raw.values())), strict=True)
+    )
     for name in ("directions", "times", "motion", "coupling"):
         assert not got[name][10:].any(), name
         assert got[name][:10].any(), name
@@ -192,10 +194,10 @@ def test_rows_that_there_are_not() -> None:
     for count in (38, -1):
         model.effect_sets = EffectSets(0, count, None)
         with pytest.raises(InputError, match="conditioned: expected a number of rows from 0 to 37"):
-            model.observe(raw, Query(CENTER, TIME))
+            model.slice_geometry(raw, Query(CENTER, TIME))
     rotating, single = rotated(torch.float32)
     with pytest.raises(InputError, match="conditioned"):
-        observe_rotated(*single.values(), rotating.clock, TIME, rotating.log_lambda["time"], conditioned=46)
+        slice_rotated(*single.values(), rotating.clock, TIME, rotating.log_lambda["time"], conditioned=46)
     with pytest.raises(InputError, match="refine: rows"):
         Refinement([3, 4], torch.Generator())([torch.ones(2, 3), torch.ones(2, 4)], TIME, by_kernel=True, rows=3)
     for intervals in (torch.ones(3, 2), torch.ones(2, 3), torch.ones(2, 2).double(), torch.empty(0)):
@@ -240,7 +242,7 @@ def test_torch_is_told_the_truth(name: str, classed: bool) -> None:
         model.effect_sets = model.effect_sets._replace(intervals=intervals_around(TIME, model.effect_sets.refined)[1])
     with Calls() as calls:
         model.slice(Query(CENTER, TIME))
-    observe = "observe_triangular" if name == "7dgs" else "observe_rotated"
-    assert {f"gsbench::{one}" for one in ("refine", observe, "show_colors")} <= calls.found.keys()
+    slicing = "slice_triangular" if name == "7dgs" else "slice_rotated"
+    assert {f"gsbench::{one}" for one in ("refine", slicing, "show_colors")} <= calls.found.keys()
     for operator, arguments in calls.found.values():
         torch.library.opcheck(operator, arguments, test_utils=("test_schema", "test_faketensor"))

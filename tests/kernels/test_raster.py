@@ -11,7 +11,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels import raster
 from gsbench.raster import RasterOutput, rasterize
-from gsbench.stability.brute import paint
+from gsbench.stability.brute import render
 
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background")
 
@@ -39,7 +39,7 @@ def differentiate(arguments: dict[str, Any], backend: str, undecided: Tensor) ->
 
 def undecided_pixels(arguments: dict[str, Any]) -> Tensor:
     exact = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-    return paint(**exact).slack <= 1e-3
+    return render(**exact).slack <= 1e-3
 
 
 @pytest.mark.usefixtures("instruction_set")
@@ -47,7 +47,7 @@ def undecided_pixels(arguments: dict[str, Any]) -> Tensor:
 def test_picture(name: str) -> None:
     """Catches any rule of the picture that differs, a bound that loses a pixel, and a wrong rounding in one ISA."""
     arguments = single(name)
-    picture = paint(**{k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()})
+    picture = render(**{k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()})
     output = rasterize(**arguments, backend="cpu")
     decided = picture.slack > 1e-3
     np.testing.assert_allclose(output.image[decided], picture.image[decided], rtol=0, atol=1e-4)

@@ -10,11 +10,11 @@ from benchmarks.scene import camera, model
 from gsbench.kernels.backends import CPU
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
-from gsbench.kernels.slices import observe_static
+from gsbench.kernels.slices import slice_static
 from gsbench.kernels.tape import Tape
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
-from gsbench.models.base import EffectSets
+from gsbench.models.base import EffectSets, tensors_of
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes.scene import Camera, View
 from gsbench.train.step import Step, fitting_threads
@@ -57,7 +57,7 @@ def test_a_tape_runs_backwards_for_several_vectors() -> None:
     """Catches a second vector whose product has the first one's in it, or is empty: the probe asks for two."""
     view = views(1)[0]
     seen = fitted("7dgs").slice(Query.of(view.camera, view.time))
-    at = [x.detach().requires_grad_() for x in seen]
+    at = [x.detach().requires_grad_() for x in tensors_of(seen)]
     with Tape() as tape:
         images = rasterize_slice(type(seen)(*at), view.camera, BACKGROUND, CPU).image
     vectors = [torch.randn(images.shape, generator=torch.Generator().manual_seed(i)) for i in range(2)]
@@ -144,7 +144,7 @@ def test_what_torch_does_in_between_is_differentiated_too() -> None:
     leaves = [scales, quats, opacities, means, sh0, shN]
 
     def loss() -> Tensor:
-        factors, faded = observe_static(2 * scales, quats, opacities)  # torch before an operation
+        factors, faded = slice_static(2 * scales, quats, opacities)  # torch before an operation
         moved = means + (factors @ factors.mT).sum(-1) * faded[:, None]  # and after it
         colors = show_colors(sh0, shN, moved, faded, torch.zeros(3), 3)
         again = show_colors(sh0, shN, 3 * moved + 1, faded, torch.zeros(3), 3)  # coefficients that are read twice
@@ -183,8 +183,8 @@ def test_what_is_added_does_not_depend_on_what_is_there() -> None:
 def test_nothing_is_noted_where_nothing_is_wanted() -> None:
     """Catches a tape that keeps every tensor of a rendering."""
     with Tape() as tape, torch.no_grad():
-        observe_static(torch.zeros(2, 3, requires_grad=True), torch.ones(2, 4), torch.zeros(2))
+        slice_static(torch.zeros(2, 3, requires_grad=True), torch.ones(2, 4), torch.zeros(2))
     assert not tape._notes
     with Tape() as tape:
-        observe_static(torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2))
+        slice_static(torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2))
     assert not tape._notes

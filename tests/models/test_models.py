@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from gsbench.errors import InputError
 from gsbench.models import Query, build
 from gsbench.models.appearance import sh_colors, sh_time_colors
+from gsbench.models.base import tensors_of
 from gsbench.models.factors import KINDS
 from gsbench.models.query import unit
 from gsbench.scenes.points import SH_C0, nearest_distances
@@ -93,7 +94,7 @@ def test_slice_has_gradients(variant: str) -> None:
 
     def sliced(*values: Tensor) -> tuple[Tensor, ...]:
         model.splats = dict(zip(names, values, strict=True))
-        return tuple(model.slice(Query.at(CAMERA, 0.45)))
+        return tuple(tensors_of(model.slice(Query.at(CAMERA, 0.45))))
 
     output = sliced(*values)
     assert (output[2] > 0).any()
@@ -107,8 +108,8 @@ def test_slice_has_gradients(variant: str) -> None:
 def test_slices_can_be_drawn(variant: str, seed: int, time: float) -> None:
     """Catches NaN, opacities outside [0, 1] and negative colours at any time, also beyond the clip."""
     sliced = lively(variant, seed=seed).slice(Query.at(CAMERA, time))
-    assert [tuple(x.shape) for x in sliced] == [(N, 3), (N, 3, 3), (N,), (N, 3)]
-    assert all(x.isfinite().all() for x in sliced)
+    assert [tuple(x.shape) for x in tensors_of(sliced)] == [(N, 3), (N, 3, 3), (N,), (N, 3)]
+    assert all(x.isfinite().all() for x in tensors_of(sliced))
     assert (sliced.opacities >= 0).all()
     assert (sliced.opacities <= 1).all()
     assert (sliced.colors >= 0).all()
@@ -150,8 +151,8 @@ def test_camera_on_a_mean(variant: str) -> None:
     """Catches 0/0: d is undefined there and taken as zero, and its gradient too."""
     model = lively(variant)
     sliced = model.slice(Query.at(model.splats["means"].data[0], 0.5))
-    sum(x.sum() for x in sliced).backward()
-    assert all(x.isfinite().all() for x in sliced)
+    sum(x.sum() for x in tensors_of(sliced)).backward()
+    assert all(x.isfinite().all() for x in tensors_of(sliced))
     assert all(p.grad.isfinite().all() for p in model.splats.values())
 
 
@@ -176,9 +177,10 @@ def test_agr_changes_nothing_at_first(name: str) -> None:
     for p in (model.refinement.weight_out, model.refinement.bias_out):
         p.data.zero_()
     model.set_active(ActiveComponents(3, False, False))
-    off = model.slice(Query.at(CAMERA, 0.3))
+    off = tensors_of(model.slice(Query.at(CAMERA, 0.3)))
     model.set_active(ActiveComponents(3, True, False))
-    assert all(torch.equal(a, b) for a, b in zip(off, model.slice(Query.at(CAMERA, 0.3)), strict=True))
+    on = tensors_of(model.slice(Query.at(CAMERA, 0.3)))
+    assert all(torch.equal(a, b) for a, b in zip(off, on, strict=True))
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -205,7 +207,7 @@ def test_what_is_off_does_not_learn(name: str) -> None:
     for refine, tune in [(False, False), (True, False), (False, True), (True, True)]:
         model.set_active(ActiveComponents(3, refine, tune))
         model.zero_grad(set_to_none=True)
-        sum(x.square().sum() for x in model.slice(Query.at(CAMERA, 0.3))).backward()
+        sum(x.square().sum() for x in tensors_of(model.slice(Query.at(CAMERA, 0.3)))).backward()
         learnt = model.refinement.weight_out.grad
         assert (learnt is not None and learnt.any(1).all().item()) == refine
         assert all((p.grad is not None and p.grad.any().item()) == tune for p in model.log_lambda.parameters())

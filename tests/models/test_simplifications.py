@@ -43,7 +43,7 @@ def test_time_goes_on_as_it_did_where_direction_is_frozen(variant: str) -> None:
     frozen = model.frozen(raw, [early, late], torch.full((2, len(model)), 0.5, dtype=torch.float64))["direction"]
 
     def fades(raw: dict[str, torch.Tensor]) -> torch.Tensor:
-        return model.observe(raw, late)[2] / model.observe(raw, early)[2]
+        return model.slice_geometry(raw, late)[2] / model.slice_geometry(raw, early)[2]
 
     assert (fades(raw) - 1).abs().amax() > 0.1
     torch.testing.assert_close(fades(raw | frozen), fades(raw), rtol=1e-6, atol=0)

@@ -53,6 +53,24 @@ def test_a_background_that_is_no_tensor_is_none() -> None:
     refused({"background": [0.0, 0.0, 0.0]}, "background: expected a tensor, got list")
 
 
+@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda", "auto", REFERENCE])
+def test_shapes_of_alpha_profiles_are_refused_before_any_work(backend: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a backend that draws Gaussians where Beta kernels are asked for, or looks at the scene first."""
+    monkeypatch.setattr("gsbench.raster.check_arguments", None)
+    asked = backend if isinstance(backend, str) else backend.name
+    refused(
+        {"shapes": torch.ones(40).double(), "backend": backend}, f"got a tensor of shape [40]: raster backend '{asked}'"
+    )
+    refused({"shapes": 2.0, "backend": backend}, "shapes: expected None, got float")
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_no_shapes_are_gaussians(backend: str) -> None:
+    """Catches an image that changes by a bit where shapes are None."""
+    arguments = case("tall", torch.float32) | {"backend": backend}
+    assert torch.equal(rasterize(**arguments).image, rasterize(**arguments, shapes=None).image)
+
+
 def test_gaussians_are_counted_for_every_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches more splats than int32 numbers because there are several cameras: 40 Gaussians in 2 are 80."""
     one = {name: x.float() if isinstance(x, Tensor) else x for name, x in case("tall").items()}

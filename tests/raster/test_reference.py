@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gsbench.raster import RasterOutput, rasterize
-from gsbench.stability.brute import Picture, paint
+from gsbench.stability.brute import Picture, render
 
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "Ks", "background")
 PROPERTY = settings(max_examples=15, deadline=None)
@@ -24,7 +24,7 @@ def draw(arguments: dict[str, Any]) -> RasterOutput:
 
 def brute_force(arguments: dict[str, Any], **more: Any) -> Picture:
     exact = {k: v.detach().double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-    return paint(**exact, **more)
+    return render(**exact, **more)
 
 
 def scene(seed: int, N: int = 12) -> dict[str, Any]:

@@ -138,10 +138,10 @@ def write_all(records: list[Record], root: Path, *, pictures: int = 0) -> Path:
             rows = [(random.random((40, 60, 3)), np.full((40, 60, 3), i / pictures)) for i in range(pictures)]
             write_png(strip(rows), folder / "pictures.png")
             if r.on_demand:
-                write_png(classes(random), folder / "classes.png")
+                write_png(effect_sets(random), folder / "effect_sets.png")
     return root / records[0].experiment
 
 
-def classes(random: np.random.Generator) -> Pixels:
-    """A picture of the size of classes.png, of noise."""
+def effect_sets(random: np.random.Generator) -> Pixels:
+    """A picture of the size of effect_sets.png, of noise."""
     return random.integers(0, 256, (120, 912, 3)).astype(np.uint8)

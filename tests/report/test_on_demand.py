@@ -189,7 +189,10 @@ def test_pictures_by_class_are_part_of_the_page(tmp_path):
     text = build.render(runs, folder)
     assert text.count(image.source) == 1
     assert 'alt="suzanne, auto: the image beside its Gaussians by effect set"' in text
-    (folder / "suzanne" / "auto" / "seed0" / "classes.png").write_bytes(b"damaged")
+    for picture in folder.glob("suzanne/auto/*/effect_sets.png"):
+        picture.rename(picture.with_name("classes.png"))  # as runs of before have it
+    assert page_part.on_demand_section(group(runs), canvas(), folder).images == [image]
+    (folder / "suzanne" / "auto" / "seed0" / "effect_sets.png").write_bytes(b"damaged")
     assert page_part.on_demand_section(group(runs), canvas(), folder).images == []
 
 
@@ -197,7 +200,7 @@ def test_pictures_by_class_keep_to_their_budget(tmp_path, monkeypatch):
     """Catches pictures that make the page too large: noise compresses worst."""
     runs = on_demand(frontier(("7dgs",), ("a", "b", "c"), 1, (1000,)))
     folder = write_all(runs, tmp_path, pictures=1)
-    at = sorted(gallery.places(folder, "classes.png").values())
+    at = sorted(gallery.places(folder, "effect_sets.png").values())
     whole = [len(one.source) for one in gallery.images([(str(path), path) for path in at])]
     assert len(whole) == 3
     monkeypatch.setattr(gallery, "IMAGES_BUDGET", sum(whole) // 3)

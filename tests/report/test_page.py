@@ -445,8 +445,8 @@ def events_by_letter(train: TrainConfig, model: dict, effects: Effects) -> dict[
     return {letter: [step for step, letters in marks if letter in letters] for letter in "RDAL"}
 
 
-LEARNT = {"lr": {"modulation": {"start": 1e-3}}}
-FIXED = {"lr": {"modulation": {"start": 0}}}
+LEARNT = {"lr": {"lambda": {"start": 1e-3}}}
+FIXED = {"lr": {"lambda": {"start": 0}}}
 
 
 def test_events_are_those_of_the_schedule():

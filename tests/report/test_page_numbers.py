@@ -18,7 +18,7 @@ from gsbench.report.page import charts, cost, events, time_to_quality, worth
 from gsbench.report.page.content import Canvas, Runs
 from gsbench.report.page.palette import Style, styles
 
-STEPS = {"iterations": 1000, "recipe_iterations": 1000, "refine_from": 250, "modulation_from": 750}
+STEPS = {"iterations": 1000, "recipe_iterations": 1000, "refine_from": 250, "lambda_from": 750}
 
 
 def canvas():
@@ -96,7 +96,7 @@ def test_what_a_training_lost_at_its_end_is_said():
 def test_events_stand_at_the_seconds_of_their_steps(ends, monkeypatch):
     """Catches events at the wrong seconds, and beyond the last point, where no one measured: 10 s at 500 steps."""
     train = dataclasses.asdict(TrainConfig(**STEPS))
-    config = {"train": train, "model": {"lr": {"modulation": {"start": 1e-3}}}}
+    config = {"train": train, "model": {"lr": {"lambda": {"start": 1e-3}}}}
     curve = [point for point in (Point(500, 10.0, 20.0), Point(1000, 40.0, 21.0)) if point.iteration <= ends]
     record = make(curve=curve)
     record = dataclasses.replace(record, provenance=dataclasses.replace(record.provenance, config=config))

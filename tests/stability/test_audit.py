@@ -16,7 +16,7 @@ BACKENDS = audit.present()
 
 
 # Trainings of hundreds of steps, and a picture of 10^5 Gaussians.
-LONG = {"one_frame", "all_images_equal", "seen_by_no_view", "reset_into_refinement", "modulation_switched_on"}
+LONG = {"one_frame", "all_images_equal", "seen_by_no_view", "reset_into_refinement", "lambda_switched_on"}
 LONG |= {"faint_crowd"}
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsbench.kernels.backends import BACKENDS
 from gsbench.models import GaussianModel, Query
+from gsbench.models.base import tensors_of
 from gsbench.raster import rasterize
 from gsbench.stability import colors, picture_cases, slices  # noqa: F401  # their cases enter the list
 from gsbench.stability.audit import present
@@ -37,7 +38,7 @@ def whole_path(model: GaussianModel, raw: dict[str, Tensor], center: Tensor, tim
     """Slice, draw, compare with a photograph, and differentiate; everything must be finite."""
     inputs = {name: value.clone().requires_grad_() for name, value in raw.items()}
     moment = torch.tensor(time)
-    means, factors, opacities = model.observe(inputs, Query(center, moment))
+    means, factors, opacities = tensors_of(model.slice_geometry(inputs, Query(center, moment)))
     shown = model.shade(inputs, means, opacities, Query(center, moment))
     viewmat = torch.eye(4)
     viewmat[:3, 3] = -center

@@ -29,7 +29,7 @@ SCENE = ("scene=", "scene.name=")
 ABLATIONS = {  # what each changes of 7DGS as it is; of another model, only its name
     "none": {},
     "no_agr": {"agr": False},
-    "fixed_lambda": {"model.lr.modulation.start": 0.0},
+    "fixed_lambda": {"model.lr.lambda.start": 0.0},
     "no_time_split": {"model.options.split_in_time": False},
     "time_only": {"model.name": "4dgs"},
     "direction_only": {"model.name": "6dgs"},

@@ -15,8 +15,8 @@ from tiny_run import ROOT
 
 from gsbench.run import progress
 from gsbench.run.progress import Progress, born
-from gsbench.sweep import plan, show, status
-from gsbench.sweep.__main__ import main
+from gsbench.sweep import plan, status
+from gsbench.sweep.__main__ import lines, main
 from gsbench.sweep.plan import Ended, Plan
 from gsbench.sweep.slurm import Queue
 from gsbench.sweep.status import RunStatus
@@ -142,7 +142,7 @@ def test_a_slurm_that_is_silent_is_said(tmp_path: Path) -> None:
     trains(tmp_path, job="7")
     run = only(tmp_path, down)
     assert run.state == "running"
-    assert "squeue is not on this machine" in "\n".join(show.lines(tmp_path, [run], down.silent))
+    assert "squeue is not on this machine" in "\n".join(lines(tmp_path, [run], down.silent))
 
 
 def test_a_job_that_ended_without_a_record_quotes_its_log(tmp_path: Path) -> None:
@@ -312,7 +312,7 @@ def test_only_what_differs_names_a_run() -> None:
     """Catches a status that repeats what all runs have in common, or hides which run failed."""
     runs = [RunStatus(crowd.overrides("7dgs", "lego", seed), state, "why" if state == "failed" else None)
             for seed, state in enumerate(["done", "failed", "done"])]  # fmt: skip
-    assert show.lines(Path("results/crowd"), runs) == [
+    assert lines(Path("results/crowd"), runs) == [
         "results/crowd: 3 runs: 2 done, 1 failed", "  failed   seed=1  why",
     ]  # fmt: skip
 

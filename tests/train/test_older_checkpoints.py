@@ -30,12 +30,14 @@ def test_a_checkpoint_of_older_names_is_read(tmp_path: Path) -> None:
     state = model.pack()
     assert OLDER.keys() <= state.keys()
     older = {"step": 7, "model": {OLDER.get(key, key): value for key, value in state.items()},
-             "floor": {"least": torch.ones(5)}}  # fmt: skip
+             "floor": {"least": torch.ones(5)}, "optimizer": {"means.0": {}, "modulation.1": {"step": 3}}}  # fmt: skip
     path = tmp_path / checkpoint.FILE_NAME
-    checkpoint.save(path, Checkpoint("training", "data", older))
+    checkpoint.save(path, Checkpoint("training", "data", older, {"data": {"modulation": 0.5}}))
 
+    assert checkpoint.read(path).config == {"data": {"initial_lambda": 0.5}}
     found = checkpoint.read(path).state
-    assert found.keys() == {"step", "model", "minimum_scale"}
+    assert found.keys() == {"step", "model", "minimum_scale", "optimizer"}
+    assert found["optimizer"] == {"means.0": {}, "lambda.1": {"step": 3}}
     assert found["model"].keys() == state.keys()
     other = as_gated(build("7dgs", lambda_t=1.0, lambda_d=1.0))
     other.initialise(Points(torch.rand(5, 3), torch.rand(5, 3)), 1.0, torch.Generator().manual_seed(1))

@@ -13,6 +13,7 @@ from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
 from gsbench.models import Query
+from gsbench.models.base import tensors_of
 from gsbench.models.render import rasterize_slice
 from gsbench.raster import RasterInfo
 from gsbench.run.checks import check_values
@@ -234,7 +235,7 @@ def test_a_model_shows_the_same_by_kernels_and_in_torch(name: str, degree: int, 
         shown.append(model.slice(Query.at(fitted.scene.train[2].camera.center, 0.4)))
     drawn = shown[1].opacities > 1 / 200  # colours of what is not drawn are not computed
     assert drawn.sum() > 10
-    for a, b in zip(*shown, strict=True):
+    for a, b in zip(*map(tensors_of, shown), strict=True):
         torch.testing.assert_close(a[drawn], b[drawn], rtol=1e-3, atol=1e-4)
 
 

@@ -24,20 +24,22 @@ from gsbench.schedule import ActiveComponents
 from gsbench.view import paths
 from gsbench.view.__main__ import main
 from gsbench.view.client import camera_at
-from gsbench.view.frame import CLASS, COST, Frame, FrameCost, FrameRequest, Painter, beside, wiped
+from gsbench.view.frame import CLASS, COST, Frame, FrameCost, FrameRenderer, FrameRequest, beside, wiped
 from gsbench.view.resolution import LEAST_PIXELS, MOST_PIXELS, MOVING_MS, Resolution
 from gsbench.view.stages import RASTER, SLICE, STAGES
 
 SIZE = 40
 
 
-def painter(backend: Backend = AUTO, effect_sets: EffectSets | None = None) -> Painter:
+def renderer(backend: Backend = AUTO, effect_sets: EffectSets | None = None) -> FrameRenderer:
     """Of 7DGS with AGR, in the midst of a training."""
     model = lively("7dgs_agr", count=80, backend=backend).float()
     model.set_active(ActiveComponents(3, True, True))
     model.effect_sets = effect_sets
     scene = SceneDescription("small", "0", 4.0, [0.0, 0.0, 0.0], True, SIZE, SIZE)
-    return Painter(LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0")), most_cost(model))
+    return FrameRenderer(
+        LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0")), most_cost(model)
+    )
 
 
 def of_every_effect_set() -> EffectSets:
@@ -48,70 +50,70 @@ def of_every_effect_set() -> EffectSets:
 
 
 @pytest.fixture(scope="module")
-def one() -> Painter:
-    return painter()
+def one() -> FrameRenderer:
+    return renderer()
 
 
-def seen_from(azimuth: float, one: Painter) -> Camera:
+def seen_from(azimuth: float, one: FrameRenderer) -> Camera:
     return paths.around(one.run, azimuth, 0.3)
 
 
-def test_a_frame_is_the_models_image(one: Painter) -> None:
+def test_a_frame_is_the_models_image(one: FrameRenderer) -> None:
     """Catches a viewer that shows another picture than the one that is measured, and times of zero."""
     camera = seen_from(0.5, one)
-    frame = one.paint(camera, FrameRequest(0.4))
+    frame = one.render(camera, FrameRequest(0.4))
     assert (frame.image == to_bytes(render(one.run.model, camera, 0.4, torch.zeros(3)).cpu().numpy())).all()
     assert frame.image.max() > 30
     assert frame.ms(SLICE) > 0
     assert frame.ms(RASTER) > 0
 
 
-def test_a_frozen_direction_slices_from_there_and_draws_from_here(one: Painter) -> None:
+def test_a_frozen_direction_slices_from_there_and_draws_from_here(one: FrameRenderer) -> None:
     """Catches a frozen slice that is also drawn from its old place, or that is not frozen."""
     here, there = seen_from(0.5, one), seen_from(2.0, one)
-    frozen = one.paint(here, FrameRequest(0.4, there.center)).image
+    frozen = one.render(here, FrameRequest(0.4, there.center)).image
     gaussians = one.run.model.slice(Query.at(there.center, 0.4))
     expected = to_bytes(rasterize_slice(gaussians, here, torch.zeros(3), AUTO).image[0].cpu().numpy())
     assert (frozen == expected).all()
-    assert (frozen != one.paint(here, FrameRequest(0.4)).image).any()
+    assert (frozen != one.render(here, FrameRequest(0.4)).image).any()
 
 
-def test_agr_is_switched_for_one_frame(one: Painter) -> None:
+def test_agr_is_switched_for_one_frame(one: FrameRenderer) -> None:
     """Catches a client that switches AGR off for all others, or on where the training had not yet."""
     camera = seen_from(0.5, one)
-    on, off, again = (one.paint(camera, FrameRequest(0.4, agr=agr)).image for agr in (True, False, True))
+    on, off, again = (one.render(camera, FrameRequest(0.4, agr=agr)).image for agr in (True, False, True))
     assert (on != off).any()
     assert (on == again).all()
-    early = painter()
+    early = renderer()
     early.trained_active = replace(early.trained_active, refine=False)
-    assert (early.paint(camera, FrameRequest(0.4)).image == off).all()
+    assert (early.render(camera, FrameRequest(0.4)).image == off).all()
 
 
-def test_harmonics_are_cut_for_one_frame(one: Painter) -> None:
+def test_harmonics_are_cut_for_one_frame(one: FrameRenderer) -> None:
     """Catches colours that still change with the direction at degree 0, and a cut that the next frame still has."""
     camera = seen_from(0.5, one)
-    images = [one.paint(camera, FrameRequest(0.4, sh_degree=degree)).image for degree in (0, 1, 3)]
-    assert (one.paint(camera, FrameRequest(0.4)).image == images[2]).all()
+    images = [one.render(camera, FrameRequest(0.4, sh_degree=degree)).image for degree in (0, 1, 3)]
+    assert (one.render(camera, FrameRequest(0.4)).image == images[2]).all()
     flat = lively("7dgs_agr", count=80).float()
     flat.splats["shN"].data.zero_()
     assert (to_bytes(render(flat.requires_grad_(False), camera, 0.4, torch.zeros(3)).cpu().numpy()) == images[0]).all()
     assert len({image.tobytes() for image in images}) == 3
-    early = painter()
+    early = renderer()
     early.trained_active = replace(early.trained_active, sh_degree=1)
-    assert (early.paint(camera, FrameRequest(0.4)).image == images[1]).all()
+    assert (early.render(camera, FrameRequest(0.4)).image == images[1]).all()
 
 
 @pytest.mark.parametrize("effect_sets", [None, of_every_effect_set()], ids=["without effect sets", "with effect sets"])
 def test_colours_are_those_of_the_picture_of_effect_sets(effect_sets: EffectSets | None) -> None:
-    """Catches a viewer whose colours mean something else than those of classes.png, or stand on another background."""
-    made = painter(effect_sets=effect_sets)
+    """Catches a viewer whose colours mean something else than in effect_sets.png, or stand on another background."""
+    made = renderer(effect_sets=effect_sets)
     camera = seen_from(0.5, made)
     panels = picture.draw(made.run.model, camera, 0.4, torch.zeros(3))[picture.LINE :]
     factor = -(-picture.LEAST_WIDTH // SIZE)
     step = factor * SIZE + picture.GAP
     for i, colours in enumerate(("image", CLASS, COST)):
         panel = panels[: factor * SIZE : factor, i * step :][:, : factor * SIZE : factor]
-        assert (made.paint(camera, FrameRequest(0.4, colours=colours)).image == panel).all()
+        assert (made.render(camera, FrameRequest(0.4, colours=colours)).image == panel).all()
     assert made.counts == made.run.model.count_by_effects()
     assert all(made.counts[name] == 16 for name in NAMES) == (effect_sets is not None)
 
@@ -120,7 +122,7 @@ def test_colours_are_those_of_the_picture_of_effect_sets(effect_sets: EffectSets
     ("kernel", "stage"),
     [
         ("refine", "AGR"),
-        ("observe_triangular", "conditioning"),
+        ("slice_triangular", "conditioning"),
         ("show_colors", "colours"),
         ("project", "projection"),
         ("count_tiles", "binning"),
@@ -128,7 +130,9 @@ def test_colours_are_those_of_the_picture_of_effect_sets(effect_sets: EffectSets
         ("blend", "blending"),
     ],
 )
-def test_a_kernels_time_is_its_stages(one: Painter, kernel: str, stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kernels_time_is_its_stages(
+    one: FrameRenderer, kernel: str, stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches time that counts for another stage, or for none."""
     run, slow = Library._run, 0.02
 
@@ -138,7 +142,7 @@ def test_a_kernels_time_is_its_stages(one: Painter, kernel: str, stage: str, mon
         run(library, name, *values)
 
     monkeypatch.setattr(Library, "_run", run_slowly)
-    (cost,) = one.paint(seen_from(0.5, one), FrameRequest(0.4)).costs
+    (cost,) = one.render(seen_from(0.5, one), FrameRequest(0.4)).costs
     assert tuple(cost.ms) == (*STAGES[SLICE], *STAGES[RASTER])
     assert max(cost.ms, key=lambda name: cost.ms[name]) == stage
     assert cost.ms[stage] >= 1000 * slow
@@ -146,12 +150,12 @@ def test_a_kernels_time_is_its_stages(one: Painter, kernel: str, stage: str, mon
 
 def test_what_torch_computes_alone_is_not_divided() -> None:
     """Catches stages of zero milliseconds, and time that is not counted, without kernels."""
-    made = painter(REFERENCE)
-    (cost,) = made.paint(seen_from(0.5, made), FrameRequest(0.4)).costs
+    made = renderer(REFERENCE)
+    (cost,) = made.render(seen_from(0.5, made), FrameRequest(0.4)).costs
     assert list(cost.ms) == [SLICE, RASTER]
     assert cost.of(SLICE) == cost.ms[SLICE] > 0
     assert cost.of(RASTER) == cost.ms[RASTER] > 0
-    (without_agr,) = painter().paint(seen_from(0.5, made), FrameRequest(0.4, agr=False)).costs
+    (without_agr,) = renderer().render(seen_from(0.5, made), FrameRequest(0.4, agr=False)).costs
     assert "AGR" not in without_agr.ms
 
 
@@ -189,7 +193,7 @@ def test_resolution_falls_while_the_camera_moves() -> None:
     assert min(resolution.size(1, 3000, moving=True)) >= 1
 
 
-def test_a_browsers_camera_is_ours(one: Painter) -> None:
+def test_a_browsers_camera_is_ours(one: FrameRenderer) -> None:
     """Catches a pose that is inverted, mirrored or with the horizontal field of view."""
     camera = seen_from(0.7, one)
     flip = camera.viewmat[:3, :3].T.double()

@@ -13,7 +13,7 @@ from gsbench.models.render import render
 from gsbench.run.load import load_run, scene_of
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view import paths
-from gsbench.view.frame import FrameRequest, Painter
+from gsbench.view.frame import FrameRenderer, FrameRequest
 from gsbench.view.nearest import MOST_WIDTH, TrainingViews, compare
 
 EXTENT = 4.0
@@ -64,16 +64,16 @@ def test_a_model_is_compared_as_it_is_measured(folder: Path) -> None:
     """Catches another PSNR than the run's own measure, swapped images, and a protocol's rounding that is left out."""
     run = load_run(folder)
     view = scene_of(run).train[1]
-    painter = Painter(run, most_cost(run.model))
+    renderer = FrameRenderer(run, most_cost(run.model))
     image = render(run.model, view.camera, view.time, torch.tensor(run.scene.background))
-    compared = compare(painter, view, FrameRequest(view.time))
+    compared = compare(renderer, view, FrameRequest(view.time))
     assert compared.psnr == psnr(image, view.image)
     assert (compared.truth == to_bytes(view.image.cpu().numpy())).all()
     assert (compared.render == to_bytes(image.cpu().numpy())).all()
     assert (compared.error == error_image(image.numpy(), view.image.numpy())).all()
     run.config.protocol.quantise = True
-    assert compare(painter, view, FrameRequest(view.time)).psnr == psnr(quantise(image), view.image) != compared.psnr
-    assert compare(painter, view, FrameRequest(view.time, agr=False)).psnr != compared.psnr
+    assert compare(renderer, view, FrameRequest(view.time)).psnr == psnr(quantise(image), view.image) != compared.psnr
+    assert compare(renderer, view, FrameRequest(view.time, agr=False)).psnr != compared.psnr
 
 
 def test_large_images_are_made_smaller_after_they_are_measured(folder: Path) -> None:
@@ -83,6 +83,6 @@ def test_large_images_are_made_smaller_after_they_are_measured(folder: Path) -> 
     wide = Camera(small.camera.viewmat, paths.intrinsics(960, 32), 960, 32)
     truth = torch.rand(32, 960, 3, generator=torch.Generator().manual_seed(0))
     view = replace(small, camera=wide, pixels=truth)
-    compared = compare(Painter(run, most_cost(run.model)), view, FrameRequest(view.time))
+    compared = compare(FrameRenderer(run, most_cost(run.model)), view, FrameRequest(view.time))
     assert {image.shape for image in compared[1:4]} == {(16, MOST_WIDTH, 3)}
     assert compared.psnr == psnr(render(run.model, wide, view.time, torch.tensor(run.scene.background)), truth)

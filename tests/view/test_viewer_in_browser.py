@@ -113,7 +113,7 @@ def test_it_opens_and_stays_on_this_machine(visit, viewer):
     said = page.locator("table").first.inner_text()
     numbers = {line.split("\t")[0].strip(): line.split("\t")[-1] for line in said.splitlines()}
     assert list(numbers) == ["ms", "slice", *STAGES["slice"], "raster", *STAGES["raster"], "FPS"]
-    assert numbers.pop("ms") == viewer.painters[0].name
+    assert numbers.pop("ms") == viewer.renderers[0].name
     assert all(float(number) >= 0 for number in numbers.values())
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(("192.0.2.1", 9))  # sends nothing; it tells this machine's own address
@@ -187,7 +187,7 @@ def test_gaussians_have_the_colours_of_their_classes_or_costs(visit, viewer):
     choose(page, "colours", "image")
     assert settle(page) == pictures[0]
     choose(page, "show", "wipe")
-    choose(page, "second model", viewer.painters[0].name)
+    choose(page, "second model", viewer.renderers[0].name)
     assert settle(page) != pictures[0]  # but for the line of the wipe the same
     slide(page, "wipe at", 1)
     assert settle(page) == pictures[0]
@@ -212,7 +212,7 @@ def test_the_error_against_the_nearest_training_view_is_shown(visit, viewer):
     page = visit()
     switch(page, "nearest training view")
     view, (truth, model, error) = nearest(page)
-    assert (truth, model) == ("training image", viewer.painters[0].name)
+    assert (truth, model) == ("training image", viewer.renderers[0].name)
     assert re.fullmatch(r"[\d.]+ dB", error)
     switch(page, "AGR")
     assert nearest(page)[1][2] != error

@@ -39,7 +39,7 @@ GSB_HD inline bool is_zero(const ObservationGrads& o, int64_t i, int n) {
     return all_zero(o.opacities, 1, i, n) && all_zero(o.means, 3, i, n) && all_zero(o.factors, 9, i, n);
 }
 
-void observe_static_rows(const RotatedArgs& a, const Observation& out) {
+void slice_static_rows(const RotatedArgs& a, const Observation& out) {
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > CHUNK)
     for (int64_t i = a.conditioned; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
@@ -52,7 +52,7 @@ void observe_static_rows(const RotatedArgs& a, const Observation& out) {
     }
 }
 
-void observe_static_rows_backward(const RotatedArgs& a, const ObservationGrads& grads, const RotatedGrads& out) {
+void slice_static_rows_backward(const RotatedArgs& a, const ObservationGrads& grads, const RotatedGrads& out) {
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > CHUNK)
     for (int64_t i = a.conditioned; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
@@ -73,9 +73,9 @@ void observe_static_rows_backward(const RotatedArgs& a, const ObservationGrads& 
 
 }  // namespace
 
-void observe_rotated(const RotatedArgs& a, const Observation& out) {
+void slice_rotated(const RotatedArgs& a, const Observation& out) {
     const float lambda_t = expf(*a.log_lambda_t), time = *a.time * *a.clock;
-    observe_static_rows(a, out);
+    slice_static_rows(a, out);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.conditioned > CHUNK)
     for (int64_t i = 0; i < a.conditioned; i += LANES) {
         const int n = lanes_from(i, a.conditioned);
@@ -88,9 +88,9 @@ void observe_rotated(const RotatedArgs& a, const Observation& out) {
     }
 }
 
-void observe_rotated_backward(const RotatedArgs& a, const ObservationGrads& grads, const RotatedGrads& out) {
+void slice_rotated_backward(const RotatedArgs& a, const ObservationGrads& grads, const RotatedGrads& out) {
     const float lambda_t = expf(*a.log_lambda_t), time = *a.time * *a.clock;
-    observe_static_rows_backward(a, grads, out);
+    slice_static_rows_backward(a, grads, out);
     const int64_t chunks = (a.conditioned + CHUNK - 1) / CHUNK;
     Buffer<float> lambdas(static_cast<size_t>(chunks));
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (chunks > 1)

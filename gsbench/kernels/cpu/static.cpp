@@ -18,7 +18,7 @@ GSB_HD inline void load(const StaticArgs& a, int64_t i, int n, StaticParameters<
 
 }  // namespace
 
-void observe_static(const StaticArgs& a, const StaticSlice& out) {
+void slice_static(const StaticArgs& a, const StaticSlice& out) {
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > FEW)
     for (int64_t i = 0; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
@@ -30,7 +30,7 @@ void observe_static(const StaticArgs& a, const StaticSlice& out) {
     }
 }
 
-void observe_static_backward(const StaticArgs& a, const StaticSliceGrads& grads, const StaticGrads& out) {
+void slice_static_backward(const StaticArgs& a, const StaticSliceGrads& grads, const StaticGrads& out) {
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > FEW)
     for (int64_t i = 0; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);

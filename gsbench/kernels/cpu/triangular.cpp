@@ -120,7 +120,7 @@ struct StaticRows {
     }
 };
 
-void observe_static_rows(const TriangularArgs& a, const Observation& out) {
+void slice_static_rows(const TriangularArgs& a, const Observation& out) {
     const StaticRows rows(a);
     rows.each_chunk([&](int64_t first, int64_t end) {
         copy_rows(a.means, out.means, 3, first, end);
@@ -135,7 +135,7 @@ void observe_static_rows(const TriangularArgs& a, const Observation& out) {
     });
 }
 
-void observe_static_rows_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
+void slice_static_rows_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     const StaticRows rows(a);
     rows.each_chunk([&](int64_t first, int64_t end) {
         for (int64_t i = first; i < end; i += LANES) {
@@ -165,13 +165,13 @@ void dispatch(const TriangularArgs& a, Run run) {
 
 }  // namespace
 
-void observe_triangular(const TriangularArgs& a, const Observation& out) {
-    observe_static_rows(a, out);
+void slice_triangular(const TriangularArgs& a, const Observation& out) {
+    slice_static_rows(a, out);
     dispatch(a, [&]<Query Q, template <class, int> class Reduction>() { observe<Q, Reduction>(a, out); });
 }
 
-void observe_triangular_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
-    observe_static_rows_backward(a, grads, out);
+void slice_triangular_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
+    slice_static_rows_backward(a, grads, out);
     dispatch(a, [&]<Query Q, template <class, int> class Reduction>() { observe_backward<Q, Reduction>(a, grads, out); });
 }
 

@@ -76,11 +76,11 @@ __global__ void observe_backward_kernel(RotatedArgs a, ObservationGrads grads, R
 
 }  // namespace
 
-void observe_rotated(const RotatedArgs& a, const Observation& out, Stream stream) {
+void slice_rotated(const RotatedArgs& a, const Observation& out, Stream stream) {
     if (a.N > 0) launch(observe_kernel, small_blocks(a.N), SMALL_BLOCK, stream, a, out);
 }
 
-void observe_rotated_backward(const RotatedArgs& a, const ObservationGrads& grads, const RotatedGrads& out,
+void slice_rotated_backward(const RotatedArgs& a, const ObservationGrads& grads, const RotatedGrads& out,
                               Stream stream) {
     if (a.N > 0) launch(observe_backward_kernel, small_blocks(a.N), SMALL_BLOCK, stream, a, grads, out);
 }

@@ -38,11 +38,11 @@ __global__ void static_backward_kernel(StaticArgs a, StaticSliceGrads grads, Sta
 
 }  // namespace
 
-void observe_static(const StaticArgs& a, const StaticSlice& out, Stream stream) {
+void slice_static(const StaticArgs& a, const StaticSlice& out, Stream stream) {
     if (a.N > 0) launch(static_kernel, small_blocks(a.N), SMALL_BLOCK, stream, a, out);
 }
 
-void observe_static_backward(const StaticArgs& a, const StaticSliceGrads& grads, const StaticGrads& out, Stream stream) {
+void slice_static_backward(const StaticArgs& a, const StaticSliceGrads& grads, const StaticGrads& out, Stream stream) {
     if (a.N > 0) launch(static_backward_kernel, small_blocks(a.N), SMALL_BLOCK, stream, a, grads, out);
 }
 

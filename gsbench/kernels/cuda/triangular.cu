@@ -106,7 +106,7 @@ template <class Run>
 void dispatch(const TriangularArgs& a, Run run) {
     if (a.subtracts) {
         throw std::invalid_argument(
-            "observe_triangular: expected the square-root scheme on a GPU, got one that subtracts");
+            "slice_triangular: expected the square-root scheme on a GPU, got one that subtracts");
     }
     if (a.N == 0) return;
     observing(a.directions, a.times, [&]<Query Q>() {
@@ -116,13 +116,13 @@ void dispatch(const TriangularArgs& a, Run run) {
 
 }  // namespace
 
-void observe_triangular(const TriangularArgs& a, const Observation& out, Stream stream) {
+void slice_triangular(const TriangularArgs& a, const Observation& out, Stream stream) {
     dispatch(a, [&]<Query Q, bool CONDITIONED>() {
         launch(observe_kernel<Q, CONDITIONED>, small_blocks(a.N), SMALL_BLOCK, stream, a, out);
     });
 }
 
-void observe_triangular_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out,
+void slice_triangular_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out,
                                  Stream stream) {
     dispatch(a, [&]<Query Q, bool CONDITIONED>() {
         launch(observe_backward_kernel<Q, CONDITIONED>, small_blocks(a.N), SMALL_BLOCK, stream, a, grads, out);

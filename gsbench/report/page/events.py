@@ -36,8 +36,8 @@ def _steps(record: Record) -> list[tuple[int, str]]:
     found = [(step, "R") for step in schedule.resets_after[:MOST_RESETS]] + [(schedule.densify_stop, "D")]
     if record.effects.refinement:
         found.append((schedule.scaled(train.refine_from), "A"))
-    if _rates(record).get("modulation", {}).get("start", 0) > 0:
-        found.append((schedule.scaled(train.modulation_from), "L"))
+    if _rates(record).get("lambda", {}).get("start", 0) > 0:
+        found.append((schedule.scaled(train.lambda_from), "L"))
     return [(step, letter) for step, letter in found if step <= train.iterations]
 
 

@@ -15,7 +15,7 @@ from gsbench.report.page.content import Canvas, Column, DataTable, Image, PageFi
 from gsbench.report.page.palette import EFFECT_SET_LIKE, MODELS
 from gsbench.report.page.svg import LINE, model_colour, stage_colour
 
-PICTURE = "classes.png"
+PICTURE, OLD_PICTURE = "effect_sets.png", "classes.png"  # runs of before have the old name
 MOST_SAID = 12  # scenes and models that have a sentence
 MOST_BARS = 24
 MOST_NOTES = 12
@@ -177,7 +177,7 @@ def _swatches() -> list[Swatch]:
 
 def _images(found: list[Decided], folder: Path) -> list[Image]:
     """Show the picture by effect set of the first seed of each scene and model, as many as there is room for."""
-    places = gallery.places(folder, PICTURE)
+    places = gallery.places(folder, OLD_PICTURE) | gallery.places(folder, PICTURE)
     paths = [next((p for r in one.runs if (p := places.get(r.path))), None) for one in found]
     captions = [f"{one.scene}, {one.name}" for one in found]
     return gallery.images([(c, path) for c, path in zip(captions, paths, strict=True) if path])

@@ -11,7 +11,7 @@ from gsbench.kernels import refine as refining
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.operation import EVERY_ROW
 from gsbench.kernels.refine import refine
-from gsbench.kernels.slices import observe_rotated, observe_static, observe_triangular
+from gsbench.kernels.slices import slice_rotated, slice_static, slice_triangular
 from gsbench.models import Query, build
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.factors import OFF_DIAGONALS
@@ -94,7 +94,7 @@ def test_slice(name: str, options: dict[str, Any]) -> None:
     expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.opacity_factor]
     model, single = model_and_raw(name, options, torch.float32)
     lambdas = list(model.log_lambda.parameters())
-    actual = list(observe_triangular(
+    actual = list(slice_triangular(
         single["means"], single.get("directions"), single.get("times"), single["log_diagonal"], single["shape"],
         single["motion"], single.get("coupling", torch.empty(37, 0)), single["opacities"], center, torch.tensor(0.4),
         lambda_of(model, "direction"), lambda_of(model, "time"),
@@ -127,7 +127,7 @@ def test_rotated_slice() -> None:
     expected = [seen.means, seen.factors, torch.sigmoid(raw["opacities"]) * seen.opacity_factor]
     assert 0 < (seen.opacity_factor == 0).sum() < len(seen.opacity_factor)  # some are culled
     model, single = rotated(torch.float32)
-    actual = list(observe_rotated(*single.values(), model.clock, torch.tensor(0.4), model.log_lambda["time"]))
+    actual = list(slice_rotated(*single.values(), model.clock, torch.tensor(0.4), model.log_lambda["time"]))
     assert_same(actual, expected)
     assert_same(gradients(actual, [*single.values(), *model.log_lambda.parameters()]),
                 gradients(expected, [*raw.values(), *exact.log_lambda.parameters()]))  # fmt: skip
@@ -146,7 +146,7 @@ def test_static_slice() -> None:
     """Catches a wrong sign of a rotation's entry, a size that does not stop, or a derivative, at a vector's end too."""
     raw, single = static(torch.float64), static(torch.float32)
     expected = [Gaussians3DModel.factors(raw), torch.sigmoid(raw["opacities"])]
-    actual = list(observe_static(*single.values()))
+    actual = list(slice_static(*single.values()))
     assert_same(actual, expected)
     assert_same(gradients(actual, list(single.values())), gradients(expected, list(raw.values())))
 
@@ -320,7 +320,7 @@ def test_errors() -> None:
     with pytest.raises(InputError, match="no gradient by center"):
         show_colors(sh0, shN, means, torch.ones(21), torch.zeros(3).requires_grad_(), 3)
     with pytest.raises(InputError, match="expected directions, times or both, got neither"):
-        observe_triangular(torch.ones(2, 3), None, None, torch.ones(2, 3), torch.ones(2, 3), torch.ones(2, 0),
+        slice_triangular(torch.ones(2, 3), None, None, torch.ones(2, 3), torch.ones(2, 3), torch.ones(2, 0),
                            torch.ones(2, 0), torch.ones(2), torch.zeros(3), None, None, None,
                            conditioned_first=True)  # fmt: skip
     with pytest.raises(InputError, match="refine: expected"):

@@ -1,0 +1,93 @@
+"""The optional shapes of a slice, on their way from a model to the rasterizer's door, which refuses them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.kernels.backends import REFERENCE
+from gsbench.models import Query
+from gsbench.models.base import Conditioned, GaussianModel, Raw, joined_shapes, tensors_of
+from gsbench.models.effect_sets import EffectSets
+from gsbench.models.gated import GatedModel
+from gsbench.models.gaussians3d import Gaussians3DModel
+from gsbench.models.render import render
+from gsbench.scenes.scene import Camera, Points
+from gsbench.view.gaussians import trained_of
+
+N = 6
+SEEN = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
+HERE = Query.of(SEEN, None)
+
+
+class Shaped(GatedModel):
+    """Balls of one radius, each with its own b."""
+
+    geometry = ("shape",)
+    observes = ("direction",)  # so that rows without effects are sliced by `static`
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        return {"shape": torch.arange(float(len(distances)))[:, None]}
+
+    def condition(self, raw: Raw, query: Any) -> Conditioned:
+        shapes, rows = raw["shape"][:, 0].exp(), len(raw["shape"])
+        return Conditioned(raw["means"], 0.1 * torch.eye(3).expand(rows, 3, 3), torch.ones(rows), shapes)
+
+    def static(self, raw: Raw) -> Conditioned:
+        return self.condition(raw, None)
+
+    def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
+        return {}
+
+    def scales(self) -> Tensor:
+        return torch.full((len(self),), 0.1)
+
+    def split(self, raw: Raw, generator: torch.Generator) -> Raw:
+        return raw
+
+
+def made(kind: type[GaussianModel], **options: Any) -> GaussianModel:
+    model, points = kind(**options), torch.rand(N, 3, generator=torch.Generator().manual_seed(0))
+    points[:, 2] += 2
+    model.initialise(Points(points, points), 1.0, torch.Generator().manual_seed(0))
+    return model
+
+
+def test_a_model_s_shapes_reach_the_door() -> None:
+    """Catches shapes that are dropped on the way, so that a Beta kernel is drawn as a Gaussian without a word."""
+    model = made(Shaped)
+    torch.testing.assert_close(model.slice(HERE).shapes, torch.arange(float(N)).exp())
+    with pytest.raises(InputError, match=r"shapes: expected None, got a tensor of shape \[6\]: raster backend 'auto'"):
+        render(model, SEEN, None, torch.zeros(3))
+
+
+def test_rows_of_two_kinds_keep_their_shapes() -> None:
+    """Catches shapes lost, or in another order, where some rows change with the query and the others do not."""
+    model = made(Shaped)
+    whole = model.slice(HERE)
+    model.effect_sets = EffectSets(0, 2, torch.full((N,), 15, dtype=torch.int32))
+    assert all(torch.equal(x, y) for x, y in zip(tensors_of(model.slice(HERE)), tensors_of(whole), strict=True))
+
+
+def test_shapes_of_some_rows_are_refused() -> None:
+    """Catches a model that forgets the shapes of its static rows, all of whose shapes would then be dropped."""
+    assert joined_shapes(None, None) is None
+    with pytest.raises(InputError, match="let `condition` and `static` of the model agree"):
+        joined_shapes(torch.ones(2), None)
+
+
+def test_a_slice_without_shapes_is_as_before() -> None:
+    """Catches an empty tensor of shapes where there are none: an image would be refused."""
+    for backend in ({}, {"backend": REFERENCE}):
+        model = made(Gaussians3DModel, **backend)
+        assert model.slice(HERE).shapes is None
+        assert render(model, SEEN, None, torch.zeros(3)).any()
+
+
+def test_a_ply_of_shapes_is_refused() -> None:
+    """Catches a PLY whose Gaussians are not what the model draws."""
+    with pytest.raises(InputError, match="PLY: expected a slice without shapes, got one of Shaped"):
+        trained_of(made(Shaped), HERE)

@@ -1,0 +1,156 @@
+"""The alpha and the regions of views: kept from RGBA images, read from a folder of masks, refused where damaged."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tiny_scene import COUNTS, edit, write_png
+
+from gsbench import scenes
+from gsbench.errors import InputError
+from gsbench.scenes import images
+from gsbench.train.pyramid import reduced
+
+MUJOCO = Path(__file__).resolve().parents[2] / "../shared/data/mujoco"
+NUMBERS = np.arange(48, dtype=np.uint8).reshape(6, 8)  # of the tiny scene's size
+
+
+def write_masks(root: Path) -> None:
+    """Give every image of the tiny scene a mask: NUMBERS, and the image's index more."""
+    for split, count in COUNTS.items():
+        (root / split / "masks").mkdir()
+        for index in range(count):
+            assert cv2.imwrite(str(root / split / "masks" / f"r_{index}.png"), NUMBERS + np.uint8(index))
+
+
+@pytest.mark.parametrize("in_8_bits", [False, True])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_alpha_is_kept_as_stored(
+    dtype: type[np.generic], in_8_bits: bool, tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches an alpha lost to the composite, taken from a colour, or rounded down from 16 bits."""
+    limit = np.iinfo(dtype).max
+    rgba = np.random.default_rng(1).integers(0, limit + 1, (6, 8, 4)).astype(dtype)
+    for name in ("train/r_0", "train/r_1", "val/r_0", "test/r_0"):
+        write_png(tiny / f"{name}.png", rgba)
+    if in_8_bits:
+        monkeypatch.setattr(images, "_MOST_FLOATS", 0)
+    for view in scenes.load(tiny).to("cpu").train:
+        assert view.alpha.dtype == torch.uint8
+        np.testing.assert_array_equal(view.alpha, np.rint(rgba[..., 3] * (255 / limit)))
+
+
+def test_alpha_is_averaged_with_the_image(tiny: Path) -> None:
+    """Catches an alpha of the full size beside a reduced image, or one that is cut out of it."""
+    alpha = cv2.imread(str(tiny / "train/r_1.png"), cv2.IMREAD_UNCHANGED)[..., 3].astype(float)
+    view = scenes.load(tiny, downscale=2).train[1]
+    np.testing.assert_allclose(view.alpha, alpha.reshape(3, 2, 4, 2).mean(axis=(1, 3)), atol=0.51)
+
+
+def test_an_image_without_alpha_has_none(tiny: Path) -> None:
+    """Catches an alpha made up for opaque images."""
+    for name in ("train/r_0", "train/r_1", "val/r_0", "test/r_0"):
+        write_png(tiny / f"{name}.png", np.zeros((6, 8, 3), np.uint8))
+    scene = scenes.load(tiny)
+    assert all(view.alpha is None for view in scene.train + scene.val + scene.test)
+
+
+def test_regions_are_the_masks_beside_the_images(tiny: Path) -> None:
+    """Catches the mask of another view, numbers that are changed, and a fingerprint that old records do not have."""
+    before = scenes.load(tiny)
+    assert all(view.regions is None for view in before.train + before.val + before.test)
+    write_masks(tiny)
+    scene = scenes.load(tiny).to("cpu")
+    for views in (scene.train, scene.val, scene.test):
+        for index, view in enumerate(views):
+            assert view.regions.dtype == torch.uint8
+            np.testing.assert_array_equal(view.regions, NUMBERS + index)
+    assert scene.fingerprint == before.fingerprint
+
+
+def test_only_masked_folders_have_regions(tiny: Path) -> None:
+    """Catches a scene that is refused because its training images alone have masks."""
+    write_masks(tiny)
+    shutil.rmtree(tiny / "test" / "masks")
+    scene = scenes.load(tiny)
+    assert scene.train[0].regions is not None
+    assert scene.test[0].regions is None
+
+
+@pytest.mark.parametrize("downscale", [2, 3])
+def test_regions_are_not_averaged(tiny: Path, downscale: int) -> None:
+    """Catches the mean of two object numbers, which is a third object, and regions of another size than the image."""
+    numbers = np.arange(72, dtype=np.uint8).reshape(6, 12)
+    write_masks(tiny)
+    for path in tiny.glob("*/r_*.png"):
+        write_png(path, np.zeros((6, 12, 4), np.uint8))
+        assert cv2.imwrite(str(path.parent / "masks" / path.name), numbers)
+    view = scenes.load(tiny, downscale=downscale).train[0]
+    assert view.regions.shape == view.image.shape[:2]
+    np.testing.assert_array_equal(view.regions, numbers[1::downscale, 1::downscale])
+
+
+def test_a_coarse_view_drops_both(tiny: Path) -> None:
+    """Catches the full-size alpha and regions of a view whose image was reduced for an early step."""
+    write_masks(tiny)
+    coarse = reduced(scenes.load(tiny).train[0], 2)
+    assert coarse.alpha is None
+    assert coarse.regions is None
+
+
+def written(image: np.ndarray) -> Callable[[Path], bool]:
+    return lambda path: cv2.imwrite(str(path), image)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (Path.unlink, "r_1.png"),
+        (written(NUMBERS[:, :7].copy()), "expected 8x6 as the image of this mask, got 7x6"),
+        (written(np.zeros((6, 8, 3), np.uint8)), "expected 8-bit grey"),
+        (written(NUMBERS.astype(np.uint16)), "expected 8-bit grey"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-20]), "truncated PNG"),
+        (lambda path: path.write_bytes(b"no PNG"), "expected a PNG"),
+    ],
+)
+def test_a_damaged_mask_is_refused(change: Callable[[Path], object], said: str, tiny: Path) -> None:
+    """Catches a mask that is left out, of another size, of colours or cut off, and is found when it is measured by."""
+    write_masks(tiny)
+    change(tiny / "train" / "masks" / "r_1.png")
+    with pytest.raises(InputError) as caught:
+        scenes.load(tiny)
+    message = str(caught.value)
+    assert said in message
+    assert "the mask of train/r_1.png" in message
+    assert "\n" not in message
+
+
+def test_a_mask_outside_the_scene_is_refused(tiny: Path, tmp_path: Path) -> None:
+    """Catches a link that reads a file of another folder."""
+    write_masks(tiny)
+    mask = tiny / "train" / "masks" / "r_1.png"
+    mask.rename(tmp_path / "elsewhere.png")
+    mask.symlink_to(tmp_path / "elsewhere.png")
+    with pytest.raises(InputError, match="which leaves it"):
+        scenes.load(tiny)
+
+
+@pytest.mark.skipif(not MUJOCO.is_dir(), reason="../shared/data/mujoco is not here")
+def test_regions_of_a_mujoco_scene(tmp_path: Path) -> None:
+    """Catches the layout of a published data set that has masks: every object is seen where the image is opaque."""
+    (root,) = MUJOCO.glob("scene1_*")
+    for split in ("train", "val", "test"):
+        shutil.copy(root / f"transforms_{split}.json", tmp_path)
+        edit(tmp_path, lambda content: content.update(frames=content["frames"][:2]), split)
+        for name in ("r_0000.png", "r_0001.png", "masks/r_0000.png", "masks/r_0001.png"):
+            (tmp_path / split / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(root / split / name, tmp_path / split / name)
+    scene = scenes.load(tmp_path, downscale=2)
+    for view in scene.train + scene.val + scene.test:
+        assert view.alpha.shape == view.regions.shape == view.image.shape[:2] == (400, 400)
+        assert set(view.regions.unique().tolist()) == {0, 1, 2}
+        assert (view.alpha[view.regions > 0] > 0).float().mean() > 0.99
