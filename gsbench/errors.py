@@ -21,7 +21,12 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or its type where it has no message, as it can be printed."""
+    """Return the first line of an error's message, or its type where it has no message, as it can be printed.
+
+    Of an error of a file it is the file and what the system says: "out/x.ply: No space left on device".
+    """
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return printable(f"{error.filename}: {error.strerror}")
     return printable((str(error) or type(error).__name__).splitlines()[0])
 
 

@@ -15,9 +15,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tiny_run import ROOT
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, one_line
 from gsbench.measure import machine
 from gsbench.measure import record as files
+from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
 from gsbench.measure.provenance import git_commit, provenance
 from gsbench.measure.record import METRICS, Cost, Effects, Gate, OnDemand, Provenance, Record, ViewScore
@@ -302,6 +303,14 @@ def test_a_failure_while_writing_leaves_the_old_record(tmp_path, monkeypatch):
         files.write(make(seed=5), path)
     assert files.read(path) == make()
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_error_of_a_file_names_it_and_nothing_else(tmp_path):
+    """Catches "[Errno 28] No space left on device: 'x' -> None", and an error that names the temporary file."""
+    with pytest.raises(OSError, match="director") as raised:
+        write_atomically(tmp_path, b"")
+    assert "None" not in str(raised.value)
+    assert one_line(raised.value) == f"{tmp_path}: {raised.value.strerror}"
 
 
 def test_paths_say_what_a_run_is_and_cannot_leave_the_root(tmp_path):
