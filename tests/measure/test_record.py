@@ -58,6 +58,7 @@ def refused(path: Path, *words: str) -> None:
 
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
+measured = st.floats(-1e100, 1e100)
 texts = st.text(st.characters(codec="utf-8"), max_size=20)
 plain = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63) + 1, 2**63 - 1) | numbers | texts,
@@ -68,10 +69,10 @@ plain = st.recursive(
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    metrics=st.dictionaries(st.sampled_from(METRICS), numbers),
+    metrics=st.dictionaries(st.sampled_from(METRICS), measured),
     config=st.dictionaries(texts, plain, max_size=4),
     reason=texts,
-    seconds=st.lists(numbers, max_size=4),
+    seconds=st.lists(measured, max_size=4),
     seed=st.integers(0, 2**63 - 1),
 )
 def test_what_is_written_is_read_back(tmp_path, metrics, config, reason, seconds, seed):
@@ -169,6 +170,7 @@ def test_what_read_would_refuse_is_not_written(tmp_path, changes, word):
         (["version"], True, ["version"]),
         (["version"], 1.0, ["version"]),
         (["cost", "fps"], 10**400, ["cost.fps"]),
+        (["metrics", "psnr"], 1e308, ["metrics.psnr", "at most 1e+100"]),  # which no chart can have on an axis
     ],
 )
 def test_a_wrong_value_is_refused_by_name(tmp_path, place, value, words):
