@@ -17,7 +17,7 @@ from gsbench.errors import InputError, one_line, printable
 from gsbench.run.stop import Stopped, stop_at_once
 from gsbench.sweep.axes import expand
 from gsbench.sweep.callbacks import started
-from gsbench.sweep.explain import explain, raised_by_hydra
+from gsbench.sweep.explain import explain, raised_by_library
 from gsbench.sweep.finish import see_through
 from gsbench.sweep.task import Problem, do
 
@@ -86,8 +86,8 @@ def _told(error: Exception) -> str | None:
     if isinstance(error, HydraException | OmegaConfBaseException):
         return explain(error)
     if isinstance(error, OSError):  # of Hydra's own files; a run's errors end in its record
-        return f"{error.filename}: {error.strerror}" if error.filename else one_line(error)
-    return one_line(error) if raised_by_hydra(error) else None
+        return one_line(error)
+    return one_line(error) if raised_by_library(error) else None
 
 
 _in_two_lines = warnings.formatwarning

@@ -21,7 +21,12 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or its type if it has no message, in printable form."""
+    """Return the first line of an error's message, or its type if it has no message, in printable form.
+
+    For an error of a file it is the file and what the system says: "out/x.ply: No space left on device".
+    """
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return printable(f"{error.filename}: {error.strerror}")
     return printable((str(error) or type(error).__name__).splitlines()[0])
 
 

@@ -30,7 +30,8 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
         temporary.unlink(missing_ok=True)
         # The error of a full disk names no file, and the temporary name tells a user nothing.
         if isinstance(error, OSError) and error.errno:
-            error.filename, error.filename2 = str(path), None
+            error.filename = str(path)
+            del error.filename2  # None would be printed
         raise
     if not lasting:
         return

@@ -9,6 +9,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 from gsbench.errors import InputError, did_you_mean
 
 T = TypeVar("T")
+LARGEST = 1e100  # the square of a number stays finite, and a chart can have it on an axis
 
 
 def parse(kind: type[T], value: object, file: str) -> T:
@@ -78,6 +79,8 @@ def _parse_any(value: Any, file: str, field: str) -> Any:
     for container in (dict[str, Any], list[Any]):
         if type(value) is get_origin(container):
             return _parse(container, value, file, field)
+    if type(value) is float and math.isfinite(value):  # of a config, which may be anything
+        return value
     return _parse_scalar(type(value), value, file, field)
 
 
@@ -92,11 +95,16 @@ def _parse_scalar(kind: Any, value: Any, file: str, field: str) -> Any:
             number = float(value)
         except OverflowError:
             number = math.inf
-        if math.isfinite(number):
+        if abs(number) <= LARGEST:
             return number
     if kind is bool and type(value) is bool:
         return value
-    names = {str: "a string", int: "an integer", float: "a finite number", bool: "true or false"}
+    names = {
+        str: "a string",
+        int: "an integer",
+        float: f"a finite number of at most {LARGEST:g}",
+        bool: "true or false",
+    }
     raise _fault(file, field, names.get(kind, "plain JSON"), value)
 
 

@@ -155,10 +155,11 @@ def _check_rate(key: str, rate: LearningRate) -> None:
 
 def _check_coarse(coarse: list[list[int]]) -> None:
     """Raise InputError unless factors are whole, fall, and end at steps that rise: [[4, 3000], [2, 15000]]."""
-    factors, steps = [pair[0] for pair in coarse], [pair[-1] for pair in coarse]
+    are_pairs = all(len(pair) == 2 for pair in coarse)
+    factors, steps = ([pair[at] for pair in coarse] if are_pairs else [] for at in (0, 1))
     fall = all(a > b for a, b in itertools.pairwise([*factors, 1]))
     rise = all(a < b for a, b in itertools.pairwise([0, *steps]))
-    if not fall or not rise or any(len(pair) != 2 for pair in coarse):
+    if not are_pairs or not fall or not rise:
         raise InputError(f"train.coarse: expected pairs (factor above 1, step of the recipe until which images are so "
                          f"much smaller), factors falling and steps rising, such as [[4,3000],[2,15000]], "
                          f"got {coarse}")  # fmt: skip
@@ -243,8 +244,8 @@ def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
     factor = max((pair[0] for pair in config.train.coarse or []), default=1)
     side = min(min(view.camera.width, view.camera.height) for view in scene.train)
     if side // factor < WINDOW:
-        raise InputError(f"train.coarse: expected images of at least {WINDOW} pixels, the loss's window, after the "
-                         f"factor {factor}, got {side // factor}")  # fmt: skip
+        key = f"train.coarse, after the factor {factor}" if factor > 1 else f"scene.downscale={config.scene.downscale}"
+        raise InputError(f"{key}: expected images of at least {WINDOW} pixels, the loss's window, got {side // factor}")
 
 
 def evaluated_views(scene: Scene, split: str) -> list[View]:

@@ -7,6 +7,7 @@ python -m gsbench.sweep retry results/EXP [launch.memory=16G ...]
 import argparse
 import json
 import os
+import shlex
 import sys
 import time
 from collections import Counter
@@ -15,9 +16,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gsbench.errors import InputError, printable
+from gsbench.sweep.plan import identity
 from gsbench.sweep.status import BROKEN, GOING, STATES, RunStatus, read, status
 
 WATCH_SECONDS = 10.0
+MOST_COMMANDS = 20  # of runs that no sweep requested
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -115,8 +118,17 @@ def _retry(folder: Path, launch: list[str]) -> int:
     from gsbench.sweep.task import do
 
     folder = folder.resolve()  # runs are launched from the folder that the first command was given in
-    count = retry(read(folder), launch, do)
-    if not count:
+    experiment = read(folder)
+    single = [run for run in status(experiment)
+              if run.state in BROKEN and identity(run.overrides) not in experiment.requested]  # fmt: skip
+    count = retry(experiment, launch, do)
+    for run in single[:MOST_COMMANDS]:
+        words = " ".join(map(shlex.quote, (*run.overrides, f"results={folder.parent}")))
+        print(f"gsbench.sweep: not of a sweep, so only its own command starts it again: python -m gsbench "
+              f"{printable(words)}", file=sys.stderr)  # fmt: skip
+    if len(single) > MOST_COMMANDS:
+        print(f"gsbench.sweep: and {len(single) - MOST_COMMANDS} more runs of no sweep", file=sys.stderr)
+    if not count and not single:
         print(f"{folder}: no run failed, is lost or never started", file=sys.stderr)
     return _verdict(_show(folder, False))
 

@@ -1,5 +1,6 @@
 """Expand a command line before Hydra reads it: scene=all becomes an axis of the sweep with one run for each scene."""
 
+import itertools
 import re
 import warnings
 from collections.abc import Sequence
@@ -31,8 +32,9 @@ def expand(words: Sequence[str]) -> list[str]:
     """
     multirun = any(word in MULTIRUN for word in words)
     words = [_with_present_names(word) for word in words if word not in MULTIRUN]
-    for word in words:
-        _check_group(*word.lstrip("+").partition("=")[::2])
+    for before, word in itertools.pairwise(["", *words]):
+        if not before.startswith("-"):  # else it is the value of an option, such as a folder
+            _check_group(*word.lstrip("+").partition("=")[::2])
     keys = {word.partition("=")[0].lstrip("+"): word.partition("=")[2] for word in words if "=" in word}
     wants_all = keys.get("scene", "all") == "all" and "exp" in keys and keys["exp"] != "stability"
     if wants_all and not any(word in INFORM for word in words):

@@ -9,6 +9,8 @@ from omegaconf.errors import OmegaConfBaseException
 from gsbench.errors import did_you_mean
 from gsbench.measure.renamed import present_key
 
+LIBRARIES = ("hydra", "omegaconf", "antlr4", "joblib", "submitit")
+
 
 def explain(error: Exception) -> str:
     """Explain an error of Hydra or OmegaConf in one line that names the key and the nearest valid one."""
@@ -29,7 +31,10 @@ def explain(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def raised_by_hydra(error: Exception) -> bool:
-    """Tell whether Hydra's own code raised an error, as it does for words that it misreads."""
+def raised_by_library(error: Exception) -> bool:
+    """Tell whether Hydra or a launcher's library raised an error itself, as they do for words or settings they misread.
+
+    An error of a run in another process is raised again by the launcher's library; its stack is its cause.
+    """
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    return str(frame.f_globals.get("__name__")).partition(".")[0] in ("hydra", "omegaconf", "antlr4")
+    return error.__cause__ is None and str(frame.f_globals.get("__name__")).partition(".")[0] in LIBRARIES

@@ -66,7 +66,7 @@ def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfi
     for group in groups.values():
         try:
             _relaunch(experiment, group, more, task)
-        except (InputError, HydraException, OmegaConfBaseException, OSError) as error:
+        except (HydraException, OmegaConfBaseException, OSError, ValueError) as error:  # ValueError: of the launcher
             why = explain(error) if isinstance(error, HydraException | OmegaConfBaseException) else str(error)
             print(f"gsbench.sweep: {len(group)} runs of {group[0].folder / plan.FILE_NAME} cannot be launched again: "
                   f"{printable(why)}", file=sys.stderr)  # fmt: skip

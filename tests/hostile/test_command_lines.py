@@ -60,6 +60,9 @@ def status_of(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
         (["results=/dev/null"], 2, "results: expected a folder that can be written"),
         (["trian.iterations=5"], 2, "trian"),
         (["train.ssim_weight=2"], 1, "train.ssim_weight: expected 0 to 1"),
+        (["scene.downscale=16"], 1, "scene.downscale=16: expected images of at least 11 pixels"),
+        (["train.coarse=[[2,3000]]"], 1, "train.coarse, after the factor 2: expected images of at least 11 pixels"),
+        (["-m", "seed=0,1", "+launch=parallel", "launch.at_once=0"], 2, "n_jobs == 0"),
     ],
 )
 def test_bad_words_are_one_line_and_a_known_status(

@@ -15,9 +15,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tiny_run import ROOT
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, one_line
 from gsbench.measure import machine
 from gsbench.measure import record as files
+from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
 from gsbench.measure.provenance import git_commit, provenance
 from gsbench.measure.record import METRICS, Cost, Effects, Gate, OnDemand, Provenance, Record, ViewScore
@@ -57,6 +58,7 @@ def refused(path: Path, *words: str) -> None:
 
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
+measured = st.floats(-1e100, 1e100)
 texts = st.text(st.characters(codec="utf-8"), max_size=20)
 plain = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63) + 1, 2**63 - 1) | numbers | texts,
@@ -67,10 +69,10 @@ plain = st.recursive(
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    metrics=st.dictionaries(st.sampled_from(METRICS), numbers),
+    metrics=st.dictionaries(st.sampled_from(METRICS), measured),
     config=st.dictionaries(texts, plain, max_size=4),
     reason=texts,
-    seconds=st.lists(numbers, max_size=4),
+    seconds=st.lists(measured, max_size=4),
     seed=st.integers(0, 2**63 - 1),
 )
 def test_what_is_written_is_read_back(tmp_path, metrics, config, reason, seconds, seed):
@@ -168,6 +170,7 @@ def test_what_read_would_refuse_is_not_written(tmp_path, changes, word):
         (["version"], True, ["version"]),
         (["version"], 1.0, ["version"]),
         (["cost", "fps"], 10**400, ["cost.fps"]),
+        (["metrics", "psnr"], 1e308, ["metrics.psnr", "at most 1e+100"]),  # which no chart can have on an axis
     ],
 )
 def test_a_wrong_value_is_refused_by_name(tmp_path, place, value, words):
@@ -302,6 +305,14 @@ def test_a_failure_while_writing_leaves_the_old_record(tmp_path, monkeypatch):
         files.write(make(seed=5), path)
     assert files.read(path) == make()
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_error_of_a_file_names_it_and_nothing_else(tmp_path):
+    """Catches "[Errno 28] No space left on device: 'x' -> None", and an error that names the temporary file."""
+    with pytest.raises(OSError, match="director") as raised:
+        write_atomically(tmp_path, b"")
+    assert "None" not in str(raised.value)
+    assert one_line(raised.value) == f"{tmp_path}: {raised.value.strerror}"
 
 
 def test_paths_say_what_a_run_is_and_cannot_leave_the_root(tmp_path):

@@ -23,7 +23,7 @@ from gsbench.report.__main__ import main
 from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import groups
 from gsbench.report.frontier import choose, points
-from gsbench.report.page import build, cost, evidence, gallery, messages, palette, time_to_quality, worth
+from gsbench.report.page import build, charts, cost, evidence, gallery, messages, palette, time_to_quality, worth
 from gsbench.report.page.content import Canvas, Column, DataTable, Runs
 from gsbench.report.page.events import of as events_of
 from gsbench.report.page.palette import DARK, LIGHT, MARKERS, styles
@@ -200,6 +200,23 @@ def test_nothing_is_dominated_by_a_mean():
     assert "By their means b is beaten by a" in text
     assert "may be chance" in text
     assert "dominated" not in text
+
+
+def test_what_a_section_leaves_out_is_said():
+    """Catches pairs that the drawing lacks in silence, a protocol of some runs that reads as that of all, and totals
+    of stages with other digits than their neighbours."""
+    records = frontier(lengths=(500, 1000))
+    said = " ".join(evidence.protocol_section(group(records)).sentences)
+    tabled = sum(r.variant == "" for r in records)
+    assert 0 < tabled < len(records)
+    assert f"of the {tabled} runs in the tables" in said
+    few = pairs_section(records)
+    many = pairs_section([dataclasses.replace(r, model=f"{r.model}{i}") for r in frontier(seeds=2, views=2,
+                          lengths=(1000,)) for i in range(2)])  # fmt: skip
+    assert len(few.table.rows) <= worth.MOST_PAIRS < len(many.table.rows)
+    assert not any("are drawn" in note for note in few.notes)
+    assert any(note.startswith(f"Of {len(many.table.rows)} pairs the {worth.MOST_PAIRS} with") for note in many.notes)
+    assert "6.60 s" in charts.stages([("a", {"slice": 6.6}), ("b", {"slice": 3.59})], ["slice"], [0]).svg("s", "")
 
 
 def test_seconds_of_another_machine_are_nowhere(tmp_path):

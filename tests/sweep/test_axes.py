@@ -27,11 +27,14 @@ def schema() -> None:
         (["--help"], ["--help"]),
         (["model=7dgs"], ["model=7dgs"]),
         (["+exp=nosuch"], ["+exp=nosuch"]),
+        (["--config-dir", "/tmp", "model=7dgs"], ["--config-dir", "/tmp", "model=7dgs"]),
+        (["model=7dgs", "--config-dir", "."], ["model=7dgs", "--config-dir", "."]),
         (["+exp=stability"], ["+exp=stability"]),
     ],
 )  # fmt: skip
 def test_scenes_are_an_axis(words: list[str], expanded: list[str]) -> None:
-    """Catches scenes that a cluster does one after the other in one job, and a flag that Hydra does not see."""
+    """Catches scenes that a cluster does one after the other in one job, and a flag that Hydra does not see,
+    and a folder of configs that is taken for a choice."""
     assert expand(words) == expanded
 
 

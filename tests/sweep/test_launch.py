@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import crowd
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -121,15 +122,31 @@ def test_retry_passes_over_what_cannot_be_launched(
         gone: ["+exp=mini", "scene=suzanne", "seed=0"],
         str(tmp_path): ["+exp=mini", "scene=suzanne", "train.iteratons=5", "seed=1"],
         "/": ["+exp=mini", "seed=[", "seed=2"],
+        "/usr": ["+exp=mini", "scene=suzanne", "+launch=parallel", "launch.at_once=0", "seed=3"],
     }
     for number, (cwd, words) in enumerate(asked.items()):
         one = Plan("basic", [words], [], cwd, "elsewhere", 1, 1, 0.0)
         plan.write(one, experiment / plan.FOLDER / f"2026-11-22_00-00-0{number}.000000")
     assert sweep_main(["retry", str(experiment)]) == 1  # they are lost as before
     told = [line for line in capsys.readouterr().err.splitlines() if "cannot be launched again" in line]
-    assert len(told) == 3
-    for line, said in zip(sorted(told), (f"'{gone}'", "Did you mean 'iterations'", "at input '['"), strict=True):
+    reasons = (f"'{gone}'", "Did you mean 'iterations'", "at input '['", "n_jobs == 0")
+    for line, said in zip(sorted(told), reasons, strict=True):
         assert said in line
+
+
+def test_retry_names_the_command_of_a_run_that_is_of_no_sweep(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a retry that says that no run failed, beside a status that lists one."""
+    run = ("7dgs", "lego", 0)
+    folder = tmp_path / "mini" / "lego" / "7dgs" / "seed0"
+    folder.mkdir(parents=True)
+    broken = crowd.record(*run) | {"status": "failed", "reason": "out of memory"}
+    (folder / "record.json").write_text(json.dumps(broken, default=str))
+    assert sweep_main(["retry", str(tmp_path / "mini")]) == 1
+    said = capsys.readouterr().err
+    assert f"python -m gsbench {' '.join(identity(crowd.overrides(*run)))} results={tmp_path}" in said
+    assert "no run failed" not in said
 
 
 def test_a_retry_launches_with_the_settings_that_it_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -359,6 +359,8 @@ def test_penalties_act_in_their_window_and_reach_the_gradient() -> None:
         ("train.penalties.size.weight=-1", "train.penalties.size.weight: expected"),
         ("train.coarse=[[2,3000],[4,15000]]", "factors falling and steps rising"),
         ("train.coarse=[[1,3000]]", "expected pairs (factor above 1"),
+        ("train.coarse=[[]]", "expected pairs (factor above 1"),
+        ("train.coarse=[[4,3000,1]]", "expected pairs (factor above 1"),
     ],
 )
 def test_faulty_schedules_are_refused(word: str, said: str) -> None:

@@ -194,7 +194,7 @@ def stages(rows: list[tuple[str, dict[str, float]]], names: list[str], colours: 
     found = []
     for label, parts in rows:
         total = sum(parts.values())
-        note = f"{total:,.0f} s" if total >= 100 else f"{total:.3g} s"
+        note = f"{total:,.0f} s" if total >= 100 else f"{total:#.3g} s"
         found.append(Bar(label, [parts.get(name, 0.0) for name in names], note))
     return bars(found, [stage_colour(i) for i in colours], "training seconds")
 

@@ -37,7 +37,8 @@ def protocol_section(group: Group) -> PageSection:
         ]
         for r in group.records
     ]
-    notes = [messages.shorten(note, LONGEST_NOTE) for note in conditions(_compared(group))]
+    compared = _compared(group)
+    notes = [messages.shorten(note, LONGEST_NOTE) for note in conditions(compared)]
     if group.elsewhere:
         left = (
             f"Seconds, ms and FPS of {messages.count(group.elsewhere, 'run')} on other machines are left out everywhere"
@@ -46,6 +47,8 @@ def protocol_section(group: Group) -> PageSection:
     ended = messages.count(len(group.finished), "run")
     lost = len(group.records) - len(group.finished)
     said = [f"{ended} finished, {messages.count(lost, 'run')} did not (below)." if lost else f"All {ended} finished."]
+    if len(compared) < len(group.records):
+        said.append(f"The lines below are of the {messages.count(len(compared), 'run')} in the tables above.")
     return PageSection(
         "protocol", "Protocol, machine, seeds", said, table=DataTable("runs.csv", columns, rows), notes=notes
     )

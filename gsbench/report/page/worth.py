@@ -213,6 +213,10 @@ def pairs_section(group: Group, family: Family, canvas: Canvas) -> PageSection:
         if first.over
         else f"{messages.NO_SPREAD.capitalize()}: no interval and no p-value is given."
     ]
+    if len(found) > MOST_PAIRS:
+        notes.append(
+            f"Of {len(found)} pairs the {MOST_PAIRS} with the largest differences are drawn; the file has all."
+        )
     said = [*([messages.scope(first)] if first.over else []), *_pair_words(group, found)]
     return PageSection("pairs", "Is it a difference?", said, [Tab("", [drawing])], table, beside=True, notes=notes)
 
