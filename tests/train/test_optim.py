@@ -9,7 +9,8 @@ import torch
 from gsbench import kernels
 from gsbench.config import DensifyConfig, LearningRate, ModelConfig, TrainConfig
 from gsbench.errors import InputError
-from gsbench.kernels.adam import adam
+from gsbench.kernels.adam import adam, adam_all
+from gsbench.kernels.headers import MAX_ADAM
 from gsbench.models import GaussianModel, build
 from gsbench.scenes.points import random_points
 from gsbench.train.densify.gradient import GradientDensification
@@ -257,6 +258,51 @@ def test_kernel_and_torch_make_the_same_update(shape: tuple[int, ...]) -> None:
     for one, two, reference in zip(*out, expected, strict=True):
         torch.testing.assert_close(one, reference, rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(one, two, rtol=0, atol=0)
+
+
+@pytest.mark.skipif(not kernels.available(), reason="the native kernels are not built here")
+def test_all_parameters_in_one_call_are_updated_as_torch_does() -> None:
+    """Catches a parameter that is left out or updated twice, another's rate or step, and a 33rd that is forgotten."""
+    random = torch.Generator().manual_seed(0)
+    shapes = [(), (0, 3), (1,), (700, 1, 3), (60_000, 2), *[(i + 1,) for i in range(MAX_ADAM)]]
+    rates = [0.01 * (i + 1) for i in range(len(shapes))]
+    start = [torch.randn(shape, generator=random) for shape in shapes]
+    gradients = [[torch.randn(shape, generator=random) for shape in shapes] for _ in range(3)]
+    expected = [x.clone().requires_grad_() for x in start]
+    reference = torch.optim.Adam(
+        [{"params": [x], "lr": rate} for x, rate in zip(expected, rates, strict=True)], eps=1e-15
+    )
+    for given in gradients:
+        for x, g in zip(expected, given, strict=True):
+            x.grad = g.clone()
+        reference.step()
+    out = []
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            x, m, v = ([y.clone() for y in start], *([torch.zeros_like(y) for y in start] for _ in range(2)))
+            for step, given in enumerate(gradients):
+                steps = [torch.tensor(step + 1.0)] * len(x)
+                adam_all(x, given, m, v, steps, rates, [0.9, 0.999], 1e-15)
+            out.append(x)
+    finally:
+        torch.set_num_threads(threads)
+    for one, two, other in zip(*out, expected, strict=True):
+        torch.testing.assert_close(one, other.detach(), rtol=1e-5, atol=1e-6)
+        assert torch.equal(one, two)
+
+
+def test_all_parameters_must_fit() -> None:
+    """Catches a gradient of another size or type, and a parameter with gaps, whose address reaches the kernel."""
+    x = [torch.zeros(4, 2)]
+    rest = [torch.ones(())], [0.1], [0.9, 0.999], 1e-15
+    with pytest.raises(InputError, match=r"expected gradient as contiguous float32 of shape \[4, 2\] on the CPU, got"):
+        adam_all(x, [torch.zeros(4, 3)], x, x, *rest)
+    with pytest.raises(InputError, match="expected mean as contiguous float32"):
+        adam_all(x, x, [torch.zeros(4, 2, dtype=torch.float64)], x, *rest)
+    with pytest.raises(InputError, match="expected parameter as contiguous float32"):
+        adam_all([torch.zeros(2, 4).T], x, x, x, *rest)
 
 
 def test_adam_refuses_what_does_not_fit() -> None:
