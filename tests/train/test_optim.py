@@ -265,13 +265,12 @@ def test_all_parameters_in_one_call_are_updated_as_torch_does() -> None:
     """Catches a parameter that is left out or updated twice, another's rate or step, and a 33rd that is forgotten."""
     random = torch.Generator().manual_seed(0)
     shapes = [(), (0, 3), (1,), (700, 1, 3), (60_000, 2), *[(i + 1,) for i in range(MAX_ADAM)]]
-    rates = [0.01 * (i + 1) for i in range(len(shapes))]
+    rates = [0.001 * (i + 1) for i in range(len(shapes))]
     start = [torch.randn(shape, generator=random) for shape in shapes]
     gradients = [[torch.randn(shape, generator=random) for shape in shapes] for _ in range(3)]
     expected = [x.clone().requires_grad_() for x in start]
-    reference = torch.optim.Adam(
-        [{"params": [x], "lr": rate} for x, rate in zip(expected, rates, strict=True)], eps=1e-15
-    )
+    groups = [{"params": [x], "lr": rate} for x, rate in zip(expected, rates, strict=True)]
+    reference = torch.optim.Adam(groups, eps=1e-15)
     for given in gradients:
         for x, g in zip(expected, given, strict=True):
             x.grad = g.clone()

@@ -9,11 +9,9 @@ from gsbench.train.step import Sums, add_up, deal
 
 
 def gradient(views: int, workers: int) -> torch.Tensor:
-    """The gradient of a batch whose views have gradients of very different sizes, so that each order rounds its own way."""
+    """The gradient of a batch of views; many numbers, since each order of sums rounds some of them its own way."""
     bounds = [views * worker // workers for worker in range(workers + 1)]
-    each = [
-        torch.tensor([1.1 * 10.0**i]) for i in torch.randperm(views, generator=torch.Generator().manual_seed(views))
-    ]
+    each = torch.randn(views, 1000, generator=torch.Generator().manual_seed(views))
     sums: list[Sums] = deal(views, bounds)
     for own, value in zip(sums, each, strict=True):
         own[0] = own[0] + value if 0 in own else value.clone()
