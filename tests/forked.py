@@ -44,9 +44,15 @@ def python_m(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     with tempfile.TemporaryDirectory() as folder:
         out, err = Path(folder, "out"), Path(folder, "err")
         asked = {"argv": [module, *arguments], "environment": os.environ | ENVIRONMENT, "files": [str(out), str(err)]}
-        print(json.dumps(asked), file=server.stdin, flush=True)
-        status = int(server.stdout.readline())
-        return subprocess.CompletedProcess([module, *arguments], status, out.read_text(), err.read_text())
+        try:
+            print(json.dumps(asked), file=server.stdin, flush=True)
+            answer = server.stdout.readline()
+        except BaseException:  # a test's time is over: the answer to come is not the next command's
+            server.kill()
+            _servers.clear()
+            raise
+        assert answer, "the process that forks has ended"
+        return subprocess.CompletedProcess([module, *arguments], int(answer), out.read_text(), err.read_text())
 
 
 def serve() -> None:
