@@ -12,40 +12,45 @@ RESULTS ?= results
 # The CUDA kernels, compiled for five architectures, take minutes: made where a GPU is to run them. CUDA=on|auto|off.
 CUDA := $(if $(shell nvidia-smi -L 2> /dev/null),auto,off)
 
+# The instruction sets that the kernels are built for: native, this machine's best, or all, which takes twice as long.
+LEVELS ?= native
+
 .PHONY: help table1 frontier tables test test-all stability stability-long bench gpu-check slurm-check sanitize lint format docs setup locks clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-setup: $(VENV)/installed  ## make .venv and install gsbench into it, with pinned versions whose hashes are checked
+setup: $(VENV)/levels-$(LEVELS)  ## make .venv and install gsbench into it, with pinned versions whose hashes are checked
 
 # locks/ has all that comes along, so pip resolves nothing and fetches no tools to build with; a file with another hash
 # is refused.
-PIP := $(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --use-pep517
+PIP := $(BIN)/pip install --quiet --disable-pip-version-check --no-compile --no-deps --no-build-isolation --use-pep517
 LOCKED := $(PIP) --require-hashes --requirement locks
+
+# Beside the kernels, which take as long to compile: unpacked on one core, their bytecode written on all (pip has one).
+TORCH := $(LOCKED)/torch.txt
+ifeq ($(CUDA),off)
+TORCH := { $(LOCKED)/torch_cpu.txt || { echo "no torch for the CPU at hand (docs/install.md): PyPI's, several GB on Linux"; $(TORCH); }; }
+endif
+LIBRARIES := $(TORCH) && $(LOCKED)/tests.txt && { $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || :; }
 
 # Installed again whenever what is installed changes: the metadata, the pins, the native sources.
 NATIVE := CMakeLists.txt $(shell find gsbench/kernels -name '*.cpp' -o -name '*.h' -o -name '*.cu')
-$(VENV)/installed: pyproject.toml $(wildcard locks/*.txt) $(NATIVE)
+$(VENV)/levels-%: pyproject.toml $(wildcard locks/*.txt) $(NATIVE)
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \
 		{ echo "gsbench needs Python 3.11, 3.12 or 3.13; $(PYTHON) is $$($(PYTHON) --version). Try make PYTHON=python3.12"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-ifeq ($(CUDA),off)
-	$(LOCKED)/torch_cpu.txt || { echo "no torch for the CPU at hand (docs/install.md): PyPI's, several GB on Linux"; \
-		$(LOCKED)/torch.txt; }
-else
-	$(LOCKED)/torch.txt
-endif
 	$(LOCKED)/build.txt
-	$(LOCKED)/tests.txt
-	$(PIP) --config-settings cmake.define.CUDA=$(CUDA) --editable .
+	$(PIP) --config-settings cmake.define.CUDA=$(CUDA) --config-settings cmake.define.GSB_LEVELS=$* --editable . & \
+		kernels=$$!; $(LIBRARIES); status=$$?; wait $$kernels && exit $$status
 	@$(BIN)/python -c 'import sys; from gsbench import kernels; sys.exit(not kernels.available())' || \
 		echo "gsbench is installed without its kernels, and slow: docs/install.md says what they need"
-	touch $@
+	rm -f $(VENV)/levels-*
+	touch $@ $(if $(filter all,$*),$(VENV)/levels-native)
 
 # Sphinx and the kernel of notebooks: for those who ask for the site or for all tests.
-$(VENV)/installed-docs: $(VENV)/installed
+$(VENV)/installed-docs: $(VENV)/levels-$(LEVELS)
 	$(LOCKED)/docs.txt
 	touch $@
 
@@ -74,17 +79,17 @@ tables: setup  ## write Tables 1 and 2 of the paper from whatever is in results/
 test: lint  ## lint, types and all tests but the slow ones
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
-test-all: lint $(VENV)/installed-docs  ## the slow tests too
+test-all: $(VENV)/levels-all lint $(VENV)/installed-docs  ## the slow tests too, in every instruction set
 	$(BIN)/python -m pytest -m 'slow or not slow'
 
-stability: setup  ## hard cases against an oracle; results/stability/, fails where a default breaks its bound
+stability: $(VENV)/levels-all  ## hard cases against an oracle; results/stability/, fails where a default breaks its bound
 	$(BIN)/python -m gsbench.stability
 
-stability-long: setup  ## the same with long trainings, and 10,000 random hard cases from slice to gradient
+stability-long: $(VENV)/levels-all  ## the same with long trainings, and 10,000 random hard cases from slice to gradient
 	$(BIN)/python -m gsbench.stability --long
 	$(BIN)/python -m pytest tests/stability -m slow
 
-bench: setup  ## time every kernel against the machine's own limits; results/benchmarks/
+bench: $(VENV)/levels-all  ## time every kernel against the machine's own limits; results/benchmarks/
 	$(BIN)/python -m benchmarks
 
 gpu-check:  ## on a machine with a GPU, offline: build, test, train, sanitize and time the CUDA kernels; results/benchmarks/

@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.process.heap import keep_freed_memory
 from gsbench.process.threads import sleep_when_idle
+from gsbench.version import __version__ as __version__
 
 keep_freed_memory()  # both before anything of gsbench imports torch or the kernels
 sleep_when_idle()
-
-__version__ = "0.2.0"  # the only place: pyproject.toml reads it here, and a test holds CITATION.cff to it
 
 __all__ = ["Query", "build", "load_run", "load_scene", "lpips", "psnr", "rasterize", "slice_gaussians", "ssim"]
 

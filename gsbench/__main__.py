@@ -11,7 +11,6 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsbench import __version__
 from gsbench.config import CONF, HERE, register_schema
 from gsbench.errors import InputError, one_line, printable
 from gsbench.run.stop import Stopped, stop_at_once
@@ -20,6 +19,7 @@ from gsbench.sweep.callbacks import started
 from gsbench.sweep.explain import explain, raised_by_library
 from gsbench.sweep.finish import see_through
 from gsbench.sweep.task import Problem, do
+from gsbench.version import __version__
 
 BAD_INPUT, FAILED = 2, 1  # exit statuses: nothing could be run as asked; a run did not end well
 _problems: list[Problem] = []  # of the runs that did not end well; a Hydra sweep goes on after them

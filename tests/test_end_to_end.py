@@ -8,7 +8,8 @@ from tiny_run import gsbench
 from gsbench.measure import record
 from gsbench.report import layout, tables
 
-SHORT = ("train.iterations=250", "train.densify.every=25", "train.curve_points=2", "data.initial_points=800")
+SHORT = ("train.iterations=150", "train.densify.every=25", "train.curve_points=1", "data.initial_points=500",
+         "protocol.renders=30", "protocol.pictures=0")  # fmt: skip
 
 
 def scores(results: Path) -> dict[tuple[str, str], float]:

@@ -1,6 +1,7 @@
 """A run small enough for a test: a data set of a few pixels, a config of a few steps, the command line around it."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from forked import ENVIRONMENT, python_m
 
 if TYPE_CHECKING:
     from gsbench.measure.record import Record
@@ -49,8 +51,8 @@ def overrides(data: Path, results: Path, *more: str) -> list[str]:
 
 
 def environment() -> dict[str, str]:
-    """One thread: tests share the machine, and the sums of a run are those of its thread count."""
-    return {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
+    """That of a process which shares the machine with other tests."""
+    return os.environ | ENVIRONMENT
 
 
 def command(*arguments: str) -> list[str]:
@@ -60,9 +62,29 @@ def command(*arguments: str) -> list[str]:
 
 def gsbench(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run the command line to its end."""
-    return subprocess.run(
-        command(*arguments), capture_output=True, text=True, timeout=240, cwd=ROOT, env=environment(), check=False
-    )
+    return python_m("gsbench", *arguments)
+
+
+def main_here(*arguments: str) -> int:
+    """Run the command line in this process, as if it were a new one; return its exit status."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    from gsbench import __main__ as entry
+
+    argv, handler = sys.argv, signal.getsignal(signal.SIGTERM)
+    GlobalHydra.instance().clear()
+    sys.argv = ["gsbench", *arguments]
+    try:
+        entry.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    finally:
+        sys.argv = argv
+        signal.signal(signal.SIGTERM, handler)
+        entry._problems.clear()
+        entry.started.clear()
+        GlobalHydra.instance().clear()
+    return 0
 
 
 def run_here(*words: str) -> tuple["Record", Path]:

@@ -74,6 +74,8 @@ class _Refine(Operation):
         if not all(isinstance(x, Tensor) for x in tensors):
             kinds = ", ".join(sorted({type(x).__name__ for x in tensors if not isinstance(x, Tensor)}))
             raise InputError(f"refine: expected tensors, got {kinds}")
+        if not isinstance(refined, int):
+            raise InputError(f"refine: expected rows as int, got {type(refined).__name__}")
         return tensors, (refined,)
 
     def differentiable(self, tensors: Tensors) -> list[bool]:

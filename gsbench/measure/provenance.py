@@ -9,9 +9,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from gsbench import __version__
 from gsbench.measure.machine import hardware
 from gsbench.measure.record import Provenance
+from gsbench.version import __version__
 
 PACKAGES = ("torch", "numpy", "scikit-image", "lpips", "opencv-contrib-python-headless")
 

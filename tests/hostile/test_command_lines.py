@@ -1,43 +1,17 @@
 """Hostile command lines: each ends in one line and the exit status of docs/runs.md, and never in a stack trace."""
 
-import signal
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
-from tiny_run import overrides, write_moving_square
+from tiny_run import main_here, overrides, write_moving_square
 
 import gsbench
-from gsbench import __main__ as entry
 from gsbench.measure import record
 
 
 @pytest.fixture(scope="module")
 def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_moving_square(tmp_path_factory.mktemp("data"))
-
-
-@pytest.fixture(autouse=True)
-def _as_a_new_process() -> Iterator[None]:
-    """Clears what a command leaves in its process."""
-    before = signal.getsignal(signal.SIGTERM)
-    yield
-    signal.signal(signal.SIGTERM, before)
-    entry._problems.clear()
-    GlobalHydra.instance().clear()
-
-
-def status_of(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
-    """The exit status of `python -m gsbench` with some words, in this process."""
-    GlobalHydra.instance().clear()
-    monkeypatch.setattr(sys, "argv", ["gsbench", *words])
-    try:
-        entry.main()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
 
 
 @pytest.mark.parametrize(
@@ -66,29 +40,27 @@ def status_of(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     ],
 )
 def test_bad_words_are_one_line_and_a_known_status(
-    words: list[str], status: int, said: str, square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    words: list[str], status: int, said: str, square: Path, tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     """Catches a stack trace of gsbench's or of Hydra's, and one exit status for bad input and for failed runs."""
-    assert status_of([*overrides(square, tmp_path, "model=3dgs"), *words], monkeypatch) == status
+    assert main_here(*overrides(square, tmp_path, "model=3dgs"), *words) == status
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: error:")]
     assert len(errors) == 1
     assert said in errors[0]
     assert [record.read(path).status for path in record.find(tmp_path)] == (["failed"] if status == 1 else [])
 
 
-def test_a_scene_without_a_name_says_which_key(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_scene_without_a_name_says_which_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a message that names a missing value of OmegaConf's and not what to type."""
     words = ["+exp=dnerf", "scene=custom", f"data.root={tmp_path}", f"results={tmp_path}"]
-    assert status_of(words, monkeypatch) == 2
+    assert main_here(*words) == 2
     assert "scene.name=FOLDER" in capsys.readouterr().err
 
 
-def test_the_version_is_that_of_gsbench(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_that_of_gsbench(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches the version of Hydra."""
-    assert status_of(["--version"], monkeypatch) == 0
+    assert main_here("--version") == 0
     assert capsys.readouterr().out == f"gsbench {gsbench.__version__}\n"
 
 
@@ -98,7 +70,7 @@ def test_a_reader_who_has_gone_costs_no_record(
     """Catches `python -m gsbench ... | head`, which put a failed record in the place of a finished run's."""
     words = [*overrides(square, tmp_path, "model=3dgs", "train.iterations=3"), "protocol.pictures=0"]
     words.remove("train.iterations=30")
-    assert status_of(words, monkeypatch) == 0
+    assert main_here(*words) == 0
     (path,) = record.find(tmp_path)
 
     def closed(*_: object, file: object = None, **__: object) -> None:
@@ -107,18 +79,18 @@ def test_a_reader_who_has_gone_costs_no_record(
 
     with monkeypatch.context() as patched:
         patched.setattr("builtins.print", closed)
-        assert status_of(words, patched) != 0
+        assert main_here(*words) != 0
     assert record.read(path).status == "ok"
     assert not list(tmp_path.rglob("progress.json"))
     capsys.readouterr()
 
 
 def test_a_training_that_diverges_without_harmonics_has_a_record(
-    square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches the largest of no coefficients, which took the record with it."""
     words = overrides(square, tmp_path, "model=3dgs", "model.sh_degree=0", "model.lr.means.start=1e38")
-    assert status_of(words, monkeypatch) == 1
+    assert main_here(*words) == 1
     (path,) = record.find(tmp_path)
     found = record.read(path)
     assert found.status == "diverged"
@@ -136,8 +108,7 @@ def test_an_error_that_nobody_foresaw_is_a_record(
 
     monkeypatch.setattr("gsbench.run.attempt.Attempt.measure", fault)
     words = [*overrides(square, tmp_path, "model=3dgs"), "-m", "seed=0,1"]
-    assert status_of(words, monkeypatch) == 1
-    entry.started.clear()
+    assert main_here(*words) == 1
     found = [record.read(path) for path in record.find(tmp_path)]
     assert [one.status for one in found] == ["failed", "failed"]
     for one, path in zip(found, record.find(tmp_path), strict=True):

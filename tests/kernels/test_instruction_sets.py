@@ -52,6 +52,8 @@ def test_a_higher_instruction_set_is_not_slower() -> None:
     """Catches a kernel for which wider vectors lose, as gathers of AVX-512 did: v4 took twice as long as v3."""
     torch.set_num_threads(1)
     levels, best = kernels.native().instruction_sets(), kernels.native().active()
+    if len(levels) == 1:
+        pytest.skip("needs the kernels of several instruction sets: make test LEVELS=all")
     try:
         for name, call in calls().items():
             cost = {}

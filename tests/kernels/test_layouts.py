@@ -1,7 +1,6 @@
 """Tensors that are not row by row in memory: the results and gradients of the same values that are."""
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
@@ -12,7 +11,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import HIDDEN
 from gsbench.kernels.refine import refine
-from gsbench.kernels.slices import slice_static, slice_triangular
+from gsbench.kernels.slices import slice_static
 from gsbench.raster import rasterize
 
 N = 5
@@ -65,23 +64,6 @@ def test_transposed_weights_of_agr() -> None:
     for got, expected in zip(run([LAYOUTS["transposed"](x) for x in plain]), run(plain), strict=True):
         for x, y in zip(got, expected, strict=True):
             torch.testing.assert_close(x, y)
-
-
-def triangular() -> dict[str, Any]:
-    return {"means": torch.rand(N, 3), "directions": torch.rand(N, 3), "times": torch.rand(N, 1),
-            "log_diagonal": torch.rand(N, 7), "shape": torch.rand(N, 3), "motion": torch.rand(N, 12),
-            "coupling": torch.rand(N, 6), "opacities": torch.rand(N), "center": torch.rand(3),
-            "time": torch.tensor(0.5), "log_lambda_d": torch.tensor(0.0), "log_lambda_t": torch.tensor(0.0),
-            "conditioned_first": True}  # fmt: skip
-
-
-@pytest.mark.parametrize("nothing", [None, torch.zeros(0)])
-@pytest.mark.parametrize("name", ["times", "time", "log_lambda_t"])
-def test_a_part_of_time_alone_is_refused(name: str, nothing: Tensor | None) -> None:
-    """Catches a null address in a kernel, which ended the process by a signal."""
-    slice_triangular(**triangular())
-    with pytest.raises(InputError):
-        slice_triangular(**triangular() | {name: nothing})
 
 
 def test_waves_without_times_are_refused() -> None:

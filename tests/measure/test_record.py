@@ -100,16 +100,16 @@ def test_a_metric_that_is_not_finite_becomes_null_with_its_reason(tmp_path, valu
     assert read.curve == [Point(1, 1.0, None)]
 
 
-def test_a_curve_of_a_million_points_is_refused(tmp_path):
-    """Would catch a record of 33 MB that is read for seconds and drawn for minutes."""
+def test_a_curve_of_too_many_points_is_refused(tmp_path):
+    """Would catch a long record that is read for seconds and drawn for minutes."""
     path = tmp_path / "record.json"
     files.write(make(), path)
     many = json.loads(path.read_text())
-    many["curve"] = [[i, float(i), 20.0] for i in range(1_000_000)]
+    many["curve"] = [[i, float(i), 20.0] for i in range(100_000)]
     path.write_text(json.dumps(many))
     started = time.process_time()
-    refused(path, "curve: expected at most 10,000 points, got 1,000,000")
-    assert time.process_time() - started < 10
+    refused(path, "curve: expected at most 10,000 points, got 100,000")
+    assert time.process_time() - started < 2
     with pytest.raises(InputError, match="at most 10,000"):
         files.write(make(curve=[Point(i, float(i), 20.0) for i in range(10_001)]), path)
 

@@ -36,19 +36,16 @@ def seeded(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def fresh(variant: str, count: int = N, seed: int = 0, **options: Any) -> GaussianModel:
-    """A model as it starts, in float32."""
-    name, own = VARIANTS[variant]
-    model = build(name, **own | options)
+def started(model: GaussianModel, count: int = N, seed: int = 0) -> GaussianModel:
+    """A model that was just built, with Gaussians at random points."""
     g = seeded(seed)
     model.initialise(Points(torch.rand(count, 3, generator=g) * 2 - 1, torch.rand(count, 3, generator=g)), EXTENT, g)
     return model
 
 
-def lively(variant: str, count: int = N, seed: int = 0, **options: Any) -> GaussianModel:
-    """A model in float64 with every raw parameter moved and networks that say something."""
-    model = fresh(variant, count, seed, **options).double()
-    g = seeded(seed + 1)
+def moved(model: GaussianModel, seed: int = 0) -> GaussianModel:
+    """The model in float64, with every raw parameter moved and networks that say something."""
+    model, g = model.double(), seeded(seed + 1)
     with torch.no_grad():
         for parameter in model.splats.values():
             parameter += 0.3 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
@@ -56,6 +53,17 @@ def lively(variant: str, count: int = N, seed: int = 0, **options: Any) -> Gauss
             for parameter in (model.refinement.weight_out, model.refinement.bias_out):
                 parameter += 0.05 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
     return model
+
+
+def fresh(variant: str, count: int = N, seed: int = 0, **options: Any) -> GaussianModel:
+    """A model as it starts, in float32."""
+    name, own = VARIANTS[variant]
+    return started(build(name, **own | options), count, seed)
+
+
+def lively(variant: str, count: int = N, seed: int = 0, **options: Any) -> GaussianModel:
+    """A model in the midst of a training, in float64."""
+    return moved(fresh(variant, count, seed, **options), seed)
 
 
 def raw(model: GaussianModel) -> dict[str, Tensor]:

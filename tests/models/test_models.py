@@ -1,6 +1,5 @@
 """What holds for every model: how it starts, what it needs, how its active components act, what `build` refuses."""
 
-import math
 from typing import Any
 
 import pytest
@@ -85,8 +84,9 @@ def test_same_seed_same_model(variant: str) -> None:
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_slice_has_gradients(variant: str) -> None:
     """Catches a wrong or lost derivative on the way from any raw parameter to the slice (central differences)."""
-    model = lively(variant, 4)
-    model.set_active(ActiveComponents(3, True, True))
+    degree = 3 if variant == "3dgs" else 1  # every coefficient is one more central difference
+    model = lively(variant, 4, sh_degree=degree)
+    model.set_active(ActiveComponents(degree, True, True))
     names = sorted(model.splats)
 
     values = [model.splats[name].detach().requires_grad_() for name in names]
@@ -216,14 +216,6 @@ def test_what_is_off_does_not_learn(name: str) -> None:
     assert all(model.lambda_of(key) > 0 for key in model.log_lambda)
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_groups_hold_every_parameter_once(name: str) -> None:
-    """Catches a parameter without a learning rate or with two."""
-    model = fresh(f"{name}_agr")
-    grouped = [id(p) for parameters in model.groups().values() for p in parameters]
-    assert sorted(grouped) == sorted(id(p) for p in model.parameters())
-
-
 def test_sh_degree_grows_with_the_phase() -> None:
     """Catches colours that use coefficients of a degree not yet on."""
     model = lively("3dgs")
@@ -247,24 +239,12 @@ def test_sh_degree_grows_with_the_phase() -> None:
         ("7dgs", MODELS["7dgs"] | {"scheme": "shur"}, "Did you mean 'schur'?"),
         ("4dgs", {"scheme": "shur"}, "Did you mean 'schur'?"),
         ("3dgs", {"sh_degree": 4}, "sh_degree: expected 0, 1, 2 or 3, got 4"),
-        ("3dgs", {"sh_degree": 1.0}, "sh_degree: expected int, got 1.0"),
-        ("3dgs", {"agr": 1}, "agr: expected bool, got 1"),
-        ("7dgs", {"lambda_d": 1.0, "lambda_t": 1.0, "directional_half": "no"}, "directional_half: expected bool"),
-        ("6dgs", {"lambda_d": True}, "lambda_d: expected float, got True"),
-        ("4dgs", {"time_degree": 10**30}, "time_degree"),
-        ("4dgs", {"time_degree": -1}, "time_degree"),
         ("4dgs", {"lambda_t": 0.0}, "lambda_t"),
-        ("4dgs", {"lambda_t": math.nan}, "lambda_t"),
-        ("7dgs", {"lambda_t": 0.5, "lambda_d": -0.5}, "lambda_d"),
-        ("7dgs", {"lambda_t": math.inf, "lambda_d": 0.5}, "lambda_t"),
-        ("7dgs", {"lambda_t": 0.5}, "lambda_d"),
-        ("7dgs", {"lambda_d": 0.5}, "lambda_t"),
         ("6dgs", {"lambda_d": 0.5, "lambda_t": 0.5}, "lambda_t"),
-        ("6dgs", {}, "lambda_d"),
     ],
 )
 def test_build_refuses(name: str, options: dict[str, Any], message: str) -> None:
-    """Catches an option that is misspelt, missing, out of range or of another model, and met only in mid-training."""
+    """Catches an option that is misspelt, out of range or of another model, without a word about what is meant."""
     with pytest.raises(InputError) as error:
         build(name, **options)
     assert message in str(error.value)

@@ -1,6 +1,7 @@
 """A run's name: made of what its training reads, equal for equal trainings, and fit for a folder."""
 
 import copy
+import functools
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,7 @@ def composer() -> Iterator[None]:
         yield
 
 
+@functools.cache  # a composition takes long, and most tests compare with the plain run
 def named(*words: str) -> Run:
     """The run of `python -m gsbench +exp=mini scene=suzanne` and these words."""
     composed = hydra.compose("config", ["+exp=mini", "scene=suzanne", *words], return_hydra_config=True)

@@ -3,7 +3,6 @@
 import json
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,12 @@ from typing import Any
 import crowd
 import pytest
 import torch
+from forked import python_m
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from tiny_run import ROOT, environment, gsbench, overrides, write_moving_square
+from tiny_run import gsbench, overrides, write_moving_square
 
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
@@ -61,10 +61,7 @@ def composed(*words: str, **more: Any) -> DictConfig:
 
 def sweep(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run `python -m gsbench.sweep`."""
-    command = [sys.executable, "-m", "gsbench.sweep", *arguments]
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=240, cwd=ROOT, env=environment(), check=False
-    )
+    return python_m("gsbench.sweep", *arguments)
 
 
 def states(experiment: Path) -> list[str]:

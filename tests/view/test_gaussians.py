@@ -83,13 +83,6 @@ def test_harmonics_are_right_from_everywhere(variant: str) -> None:
         assert (drawn(data, seen) - render(model, seen, 0.4, BACKGROUND)).abs().max() < 2e-3
 
 
-@pytest.mark.parametrize("name", ["6dgs", "7dgs"])
-def test_a_slice_of_one_direction_has_no_harmonics(name: str) -> None:
-    """Catches a PLY that claims to be right from everywhere for a model whose geometry is not."""
-    with pytest.raises(InputError, match="--direction"):
-        trained_of(trained(name), Query.at(torch.zeros(3), 0.4), keep_harmonics=True)
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_what_is_culled_is_left_out(name: str) -> None:
     """Catches a file of Gaussians that nobody sees, and an empty file."""

@@ -34,7 +34,10 @@ static std::vector<const Kernels*> usable() {
         out.push_back(&v4::table);
     }
 #endif
-    if (out.empty()) throw std::runtime_error("this processor runs none of the instruction sets that gsbench was built for");
+    if (out.empty()) {
+        throw std::runtime_error("this processor runs none of the instruction sets that gsbench was built for: "
+                                 "build it here, or for all of them by make setup LEVELS=all");
+    }
     return out;
 }
 

@@ -1,0 +1,185 @@
+"""What holds for every registered model: options, slices, gradients, checkpoints, gates and the export of a slice.
+
+Models are found in the registry and their options in their constructors: a new one is tested without being listed.
+"""
+
+import copy
+import inspect
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from small import CAMERA, moved, started
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.models import GaussianModel, Query, build, registry
+from gsbench.models.effect_sets import EffectSets
+from gsbench.models.gated import GatedModel, as_gated
+from gsbench.models.simplifications import simplifications_of
+from gsbench.scenes.trained import ply_of, read_trained
+from gsbench.schedule import ActiveComponents
+from gsbench.view.gaussians import has_harmonics, trained_of
+
+N = 12
+GIVEN: dict[Any, Any] = {float: 0.5, int: 1, bool: True}  # for an option without a default, by its type
+WRONG: dict[Any, tuple[Any, ...]] = {
+    float: ("1", True, math.nan, math.inf, -1.0),
+    int: ("1", 1.0, True, -1, 10**30),
+    bool: ("no", 1),
+    str: ("nonsense", 1),
+}
+assert registry.is_registered("3dgs")  # all are
+NAMES = sorted(registry._REGISTRY)
+EVERY = pytest.mark.parametrize(("name", "agr"), [(name, agr) for name in NAMES for agr in (False, True)])
+QUERY = Query.at(CAMERA, 0.45)
+
+
+def options_of(name: str) -> dict[str, inspect.Parameter]:
+    """The options of a model's class and of its bases."""
+    classes = [cls for cls in reversed(registry.find(name).__mro__) if issubclass(cls, GaussianModel)]
+    return {p.name: p for cls in classes for p in inspect.signature(cls.__init__, eval_str=True).parameters.values()
+            if p.kind is p.KEYWORD_ONLY}  # fmt: skip
+
+
+def needed(name: str) -> dict[str, Any]:
+    """Values of the options that have no default."""
+    return {key: GIVEN[p.annotation] for key, p in options_of(name).items() if p.default is p.empty}
+
+
+def made(name: str, agr: bool, count: int = N, seed: int = 0) -> GaussianModel:
+    """A model in the midst of a training, with everything switched on, in float64."""
+    model = moved(started(build(name, agr=agr, **needed(name)), count, seed), seed)
+    model.set_active(ActiveComponents(3, agr, True))
+    return model
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    """Whether two states have the same bits."""
+    return a.keys() == b.keys() and all(torch.equal(x, b[key]) and x.dtype == b[key].dtype for key, x in a.items())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_wrong_options_are_refused(name: str) -> None:
+    """Catches an option that is misspelt, missing or of another type and met only in mid-training."""
+    good = needed(name)
+    with pytest.raises(InputError, match="has no option 'nonsense'"):
+        build(name, nonsense=1, **good)
+    for key in good:
+        with pytest.raises(InputError, match=key):
+            build(name, **{other: x for other, x in good.items() if other != key})
+    for key, parameter in options_of(name).items():
+        for wrong in WRONG.get(parameter.annotation, ("nonsense",)):
+            with pytest.raises(InputError) as error:
+                build(name, **good | {key: wrong})
+            assert key in str(error.value)
+            assert "\n" not in str(error.value)
+
+
+@EVERY
+@pytest.mark.parametrize("count", [0, 1, N])
+def test_a_slice_has_its_shapes(name: str, agr: bool, count: int) -> None:
+    """Catches a model that needs a Gaussian, broadcasts a single one, or says otherwise by its kernels."""
+    model = made(name, agr)
+    model.select(torch.arange(count))
+    seen = model.slice(QUERY)
+    assert len(model) == count
+    assert [tuple(x.shape) for x in seen] == [(count, 3), (count, 3, 3), (count,), (count, 3)]
+    assert all(x.isfinite().all() for x in seen)
+    assert ((seen.opacities >= 0) & (seen.opacities <= 1)).all()
+    assert (seen.colors >= 0).all()
+    by_kernels = copy.deepcopy(model).float().slice(Query.at(CAMERA.float(), 0.45))
+    drawn = (seen.opacities > 1 / 200)[:, None]  # kernels do not colour what cannot be seen
+    for x, y in zip(by_kernels[:3], seen[:3], strict=True):
+        torch.testing.assert_close(x.double(), y, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(by_kernels.colors.double() * drawn, seen.colors * drawn, rtol=1e-3, atol=1e-4)
+
+
+@EVERY
+def test_gradients_reach_every_group(name: str, agr: bool) -> None:
+    """Catches a parameter that the optimizer has a rate for, and that learns nothing or turns NaN."""
+    model = made(name, agr)
+    sum(x.square().sum() for x in model.slice(QUERY)).backward()
+    for group, parameters in model.groups().items():
+        for x in parameters:
+            assert x.grad is not None, group
+            assert x.grad.isfinite().all(), group
+            assert x.grad.any(), group
+    grouped = [id(p) for parameters in model.groups().values() for p in parameters]
+    assert sorted(grouped) == sorted(id(p) for p in model.parameters())  # each once
+
+
+@EVERY
+def test_a_checkpoint_is_the_model(name: str, agr: bool) -> None:
+    """Catches state that is not saved: a model of another size that loads it is the same to the bit."""
+    model, other = made(name, agr), made(name, agr, count=5, seed=3)
+    objects = dict(other.splats.items())
+    other.load_state(model.pack())
+    assert same(model.pack(), other.pack())
+    assert all(torch.equal(x, y) for x, y in zip(model.slice(QUERY), other.slice(QUERY), strict=True))
+    assert all(other.splats[key] is parameter for key, parameter in objects.items())
+    state, means = model.pack(), model.pack()["splats.means"]
+    others = (means[:-1], means[:, :2], means[0, 0], means.float(), means.to_sparse(), "means")
+    changed = [state | {"splats.means": x} for x in others] + [state | {"splats.extra": means}, {}]
+    for wrong in (*changed, {key: x for key, x in state.items() if key != "splats.means"}):
+        with pytest.raises(InputError, match=r"^checkpoint: ") as error:
+            other.load_state(wrong)
+        assert "\n" not in str(error.value)
+    with pytest.raises(InputError, match=r"^checkpoint: "):
+        other.load_state(made(name, not agr).pack())
+    assert same(model.pack(), other.pack())  # nothing of them was loaded
+
+
+@EVERY
+def test_gates_are_asked_for_or_refused(name: str, agr: bool) -> None:
+    """Catches a model that gates take and cannot simplify, and a checkpoint of other rows than were gated."""
+    model = made(name, agr).requires_grad_(False)
+    if not isinstance(model, GatedModel):
+        with pytest.raises(InputError, match="is no GatedModel"):
+            as_gated(model)
+        return
+    queries = [QUERY, Query.at(-CAMERA, 0.7)]
+    found = simplifications_of(as_gated(model), queries, [model.slice(query) for query in queries])
+    assert {"removed"} < {one.name for one in found}
+    for one in found:
+        for key, x in (one.raw or {}).items():
+            assert x.shape == model.splats[key].shape
+            assert x.isfinite().all(), (one.name, key)
+    orders = torch.arange(N, dtype=torch.int32) % 4
+    model.effect_sets = EffectSets(3 if agr else 0, 7, orders, torch.zeros(N, dtype=torch.uint8))
+    model.fill(model.effect_sets)
+    other = made(name, agr, count=5, seed=3)
+    other.load_state(model.pack())
+    assert same(model.pack(), other.pack())
+    assert all(torch.equal(x, y) for x, y in zip(model.slice(QUERY), other.slice(QUERY), strict=True))
+    seen, later = (model.slice(query) for query in queries)
+    assert all(torch.equal(x[7:], y[7:]) for x, y in zip(seen[:3], later[:3], strict=True))  # static rows
+
+
+@EVERY
+def test_a_slice_is_exported(name: str, agr: bool, tmp_path: Path) -> None:
+    """Catches a PLY that has lost a Gaussian or moved one, and harmonics for a model whose slice has none."""
+    model, query = made(name, agr).float(), Query.at(CAMERA.float(), 0.45)
+    (tmp_path / "slice.ply").write_bytes(ply_of(trained_of(model, query)))
+    read, seen = read_trained(tmp_path / "slice.ply"), model.slice(query)
+    drawn = seen.opacities >= 1 / 255
+    torch.testing.assert_close(read.means, seen.means[drawn].detach())
+    torch.testing.assert_close(torch.sigmoid(read.logits), seen.opacities[drawn].detach())
+    volumes = torch.linalg.det(seen.factors[drawn].detach()).abs()
+    torch.testing.assert_close(read.log_scales.sum(1).exp(), volumes, rtol=1e-3, atol=1e-6)
+    if has_harmonics(model):
+        assert len(trained_of(model, query, keep_harmonics=True)) == len(read)
+    else:
+        with pytest.raises(InputError, match="--direction"):
+            trained_of(model, query, keep_harmonics=True)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_before_it_has_gaussians(name: str) -> None:
+    """Catches an error of Python for the length of a model that was only built, and for its start at no points."""
+    model = build(name, **needed(name))
+    assert len(model) == 0
+    with pytest.raises(InputError, match="points: expected more than 3"):
+        started(model, 0)
