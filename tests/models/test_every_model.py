@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query, build, registry
+from gsbench.models.base import tensors_of
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel, as_gated
 from gsbench.models.simplifications import simplifications_of
@@ -86,8 +87,8 @@ def test_a_slice_has_its_shapes(name: str, agr: bool, count: int) -> None:
     model.select(torch.arange(count))
     seen = model.slice(QUERY)
     assert len(model) == count
-    assert [tuple(x.shape) for x in seen] == [(count, 3), (count, 3, 3), (count,), (count, 3)]
-    assert all(x.isfinite().all() for x in seen)
+    assert [tuple(x.shape) for x in tensors_of(seen)] == [(count, 3), (count, 3, 3), (count,), (count, 3)]
+    assert all(x.isfinite().all() for x in tensors_of(seen))
     assert ((seen.opacities >= 0) & (seen.opacities <= 1)).all()
     assert (seen.colors >= 0).all()
     by_kernels = copy.deepcopy(model).float().slice(Query.at(CAMERA.float(), 0.45))
@@ -101,7 +102,7 @@ def test_a_slice_has_its_shapes(name: str, agr: bool, count: int) -> None:
 def test_gradients_reach_every_group(name: str, agr: bool) -> None:
     """Catches a parameter that the optimizer has a rate for, and that learns nothing or turns NaN."""
     model = made(name, agr)
-    sum(x.square().sum() for x in model.slice(QUERY)).backward()
+    sum(x.square().sum() for x in tensors_of(model.slice(QUERY))).backward()
     for group, parameters in model.groups().items():
         for x in parameters:
             assert x.grad is not None, group
@@ -118,7 +119,8 @@ def test_a_checkpoint_is_the_model(name: str, agr: bool) -> None:
     objects = dict(other.splats.items())
     other.load_state(model.pack())
     assert same(model.pack(), other.pack())
-    assert all(torch.equal(x, y) for x, y in zip(model.slice(QUERY), other.slice(QUERY), strict=True))
+    seen, again = tensors_of(model.slice(QUERY)), tensors_of(other.slice(QUERY))
+    assert all(torch.equal(x, y) for x, y in zip(seen, again, strict=True))
     assert all(other.splats[key] is parameter for key, parameter in objects.items())
     state, means = model.pack(), model.pack()["splats.means"]
     others = (means[:-1], means[:, :2], means[0, 0], means.float(), means.to_sparse(), "means")
@@ -153,7 +155,8 @@ def test_gates_are_asked_for_or_refused(name: str, agr: bool) -> None:
     other = made(name, agr, count=5, seed=3)
     other.load_state(model.pack())
     assert same(model.pack(), other.pack())
-    assert all(torch.equal(x, y) for x, y in zip(model.slice(QUERY), other.slice(QUERY), strict=True))
+    seen, again = tensors_of(model.slice(QUERY)), tensors_of(other.slice(QUERY))
+    assert all(torch.equal(x, y) for x, y in zip(seen, again, strict=True))
     seen, later = (model.slice(query) for query in queries)
     assert all(torch.equal(x[7:], y[7:]) for x, y in zip(seen[:3], later[:3], strict=True))  # static rows
 
