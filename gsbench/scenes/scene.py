@@ -1,6 +1,5 @@
 """Define cameras, views (a camera, a time and an image) and scenes (views by split, background, extent)."""
 
-import functools
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,7 +15,7 @@ class Camera:
     width: int
     height: int
 
-    @functools.cached_property
+    @property
     def center(self) -> Tensor:
         """Return the camera's position in the world, [3]."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]

@@ -103,7 +103,7 @@ def test_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch
 def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches momentum that moves on what a gate froze, and kept entries that no longer learn."""
     monkeypatch.setattr("gsbench.train.gating.LOSS_WITH_AGR", 20.0)
-    monkeypatch.setattr("gsbench.effects.budget.SHARES", (0.5,))
+    monkeypatch.setattr("gsbench.effects.budget.SHARES", (0.2,))
     one = trainer("effects.gate=both")
     one.run(lambda _: None, "test", lambda: one.step < 61)
     effect_sets = one.model.effect_sets
