@@ -45,35 +45,42 @@ def fitting_threads(gaussians: int, pixels: int) -> Iterator[None]:
 
 
 def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
-    """Choose what each view's gradients are added to, so that few are held at once and any number of threads agrees.
+    """Choose what each view's gradients are added to, so that few are held at once and any number of workers agrees.
 
-    The first half of the views has one sum and the second half another; the two are added at the end. Views of a
-    worker that begins within a half have a sum each, which `add_up` adds to that half's: to the last bit it makes no
-    difference whether a view adds to a sum or is added to it (`gsbench.kernels.tape`).
+    Views of one part of the batch (`_parts`) share a sum. Views of a worker that begins within a part have a sum each,
+    which `add_up` adds to that of the part. To the last bit it makes no difference whether a view adds to a sum or is
+    added to it (`gsbench.kernels.tape`).
 
     Args:
-        views: in the batch.
+        views: number of views in the batch.
         bounds: worker i sees the views from bounds[i] to bounds[i + 1].
+
+    Returns:
+        For each view the dictionary of its sum; views that share a sum have the same one.
     """
-    halves = {0, (views + 1) // 2}
     sums: list[Sums] = []
-    begins = 0  # of the half or the worker that the view belongs to
+    begins = 0  # of the part or the worker that the view belongs to
     for i in range(views):
-        if i in halves or i in bounds:
+        if i in _parts(views) or i in bounds:
             begins = i
-        sums.append(sums[-1] if i > begins and begins in halves else {})
+        sums.append(sums[-1] if i > begins and begins in _parts(views) else {})
     return sums
 
 
 def add_up(sums: Sequence[Sums]) -> Sums:
-    """Add the sums that `deal` chose: each half's in the order of the views, then the second half's to the first's."""
-    middle = (len(sums) + 1) // 2
-    parts = [_in_order(half) for half in (sums[:middle], sums[middle:]) if half]
-    return _in_order(parts)
+    """Add the sums that `deal` chose: those of a part in the order of the views, then one part to the other."""
+    ends = [*_parts(len(sums))[1:], len(sums)]
+    return _in_order([_in_order(sums[i:end]) for i, end in zip(_parts(len(sums)), ends, strict=True)])
+
+
+def _parts(views: int) -> list[int]:
+    """Return where the two halves of a batch begin; a last half of one view would only cost a sum of its own."""
+    middle = (views + 1) // 2
+    return [0, middle] if views - middle > 1 else [0]
 
 
 def _in_order(parts: Sequence[Sums]) -> Sums:
-    """Add dictionaries of sums to the first; one that occurs again is added once."""
+    """Add sums to the first of them, in their order; a sum that several views share is added once."""
     total = parts[0]
     done = {id(total)}
     for part in parts[1:]:
