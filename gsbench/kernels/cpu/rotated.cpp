@@ -5,7 +5,7 @@
 
 #include "buffer.h"
 #include "isa.h"
-#include "rows.h"
+#include "observation.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
@@ -35,10 +35,6 @@ GSB_HD inline void load_static(const RotatedArgs& a, int64_t i, int n, StaticPar
     p.opacity = load_first(a.opacities + i, n);
 }
 
-GSB_HD inline bool is_zero(const ObservationGrads& o, int64_t i, int n) {
-    return all_zero(o.opacities, 1, i, n) && all_zero(o.means, 3, i, n) && all_zero(o.factors, 9, i, n);
-}
-
 void slice_static_rows(const RotatedArgs& a, const Observation& out) {
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > CHUNK)
     for (int64_t i = a.conditioned; i < a.N; i += LANES) {
@@ -58,13 +54,13 @@ void slice_static_rows_backward(const RotatedArgs& a, const ObservationGrads& gr
         const int n = lanes_from(i, a.N);
         if (is_zero(grads, i, n)) continue;
         StaticParameters<Vec> raw, g;
-        Vec g_mean[3], g_factor[3][3], g_left[4];
+        Observed<Vec> given;
+        Vec g_left[4];
         load_static(a, i, n, raw);
-        gather_row(grads.means, i, n, g_mean);
-        gather_matrix(grads.factors, i, n, g_factor);
-        StaticGaussian<Vec>(raw).vjp(g_factor, load_first(grads.opacities + i, n), g);
+        load(grads, i, n, given);
+        StaticGaussian<Vec>(raw).vjp(given.factor, given.opacity, g);
         turn_of_space(g.quat, g_left);
-        add_row(g_mean, out.means, i, n);
+        add_row(given.mean, out.means, i, n);
         add_columns(g.scales, out.scales, 4, 0, i, n);
         add_row(g_left, out.left_quats, i, n);
         add_first(g.opacity, out.opacities + i, n);
@@ -81,10 +77,7 @@ void slice_rotated(const RotatedArgs& a, const Observation& out) {
         const int n = lanes_from(i, a.conditioned);
         RotatedParameters<Vec> raw;
         load(a, i, n, raw);
-        const Observed<Vec> seen = RotatedGaussian<Vec>(raw, lambda_t, time).observe();
-        scatter_row(seen.mean, out.means, i, n);
-        scatter_matrix(seen.factor, out.factors, i, n);
-        store_first(seen.opacity, out.opacities + i, n);
+        store(RotatedGaussian<Vec>(raw, lambda_t, time).observe(), out, i, n);
     }
 }
 
@@ -103,9 +96,7 @@ void slice_rotated_backward(const RotatedArgs& a, const ObservationGrads& grads,
             RotatedParameters<Vec> raw, g;
             Observed<Vec> given;
             load(a, i, n, raw);
-            gather_row(grads.means, i, n, given.mean);
-            gather_matrix(grads.factors, i, n, given.factor);
-            given.opacity = load_first(grads.opacities + i, n);
+            load(grads, i, n, given);
             RotatedGaussian<Vec> gaussian(raw, lambda_t, time);
             gaussian.observe();
             gaussian.vjp(given, g);

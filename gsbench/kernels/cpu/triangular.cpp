@@ -5,7 +5,7 @@
 
 #include "buffer.h"
 #include "isa.h"
-#include "rows.h"
+#include "observation.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
@@ -31,16 +31,6 @@ GSB_HD inline void load(const TriangularArgs& a, int64_t i, int n, TriangularPar
     p.opacity = load_first(a.opacities + i, n);
 }
 
-GSB_HD inline bool is_zero(const ObservationGrads& o, int64_t i, int n) {
-    return all_zero(o.opacities, 1, i, n) && all_zero(o.means, 3, i, n) && all_zero(o.factors, 9, i, n);
-}
-
-GSB_HD inline void load(const ObservationGrads& o, int64_t i, int n, Observed<Vec>& out) {
-    gather_row(o.means, i, n, out.mean);
-    gather_matrix(o.factors, i, n, out.factor);
-    out.opacity = load_first(o.opacities + i, n);
-}
-
 template <Query Q, template <class, int> class Reduction>
 void observe(const TriangularArgs& a, const Observation& out) {
     const TriangularModel model = model_of(a);
@@ -50,10 +40,7 @@ void observe(const TriangularArgs& a, const Observation& out) {
         TriangularParameters<Vec, Q> raw;
         load<Q>(a, i, n, raw);
         TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
-        const Observed<Vec> seen = gaussian.observe();
-        scatter_row(seen.mean, out.means, i, n);
-        scatter_matrix(seen.factor, out.factors, i, n);
-        store_first(seen.opacity, out.opacities + i, n);
+        store(gaussian.observe(), out, i, n);
     }
 }
 
@@ -142,12 +129,11 @@ void slice_static_rows_backward(const TriangularArgs& a, const ObservationGrads&
             const int n = lanes_from(i, end);
             if (is_zero(grads, i, n)) continue;
             StaticTriangularParameters<Vec> raw, g;
-            Vec g_mean[3], g_factor[3][3];
+            Observed<Vec> given;
             rows.load(i, n, raw);
-            gather_row(grads.means, i, n, g_mean);
-            gather_matrix(grads.factors, i, n, g_factor);
-            StaticTriangularGaussian<Vec>(raw, a.form).vjp(g_factor, load_first(grads.opacities + i, n), g);
-            add_row(g_mean, out.means, i, n);
+            load(grads, i, n, given);
+            StaticTriangularGaussian<Vec>(raw, a.form).vjp(given.factor, given.opacity, g);
+            add_row(given.mean, out.means, i, n);
             add_columns(g.log_diagonal, out.log_diagonal, rows.width, rows.space, i, n);
             add_row(g.shape, out.shape, i, n);
             add_first(g.opacity, out.opacities + i, n);
