@@ -20,9 +20,9 @@ def watch(folder: Path, *, train: bool = False, every: float = EVERY) -> int:
     while this runs; the last page does not.
 
     Args:
-        folder: where records are or will be.
-        train: as in `gsbench.report.tables.build`.
-        every: seconds between two looks.
+        folder: the folder where records are or will be.
+        train: whether to show PSNR on training views too.
+        every: seconds between two looks at the folder.
     """
     seen, said = State(), ""
     try:

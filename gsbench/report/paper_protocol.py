@@ -25,7 +25,7 @@ class ModelRecipe(NamedTuple):
 
 @dataclass(frozen=True)
 class Pool:
-    """Runs of one data set that may share a table."""
+    """Runs of one data set with the same protocol, which may share a table."""
 
     dataset: str
     experiment: str
@@ -130,7 +130,7 @@ def finished(records: list[Record], one: ModelRecipe, scenes: Sequence[str]) -> 
 
 
 def _size(record: Record) -> str:
-    """Return the size of a run's images as width x height; the text of the record is not trusted."""
+    """Return the size of a run's images as its record has it, such as "400x400", with control characters escaped."""
     return printable(record.protocol.get("resolution", "a size not recorded"))
 
 

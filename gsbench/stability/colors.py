@@ -21,7 +21,7 @@ COPIES = 1024  # of a case's Gaussians, for its timing
 
 @dataclass
 class ColorInputs:
-    """Gaussians of one model, with the place and the time of a query."""
+    """Gaussians of one model, with the camera centre and the time for which colours are computed."""
 
     model: str
     means: Tensor  # [COUNT, 3]

@@ -46,12 +46,12 @@ def fitting_threads(gaussians: int, pixels: int) -> Iterator[None]:
 def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
     """Choose what each view's gradients are added to, so that few are held at once and any number of threads agrees.
 
-    The first half of the views has one sum and the second half another; the two are added at the end. Views of a
-    worker that begins within a half have a sum each, which `add_up` adds to that half's: to the last bit it makes no
-    difference whether a view adds to a sum or is added to it (`gsbench.kernels.tape`).
+    The first half of the views has one sum and the second half another; the two are added at the end. If a worker
+    begins within a half, each of its views has a sum of its own, which `add_up` adds to the sum of that half. The
+    result has the same bits as if the view had been added directly (`gsbench.kernels.tape`).
 
     Args:
-        views: in the batch.
+        views: number of views in the batch.
         bounds: worker i sees the views from bounds[i] to bounds[i + 1].
     """
     halves = {0, (views + 1) // 2}
@@ -72,7 +72,7 @@ def add_up(sums: Sequence[Sums]) -> Sums:
 
 
 def _in_order(parts: Sequence[Sums]) -> Sums:
-    """Add dictionaries of sums to the first; one that occurs again is added once."""
+    """Add up dictionaries of gradients in the first one. Views may share a dictionary; it is added only once."""
     total = parts[0]
     done = {id(total)}
     for part in parts[1:]:
@@ -92,12 +92,12 @@ class Seen(NamedTuple):
 
 
 class Step:
-    """See views, and leave the gradient of their mean loss in the model's parameters."""
+    """Render views, and leave the gradient of their mean loss in the model's parameters."""
 
     def __init__(
         self, model: GaussianModel, background: Tensor, ssim_weight: float, antialias: bool, stages: StageClock
     ) -> None:
-        """Train `model` before a background colour [3]; its time goes to `stages`."""
+        """Prepare steps of `model` over a background colour [3]; `stages` sums the seconds of each stage."""
         self.model = model
         self.background = background
         self.ssim_weight = ssim_weight
@@ -132,7 +132,7 @@ class Step:
     def _by_workers(
         self, views: Sequence[View], sources: list[nn.Parameter], sums: list[Sums], bounds: list[int]
     ) -> list[Seen]:
-        """Let each worker see the views between its two `bounds`."""
+        """Let each worker render the views between its two `bounds`."""
         started = time.perf_counter()
         workers = len(bounds) - 1
         clocks = [StageClock() for _ in range(workers)]
@@ -146,7 +146,7 @@ class Step:
         return seen
 
     def _see(self, view: View, sources: list[nn.Parameter], sums: Sums, views: int, stages: StageClock) -> Seen:
-        """See one view of a batch; its gradients are added to `sums`."""
+        """Render one view of a batch and add the gradients of its loss to `sums`."""
         with Tape() as tape:
             with stages("slice"):
                 query = Query.of(view.camera, view.time)
