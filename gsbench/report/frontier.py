@@ -67,7 +67,7 @@ def beats(q: FrontierPoint, p: FrontierPoint, cost: str) -> bool:
 
 @dataclass(frozen=True)
 class BudgetChoice:
-    """The best point within a budget, and its difference to the best point of each other model on the evaluated split."""
+    """The best point within a budget, and its difference to each other model's best point on the evaluated split."""
 
     point: FrontierPoint
     on_val: bool  # whether it was chosen on val; otherwise on what is shown, as some runs have no PSNR on val
@@ -159,7 +159,7 @@ def targets(group: Group) -> list[Target]:
 
 
 def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, float]]:
-    """Return the targets of a scene: round values of PSNR between the worst and the best result, and the paper's one."""
+    """Return the targets of a scene: round values of PSNR between the worst and the best result, and the paper's."""
     if not reached:
         return []
     rules = [(f"{psnr:g} dB", psnr) for psnr in round_numbers(min(reached), max(reached))]

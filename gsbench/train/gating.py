@@ -112,7 +112,7 @@ class Gating:
         return shape_of(self.model)
 
     def compare(self, ungated: Shape, views: list[View]) -> None:
-        """Measure on the evaluated `views` what the removal of effects changed, and what freezing direction would change."""
+        """Measure on `views` what the removal of effects changed, and what freezing direction would change."""
         if self.gates and self.gates[-1].step is None:
             before = copy.deepcopy(self.model)
             become(before, ungated)
