@@ -1,4 +1,4 @@
-"""Slice the geometry of a model: Gaussians with triangular factors, with rotated factors, or without a query."""
+"""Compute 3D Gaussians at a camera and a time (a slice) from 7D, 6D or 4D ones, or from 3D ones that do not change."""
 
 from typing import Any
 
@@ -34,7 +34,7 @@ _triangular = Operation(
 
 
 def _conditioned(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
-    """Return how many rows change with the query."""
+    """Return how many rows change with the camera and time."""
     return {"conditioned": first_rows("conditioned", numbers["conditioned"], given["means"])}
 
 
@@ -83,7 +83,7 @@ def observe_triangular(
         motion: its entries of p by d and t, world units.
         coupling: its entries within d and t.
         opacities: before the sigmoid.
-        center: the camera's, world units.
+        center: the camera's centre, world units.
         time: clips.
         log_lambda_d: ln lambda_d, the coefficient of f_dir.
         log_lambda_t: ln lambda_t, the coefficient of f_temp.
@@ -94,8 +94,8 @@ def observe_triangular(
         conditioned: how many rows change with the query, by default all.
 
     Raises:
-        InputError: not float32 on one device, shapes that do not fit, nothing is observed, a gradient by `center` or
-            `time` is asked for, or more rows are conditioned than there are.
+        InputError: tensors are not float32 on one device, their shapes do not fit, nothing is observed, a gradient by
+            `center` or `time` is asked for, or more rows are conditioned than there are.
     """
     timed = times is not None
     seen = _triangular(means, directions, times, log_diagonal, shape, motion, coupling, opacities, center,
@@ -150,17 +150,17 @@ def observe_rotated(
     Args:
         means: world units.
         times: mu_t, clips.
-        scales: logarithms of world units, also that of time.
-        left_quats: any length but zero.
-        right_quats: any length but zero.
+        scales: the logarithms of the standard deviations along four axes, world units.
+        left_quats: the left quaternions, of any length but zero.
+        right_quats: the right quaternions, of any length but zero.
         opacities: before the sigmoid.
-        clock: world units for each clip.
+        clock: the number of world units that the length of the sequence counts as.
         time: clips.
         log_lambda_t: ln lambda_t, the coefficient of f_temp.
         conditioned: how many rows change with the time, by default all.
 
     Raises:
-        InputError: not float32 on one device, shapes that do not fit, or more rows are conditioned than there are.
+        InputError: tensors are not float32 on one device, their shapes do not fit, or `conditioned` exceeds the rows.
     """
     seen = _rotated(means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
                     EVERY_ROW if conditioned is None else conditioned)  # fmt: skip
@@ -187,7 +187,7 @@ def observe_static(
     """Return factors F = R diag(exp scales) [N, 3, 3] (3DGS eq. 6) and opacities [N] of 3D Gaussians, their own slices.
 
     Raises:
-        InputError: not float32 on one device, or shapes that do not fit.
+        InputError: tensors are not float32 on one device, or their shapes do not fit.
     """
     seen = _static(scales, quats, opacities)
     return seen[0], seen[1]

@@ -9,7 +9,7 @@ from gsbench.sweep.status import STATES, RunStatus
 
 
 def lines(experiment: Path, runs: Sequence[RunStatus], silent: str | None = None) -> list[str]:
-    """Show the runs of an experiment; `silent` says why Slurm did not answer."""
+    """Return the lines that show the runs of an experiment; `silent` says why Slurm did not answer."""
     counts = Counter(run.state for run in runs)
     summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
     shown = [f"{experiment}: {len(runs)} runs: {summary}" if runs else f"{experiment}: no run was asked for"]

@@ -50,7 +50,7 @@ class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
     up_direction: Three
 
     def is_usable(self) -> bool:
-        """Tell whether an image can be rendered from there."""
+        """Tell whether an image can be rendered from this pose."""
         lengths = (*self.position, *self.look_at, *self.up_direction)
         return (
             all(abs(length) <= FURTHEST for length in lengths)  # which NaN is not
@@ -124,7 +124,7 @@ class Door:
 
         Args:
             host: the address or the name to listen on.
-            port: the first to be tried.
+            port: the first port to try.
 
         Raises:
             InputError: the host cannot be listened on, or no port is free.
