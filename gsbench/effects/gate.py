@@ -49,7 +49,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
 
     Args:
         sensitivity: predicted errors of the model's simplifications.
-        model: the model of `sensitivity`; it may have effect sets already.
+        model: the model of `sensitivity`; effects may have been removed from it before.
         budget: the share of the model's squared error that may be added, such as 0.01, which costs 0.043 dB of PSNR.
     """
     now = effect_sets_of(model)
@@ -115,7 +115,7 @@ def _shading(orders: Tensor) -> Tensor:
 
 
 def effect_sets_of(model: GaussianModel) -> EffectSets:
-    """Return the effect sets of a model; if it has none, make them from the effects that its rows have."""
+    """Return which effects each Gaussian of a model keeps; all that the model has if none was removed."""
     if model.effect_sets is not None:
         return model.effect_sets
     rows = model.count_by_effects()
@@ -132,7 +132,7 @@ def apply(
     choice: ChosenSimplifications,
     intervals: Tensor | None = None,  # [N, 2]
 ) -> tuple[Tensor, Tensor]:
-    """Turn each Gaussian of a model into its simplification, drop the removed ones, sort the others by effect set.
+    """Simplify each Gaussian of a model, drop the removed ones, and sort the others by the effects that they keep.
 
     Args:
         model: the model to change in place.

@@ -75,16 +75,16 @@ def observe_triangular(
     has no f_temp and no f_dir. The gradient of all other parameters is zero.
 
     Args:
-        means: mu_p, world units.
-        directions: mu_d.
-        times: mu_t, clips.
+        means: the mean positions mu_p, world units.
+        directions: the mean directions mu_d.
+        times: the mean times mu_t; 1 is the length of the sequence.
         log_diagonal: the logarithms of the factor's diagonal.
-        shape: the factor's entries within p.
-        motion: its entries of p by d and t, world units.
-        coupling: its entries within d and t.
-        opacities: before the sigmoid.
+        shape: the entries of the factor within p (below its diagonal).
+        motion: the entries of the factor between p and d or t, world units.
+        coupling: the entries of the factor within d and t.
+        opacities: the opacities before the sigmoid (logits).
         center: the camera's centre, world units.
-        time: clips.
+        time: the time at which to slice; 1 is the length of the sequence.
         log_lambda_d: ln lambda_d, the coefficient of f_dir.
         log_lambda_t: ln lambda_t, the coefficient of f_temp.
         conditioned_first: whether the factor's rows are ordered (d, t, p), else (p, t, d).
@@ -148,14 +148,14 @@ def observe_rotated(
     parameters is zero.
 
     Args:
-        means: world units.
-        times: mu_t, clips.
+        means: the mean positions, world units.
+        times: the mean times mu_t; 1 is the length of the sequence.
         scales: the logarithms of the standard deviations along four axes, world units.
         left_quats: the left quaternions, of any length but zero.
         right_quats: the right quaternions, of any length but zero.
-        opacities: before the sigmoid.
+        opacities: the opacities before the sigmoid (logits).
         clock: the number of world units that the length of the sequence counts as.
-        time: clips.
+        time: the time at which to slice; 1 is the length of the sequence.
         log_lambda_t: ln lambda_t, the coefficient of f_temp.
         conditioned: how many rows change with the time, by default all.
 

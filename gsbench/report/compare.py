@@ -61,8 +61,8 @@ def pairs(group: Group, family: Family) -> list[Pair]:
 def improvement(group: Group, a: Configuration, b: Configuration) -> float:
     """Return the probability that a run of `a` has a higher PSNR than one of `b` on the same view of the same scene.
 
-    Every run of `a` is compared with every run of `b`; a tie counts half; scenes count equally. Agarwal et al. 2021
-    (arXiv 2108.13264) compare runs so; here it is done for each view. NaN if they share no view.
+    Every run of `a` is compared with every run of `b`; equal values count half; scenes count equally. Agarwal et al.
+    2021 (arXiv 2108.13264) compare runs so; here it is done for each view. NaN if they share no view.
     """
     shares = []
     for scene in sorted(set(a.runs) & set(b.runs)):
@@ -192,7 +192,7 @@ def _given(name: str, held: list[int], values: tuple[bool, ...]) -> str:
 def _weights(
     varied: tuple[int, ...], held: list[int], given: list[tuple[bool, ...]], share: float
 ) -> dict[Cell, float]:
-    """Return the weight of each cell: plus where an even number of the varied effects is off, minus otherwise."""
+    """Return the signed weights of the models whose weighted sum is an effect or an interaction of effects."""
     weights = {}
     for values in given:
         for on in itertools.product((False, True), repeat=len(varied)):
@@ -202,7 +202,7 @@ def _weights(
 
 
 def _price(family: Family, cells: dict[Cell, Configuration], name: str, weights: dict[Cell, float]) -> Price | None:
-    """Compute a weighted sum of models in each unit; None if a model is missing or no scene has all of the models."""
+    """Compute a difference of models in dB, seconds, ms and MB; None if a model is missing or they share no scene."""
     if not weights.keys() <= cells.keys():
         return None
     sums = _sum(cells, weights)

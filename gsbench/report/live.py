@@ -17,7 +17,7 @@ def watch(folder: Path, *, train: bool = False, every: float = EVERY) -> int:
     """Write ``table.md``, ``table.csv`` and ``report.html`` as records arrive, until Ctrl-C; return the exit code.
 
     A folder without records, or with a damaged record, is reported once and read again later. The page reloads itself
-    while this runs; the last page does not.
+    in the browser until `watch` ends.
 
     Args:
         folder: the folder where records are or will be.

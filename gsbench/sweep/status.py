@@ -173,9 +173,9 @@ def _explained(experiment: Experiment, one: Identity, run: RunStatus, endings: d
 
 
 def _told(log: Path) -> str:
-    """Return the last line of a log that names a cause, else the last that reports an error, else the last line.
+    """Return the last line of a log that names a cause, else the last that reports an error, else the last one.
 
-    Where a log reports no error but an exit code, its first other line is returned: the shell's message.
+    If a log reports only an exit code, its first other line is returned, which is the shell's message.
     """
     if not log.is_file():  # reading a pipe would block
         return "(no log)"

@@ -107,7 +107,7 @@ def is_known(message: object) -> bool:
 
 
 class Connection(ServerConnection):
-    """A browser's connection that passes only known messages; others can stop viser or fill its memory."""
+    """A browser's connection that passes only known messages; other messages could stop viser or fill its memory."""
 
     async def recv(self, decode: bool | None = None) -> Any:
         """Wait for the next known message."""

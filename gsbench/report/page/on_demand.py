@@ -176,7 +176,7 @@ def _swatches() -> list[Swatch]:
 
 
 def _images(found: list[Decided], folder: Path) -> list[Image]:
-    """Show the picture by effect set of the first seed of each scene and model, as many as there is room for."""
+    """Show pictures of Gaussians in the colours of their effects, for the first seed of each scene and model."""
     places = gallery.places(folder, PICTURE)
     paths = [next((p for r in one.runs if (p := places.get(r.path))), None) for one in found]
     captions = [f"{one.scene}, {one.name}" for one in found]
