@@ -218,5 +218,5 @@ def _price(family: Family, cells: dict[Cell, Configuration], name: str, weights:
 
 
 def _sum(cells: dict[Cell, Configuration], weights: dict[Cell, float]) -> Weights:
-    """Return the configurations of a sum with their weights; those with positive weight come first."""
+    """Return the configurations of a weighted sum with their weights, positive weights first."""
     return sorted(((w, cells[cell]) for cell, w in weights.items()), key=lambda term: (-term[0], term[1].model))

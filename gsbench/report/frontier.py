@@ -140,10 +140,10 @@ class Target:
 
 
 def targets(group: Group) -> list[Target]:
-    """Return the targets of every scene and the seconds that the frontier of each model needs for them.
+    """Return the targets (round values of PSNR on val) of every scene, and the seconds that each model needs to reach them.
 
     The seconds are those of the quickest finished configuration whose mean over the seeds reaches the target. Nothing
-    is interpolated: a run of another length was not done.
+    is interpolated between lengths of training.
     """
     found = []
     for scene in group.scenes:

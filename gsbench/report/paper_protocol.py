@@ -135,7 +135,7 @@ def _size(record: Record) -> str:
 
 
 def _pixels(size: str) -> int:
-    """Count the pixels of a size; 0 if the text is no size."""
+    """Count the pixels of a size such as "400x400"; 0 if the text is not a size."""
     numbers = size.split("x")
     return int(numbers[0]) * int(numbers[1]) if re.fullmatch(r"[0-9]{1,6}x[0-9]{1,6}", size) else 0
 
