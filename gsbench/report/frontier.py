@@ -140,7 +140,7 @@ class Target:
 
 
 def targets(group: Group) -> list[Target]:
-    """Return the targets (round values of PSNR on val) of every scene, and the seconds that each model needs to reach them.
+    """Return the targets (values of PSNR on val) of every scene, and the seconds that each model needs for them.
 
     The seconds are those of the quickest finished configuration whose mean over the seeds reaches the target. Nothing
     is interpolated between lengths of training.
