@@ -63,7 +63,7 @@ class Backbone:
 
     @property
     def trunk_sha256(self) -> tuple[str, ...]:
-        """Return the first digits of the SHA-256 of the files accepted as trunk weights."""
+        """Return the first digits of the SHA-256 of the files that are accepted as weights of an LPIPS network."""
         return (Path(self.file).stem.rsplit("-", 1)[1], *self.other_sha256)
 
 

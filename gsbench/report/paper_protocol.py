@@ -40,7 +40,7 @@ class Pool:
 
     @property
     def effort(self) -> int:
-        """Return pixels of the pool's largest image times iterations: the higher, the nearer to the paper."""
+        """Return pixels of the largest image times iterations; runs with more are nearer to the paper."""
         return self.steps * max(_pixels(_size(r)) for r in self.runs)
 
 

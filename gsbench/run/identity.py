@@ -110,7 +110,10 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
 
 
 def _storable(value: Any) -> Any:
-    """Convert values that a record cannot hold, such as NaN, to text; the record of the refused run shows them."""
+    """Convert values that a record cannot hold, such as NaN, to text. A run with them is refused.
+
+    Its record shows the text.
+    """
     if isinstance(value, dict):
         return {key: _storable(one) for key, one in value.items()}
     if isinstance(value, float):

@@ -51,9 +51,9 @@ class Trainer:
 
         Args:
             model: the initialised model on `config.device`.
-            scene: gives the training and the val views.
+            scene: the scene, which has the training and the val views.
             views: the views of the evaluated split.
-            config: the recipe.
+            config: the config of the run.
 
         Raises:
             InputError: a training image has a value that is not finite.

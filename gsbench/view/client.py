@@ -61,7 +61,7 @@ class Client:
         self.changed.set()
 
     def _work(self) -> None:
-        """Render whenever something changes, and once more when it no longer does, until the browser leaves."""
+        """Render after each change of controls or camera, and in full when changes end, until the browser leaves."""
         while True:
             playing = self.controls.play.value
             changed = self.changed.wait(FRAME_S if playing else None if self.rests else REST_S)
