@@ -195,5 +195,5 @@ class Config:
 
 
 def register_schema() -> None:
-    """Let Hydra check conf/config.yaml and its groups against the classes above."""
+    """Let Hydra check conf/config.yaml and its groups against the dataclasses of this module."""
     ConfigStore.instance().store(name="schema", node=Config)

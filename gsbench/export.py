@@ -32,7 +32,7 @@ class ExportRequest(NamedTuple):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the requested files; return 0, or 2 with one line on stderr."""
+    """Write the files that the command line asks for; return 0, or 2 with one line on stderr if that fails."""
     try:
         asked = prepare(parser().parse_args(arguments))
         if asked.options.ply:

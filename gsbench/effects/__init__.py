@@ -1,1 +1,1 @@
-"""Choose the effects that a scene and each of its Gaussians need: time, direction, AGR, harmonics."""
+"""Choose what a scene and each Gaussian depend on: time, direction of view, AGR and colour harmonics."""

@@ -1,4 +1,4 @@
-"""Test without a training whether a scene needs time; gate the model of a finished run, or draw its effect sets.
+"""Test without a training whether a scene needs time; remove effects from a finished run's model, or draw them.
 
 python -m gsbench.effects SCENE_FOLDER [--json]
 python -m gsbench.effects --checkpoint RUN_FOLDER [--budget-db 0.05] [--data-root PATH]

@@ -1,4 +1,4 @@
-"""Gate a model as long as its measured loss stays within a budget."""
+"""Remove time, direction or AGR from a model's Gaussians, as far as the measured loss of PSNR stays within a budget."""
 
 import copy
 import math
@@ -21,7 +21,7 @@ MOST_PREDICTED = 2.0  # times the budget: on few views a loss may be measured th
 
 @dataclass(frozen=True)
 class Gated:
-    """A model after a gate."""
+    """A model after effects were removed from some of its Gaussians, and what this cost."""
 
     model: GatedModel
     gate: Gate  # what was decided, for the record
@@ -36,16 +36,18 @@ def gate_within(
     measure: Callable[[GaussianModel], float],
     intervals: Tensor | None = None,  # [N, 2]
 ) -> Gated | None:
-    """Apply the largest of SHARES whose measured loss is within the budget; None if none is.
+    """Simplify as many Gaussians as the budget allows: try SHARES from the largest.
 
-    The model itself is not changed.
+    Return None if no share is within it.
+
+    Each share is that of the squared error which the simplifications may add. The model itself is not changed.
 
     Args:
-        model: trained, or in training.
-        sensitivity: of its simplifications.
+        model: the model to simplify, trained or in training.
+        sensitivity: predicted errors of the model's simplifications.
         budget_db: the most dB by which `measure` may fall.
-        measure: returns the PSNR of a model, dB, on views that the probe did not use.
-        intervals: the times at which each Gaussian can be seen; AGR does not move it at others.
+        measure: returns the PSNR of a model in dB, on views that were not used for `sensitivity`.
+        intervals: the times at which each Gaussian can be seen; AGR does not move a Gaussian at other times.
     """
     before = measure(model)
     for share in SHARES:
@@ -70,7 +72,7 @@ def gate_within(
 
 
 def orders_of(model: GaussianModel) -> dict[str, int]:
-    """Count the Gaussians by the degree of their harmonics, and by frequencies of time if there are several."""
+    """Count the Gaussians by the degree of their harmonics, and in 4DGS by the frequencies of their colour in time."""
     if model.effect_sets is None or model.effect_sets.orders is None:
         return {}
     values, counts = torch.unique(model.effect_sets.orders, return_counts=True)

@@ -34,7 +34,7 @@ ON, OFF, UNDECIDED = "on", "off", "undecided"
 
 @dataclass(frozen=True)
 class ScreenResult:
-    """The answer of one test."""
+    """The answer of one test whether the scene changes with time."""
 
     decision: str
     reason: str
@@ -47,9 +47,9 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
     """Decide from its training views whether a scene changes with time.
 
     Args:
-        scene: its training views are used, much reduced.
-        seed: of the points and the permutations.
-        backend: renders the static fit; see `gsbench.kernels.backends.resolve`.
+        scene: the scene to test; its training views are used at a small size.
+        seed: seed of the fit's points and of the random permutations.
+        backend: the backend that renders the static fit; see `gsbench.kernels.backends.resolve`.
 
     Raises:
         InputError: the scene has no training view.
@@ -65,7 +65,7 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
 def import_compiler() -> None:
     """Make torch import its compiler before a clock starts, which its first optimizer would do.
 
-    The import takes a second that would count as time of the screen. A training makes its optimizer before its clock
+    The import takes a second that would count as time of the test. A training makes its optimizer before its clock
     starts, too.
     """
     torch.optim.Adam([torch.zeros(1)])
@@ -136,7 +136,7 @@ def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> ScreenRe
 
 
 def _dummies(places: list[list[int]]) -> Array:  # [V, P]
-    """Return a column for each place, one at its views."""
+    """Return a column for each camera place: 1 at the views from this place, 0 at others."""
     columns = np.zeros((sum(map(len, places)), len(places)))
     for number, place in enumerate(places):
         columns[place, number] = 1

@@ -19,12 +19,12 @@ from gsbench.scenes import View
 def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianModel | None:
     """Return a copy whose slices do not change with the direction of view.
 
-    It is None if the model's slices never do, or if the model cannot freeze what it observes. AGR, time and the
-    harmonics of the colours stay.
+    Return None if the model's Gaussians never depend on direction, or if the model cannot replace it by a constant.
+    AGR, time and the harmonics of the colours stay.
 
     Args:
-        model: trained.
-        views: training views, over which the frozen direction is averaged.
+        model: the trained model.
+        views: training views; the constant that replaces direction is the mean over them.
     """
     if not isinstance(model, GatedModel) or "direction" not in model.observes:
         return None

@@ -3,7 +3,7 @@
 An image of a static scene is y = clip(a x + b) of what the place sees, x, with a gain a and an offset b for each image
 and channel. Both are fitted by least absolute deviations (iteratively reweighted: Schlossmacher 1973), so that what
 moves through less than half of the image is an outlier and does not change them. x is the median over the images of
-(y - b) / a where y is not saturated, so that x may exceed 1.
+(y - b) / a, without saturated y, so x may exceed 1.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ Mask = NDArray[np.bool_]
 def changes(
     images: Array,  # [n, H, W, 3] of one camera place, in [0, 1]
 ) -> Array:  # [n, H, W, 3]
-    """Return how each image differs from the place's mean, without its gain and offset.
+    """Return how each image differs from the mean of its camera place, after the image's gain and offset were removed.
 
     If the expected value is saturated, a difference of at most three standard deviations of noise counts as none.
     """
@@ -53,7 +53,7 @@ def changes(
 def _telling(
     saturated: Mask,  # [n, 3, P]
 ) -> NDArray[np.int64]:
-    """Choose at most twice FIT_PIXELS pixels, evenly spaced; half of them are not saturated in any image."""
+    """Choose the pixels of the fit: up to FIT_PIXELS that no image saturates, and up to FIT_PIXELS of all pixels."""
     inside = np.flatnonzero((~saturated.any(0)).any(0))
     spaced = [every[:: max(1, -(-len(every) // FIT_PIXELS))] for every in (inside, np.arange(saturated.shape[2]))]
     return np.unique(np.concatenate(spaced))
@@ -64,7 +64,7 @@ def _fit(
     x: Array,  # [3, P]
     use: Mask,  # [n, 3, P]
 ) -> tuple[Array, Array]:
-    """Fit y = a x + b to the pixels in `use`, and a little to black that stays black; return a and b, [n, 3, 1]."""
+    """Fit a and b, [n, 3, 1], of y = a x + b for n images to the pixels in `use` and, at small weight, to y = x = 0."""
     number = use.sum(-1, keepdims=True)
     enough = number >= LEAST_PIXELS
     y, x = np.pad(y, ((0, 0), (0, 0), (0, 1))), np.pad(x, ((0, 0), (0, 1)))
@@ -97,7 +97,10 @@ def _seen(
     saturated: Mask,  # [n, 3, P]
     full: Mask,  # [3, P] where the first image is saturated, whether it is white and not black
 ) -> Array:  # [3, P]
-    """Return the median of unsaturated values; if all are saturated, the least value that saturates every image."""
+    """Return each pixel's median of unsaturated values.
+
+    If all are saturated, the least value that saturates every image.
+    """
     ordered = np.sort(np.where(saturated, np.float32(np.inf), values), 0)
     number = (~saturated).sum(0)
     middle = np.take_along_axis(ordered, np.maximum(number - 1, 0)[None] // 2, 0)[0]

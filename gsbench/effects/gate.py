@@ -1,8 +1,8 @@
 """Remove effects that Gaussians do not need: choose simplifications within a budget of error, and apply them.
 
-Every Gaussian takes the simplification that minimises time + lambda error: its frame time, and the error that
-gsbench.effects.sensitivity predicts. lambda is such that the errors add up to the budget. The same rule decides about
-time, direction, AGR, harmonics and removal.
+Every Gaussian takes the simplification that minimises time + lambda error. Here time is what the Gaussian costs in a
+frame, and error is what gsbench.effects.sensitivity predicts. lambda, the same for all Gaussians, is such that the
+errors add up to the budget. The same rule decides about time, direction, AGR, harmonics and removal.
 """
 
 from dataclasses import dataclass
@@ -48,9 +48,9 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     finds the smallest lambda for which the errors add up to at most `budget` x `sensitivity.total`.
 
     Args:
-        sensitivity: of the model's simplifications.
-        model: the model of `sensitivity`; it may have effect sets already.
-        budget: a share of the model's squared error, such as 0.01, which is 0.043 dB.
+        sensitivity: predicted errors of the model's simplifications.
+        model: the model of `sensitivity`; effects may have been removed from it before.
+        budget: the share of the model's squared error that may be added, such as 0.01, which costs 0.043 dB of PSNR.
     """
     now = effect_sets_of(model)
     live = _live_cost(model, now)
@@ -86,7 +86,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
 
 
 def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
-    """Return the nanoseconds of each Gaussian as it is, without its colour, [N]."""
+    """Return the nanoseconds of a frame that each Gaussian takes, without its colour and rasterization, [N]."""
     like = model.splats["opacities"].detach()
     cost = torch.full_like(like, COSTS[STATIC])
     cost[: now.conditioned] = SLICING
@@ -97,25 +97,25 @@ def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
 
 
 def cost_of(model: GaussianModel) -> Tensor:
-    """Return the nanoseconds of each Gaussian before it is rasterized, with its colour, [N]."""
+    """Return the nanoseconds of a frame that each Gaussian takes, with its colour, without rasterization, [N]."""
     now = effect_sets_of(model)
     assert now.orders is not None
     return _live_cost(model, now) + _shading(now.orders)
 
 
 def most_cost(model: GaussianModel) -> float:
-    """Return the nanoseconds of a Gaussian that has every effect of this model."""
+    """Return the nanoseconds that a Gaussian with every effect of this model adds to a frame."""
     return REFINING + SLICING + float(_shading(torch.tensor(model.full_order())))
 
 
 def _shading(orders: Tensor) -> Tensor:
-    """Return the nanoseconds of evaluating colours of the given packed orders."""
+    """Return the nanoseconds to evaluate each colour; `orders` pack its harmonic degree and Fourier order."""
     order = order_of(orders)
     return torch.tensor(COLORING, device=orders.device)[order.degree] * order.waves
 
 
 def effect_sets_of(model: GaussianModel) -> EffectSets:
-    """Return the effect sets of a model; if it has none, make them from the effects that its rows have."""
+    """Return which effects each Gaussian of a model keeps; all that the model has if none was removed."""
     if model.effect_sets is not None:
         return model.effect_sets
     rows = model.count_by_effects()
@@ -132,12 +132,12 @@ def apply(
     choice: ChosenSimplifications,
     intervals: Tensor | None = None,  # [N, 2]
 ) -> tuple[Tensor, Tensor]:
-    """Turn each Gaussian of a model into its simplification, drop the removed ones, sort the others by effect set.
+    """Simplify each Gaussian of a model, drop the removed ones, and sort the others by the effects that they keep.
 
     Args:
-        model: becomes the gated one.
-        sensitivity: of its simplifications.
-        choice: one simplification for each Gaussian.
+        model: the model to change in place.
+        sensitivity: predicted errors of the model's simplifications.
+        choice: the simplification of each Gaussian, from `choose`.
         intervals: the times at which each Gaussian can be seen, see `EffectSets.intervals`.
 
     Returns:

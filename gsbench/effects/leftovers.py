@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 
 def leftovers(views: Sequence[View], scene: Scene, seed: int, backend: str) -> Array:
-    """Fit 3DGS of degree 0 for STEPS steps; return the Gram matrix [V, V] of the views' gradients by the means."""
+    """Fit 3DGS of degree 0 for STEPS steps; return products g_v . g_w [V, V] of views' gradients."""
     random = torch.Generator().manual_seed(seed)
     points = scene_points(views, scene, random)
     device = views[0].camera.viewmat.device

@@ -19,17 +19,17 @@ _KEEP = {
 
 
 def of_decision(screen: TimeScreen) -> str:
-    """Say whether time is simulated."""
+    """Say whether the model depends on time."""
     return f"time is {screen.decision}{', so it is simulated' if screen.decision == 'undecided' else ''}"
 
 
 def of_screen(screen: TimeScreen) -> str:
-    """Say whether time is simulated, and why."""
+    """Say whether the model depends on time, and why."""
     return f"{of_decision(screen)}: {screen.reason}"
 
 
 def of_gate(gate: Gate) -> str:
-    """Say how many Gaussians and effects a gate left, and how many dB that cost."""
+    """Say how many Gaussians and effects are left after a removal of effects, and how many dB this cost."""
     left = sum(number for name, number in gate.rows.items() if name != "removed")
     when = "at the end" if gate.step is None else f"after step {gate.step}"
     kept = ", ".join(f"{gate.rows[name]} {words}" for name, words in _KEEP.items() if gate.rows.get(name))
@@ -46,13 +46,13 @@ def of_gate(gate: Gate) -> str:
 
 
 def of_direction(found: Direction) -> str:
-    """Say what direction is worth."""
+    """Say how many Gaussians depend on direction, and what freezing it in all of them would change."""
     return (f"direction: {found.kept:.0%} of the Gaussians keep it; freezing it in all would change PSNR by "
             f"{-found.loss_db:+.2f} dB and a frame from {found.frame_ms:.2f} to "
             f"{found.frame_ms_without:.2f} ms")  # fmt: skip
 
 
 def lines(found: OnDemand) -> list[str]:
-    """Return a sentence on each line about what the gates decided; `of_screen` has that of the screen."""
+    """Return a sentence on each line about the effects that were removed; `of_screen` has the test for time."""
     said = [of_gate(gate) for gate in found.gates]
     return said + ([of_direction(found.direction)] if found.direction else []) + found.notes

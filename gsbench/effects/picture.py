@@ -39,14 +39,14 @@ def draw(
     """Draw the three panels with their titles and a legend: uint8 [H', W', 3] RGB.
 
     Args:
-        model: initialised; without effect sets all its Gaussians have the same one.
-        camera: of the image.
-        time: in [0, 1]; None if the scene has no time.
-        background: colour [3] of the image; the second panel has white.
+        model: an initialised model; if no effects were removed, all its Gaussians have the same colour.
+        camera: the camera of the image.
+        time: the time of the image in [0, 1]; None if the scene has no time.
+        background: background colour [3] of the first panel; that of the second is white.
         antialias: see `gsbench.raster.rasterize`.
 
     Raises:
-        InputError: the model observes time and `time` is None.
+        InputError: the model depends on time and `time` is None.
     """
     seen = model.slice(Query.of(camera, time))
     layers = (
@@ -74,7 +74,7 @@ def cost_colors(model: GaussianModel, most: float) -> Tensor:
 
 
 def kinds_of(model: GaussianModel) -> Tensor:
-    """Return the effect set of each Gaussian as its index in NAMES, [N] int64."""
+    """Return the effect set (the effects that it keeps) of each Gaussian as an index into NAMES, [N] int64."""
     effect_sets = effect_sets_of(model)
     assert effect_sets.frozen is not None
     place = torch.arange(len(model), device=effect_sets.frozen.device)

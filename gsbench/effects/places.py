@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Places:
-    """The numbers of the views of each place."""
+    """The views from each camera place, as indices into a list of views."""
 
     fixed: list[list[int]]  # at least two of each place
     held: list[list[int]]  # places of cameras that move a little; empty, or most of the views that no fixed place has
@@ -37,7 +37,7 @@ def find_places(views: Sequence[View], extent: float) -> Places:
 
     Args:
         views: with times.
-        extent: of the scene; it is used as the distance if the cameras look at no common point.
+        extent: the scene's extent, taken as the distance to the scene if the cameras look at no common point.
     """
     poses = _poses(views, extent)
     exact = _groups(list(range(len(views))), poses, SAME)
@@ -53,7 +53,7 @@ def find_places(views: Sequence[View], extent: float) -> Places:
 
 
 def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
-    """Return a vector for each camera; distances between vectors are about the shift of the image, in longer sides."""
+    """Return a vector for each camera; the distance of two vectors is about the shift of the image, in longer sides."""
     center = center_of(views)
     rows = []
     for view in views:
@@ -75,7 +75,7 @@ def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
 
 
 def _groups(numbers: list[int], poses: Array, tolerance: float) -> list[list[int]]:
-    """Group views so that none is farther from the first view of its group than the tolerance."""
+    """Group views so that no view is farther than the tolerance from the first view of its group."""
     groups: list[list[int]] = []
     left = np.array(numbers, dtype=np.int64)
     while len(left):

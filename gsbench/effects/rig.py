@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlaceComparison:
-    """The result of comparing the images of the places."""
+    """The result of comparing the images of each camera place with one another."""
 
     changed: float  # share of the blocks, over all places
     p: float | None  # of slow waves; None: nothing changes, or no place has images enough
@@ -42,12 +42,12 @@ class PlaceComparison:
 
 
 def compare_places(views: Sequence[View], places: Sequence[Sequence[int]], seed: int) -> PlaceComparison:
-    """Compare the images of each place with one another.
+    """Compare the images of each camera place with one another, to find changes with time.
 
     Args:
         views: with times.
-        places: numbers of the views of each place, at least two for each.
-        seed: of the permutations.
+        places: for each camera place the indices of its views, at least two.
+        seed: seed of the random permutations.
     """
     most = max(4, MOST_VIEWS // len(places))
     blocks, changed, means, times = 0, 0, [], []
@@ -66,7 +66,10 @@ def compare_places(views: Sequence[View], places: Sequence[Sequence[int]], seed:
 
 
 def _spread(ordered: list[int], most: int, start: float) -> list[int]:
-    """Choose at most `most`, evenly spaced, the first of them by `start` in [0, 1): places look at other moments."""
+    """Choose at most `most` views, evenly spaced.
+
+    `start` in [0, 1) shifts them, so that camera places differ in time.
+    """
     if len(ordered) <= most:
         return ordered
     return [ordered[int((i + start) * len(ordered) / most)] for i in range(most)]
@@ -106,7 +109,7 @@ def _is_changed(
 
 
 def _slow(means: list[Array], times: list[Array], seed: int) -> tuple[float, float]:
-    """Return p and z of the share of energy that goes with slow waves, summed over places."""
+    """Return p-value and z-score of the share of energy that follows slow waves of time, summed over camera places."""
     moments = np.unique(np.concatenate(times))
     keys = np.random.default_rng(seed).random((PERMUTATIONS, len(moments)))
     total = np.zeros(1 + PERMUTATIONS)

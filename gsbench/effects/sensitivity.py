@@ -71,15 +71,15 @@ def probe(
     """Predict the error of every simplification of every Gaussian.
 
     Args:
-        model: trained, or on its way.
+        model: the model, trained or in training.
         views: training views.
-        background: colour [3].
-        seed: of the random signs.
-        most: the number of views, evenly spaced, that are used.
+        background: background colour [3].
+        seed: seed of the random signs g.
+        most: the largest number of views that are used, evenly spaced.
         draws: random g for each view; one draw says little about a Gaussian that few views show.
         antialias: see `gsbench.raster.rasterize`.
-        by_halves: whether time or direction alone may be frozen.
-        hidden: Gaussians that no view shows.
+        by_halves: whether time alone or direction alone may be frozen, not only both.
+        hidden: mask of Gaussians that no view shows.
     """
     looked_at = evenly(views, most)
     queries = [Query.of(view.camera, view.time) for view in looked_at]
@@ -90,7 +90,7 @@ def probe(
     seeds = torch.randint(2**62, (len(looked_at),), generator=random).tolist()
 
     def errors_in(v: int) -> tuple[float, list[Tensor]]:
-        """Return the squared error of a view as it is, and what each simplification would add to it."""
+        """Return the squared error of a view's image, and what each simplification would add to this error."""
         view = looked_at[v]
         drawing = ViewRasterizer(model, view.camera, background, antialias)
         here = drawing(seen[v])
@@ -115,7 +115,7 @@ def probe(
 
 
 class Drawn(NamedTuple):
-    """A rendered slice."""
+    """The image of a model at one view, with the derivative by the Gaussians."""
 
     at: Gaussians3D
     tape: Tape  # how
@@ -129,7 +129,7 @@ class Drawn(NamedTuple):
         return self.images[0].detach()
 
     def products(self, vectors: list[Tensor]) -> Tensor:
-        """Multiply K vectors [H, W, 3] by the derivative of the image by the slice, from the left: [K, N, 16]."""
+        """Return the gradients [K, N, 16], by the Gaussians' rows, of the image's scalar products with K `vectors`."""
         found = []
         for vector in vectors:
             sums: dict[int, Tensor] = {}
@@ -148,7 +148,7 @@ class ViewRasterizer(NamedTuple):
 
     @torch.enable_grad()
     def __call__(self, gaussians: Gaussians3D) -> Drawn:
-        """Draw a slice."""
+        """Rasterize the 3D Gaussians of the view."""
         at = Gaussians3D(*(x.detach().requires_grad_() for x in tensors_of(gaussians)))
         with Tape() as tape:
             output = rasterize_slice(at, self.camera, self.background, self.model.backend, self.antialias)
@@ -156,7 +156,7 @@ class ViewRasterizer(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A model seen by one view."""
+    """A model at one view, with the camera and time of the view."""
 
     model: GaussianModel
     query: Query
@@ -169,7 +169,7 @@ class Place(NamedTuple):
 
 
 def _error(simplification: Simplification, here: Place, draw: ViewRasterizer) -> Tensor:
-    """Compute E [N] of a simplification in one view."""
+    """Compute the error E [N] that a simplification of each Gaussian adds in one view (formula in the module)."""
     model, live = here.model, here.live
     if simplification.raw is None:
         return _grown(here.removed)

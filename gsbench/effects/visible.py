@@ -1,4 +1,4 @@
-"""Find the times at which each Gaussian can be seen; at other times AGR need not move it."""
+"""Find the times at which each Gaussian can be seen; at other times AGR need not move the Gaussian."""
 
 import itertools
 import math
@@ -15,13 +15,13 @@ from gsbench.scenes import View
 
 @torch.no_grad()
 def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
-    """Return the first and the last time at which a view can show each Gaussian, clips; (inf, -inf) where none can.
+    """Return the first and last time at which a view can show each Gaussian, in [0, 1]; (inf, -inf) if no view can.
 
     A view can show a Gaussian if its opacity in the slice, with or without AGR, reaches ALPHA_MIN. The interval is
     extended on both sides by the largest gap between the times of neighbouring views.
 
     Args:
-        model: trained.
+        model: the trained model.
         views: training views.
     """
     own = dict(model.splats.items())
@@ -47,7 +47,7 @@ def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
 
 
 def share_asleep(model: GaussianModel, views: Sequence[View]) -> float | None:
-    """Return the share of AGR's work that intervals leave out, mean over views; None without intervals."""
+    """Return the share of AGR's work that is saved at times when a Gaussian is invisible; None if these are unknown."""
     intervals = None if model.effect_sets is None else model.effect_sets.intervals
     if intervals is None or not len(intervals):
         return None

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Evidence:
-    """The result of the permutation test."""
+    """The result of the permutation test: whether residuals follow slow waves of time."""
 
     p: float
     z: float
@@ -33,10 +33,10 @@ def evidence(
     """Test whether gradients follow slow waves of time, given what the camera explains (Freedman and Lane 1983).
 
     Args:
-        leftovers: g_v . g_w for all pairs of views.
-        times: of the views.
+        leftovers: the scalar products g_v . g_w of the gradients of all pairs of views.
+        times: the times of the views.
         camera: functions of the camera; their span is removed from gradients and waves.
-        seed: of the permutations.
+        seed: seed of the random permutations.
         places: groups of views within which times are permuted; by default all views are one group.
     """
     waves = slow_waves(times)
@@ -64,7 +64,7 @@ def evidence(
 def slow_waves(
     times: Array,  # [V] in [0, 1]
 ) -> Array:  # [V, WAVES]
-    """Return slow waves of time, each less its mean."""
+    """Return slow waves of time, cosines with the mean removed from each."""
     waves = np.cos(math.pi * np.outer(times, np.arange(1, WAVES + 1)))
     return np.asarray(waves - waves.mean(0))
 
@@ -73,14 +73,14 @@ def compare(
     actual: float,
     null: Array,  # [PERMUTATIONS] the same of times that were dealt at random
 ) -> tuple[float, float]:
-    """Return p, the share of permutations (with the actual one) that reach the actual value, and its z."""
+    """Return the p-value (share of random orders and the actual one that reach the actual value) and the z-score."""
     p = (1 + int((null >= actual - TIE * abs(actual)).sum())) / (1 + len(null))
     spread = float(null.std())
     return p, (actual - float(null.mean())) / spread if spread > TIE * abs(actual) else 0.0
 
 
 def _deal(views: int, places: Sequence[Sequence[int]] | None, random: np.random.Generator) -> NDArray[np.int64]:
-    """Draw a permutation of the views that leaves each at its place."""
+    """Draw a random permutation of the views within each camera place."""
     if places is None:
         return random.permutation(views)
     dealt = np.arange(views)

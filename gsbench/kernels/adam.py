@@ -1,4 +1,4 @@
-"""Update parameters by Adam in place: the rows of one that were drawn, or all of several in one call."""
+"""Update parameters by Adam in place: some rows of one parameter, or all rows of several parameters in one call."""
 
 from collections.abc import Sequence
 
@@ -28,9 +28,9 @@ def adam(
 
     Args:
         parameter: the tensor that is updated.
-        gradient: of the loss by the parameter.
+        gradient: the gradient of the loss by the parameter.
         mean: the running mean of the gradient.
-        square: the running mean of its square.
+        square: the running mean of the squared gradient.
         drawn: the rows that are updated.
         rate: the learning rate.
         betas: the share of each running mean that is kept.
@@ -38,7 +38,7 @@ def adam(
         step: the number of this update.
 
     Raises:
-        InputError: not contiguous float32 on one device, or shapes that do not fit.
+        InputError: tensors are not contiguous float32 on one device, or their shapes do not fit.
     """
     named = {"parameter": parameter, "gradient": gradient, "mean": mean, "square": square}
     for name, x in named.items():
@@ -85,21 +85,21 @@ def adam_all(
 ) -> None:
     """Update parameters on the CPU, each at a rate of its own, as `torch.optim.Adam` does.
 
-    One call instead of one for each parameter: a small model has a dozen parameters, and a call of torch costs as much
-    as their update.
+    One call updates all parameters, because a small model has a dozen of them, and a call of torch costs as much as
+    their update.
 
     Args:
-        parameters: what is moved, of any shapes.
-        gradients: of the loss by them.
+        parameters: the tensors to update, of any shapes.
+        gradients: the gradients of the loss by the parameters.
         means: the running means of the gradients.
-        squares: those of their squares.
-        steps: the numbers of this update, from 1.
+        squares: the running means of the squared gradients.
+        steps: the number of this update for each parameter, from 1.
         rates: the learning rates.
-        betas: how much of the two means is kept.
+        betas: the share of each running mean that is kept.
         eps: added to the root of the mean square.
 
     Raises:
-        InputError: not float32 on the CPU, row by row in memory, or shapes that do not fit.
+        InputError: tensors are not float32 on the CPU and row by row in memory, or their shapes do not fit.
     """
     gradients = in_rows(list(gradients))
     for name, listed in {"parameter": parameters, "gradient": gradients, "mean": means, "square": squares}.items():

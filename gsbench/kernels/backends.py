@@ -14,18 +14,18 @@ from gsbench.kernels import cuda
 
 @dataclass(frozen=True)
 class Backend:
-    """Decides whether kernels or torch compute: models, rasterizer, loss and optimizer ask it whether it `serves`."""
+    """Decides whether kernels or torch compute; models, rasterizer, loss and optimizer ask by `serves`."""
 
     name: str
     devices: tuple[str, ...]  # the kinds of device on which it uses kernels
 
     def serves(self, tensor: Tensor) -> bool:
-        """Tell whether kernels do the work on such a tensor; otherwise torch does."""
+        """Tell whether kernels compute with a tensor of this device and type; otherwise torch computes."""
         device = tensor.device.type
         return tensor.dtype == torch.float32 and device in self.devices and _built(device)
 
     def workers(self, tensor: Tensor) -> int:
-        """Return how many Python threads should share independent pieces of work on such tensors.
+        """Return how many Python threads should share independent pieces of work on tensors of this device.
 
         Only the CPU's kernels gain by threads: torch holds Python's lock between its operations, and a GPU does one
         thing after the other anyway.

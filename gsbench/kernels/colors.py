@@ -65,18 +65,18 @@ def show_colors(
     Args:
         sh0: the constant coefficient.
         shN: the other coefficients: K harmonics for each frequency, of which (degree + 1)^2 are used.
-        means: world units.
-        opacities: of the slice, in [0, 1]; colours give them no gradient.
-        center: the camera's, world units.
-        degree: of the harmonics, 0 to 3.
-        times: mu_t, if colours change with time.
-        time: clips.
-        waves: frequencies of time, the constant one included.
-        orders: the order of each colour, degree + 4 (waves - 1); coefficients above it are not read, and their
-            gradient is zero. None: all colours have `degree` and `waves`.
+        means: the means of the Gaussians, world units.
+        opacities: the opacities after slicing, in [0, 1]; colours give them no gradient.
+        center: the camera's centre, world units.
+        degree: the degree of the harmonics, 0 to 3.
+        times: the mean times mu_t, if colours change with time.
+        time: the time at which to compute colours; 1 is the length of the sequence.
+        waves: the number of frequencies in time, including the constant.
+        orders: each colour's own degree and waves, packed as degree + 4 (waves - 1); coefficients above it are not
+            read, and their gradient is zero. None: all colours have `degree` and `waves`.
 
     Raises:
-        InputError: not float32 on one device, or shapes that do not fit.
+        InputError: tensors are not float32 on one device, or their shapes do not fit.
     """
     if degree not in range(4) or waves not in range(1, MAX_WAVES + 1):
         raise InputError(f"show_colors: expected degree 0 to 3 and 1 to {MAX_WAVES} frequencies, got "

@@ -26,8 +26,8 @@ class Input:
     Args:
         shape: sizes such as "N 3" or "C height width D". A size is a number, or a name that means one size wherever it
             stands in the operation. A first size that may be left out has a question mark.
-        gradient: what backward does with its gradient.
-        dtype: float32, or int32 for indices.
+        gradient: what the backward kernel does with the input's gradient.
+        dtype: the type, float32 or, for indices, int32.
         left_out_with: makes the input optional; inputs with the same name are left out together.
         is_list: the tensor is [n]; n differs from call to call and is no other size.
     """

@@ -14,7 +14,7 @@ from gsbench.kernels.tensors import check_number, check_tensor
 
 
 class _Similarity(Operation):
-    """The loss: forward computes its gradient too, so backward is a product."""
+    """The loss as an autograd function. Forward also computes the gradient, so backward only multiplies by a number."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -63,7 +63,7 @@ def l1_ssim(
     The value is that of `gsbench.train.losses.photometric`.
 
     Raises:
-        InputError: not two float32 images of one size on one device, or `target` requires a gradient.
+        InputError: the arguments are not two float32 images of one size on one device, or `target` requires a gradient.
     """
     check_tensor(image, "l1_ssim: image", (torch.float32,))
     check_tensor(target, "l1_ssim: target", (torch.float32,))

@@ -1,4 +1,4 @@
-"""Declare an operation of the kernels once: its check, calls, gradient, fake and place on a tape follow from that.
+"""Declare an operation of the kernels once. Its checks, calls, gradient and fake for torch.compile follow from this.
 
 An operation is a pair of functions on tensors, `forward` and `backward`. If a tape (gsbench.kernels.tape) is active, it
 records each call. Otherwise torch's autograd does, which knows the operation as `torch.ops.gsbench.NAME`.
@@ -46,7 +46,7 @@ class Operation:
         """Declare the operation.
 
         Args:
-            name: of the operation and its kernel.
+            name: the name of the operation and of its kernel.
             inputs: the tensors it takes, by the names of the kernel's fields.
             outputs: the tensors it returns.
             numbers: the type of each argument that is no tensor; an int may be a size too.
@@ -86,8 +86,8 @@ class Operation:
         """Return the outputs for tensors (None: left out) and then numbers, in the order of the declaration.
 
         Raises:
-            InputError: shapes that do not fit, another type than float32, more than one device, or an input that
-                requires a gradient that the operation does not have.
+            InputError: shapes do not fit, tensors are not float32 or not on one device, or an input requires a gradient
+                that the operation does not have.
         """
         tensors, numbers = self.split(arguments)
         for (key, declared), x in zip(self.inputs.items(), tensors, strict=False):

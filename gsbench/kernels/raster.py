@@ -137,7 +137,7 @@ def backward_by_splat() -> Iterator[None]:
 
 
 def flag_values(*values: Tensor) -> Tensor:
-    """Return [1] int64, not zero if a value is not finite or out of range; the device finds it, and nothing waits.
+    """Return [1] int64 on the device of `values`, not zero if a value is not finite or out of range.
 
     `values` are means, factors, opacities, colours, viewmats, Ks and background, as in `rasterize`.
     """
@@ -152,12 +152,14 @@ def flag_values(*values: Tensor) -> Tensor:
 
 @torch.no_grad()
 def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, int]:
-    """Sort splats by depth, ties by index, and list those of each tile; return `flags` [1] int64 as an int too.
+    """Sort splats by depth (equal depths by index), and list those of each tile.
+
+    Return `flags` [1] int64 as an int too.
 
     On a GPU this waits once for the device, to read the number of intersections and `flags`.
 
     Raises:
-        InputError: more intersections than int32 can count or memory can hold.
+        InputError: there are more intersections of splats and tiles than int32 can count or memory can hold.
     """
     library = library_of(splats.depths.device.type)
     if not library.needs_scratch:
@@ -248,5 +250,5 @@ def _list_on_gpu(
 
 
 def _scratch(library: Library, items: int, like: Tensor) -> Tensor:
-    """Allocate the memory that sorting and summing so many items need."""
+    """Allocate the memory that sorting and summing a number of items need."""
     return allocate("scratch space to sort", like, (library.extension.scratch_bytes(items),), torch.uint8)

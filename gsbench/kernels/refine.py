@@ -189,14 +189,14 @@ def refine(
         bias_in: the biases of the first layers.
         weight_out: the second layers, a row for each number that is moved.
         bias_out: the biases of the second layers.
-        units: the unit of each number that the perceptrons read or move.
+        units: the unit of each number that the perceptrons read or change.
         gamma: the encoded time, equal for all Gaussians.
         rows: how many of the first rows are moved, by default all; the others are copied.
         intervals: the first and the last time at which each of these rows is moved; always, by default.
-        time: needed with intervals.
+        time: the time of the view, needed with intervals.
 
     Raises:
-        InputError: not float32 on one device, shapes that do not fit, or there are not so many rows.
+        InputError: tensors are not float32 on one device, their shapes do not fit, or there are fewer than `rows` rows.
     """
     if (intervals is None) != (time is None):
         raise InputError("refine: expected intervals and time together, got one of them")

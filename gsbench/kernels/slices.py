@@ -1,4 +1,4 @@
-"""Slice the geometry of a model: Gaussians with triangular factors, with rotated factors, or without a query."""
+"""Compute 3D Gaussians at a camera and a time (a slice) from 7D, 6D or 4D ones, or from 3D ones that do not change."""
 
 from typing import Any
 
@@ -34,7 +34,7 @@ _triangular = Operation(
 
 
 def _conditioned(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
-    """Return how many rows change with the query."""
+    """Return how many rows change with the camera and time."""
     return {"conditioned": first_rows("conditioned", numbers["conditioned"], given["means"])}
 
 
@@ -75,16 +75,16 @@ def slice_triangular(
     has no f_temp and no f_dir. The gradient of all other parameters is zero.
 
     Args:
-        means: mu_p, world units.
-        directions: mu_d.
-        times: mu_t, clips.
+        means: the mean positions mu_p, world units.
+        directions: the mean directions mu_d.
+        times: the mean times mu_t; 1 is the length of the sequence.
         log_diagonal: the logarithms of the factor's diagonal.
-        shape: the factor's entries within p.
-        motion: its entries of p by d and t, world units.
-        coupling: its entries within d and t.
-        opacities: before the sigmoid.
-        center: the camera's, world units.
-        time: clips.
+        shape: the entries of the factor within p (below its diagonal).
+        motion: the entries of the factor between p and d or t, world units.
+        coupling: the entries of the factor within d and t.
+        opacities: the opacities before the sigmoid (logits).
+        center: the camera's centre, world units.
+        time: the time at which to slice; 1 is the length of the sequence.
         log_lambda_d: ln lambda_d, the coefficient of f_dir.
         log_lambda_t: ln lambda_t, the coefficient of f_temp.
         conditioned_first: whether the factor's rows are ordered (d, t, p), else (p, t, d).
@@ -94,8 +94,8 @@ def slice_triangular(
         conditioned: how many rows change with the query, by default all.
 
     Raises:
-        InputError: not float32 on one device, shapes that do not fit, nothing is observed, a gradient by `center` or
-            `time` is asked for, or more rows are conditioned than there are.
+        InputError: tensors are not float32 on one device, their shapes do not fit, nothing is observed, a gradient by
+            `center` or `time` is asked for, or more rows are conditioned than there are.
     """
     timed = times is not None
     seen = _triangular(means, directions, times, log_diagonal, shape, motion, coupling, opacities, center,
@@ -148,19 +148,19 @@ def slice_rotated(
     parameters is zero.
 
     Args:
-        means: world units.
-        times: mu_t, clips.
-        scales: logarithms of world units, also that of time.
-        left_quats: any length but zero.
-        right_quats: any length but zero.
-        opacities: before the sigmoid.
-        clock: world units for each clip.
-        time: clips.
+        means: the mean positions, world units.
+        times: the mean times mu_t; 1 is the length of the sequence.
+        scales: the logarithms of the standard deviations along four axes, world units.
+        left_quats: the left quaternions, of any length but zero.
+        right_quats: the right quaternions, of any length but zero.
+        opacities: the opacities before the sigmoid (logits).
+        clock: the number of world units that the length of the sequence counts as.
+        time: the time at which to slice; 1 is the length of the sequence.
         log_lambda_t: ln lambda_t, the coefficient of f_temp.
         conditioned: how many rows change with the time, by default all.
 
     Raises:
-        InputError: not float32 on one device, shapes that do not fit, or more rows are conditioned than there are.
+        InputError: tensors are not float32 on one device, their shapes do not fit, or `conditioned` exceeds the rows.
     """
     seen = _rotated(means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
                     EVERY_ROW if conditioned is None else conditioned)  # fmt: skip
@@ -187,7 +187,7 @@ def slice_static(
     """Return factors F = R diag(exp scales) [N, 3, 3] (3DGS eq. 6) and opacities [N] of 3D Gaussians, their own slices.
 
     Raises:
-        InputError: not float32 on one device, or shapes that do not fit.
+        InputError: tensors are not float32 on one device, or their shapes do not fit.
     """
     seen = _static(scales, quats, opacities)
     return seen[0], seen[1]

@@ -1,4 +1,4 @@
-"""Differentiate a chain of operations without autograd: record them as they run, then run them backwards.
+"""Differentiate a chain of operations without autograd: record operations as they run, then run them backwards.
 
 A training step is a few dozen calls of kernels on small tensors. Autograd's graph and torch's dispatch would cost more
 than the kernels. Autograd differentiates everything else: if a tensor of its graph enters an operation, the tape gives
@@ -99,8 +99,8 @@ class Tape:
     def backward(self, loss: Tensor, seed: Tensor, sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
         """Add the gradients of `seed` times `loss` by `sources` to `sums`, whose keys are the ids of the sources.
 
-        The added bits do not depend on what `sums` holds already. The tape may run backwards again, for another
-        seed.
+        What is added has the same bits whether `sums` already holds a gradient or not. The tape may run backwards
+        again, for another seed.
         """
         at = _Gradients(self._notes, sources, sums)
         at.give(loss, seed)
@@ -110,7 +110,7 @@ class Tape:
 
 
 class _Gradients:
-    """The gradients of one backward pass."""
+    """The gradients that one backward pass has computed so far, by tensor."""
 
     def __init__(self, notes: list[_Note], sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
         self.notes = notes
@@ -120,7 +120,7 @@ class _Gradients:
         self.uses = Counter([id(x) for note in notes for x in note.tensors])
 
     def give(self, x: Tensor, gradient: Tensor) -> None:
-        """Accumulate dL/dx; if x has a `grad_fn`, backpropagate through autograd."""
+        """Accumulate the gradient dL/dx of a tensor x; if x has a `grad_fn`, backpropagate through autograd."""
         self._add(x, gradient)
         if x.grad_fn is None:
             return

@@ -17,7 +17,10 @@ class Point(NamedTuple):
 
 @dataclass
 class Curve:
-    """The points of one run in order. The checkpoint holds them, so that a resumed run continues the curve."""
+    """The points of a run's training curve in order.
+
+    The checkpoint holds them, so a resumed run continues the curve.
+    """
 
     points: list[Point] = field(default_factory=list)
 

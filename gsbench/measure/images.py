@@ -21,8 +21,8 @@ Pixels = npt.NDArray[np.uint8]
 def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
     """Put (render, truth) pairs, each [H, W, 3] in [0, 1] of one size, into a strip: uint8 [H', W', 3] RGB.
 
-    The third column is the absolute error, the mean over RGB, from black (none) to bright yellow (0.2 or more). The
-    header names the columns and shows this scale.
+    The third column is the absolute error (the mean over RGB), from black for no error to bright yellow for 0.2 or
+    more. The header names the columns and shows this scale.
 
     Raises:
         InputError: there is no pair, or sizes differ.
@@ -46,7 +46,7 @@ def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
 
 
 def error_image(render: npt.NDArray[np.float32], truth: npt.NDArray[np.float32]) -> Pixels:  # [H, W, 3], each
-    """Map the absolute error, the mean over RGB, to colours: black is none, bright yellow 0.2 or more, magenta NaN."""
+    """Map the absolute error (mean over RGB) to colours: black for 0, bright yellow from 0.2 on, magenta for NaN."""
     error = np.abs(np.clip(render, 0, 1) - np.clip(truth, 0, 1)).mean(-1)
     shown = inferno(np.nan_to_num(error) / ERROR_SCALE)
     shown[np.isnan(error)] = (255, 0, 255)

@@ -46,8 +46,8 @@ def named(device: str, threads: int, hardware: Hardware | None) -> str:
 
     Args:
         device: the processor or GPU by name.
-        threads: of torch and of the kernels.
-        hardware: None for older records, which lack it.
+        threads: the number of threads of torch and of the kernels.
+        hardware: the processor and memory; None for older records, which lack them.
     """
     where = "" if hardware is None or device == hardware.processor else f"{device} in "
     return f"{where}{hardware or device}, {threads} thread{'' if threads == 1 else 's'}"
@@ -57,7 +57,7 @@ def hardware(instruction_set: str | None = None) -> Hardware:
     """Describe this machine.
 
     Args:
-        instruction_set: that the CPU's kernels run with (`gsbench.kernels.instruction_set`).
+        instruction_set: the instruction set that the CPU's kernels run with (`gsbench.kernels.instruction_set`).
     """
     facts = _facts(CPUINFO)
     kind = {name: next((facts[key] for key in keys if key in facts), None) for name, keys in _KEYS.items()}

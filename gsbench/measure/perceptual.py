@@ -1,8 +1,9 @@
 """Compute LPIPS 0.1, the distance between the features of two images in a trained network (Zhang et al. 2018).
 
-Results are bit-equal to those of the lpips package on the same trunk. The package is not imported, because it imports
-torchvision, whose wheel fails on CPU builds of torch, and does not check weights. Its linear weights are read from its
-wheel; the weights of the trunk come from a file that is checked by its SHA-256.
+The network without LPIPS' own linear layers is called trunk. Results are bit-equal to those of the lpips package on the
+same trunk. The package is not imported, because it imports torchvision, whose wheel fails on CPU builds of torch, and
+does not check weights. Its linear weights are read from its wheel; the weights of the trunk come from a file that is
+checked by its SHA-256.
 """
 
 import hashlib
@@ -22,7 +23,7 @@ from gsbench.errors import InputError, did_you_mean
 
 
 class BackboneMissing(Exception):  # noqa: N818  # not an error: the column stays empty, and this is its reason
-    """The weights of a backbone are not on this machine; the message is the reason for the empty column."""
+    """The weights of an LPIPS network are not on this machine; the message explains the empty column of a table."""
 
 
 def _alexnet() -> nn.Sequential:
@@ -51,7 +52,7 @@ def _vgg16() -> nn.Sequential:
 
 @dataclass(frozen=True)
 class Backbone:
-    """A trunk: its layers, the outputs that are compared, and the SHA-256 of its weights."""
+    """A pretrained network of LPIPS: its layers, the outputs that are compared, and the SHA-256 of its weights."""
 
     trunk: Callable[[], nn.Sequential]
     taps: tuple[int, ...]  # the ReLUs whose outputs are compared
@@ -62,7 +63,7 @@ class Backbone:
 
     @property
     def trunk_sha256(self) -> tuple[str, ...]:
-        """Return the first digits of the SHA-256 of the files accepted as trunk weights."""
+        """Return the first digits of the SHA-256 of the files that are accepted as weights of an LPIPS network."""
         return (Path(self.file).stem.rsplit("-", 1)[1], *self.other_sha256)
 
 

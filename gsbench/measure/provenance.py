@@ -29,9 +29,9 @@ def provenance(
     Args:
         config: the whole resolved config, plain JSON.
         data_hash: the fingerprint of the scene.
-        threads: of torch, and of the kernels, which use as many.
+        threads: the number of threads of torch, which is also that of the kernels.
         device: the name of the GPU; None stands for the processor, which is then named.
-        instruction_set: that the CPU's kernels run with; None: they are not built.
+        instruction_set: the instruction set that the CPU's kernels run with; None if they are not built.
     """
     here = hardware(instruction_set)
     return Provenance(

@@ -42,10 +42,10 @@ def psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
 
     Args:
         a: an image [H, W, 3] of floats, clamped to [0, 1].
-        b: another one of the same size, on the same device.
+        b: another image of the same size, on the same device.
 
     Returns:
-        dB; infinite for equal images.
+        PSNR in dB; infinite for equal images.
 
     Raises:
         InputError: they are not two images of one size.
@@ -77,13 +77,13 @@ def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
 
     Args:
         a: an image [H, W, 3] of floats, clamped to [0, 1], of at least 11 pixels a side.
-        b: another one of the same size, on the same device.
+        b: another image of the same size, on the same device.
 
     Returns:
         SSIM in [-1, 1]; 1 for equal images.
 
     Raises:
-        InputError: they are not two images of one size, or they are too small.
+        InputError: the arguments are not two images of one size, or the images are too small.
 
     Example:
         >>> import torch
@@ -116,14 +116,14 @@ def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = N
     Args:
         a: an image [H, W, 3] of floats, clamped to [0, 1] and scaled to [-1, 1], of at least 31 pixels a side for
             `alex` and 16 for `vgg`.
-        b: another one of the same size, on the same device, which computes the distance.
+        b: another image of the same size, on the same device; this device computes the distance.
         backbone: `alex` or `vgg`.
         weights: a file with the weights of the trunk; None: torchvision's, in $TORCH_HOME/hub/checkpoints.
 
     Raises:
         gsbench.measure.perceptual.BackboneMissing: no file is named, and torchvision's is not on this machine.
-        InputError: they are not two images of one size, they are too small, the backbone is unknown, or the file
-            `weights` is missing or holds other weights.
+        InputError: the arguments are not two images of one size, the images are too small, the backbone is unknown, or
+            the file `weights` is missing or holds other weights.
 
     Example:
         On a machine without the weights; with them it is 0.0.
@@ -150,7 +150,7 @@ def quantise(image: Tensor) -> Tensor:  # [..., 3]
 
 @dataclass(frozen=True)
 class Quality:
-    """The quality over the views of a split, by the names of the record."""
+    """The metrics of a split: the mean over its views and the value of each view, by the names in the record."""
 
     metrics: dict[str, float | None]  # means over the views
     missing: dict[str, str]  # why a metric is None
@@ -169,11 +169,12 @@ def evaluate(
     A metric is None, with the reason, where its backbone is missing or an image is too small for it.
 
     Args:
-        images: of the views of a split, renders beside ground truth.
+        images: pairs of a render and the ground truth, for the views of a split.
         background: the colour that the truth was composited over; an image of only this colour scores
             `psnr_background_only`.
         quantised: whether renders are rounded to 8 bits first.
-        weights: trunk files by backbone; see `gsbench.measure.perceptual.load`, and the InputError that it raises.
+        weights: the files with the weights of LPIPS' networks, by backbone; see `gsbench.measure.perceptual.load`, and
+            the InputError that it raises.
     """
     measures: dict[str, Callable[[Tensor, Tensor], float]] = {
         "psnr": psnr,

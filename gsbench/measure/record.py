@@ -42,7 +42,7 @@ METRICS = (
 
 @dataclass(frozen=True)
 class Effects:
-    """The effects that the model has."""
+    """Which effects the model has: time, direction and AGR."""
 
     time: bool
     direction: bool
@@ -51,7 +51,7 @@ class Effects:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """The quality of one rendered view; None if it is missing or not finite."""
+    """The metrics of one rendered view; a metric is None if it is missing or not finite."""
 
     name: str
     psnr: float | None = None
@@ -63,7 +63,7 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Cost:
-    """The cost of the run."""
+    """What the run cost: seconds, memory, frame times and the size of the model."""
 
     train_s: float  # seconds of the whole training loop less evaluation
     stage_s: dict[str, float]  # the same by stage
@@ -94,7 +94,7 @@ RENAMED_EFFECT_SETS = {"sliced": "conditioned", "still": "static"}  # .. and nam
 
 @dataclass(frozen=True)
 class Gate:
-    """The decision of one gate, by gsbench.effects."""
+    """One removal of effects from Gaussians (a gate of gsbench.effects): when it was done, its result and its loss."""
 
     share: float  # of the squared error, the budget of the prediction
     predicted_db: float
@@ -113,7 +113,7 @@ class Gate:
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return a gate as JSON with its present names, also if an older gsbench wrote it."""
+        """Return the JSON of a gate with the present names of its keys, also if an older gsbench wrote it."""
         plain = {RENAMED_KEYS.get(key, key): value for key, value in plain.items()}
         if isinstance(rows := plain.get("rows"), dict):
             plain["rows"] = {RENAMED_EFFECT_SETS.get(name, name): count for name, count in rows.items()}
@@ -122,7 +122,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class Direction:
-    """What direction is worth to a model in dB and ms; no test on a scene detects it."""
+    """What freezing the direction of view in all Gaussians of a trained model changes in dB and ms."""
 
     kept: float  # share of the Gaussians whose slices change with the direction of view
     loss_db: float  # PSNR lost on the evaluated split if direction were frozen in all of them
@@ -132,7 +132,7 @@ class Direction:
 
 @dataclass(frozen=True)
 class OnDemand:
-    """Which effects were chosen for the scene and for each Gaussian."""
+    """Which effects (time, direction, AGR) were chosen for the scene and for its Gaussians, and why."""
 
     screen: TimeScreen | None = None
     gates: list[Gate] = field(default_factory=list)
@@ -142,7 +142,7 @@ class OnDemand:
 
 @dataclass(frozen=True)
 class Provenance:
-    """The provenance of the numbers; `gsbench.measure.provenance.provenance` fills it in."""
+    """Where the numbers come from: commit, versions, machine, config and time (made by gsbench.measure.provenance)."""
 
     git_commit: str | None  # "-dirty" at the end where tracked files were changed; None outside a git checkout
     versions: dict[str, str]  # python and the packages that the numbers depend on
@@ -162,7 +162,7 @@ class Provenance:
 
     @property
     def machine(self) -> str:
-        """Return the machine and the threads as text; seconds are comparable only where it is equal."""
+        """Return the machine and the threads as text; seconds of two runs are comparable only if this text is equal."""
         return named(self.device, self.threads, self.hardware)
 
 
@@ -202,7 +202,7 @@ def write(record: Record, path: Path) -> None:
     A metric that is not finite becomes null with its reason.
 
     Raises:
-        InputError: `read` would refuse this record; the message names the field.
+        InputError: the record is not valid, so `read` would refuse it; the message names the field.
     """
     try:
         plain = json.loads(json.dumps(dataclasses.asdict(_without_non_finite(record))))
@@ -246,10 +246,10 @@ def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, 
 
     Args:
         root: the folder of all results.
-        experiment: its name.
-        scene: its name.
+        experiment: the name of the experiment.
+        scene: the name of the scene.
         model: the label of the run: the model's name, with _agr or _noagr if it differs from the published method.
-        seed: at least 0 and below 2^63.
+        seed: the seed of the run, at least 0 and below 2^63.
         variant: the settings that differ from the experiment's; "" for none.
 
     Raises:
@@ -261,7 +261,7 @@ def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, 
 
 
 def model_folder(model: str, variant: str) -> str:
-    """Name the folder that holds all seeds of a model at a variant, which may be ""."""
+    """Name the folder of all seeds of a model with the settings of a variant, which may be ""."""
     return f"{model},{variant}" if variant else model
 
 

@@ -33,8 +33,8 @@ class RenderTimes:
     def fps(self) -> float:
         """Return frames per second: FPS = 1000 / p50, the median milliseconds of a render.
 
-        A render is timed from the query to the image, slices and AGR included, between two synchronisations of the
-        device, after warm-up renders; the evaluated views take turns.
+        A render starts with a camera and a time and ends with the image; slicing and AGR are included. It is timed
+        between two synchronisations of the device, after warm-up renders. The evaluated views take turns.
         """
         return 1000.0 / self.p50
 
@@ -58,15 +58,16 @@ def time_renders(
     warmup: int = 5,
     synchronise: Callable[[], None] = nothing_to_wait_for,
 ) -> RenderTimes:
-    """Time `render(i)`, i = 0..count-1, after `warmup` untimed calls.
+    """Time `count` calls of `render(i)`, i = 0, 1, ..., after `warmup` untimed calls.
 
     FPS in gsbench is 1000 / the median of these milliseconds. A call renders an image on the device from the model,
-    with slicing and AGR, and caches nothing for the next call. The device is idle at both ends of a timing.
+    with slicing and AGR, and caches nothing for the next call. The device is idle when a timing starts and when it
+    ends.
 
     Args:
-        render: renders frame i.
-        count: of timed calls.
-        warmup: of untimed calls before them.
+        render: the function that renders frame i.
+        count: number of timed calls.
+        warmup: number of untimed calls before them.
         synchronise: waits for the device.
 
     Raises:
@@ -95,8 +96,8 @@ def time_in_turns(
     """Time several functions frame by frame in turns, so that other load on the machine affects all equally.
 
     Args:
-        renders: each renders frame i, as in `time_renders`.
-        count: of timed calls of each.
+        renders: the functions to time; each renders frame i, as in `time_renders`.
+        count: number of timed calls of each function.
         synchronise: waits for the device.
     """
     times: list[list[float]] = [[] for _ in renders]
@@ -127,7 +128,7 @@ class StageClock:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Time the block; raises InputError inside another stage, as the seconds would count twice."""
+        """Time a block of work; raises InputError inside another stage, because the seconds would count twice."""
         if self._current is not None:
             raise InputError(f"stages: '{name}' was opened inside '{self._current}'; close that one first")
         self._current = name
@@ -206,12 +207,12 @@ class Laps:
 class Effort:
     """Sums the CPU-seconds of this process over blocks, ``with effort: ...``, and averages the load of the machine.
 
-    Both show whether the machine did other work: the load counts all processes that ran or waited, and CPU-seconds do
-    not grow while another process runs. An unknown value is None.
+    The load average and the CPU-seconds show whether the machine did other work: the load counts all processes that ran
+    or waited, and CPU-seconds do not grow while another process runs. An unknown value is None.
     """
 
     def __init__(self) -> None:
-        """Begin without seconds."""
+        """Start with no CPU-seconds and no load."""
         self._seconds = self._cpu_s = self._load_s = 0.0
         self._began = 0.0, 0.0
 
@@ -237,7 +238,7 @@ class Effort:
 
     @property
     def load(self) -> float | None:
-        """Return the mean of `load()` over the seconds."""
+        """Return the mean load of the machine over the timed seconds."""
         mean = self._load_s / self._seconds if self._seconds else math.nan
         return mean if math.isfinite(mean) else None
 
@@ -304,7 +305,7 @@ def _clock_of(device: str) -> _Clock:
 
 
 def reset_peak_memory(device: str = "cpu") -> None:
-    """Reset the peak, so that a run does not report the peak of an earlier run in the same process (multirun)."""
+    """Reset the peak of memory, so that a run does not report that of an earlier run in the same process (multirun)."""
     if device.startswith("cuda"):
         import torch
 
@@ -316,7 +317,7 @@ def reset_peak_memory(device: str = "cpu") -> None:
 
 
 def peak_memory(device: str = "cpu") -> int:
-    """Return the peak bytes: on a GPU those that torch allocated, else the process' resident memory with libraries."""
+    """Return the peak of memory in bytes: on a GPU what torch allocated, else the process' resident memory."""
     if device.startswith("cuda"):
         import torch
 

@@ -48,9 +48,9 @@ def coefficients_within(
     """Tell which of the stored coefficients are within each Gaussian's order.
 
     Args:
-        packed: the Gaussians' orders.
-        degree: of the coefficients that are stored for each frequency.
-        waves: frequencies that are stored.
+        packed: the harmonic degree and Fourier order of each Gaussian, packed in one number.
+        degree: the harmonic degree of the coefficients that are stored for each frequency.
+        waves: the number of frequencies that are stored.
     """
     own = order_of(packed)
     degrees = packed.new_tensor([math.isqrt(k) for k in range((degree + 1) ** 2)])

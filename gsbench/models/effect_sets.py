@@ -22,7 +22,7 @@ class EffectSets(NamedTuple):
     intervals: Tensor | None = None  # [refined, 2] clips: AGR moves a row from a first to a last time; None: always
 
     def by_name(self, rows: int) -> dict[str, int]:
-        """Count the Gaussians of each effect set of NAMES, among the given number of rows."""
+        """Count by NAMES how many of the given number of Gaussians keep which effects."""
         frozen = [0, 0] if self.frozen is None else [int((self.frozen == bit).sum()) for bit in (TIME, DIRECTION)]
         conditioned = self.conditioned - self.refined - sum(frozen)
         return dict(zip(NAMES, (self.refined, conditioned, *frozen, rows - self.conditioned), strict=True))

@@ -236,7 +236,7 @@ class Gaussians4DModel(GatedModel):
         return torch.exp(-0.5 * self.lambda_of("time") * mahalanobis(factor[:, 3:], delta))
 
     def factors(self, raw: Raw) -> Tensor:
-        """Compute the factors R S with rows (x, y, z, t), t in clips, [N, 4, 4]."""
+        """Compute the factors R S with rows (x, y, z, t), [N, 4, 4]; the unit of t is the length of the sequence."""
         factor = rotation4d(raw["left_quats"], raw["right_quats"]) * sizes(raw["scales"])[:, None, :]
         return torch.cat([factor[:, :3], factor[:, 3:] / self.clock], 1)
 

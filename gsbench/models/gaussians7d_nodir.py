@@ -10,7 +10,7 @@ from gsbench.models.triangular import TimedModel
 
 @register("7dgs_nodir")
 class Gaussians7DWithoutDirectionModel(TimedModel):
-    """Gaussians conditioned on q = {t}."""
+    """Gaussians over position and time, which are sliced at a time, for any direction of view."""
 
     observes = ("time",)
     centers = ("means", "times")

@@ -19,7 +19,7 @@ class Query(NamedTuple):
 
     Args:
         center: the camera's position [3], world units.
-        time: in [0, 1], clips, []; None: the scene has no time.
+        time: the time in [0, 1], a tensor []; None if the scene has no time.
 
     Example:
         >>> import torch

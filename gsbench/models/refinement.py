@@ -21,7 +21,7 @@ def encode_time(time: Tensor, octaves: int = OCTAVES) -> Tensor:
 
 @functools.cache
 def _frequencies(octaves: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Return 2^k pi, [K], cached: on a GPU an operation on a few numbers costs as much as one on thousands."""
+    """Return the frequencies 2^k pi of K octaves, [K]; they are cached, because each operation on a GPU takes time."""
     return math.pi * 2.0 ** torch.arange(octaves, device=device, dtype=dtype)
 
 

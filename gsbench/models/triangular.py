@@ -166,7 +166,7 @@ class TriangularModel(GatedModel):
         self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=least.log()[:, None])
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Sample children along the parent's path if it is long in time, else from its slice.
+        """Sample children along the parent's path if the parent is long in time, else from its 3D Gaussian.
 
         In the reduced factor [T_qq 0; K T_qq T_pp] a child's shape is T_pp / 1.6 (space), or T_qq with its last row,
         that of t, divided by 1.6 (time). K does not change: a child moves as its parent did.

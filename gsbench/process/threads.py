@@ -34,7 +34,7 @@ def sleep_when_idle() -> None:
 
 
 def _crowd(runtime: ctypes.CDLL, made: threading.Event) -> None:
-    """Start one OpenMP thread more than there are processors, and keep them: they end with this thread."""
+    """Start one OpenMP thread more than there are processors, and keep this thread alive, because they end with it."""
     nothing = ctypes.CDLL(None).sched_yield  # each of them runs it once; it takes no argument
     runtime.GOMP_parallel(nothing, None, runtime.omp_get_num_procs() + 1, 0)
     made.set()

@@ -1,1 +1,1 @@
-"""Make tables and image strips from records, without torch."""
+"""Make tables and an HTML page from the records of runs; this package needs no torch."""

@@ -25,9 +25,9 @@ SAME_LOAD = 0.5  # mean loads further apart than this make seconds of two runs i
 
 @dataclass(frozen=True)
 class Limit:
-    """The difference up to which two means are equal, and the widest interval that shows that they are.
+    """The largest difference of two means that count as equal, and the widest interval that can show this.
 
-    Both are parts of the other folder's mean if the limit is relative.
+    If the limit is relative, both numbers are parts of the mean in the second folder.
     """
 
     equal: float
@@ -57,7 +57,7 @@ NONE = Estimate(math.nan, 0, 0, "")
 
 @dataclass(frozen=True)
 class Judged:
-    """A quantity of a model on a scene: the difference of the means, ours less theirs, and the verdict."""
+    """A quantity of a model on a scene: the mean in the first folder less that in the second, and the verdict."""
 
     ours: list[float]  # by run
     theirs: list[float]
@@ -91,7 +91,7 @@ class Comparison:
     only_theirs: list[str]
 
     def of(self, quantity: str, verdict: str) -> list[ComparedRuns]:
-        """List the rows whose quantity has this verdict."""
+        """List the rows in which a quantity has a given verdict."""
         return [row for row in self.rows if row.judged[quantity].verdict == verdict]
 
     @property
@@ -216,7 +216,7 @@ def _squares(*samples: list[float]) -> tuple[float, int]:
 
 
 def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
-    """Return why no quantity of two samples of runs can be compared; "" if all compare."""
+    """Return why no quantity of two samples of runs can be compared; "" if quantities can be compared."""
     if not ours or not theirs:
         return f"no run finished {'here' if not ours else 'there'}"
     first = theirs[0]
@@ -250,7 +250,7 @@ def _other_machine(ours: list[Record], theirs: list[Record]) -> str:
 
 
 def _judge(found: Judged, limit: Limit, p: float) -> Judged:
-    """Decide the verdict by RULE."""
+    """Decide by RULE whether two means agree, differ, or cannot be told."""
     if found.reason:
         return found
     unit = abs(fmean(found.theirs)) if limit.relative else 1.0
@@ -266,6 +266,6 @@ def _judge(found: Judged, limit: Limit, p: float) -> Judged:
 
 
 def _places(rows: list[ComparedRuns]) -> str:
-    """Name the first few models on scenes."""
+    """Name the first few of a list of (model, scene) pairs."""
     named = [f"{printable(row.model)} on {printable(row.scene)}" for row in rows[:3]]
     return ", ".join(named) + (f" and {len(rows) - 3} more" if len(rows) > 3 else "")

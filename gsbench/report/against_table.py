@@ -21,7 +21,7 @@ COLUMNS = [
 
 
 def tables(of: Comparison) -> list[Table]:
-    """Make a table with a line (ours / theirs) for each scene, model and seed, and the difference for each model."""
+    """Make a table with the values of both folders for each scene, model and seed, and each model's difference."""
     scenes = sorted({(row.experiment, row.dataset, row.scene) for row in of.rows})
     several = len({scene[:2] for scene in scenes}) > 1
     sections = []

@@ -1,4 +1,4 @@
-"""Compare models pair by pair, and price each effect in dB, seconds, milliseconds and bytes."""
+"""Compare models pair by pair, and say what each effect gains in dB and costs in seconds, milliseconds and bytes."""
 
 import itertools
 import math
@@ -20,7 +20,7 @@ NESTED = ("7dgs_nodir", "7dgs_nodir_agr")  # 7dgs less direction: differ from it
 
 @dataclass(frozen=True)
 class Pair:
-    """How much better one model is than another at the common variant."""
+    """How much better one model is than another, with the settings that most runs of the experiment share."""
 
     better: Configuration  # by its mean; by name where they tie
     other: Configuration
@@ -31,7 +31,7 @@ class Pair:
 
 
 def paired(group: Group) -> list[Weights]:
-    """Return the differences that `pairs` needs: of every two models at the common variant, including gated models.
+    """Return the differences that `pairs` needs: of every two models with the settings that most runs share.
 
     An ablation is compared with the full models, not with other ablations.
     """
@@ -43,8 +43,8 @@ def pairs(group: Group, family: Family) -> list[Pair]:
     """Compare the models that share a scene on the runs that both have finished; the largest difference comes first.
 
     Args:
-        group: the records.
-        family: holds `paired`.
+        group: the records of one experiment.
+        family: the adjusted comparisons of the report; it holds those of `paired`.
     """
     found = []
     for (_, a), (_, b) in paired(group):
@@ -61,8 +61,8 @@ def pairs(group: Group, family: Family) -> list[Pair]:
 def improvement(group: Group, a: Configuration, b: Configuration) -> float:
     """Return the probability that a run of `a` has a higher PSNR than one of `b` on the same view of the same scene.
 
-    Every run of `a` is compared with every run of `b`; a tie counts half; scenes count equally. Agarwal et al. 2021
-    (arXiv 2108.13264) compare runs so; here it is done for each view. NaN if they share no view.
+    Every run of `a` is compared with every run of `b`; equal values count half; scenes count equally. Agarwal et al.
+    2021 (arXiv 2108.13264) compare runs so; here it is done for each view. NaN if they share no view.
     """
     shares = []
     for scene in sorted(set(a.runs) & set(b.runs)):
@@ -94,7 +94,7 @@ class Price:
 
 @dataclass(frozen=True)
 class Cube:
-    """The 2 x 2 x 2 of time, direction and AGR, as far as it was run."""
+    """The eight models with and without time, direction and AGR, as far as they were run."""
 
     cells: dict[Cell, Configuration]
     prices: list[Price]
@@ -105,21 +105,21 @@ class Cube:
 
 
 def priced(group: Group) -> list[Weights]:
-    """Return the contrasts that `cube` needs, in each of PRICES."""
+    """Return the weighted sums of models that `cube` needs, for each quantity of PRICES."""
     cells, own, _ = _filled(group)
     return [_sum(of, weights) for _, weights in _contrasts() for of in (cells, own) if weights.keys() <= of.keys()]
 
 
 def cube(group: Group, family: Family) -> Cube:
-    """Price every effect whose cells were run at the common variant.
+    """Compute what time, direction and AGR gain and cost, from the eight models with and without them.
 
     An effect is priced with each of the other two on or off (12 differences). An interaction of two effects is the
     difference of two such prices (6), and that of three effects is the difference of two interactions. The mean effects
     need all eight cells.
 
     Args:
-        group: the records.
-        family: holds `priced`.
+        group: the records of one experiment.
+        family: the adjusted comparisons of the report; it holds those of `priced`.
     """
     cells, own, left_out = _filled(group)
     every: list[Cell] = list(itertools.product((False, True), (False, True), (False, True)))
@@ -136,7 +136,7 @@ def cube(group: Group, family: Family) -> Cube:
 
 
 def _filled(group: Group) -> tuple[dict[Cell, Configuration], dict[Cell, Configuration], list[str]]:
-    """Fill the cells of the cube.
+    """Find the runs of the eight models with and without time, direction and AGR (the cells).
 
     Returns:
         The configuration of each cell, the same with the models of NESTED, and the models left out because another
@@ -153,7 +153,7 @@ def _filled(group: Group) -> tuple[dict[Cell, Configuration], dict[Cell, Configu
 
 
 def is_single(name: str) -> bool:
-    """Tell whether a price is that of one effect, with stated other effects on."""
+    """Tell whether a price is that of one effect, in models whose other effects are stated."""
     return " × " not in name and MEAN not in name
 
 
@@ -163,7 +163,7 @@ def _cell(configuration: Configuration) -> Cell:
 
 
 def _words(cell: Cell) -> str:
-    """Name the effects of a cell."""
+    """Name the effects (time, direction, AGR) of one of the eight models."""
     on = [name for name, has in zip(FACTORS, cell, strict=True) if has]
     return " + ".join(on) or "no effect"
 
@@ -184,7 +184,7 @@ def _contrasts() -> list[tuple[str, dict[Cell, float]]]:
 
 
 def _given(name: str, held: list[int], values: tuple[bool, ...]) -> str:
-    """Name an effect with the other effects that are on."""
+    """Name an effect with the other effects of the compared models, as in "direction given time"."""
     on = [FACTORS[i] for i, value in zip(held, values, strict=True) if value]
     return f"{name}, with {' and '.join(on)}" if on else f"{name} alone" if len(held) == 2 else name
 
@@ -192,7 +192,7 @@ def _given(name: str, held: list[int], values: tuple[bool, ...]) -> str:
 def _weights(
     varied: tuple[int, ...], held: list[int], given: list[tuple[bool, ...]], share: float
 ) -> dict[Cell, float]:
-    """Return the weight of each cell: plus where an even number of the varied effects is off, minus otherwise."""
+    """Return the signed weights of the models whose weighted sum is an effect or an interaction of effects."""
     weights = {}
     for values in given:
         for on in itertools.product((False, True), repeat=len(varied)):
@@ -202,7 +202,7 @@ def _weights(
 
 
 def _price(family: Family, cells: dict[Cell, Configuration], name: str, weights: dict[Cell, float]) -> Price | None:
-    """Read a contrast in each unit; None if a cell is missing or no scene has all of them."""
+    """Compute a difference of models in dB, seconds, ms and MB; None if a model is missing or they share no scene."""
     if not weights.keys() <= cells.keys():
         return None
     sums = _sum(cells, weights)
@@ -218,5 +218,5 @@ def _price(family: Family, cells: dict[Cell, Configuration], name: str, weights:
 
 
 def _sum(cells: dict[Cell, Configuration], weights: dict[Cell, float]) -> Weights:
-    """Return the configurations of cells with their weights, those that are added first."""
+    """Return the configurations of a weighted sum with their weights, positive weights first."""
     return sorted(((w, cells[cell]) for cell, w in weights.items()), key=lambda term: (-term[0], term[1].model))

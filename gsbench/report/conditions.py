@@ -25,12 +25,12 @@ Get = Callable[[Record], str]
 def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:
     """List footnotes on protocol, data, machine, commit, versions and seeds; warnings come first.
 
-    They describe the finished runs, as only these have numbers: a failed run may have stopped before it knew its
-    backend or its data. If no run finished, there is no warning, as nothing is compared.
+    The footnotes describe the finished runs, as only these have numbers. A failed run may have stopped before it knew
+    its backend or its data. If no run finished, there is no warning, as nothing is compared.
 
     Args:
-        records: of one table.
-        spread: the meaning of ± in it.
+        records: the records of one table.
+        spread: what ± means in this table.
     """
     finished = [r for r in records if r.status == "ok"]
     notes = _stated(finished or records, spread)
@@ -113,7 +113,7 @@ def _seeds(records: list[Record], spread: str) -> str:
 
 
 def _goes_with_scene(records: list[Record], get: Get) -> bool:
-    """Tell whether each scene has a single value."""
+    """Tell whether all runs of a scene have the same value, so that values differ only between scenes."""
     return len({(r.scene, get(r)) for r in records}) == len({r.scene for r in records})
 
 

@@ -1,7 +1,7 @@
 """Group the records of an experiment by model, variant and scene, and read quantities from them.
 
 A configuration is a model with a variant, such as another length or capacity. Its runs differ only in scene and seed;
-on a frontier it is one point.
+in a figure it is one point.
 """
 
 import math
@@ -21,7 +21,7 @@ Values = npt.NDArray[np.float64]
 def psnr_val(record: Record) -> float:
     """Return the PSNR on val at the end of the run, dB; NaN if it was not measured.
 
-    The curve ends before the gate at the end, so the gate's loss on val is subtracted.
+    The training curve ends before effects are removed from the finished model, so the loss by this is subtracted.
     """
     if record.protocol.get("eval_split") == "val":
         return _number((record.metrics or {}).get("psnr"))
@@ -45,7 +45,7 @@ OF_THE_MACHINE = ("seconds", "cpu_s", "ms")  # quantities that compare only betw
 
 @dataclass(frozen=True)
 class Configuration:
-    """The finished runs of a model at one variant."""
+    """The finished runs of a model with the same settings."""
 
     model: str
     variant: str  # empty: as the experiment has it
@@ -109,14 +109,14 @@ class Group:
 
     @cached_property
     def series(self) -> list[str]:
-        """Name the frontiers, also of runs that failed: one for each model, and one for its gated runs."""
+        """Name the curves of the report: one for each model, and one for its runs from which effects were removed."""
         return sorted({self.series_of(r) for r in self.records})
 
     def series_of(self, record: Record) -> str:
-        """Name the frontier that a run belongs to.
+        """Name the curve of the report that a run belongs to.
 
-        The lengths, capacities and budgets of a model share a frontier, and its gated runs have their own. Where all
-        runs were gated alike, the name is that of the model.
+        Runs of a model with other lengths and sizes share a curve. Runs from which effects were removed
+        (`effects.gate`) have a curve of their own, unless this holds for all runs.
         """
         own = gating(record)
         return f"{record.model}, {own}" if own and len(self._gatings) > 1 else record.model
@@ -127,20 +127,20 @@ class Group:
 
     @cached_property
     def variant(self) -> str:
-        """Return the variant at which models are compared: the most common one; at a tie, one without ablation."""
+        """Return the variant at which models are compared: that of most runs, preferably one without ablation."""
         shared = Counter(c.variant for c in self.configurations)
         return min(shared, key=lambda variant: (-shared[variant], is_ablated(variant), variant), default="")
 
     @cached_property
     def main_configurations(self) -> list[Configuration]:
-        """Return the configuration of every model at the common variant."""
+        """Return the configuration of every model with the settings that most runs share."""
         return [c for c in self.configurations if c.variant == self.variant]
 
     @cached_property
     def compared(self) -> list[Configuration]:
         """Return the configurations that are compared in pairs.
 
-        Their variants equal the common one, apart from gates and ablations.
+        These have the settings that most runs share, apart from ablations and the removal of effects.
         """
         return [c for c in self.configurations if _common(c.variant) == _common(self.variant)]
 
@@ -151,15 +151,15 @@ class Group:
 
     @cached_property
     def covered(self) -> list[str]:
-        """Return the scenes that every model has finished at the common variant, over which averages are taken."""
+        """Return the scenes over which averages are taken, those that every model finished with the common settings."""
         main = self.main_configurations
         return [s for s in self.scenes if main and all(s in c.runs for c in main)]
 
     @cached_property
     def basis(self) -> list[str]:
-        """Return the scenes over which answers are averaged.
+        """Return the scenes over which the report averages its answers.
 
-        These are the covered scenes; if there are none, the scene with most configurations.
+        These are the scenes that every model finished (`covered`), or else the scene with most configurations.
         """
         if self.covered or not self.configurations:
             return self.covered
@@ -196,7 +196,10 @@ class Group:
         return [paired for s in scenes if (paired := self._paired(weights, s, quantity)).size]
 
     def _paired(self, weights: list[tuple[float, Configuration]], scene: str, quantity: str) -> Values:
-        """Return the weighted sum on one scene, [seeds, views]; it is empty if no seed or no view is shared."""
+        """Return the weighted sum on one scene, [seeds, views].
+
+        Empty if the configurations share no seed or no view.
+        """
         by_seed = [{r.seed: s for r in c.runs[scene] if (s := self.scores(r, quantity))} for _, c in weights]
         seeds = sorted(set.intersection(*map(set, by_seed)))
         every = [scores[seed] for scores in by_seed for seed in seeds]
@@ -207,7 +210,7 @@ class Group:
         return total
 
     def scores(self, record: Record, quantity: str) -> dict[str, float]:
-        """Return a quantity by view; a single value where it is not measured by view."""
+        """Return a quantity by view; a single value if the quantity is not measured by view."""
         if quantity == "psnr" and record.per_view:
             return {v.name: v.psnr for v in record.per_view if v.psnr is not None}
         value = self.value(record, quantity)
@@ -223,7 +226,7 @@ def groups(records: list[Record]) -> list[Group]:
 
 
 def gating(record: Record) -> str:
-    """Return when the Gaussians of a run were gated, as a variant writes it; "" if that is its model's default."""
+    """Return when effects were removed in a run, as its variant writes it; "" if this is the model's default."""
     config = record.provenance.config
     effects, model = (part if isinstance(part := config.get(name), dict) else {} for name in ("effects", "model"))
     gate = effects.get("gate", "off")
@@ -241,7 +244,7 @@ def without(variant: str, *names: str) -> str:
 
 
 def _common(variant: str) -> str:
-    """Return a variant without its settings of gates and ablations."""
+    """Return a variant without its settings of ablations and of the removal of effects."""
     return without(variant, "gate", "budget_db", "ablation")
 
 

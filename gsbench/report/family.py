@@ -13,7 +13,7 @@ Key = tuple[tuple[str, str, float], ...]
 
 @dataclass(frozen=True)
 class Tested:
-    """A contrast of configurations with its own interval and with its p-value among all comparisons of the report."""
+    """A difference of configurations with its interval, and its p-value corrected for all comparisons of the report."""
 
     difference: Estimate
     p: float  # of no difference, after Holm for the whole family; NaN where no spread is known
@@ -33,20 +33,20 @@ class Family:
     """All comparisons of one experiment that a report makes; in each quantity they are adjusted together."""
 
     def __init__(self, group: Group, asked: Mapping[str, Iterable[Weights]]) -> None:
-        """Estimate every contrast once.
+        """Estimate every difference once, and adjust the p-values of each quantity together.
 
         Args:
-            group: the records.
-            asked: the contrasts by quantity of `configurations.QUANTITIES`. A contrast that is asked for twice, or
-                with the opposite sign, counts once.
+            group: the records of one experiment.
+            asked: the differences (weighted sums of configurations) by quantity of `configurations.QUANTITIES`. A
+                difference that is asked for twice, or with the opposite sign, counts once.
         """
         self._found = {quantity: _tested(group, quantity, contrasts) for quantity, contrasts in asked.items()}
 
     def of(self, weights: Weights, quantity: str = "psnr") -> Tested:
-        """Return a contrast of the family, with the sign of these weights.
+        """Return one of the estimated differences, with the sign of these weights.
 
         Raises:
-            KeyError: the family has no such contrast.
+            KeyError: this difference was not asked for.
         """
         key, sign = _key(weights)
         found = self._found[quantity][key]

@@ -1,4 +1,4 @@
-"""Find the frontier of a model over lengths and capacities, what a budget buys, and the time to a quality."""
+"""Find each model's best PSNR by cost (its frontier), the best model within a budget, and the time to reach a PSNR."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ class FrontierPoint:
 
     @property
     def series(self) -> str:
-        """Return the frontier that the point belongs to: that of a model, or of a gated one."""
+        """Return the curve of the report that the point belongs to: the model, or the model with effects removed."""
         return self.configuration.series
 
 
@@ -45,7 +45,7 @@ def points(group: Group, scenes: list[str]) -> list[FrontierPoint]:
 
 
 def frontier(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
-    """Return the points that beat all cheaper ones in PSNR, by rising cost."""
+    """Return the points that have a higher PSNR than all cheaper points, by rising cost."""
     best: list[FrontierPoint] = []
     for point in sorted(of, key=lambda p: (p.cost[cost], -p.psnr.mean)):
         if not math.isnan(point.cost[cost]) and (not best or point.psnr.mean > best[-1].psnr.mean):
@@ -54,7 +54,7 @@ def frontier(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
 
 
 def beaten(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
-    """Return the points that another point beats, by their means: see `beats`."""
+    """Return the points that are beaten by another point in PSNR and cost, see `beats`."""
     known = [p for p in of if not math.isnan(p.cost[cost])]
     return [p for p in known if any(beats(q, p, cost) for q in known)]
 
@@ -67,7 +67,7 @@ def beats(q: FrontierPoint, p: FrontierPoint, cost: str) -> bool:
 
 @dataclass(frozen=True)
 class BudgetChoice:
-    """The best point within a budget, and how the best of each other model compares with it on the evaluated split."""
+    """The best point within a budget, and its difference to each other model's best point on the evaluated split."""
 
     point: FrontierPoint
     on_val: bool  # whether it was chosen on val; otherwise on what is shown, as some runs have no PSNR on val
@@ -83,7 +83,7 @@ def has_val(of: Sequence[FrontierPoint]) -> bool:
 
 
 def ranked(of: Sequence[FrontierPoint]) -> list[FrontierPoint]:
-    """Return points by falling PSNR on val, or by that on the evaluated split if `has_val` is false."""
+    """Return points by falling PSNR on val, or on the evaluated split if `has_val` is false."""
     on_val = has_val(of)
     return sorted(of, key=lambda p: -(p.val if on_val else p.psnr.mean))
 
@@ -109,10 +109,10 @@ def choose(of: Sequence[FrontierPoint], cost: str, budget: float, family: Family
     The best point of each other model within the budget is compared with it, paired over seeds and views.
 
     Args:
-        of: the points.
-        cost: of COSTS.
+        of: the points among which to choose.
+        cost: the cost that the budget limits, one of COSTS.
         budget: seconds, milliseconds or MB.
-        family: holds `contested`.
+        family: the adjusted comparisons of the report; it holds those of `contested`.
     """
     found = contest(of, cost, budget)
     if not found:
@@ -131,7 +131,7 @@ def choose(of: Sequence[FrontierPoint], cost: str, budget: float, family: Family
 
 @dataclass(frozen=True)
 class Target:
-    """A PSNR on val that was set by rule, and the seconds each model needs for it on one scene."""
+    """A round value of PSNR on val, and the seconds of training that each model needs to reach it on one scene."""
 
     scene: str
     rule: str
@@ -140,10 +140,10 @@ class Target:
 
 
 def targets(group: Group) -> list[Target]:
-    """Return the targets of every scene and the seconds that the frontier of each model needs for them.
+    """Return the targets (values of PSNR on val) of every scene, and the seconds that each model needs for them.
 
     The seconds are those of the quickest finished configuration whose mean over the seeds reaches the target. Nothing
-    is interpolated: a run of another length was not done.
+    is interpolated between lengths of training.
     """
     found = []
     for scene in group.scenes:
@@ -159,7 +159,7 @@ def targets(group: Group) -> list[Target]:
 
 
 def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, float]]:
-    """Return the targets of a scene: round numbers within the range of its configurations, and the paper's number."""
+    """Return the targets of a scene: round values of PSNR between the worst and the best result, and the paper's."""
     if not reached:
         return []
     rules = [(f"{psnr:g} dB", psnr) for psnr in round_numbers(min(reached), max(reached))]

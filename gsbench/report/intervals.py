@@ -29,7 +29,7 @@ LEAST_P = 1e-12
 
 @dataclass(frozen=True)
 class Spread:
-    """The variance of a mean over one level, and its degrees of freedom."""
+    """The variance of a mean over seeds, views or scenes, and its degrees of freedom."""
 
     variance: float
     freedom: float
@@ -43,7 +43,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over scenes with its interval; without one if no spread is known."""
+    """A mean over scenes with its 95 % interval; without an interval if there is only one seed."""
 
     mean: float  # NaN: nothing was measured
     scenes: int
@@ -92,7 +92,8 @@ def estimate(scenes: list[Values], *, generalise: bool = True) -> Estimate:
     """Estimate the mean over scenes of the mean over seeds and views.
 
     Args:
-        scenes: for each scene [seeds, views], every seed with the same views; one column if there are no views.
+        scenes: for each scene the values [seeds, views], every seed with the same views; one column if there are no
+            views.
         generalise: from three scenes on the interval is over scenes like these, otherwise over these scenes.
     """
     if not scenes:
@@ -115,7 +116,7 @@ def over_seeds(values: Sequence[float]) -> Estimate:
     """Estimate the mean of one model's runs on a scene; its interval is over seeds, on this scene and these views.
 
     Args:
-        values: one for each seed.
+        values: one value for each seed.
     """
     return estimate([np.array(values, dtype=np.float64)[:, None]], generalise=False)
 

@@ -17,12 +17,12 @@ def watch(folder: Path, *, train: bool = False, every: float = EVERY) -> int:
     """Write ``table.md``, ``table.csv`` and ``report.html`` as records arrive, until Ctrl-C; return the exit code.
 
     A folder without records, or with a damaged record, is reported once and read again later. The page reloads itself
-    while this runs; the last page does not.
+    in the browser until `watch` ends.
 
     Args:
-        folder: where records are or will be.
-        train: as in `gsbench.report.tables.build`.
-        every: seconds between two looks.
+        folder: the folder where records are or will be.
+        train: whether to show PSNR on training views too.
+        every: seconds between two looks at the folder.
     """
     seen, said = State(), ""
     try:

@@ -20,7 +20,7 @@ DEGREES = 4  # of harmonics: 0, 1, 2, 3
 
 @dataclass(frozen=True)
 class Decided:
-    """The decisions on a scene for the runs of a configuration, averaged over the seeds."""
+    """The decisions about effects (time, direction, AGR) on a scene for one configuration, averaged over the seeds."""
 
     scene: str
     configuration: Configuration
@@ -40,12 +40,12 @@ class Decided:
 
     @property
     def before(self) -> float:
-        """Return the number of Gaussians before the first gate."""
+        """Return the number of Gaussians before any effect was removed."""
         return sum(self.rows.values())
 
     @property
     def left(self) -> float:
-        """Return the number of Gaussians after the last gate."""
+        """Return the number of Gaussians after the last removal of effects."""
         return self.before - self.rows.get(REMOVED, 0.0)
 
 
@@ -94,7 +94,7 @@ def _ends(gates: list[Gate]) -> bool:
 
 
 def _rows(gates: list[Gate], name: str) -> int:
-    """Count the Gaussians of an effect set after the last gate; the removed ones are those of all gates."""
+    """Count the Gaussians by the effects that they keep at the end, and those that were removed."""
     of = gates if name == REMOVED else gates[-1:]
     return sum(max(0, gate.rows.get(name, 0)) for gate in of)
 

@@ -25,7 +25,7 @@ class ModelRecipe(NamedTuple):
 
 @dataclass(frozen=True)
 class Pool:
-    """Runs of one data set that may share a table."""
+    """Runs of one data set with the same protocol, which may share a table."""
 
     dataset: str
     experiment: str
@@ -40,7 +40,7 @@ class Pool:
 
     @property
     def effort(self) -> int:
-        """Return pixels of the pool's largest image times iterations: the higher, the nearer to the paper."""
+        """Return pixels of the largest image times iterations; runs with more are nearer to the paper."""
         return self.steps * max(_pixels(_size(r)) for r in self.runs)
 
 
@@ -130,12 +130,12 @@ def finished(records: list[Record], one: ModelRecipe, scenes: Sequence[str]) -> 
 
 
 def _size(record: Record) -> str:
-    """Return the size of a run's images as width x height; the text of the record is not trusted."""
+    """Return the size of a run's images as its record has it, such as "400x400", with control characters escaped."""
     return printable(record.protocol.get("resolution", "a size not recorded"))
 
 
 def _pixels(size: str) -> int:
-    """Count the pixels of a size; 0 if the text is no size."""
+    """Count the pixels of a size such as "400x400"; 0 if the text is not a size."""
     numbers = size.split("x")
     return int(numbers[0]) * int(numbers[1]) if re.fullmatch(r"[0-9]{1,6}x[0-9]{1,6}", size) else 0
 

@@ -17,8 +17,8 @@ def mean(runs: Mapping[str, Sequence[Record]], key: str) -> Estimate:
     """Estimate the mean of a quantity over scenes, of its mean over seeds; NaN if it is missing from a run or scene.
 
     Args:
-        runs: finished ones, by scene.
-        key: a column of `gsbench.report.tables.tidy`.
+        runs: finished runs by scene.
+        key: the quantity, a column of `gsbench.report.tables.tidy`.
     """
     scenes = [np.array([[_number(quantities(run).get(key))] for run in seeds]) for seeds in runs.values()]
     if any(len(scene) == 0 or np.isnan(scene).any() for scene in scenes):

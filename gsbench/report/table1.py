@@ -146,7 +146,7 @@ class _Table1Builder:
         return rows
 
     def _paper(self, model: str, scenes: list[str]) -> dict[str, float]:
-        """Return the paper's numbers by column, averaged over `scenes`; empty if it has none of this data."""
+        """Return the paper's numbers by column, averaged over `scenes`; empty if the paper lacks this data set."""
         if self.kind != "paper":
             return {}
         rows = [row for scene in scenes if (row := paper.paper_row(self.dataset, scene, model))]
@@ -174,7 +174,7 @@ def _signed(column: QuantityColumn, difference: float) -> str:
 
 
 def _with_best(rows: list[Row]) -> list[Row]:
-    """Mark the measured rows whose final PSNR is the highest as it is shown."""
+    """Mark the measured rows with the highest final PSNR, compared as rounded in the table."""
     shown = {row.cells["psnr"].partition(" ")[0] for row in rows if row.seeds} - {EMPTY}
     best = max(shown, key=float, default=None)
     return [

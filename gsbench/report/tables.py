@@ -101,8 +101,8 @@ def build(records: list[Record], *, train: bool = False, machine: str | None = N
     """Make a table for every experiment and data set in `records`, sorted by name.
 
     Args:
-        records: of any number of experiments.
-        train: also show `psnr_train`.
+        records: the records of one or more experiments.
+        train: whether to show PSNR on training views too.
         machine: whose seconds and FPS are shown, by `Provenance.machine`; None: in each table that of most runs.
     """
     return [_TableBuilder(group.records, train, machine or group.machine).table() for group in groups(records)]
@@ -112,8 +112,8 @@ def of_one_machine(records: list[Record], machine: str) -> list[str]:
     """Name the machine whose seconds a table shows, and the runs left out; nothing if all were on one machine.
 
     Args:
-        records: of the table.
-        machine: as in `build`.
+        records: the records of the table.
+        machine: the machine whose seconds are shown; None: that of most runs.
     """
     others = Counter(r.provenance.machine for r in records if r.status == "ok" and r.provenance.machine != machine)
     if not others:
@@ -153,7 +153,7 @@ class _TableBuilder:
         return [math.nan if q[column.key] is None else float(q[column.key]) for q in counted] or [math.nan]
 
     def _name(self, record: Record) -> str:
-        """Name the row of a run by its model, and by its variant if it is not the common one."""
+        """Name the row of a run by its model, and by its settings if they differ from those of most runs."""
         return f"{record.model} {record.variant}" if record.variant != self.common else record.model
 
     def table(self) -> Table:

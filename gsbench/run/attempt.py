@@ -1,4 +1,4 @@
-"""Attempt a run in four parts: prepare it, resolve its model, fit, measure; and describe what came of it."""
+"""Do a run in four parts (prepare, choose the model, train, measure), and describe its result in a record."""
 
 import sys
 from dataclasses import replace
@@ -22,10 +22,10 @@ from gsbench.train.loop import Trainer
 
 
 class Attempt:
-    """One attempt at a run. It can describe its state in a record, also where an error stopped it."""
+    """One attempt at a run. Its result can be described in a record, also if an error stopped it."""
 
     def __init__(self, this: Run) -> None:
-        """Take a run that has a name and a folder; nothing is read or checked yet."""
+        """Take a run that has a name and a folder; no file is read and no setting checked yet."""
         self.this = this
         self.resolved = Resolved(before_scene(this.config))
         self.model: GaussianModel | None = None
@@ -53,7 +53,7 @@ class Attempt:
         return self.model, scene
 
     def fit(self, model: GaussianModel, scene: Scene) -> Trainer:
-        """Resolve the model of model=auto, and train to the end; raises as `gsbench.run.fitting.fit`."""
+        """Choose the model if it is model=auto, and train to the end; raises as `gsbench.run.fitting.fit`."""
         if is_auto(self.this.config):
             self.resolved = resolve(self.this, scene)
             self.model = model = build(self.resolved.config)
@@ -86,7 +86,7 @@ class Attempt:
     def draw(self) -> None:
         """Write pictures.png of the measured views, and effect_sets.png of a model whose effects were chosen.
 
-        It is called after the record is written, so a full disk costs the pictures and not the record.
+        The pictures are drawn after the record is written, so a full disk costs the pictures and not the record.
         """
         for name, image in self._images.items():
             path = self.this.folder / name
@@ -99,8 +99,8 @@ class Attempt:
         """Describe the run in a record without measurements: its config, its machine and how it ended.
 
         Args:
-            status: ok, failed or diverged.
-            reason: why it failed or diverged; None if it ended well.
+            status: how the run ended: ok, failed or diverged.
+            reason: why the run failed or diverged; None if it is ok.
         """
         config, scene, this = self.resolved.config, self.scene, self.this
         observes = models.find(config.model.name, config.model.module).observes

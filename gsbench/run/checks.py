@@ -117,7 +117,7 @@ def trained_start(config: Config) -> TrainedGaussians | None:
 
 
 def lpips_weights(config: Config) -> dict[str, Path]:
-    """Return the files of LPIPS' trunks that the config names, by backbone."""
+    """Return the files with weights of LPIPS' networks that the config names, by network."""
     given = {"alex": config.protocol.lpips_alex, "vgg": config.protocol.lpips_vgg}
     return {backbone: Path(file).expanduser() for backbone, file in given.items() if file}
 
@@ -228,13 +228,13 @@ def data_root(root: str) -> Path:
 
 
 def check_gates(model: GaussianModel, config: Config) -> None:
-    """Raise InputError if the config asks for gates and the model cannot be gated."""
+    """Raise InputError if the config asks to remove effects (`effects.gate`) and the model does not support this."""
     if config.effects.gate != "off":
         as_gated(model)
 
 
 def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
-    """Raise InputError if the scene cannot train the model: it has no times, or all cameras are at one place."""
+    """Raise InputError if the scene cannot train the model: the scene has no times, or all cameras are at one place."""
     if ("time" in model.observes or config.agr) and not scene.has_time:
         what = "agr=true" if config.agr else config.model.name
         raise InputError(f"{what}: expected a scene with times, {scene.name} has none: use 3dgs or 6dgs, agr=false")

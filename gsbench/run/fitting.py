@@ -31,9 +31,9 @@ def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: Traine
     """Initialise a model and prepare its training.
 
     Args:
-        model: without Gaussians.
-        scene: gives the views, and the points if the data set has some.
-        config: of the run.
+        model: the model, without Gaussians yet.
+        scene: the scene with the views, and with initial points if the data set has some.
+        config: the config of the run.
         start: trained Gaussians to start from; None: points.
     """
     random = generator(config.seed)
@@ -49,10 +49,10 @@ def fit(trainer: Trainer, this: Run, resolved: Resolved, plain: dict[str, Any]) 
     """Train to the end, starting from this training's checkpoint if the run's folder has one.
 
     Args:
-        trainer: at step 0.
-        this: the run.
-        resolved: its config, and the seconds of the time screen, which count as training.
-        plain: the config in plain values, for the checkpoint.
+        trainer: the training, at step 0.
+        this: the run to train, with its folder.
+        resolved: the config of the run, and the seconds of the test for time, which count as training.
+        plain: the config as plain values, for the checkpoint.
 
     Raises:
         InputError: the checkpoint is damaged, or no Gaussian is left.

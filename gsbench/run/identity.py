@@ -1,4 +1,4 @@
-"""Identify a run by the settings that its training reads: give it a label, a variant and a folder."""
+"""Identify a run by the settings that its training reads: give the run a label, a variant and a folder."""
 
 import hashlib
 import json
@@ -124,7 +124,10 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
 
 
 def _storable(value: Any) -> Any:
-    """Convert values that a record cannot hold, such as NaN, to text; the run is refused, and its row says why."""
+    """Convert values that a record cannot hold, such as NaN, to text. A run with them is refused.
+
+    Its record shows the text.
+    """
     if isinstance(value, dict):
         return {key: _storable(one) for key, one in value.items()}
     if isinstance(value, float):

@@ -28,7 +28,7 @@ LARGEST_EXTENT = 1e18  # world units: squares stay finite in single precision
 
 @dataclass(frozen=True)
 class SceneDescription:
-    """The facts about a scene that rendering a model of it needs, without images."""
+    """The facts about a scene that are needed to render a model of this scene, without images."""
 
     name: str
     fingerprint: str  # Scene.fingerprint of the data that the model was trained on
@@ -63,9 +63,9 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     Only the checkpoint is read. It is not trusted: nothing in it is executed, and its config and tensors are checked.
 
     Args:
-        folder: of the run, such as results/mini/suzanne/7dgs/seed0.
-        device: to render on.
-        backend: to render with, whatever the run was trained with: auto, reference, cpu or cuda.
+        folder: the folder of the run, such as results/mini/suzanne/7dgs/seed0.
+        device: the device to render on.
+        backend: the backend to render with, whatever the run was trained with: auto, reference, cpu or cuda.
 
     Raises:
         InputError: the folder has no checkpoint, or the checkpoint is damaged or not of its own config.
@@ -111,7 +111,7 @@ def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
     """Load the scene that a run was trained on.
 
     Args:
-        run: whose config names the scene.
+        run: the run whose config names the scene.
         data_root: the folder of its data set, if it differs from the one in the config.
 
     Raises:
@@ -133,7 +133,7 @@ def own_root(root: str, where: Path) -> str:
     """Return the data.root that a checkpoint names, for use if the user names none.
 
     Raises:
-        InputError: it is a package other than that of the embedded scenes; finding its files would import it.
+        InputError: the data are in a Python package other than gsbench's; to find its files would import the package.
     """
     if root.startswith(PACKAGE) and root != EMBEDDED:
         raise InputError(f"{where}: expected data in a folder or in {EMBEDDED}, its checkpoint names {root!r:.80}, "

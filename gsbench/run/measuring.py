@@ -24,7 +24,7 @@ Pairs = list[tuple[npt.ArrayLike, npt.ArrayLike]]  # render and ground truth, [H
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured of a fitted model, for its record, and the images that people look at."""
+    """What was measured of a trained model, for its record, and some of its images for pictures.png."""
 
     metrics: dict[str, float | None]
     missing: dict[str, str]  # why a metric has no value
@@ -38,9 +38,9 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
     """Measure a fitted model on the evaluated views.
 
     Args:
-        trainer: at its end.
-        config: of the run.
-        with_effect_sets: whether the Gaussians are drawn by their effect sets too.
+        trainer: the finished training.
+        config: the config of the run.
+        with_effect_sets: whether to draw Gaussians in the colours of the effects that they keep, too.
     """
     views = trainer.views
     shown: Pairs = []
@@ -106,7 +106,7 @@ def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dic
 
 
 def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[str, float | None], dict[str, str]]:
-    """Add the metrics of the evaluated split at the best iterations to those of the last iteration."""
+    """Add PSNR at the iterations that were best on val or on test to the metrics of the last iteration."""
     metrics, missing = dict(quality.metrics), dict(quality.missing)
     metrics["psnr_best_on_val"] = trainer.best.eval_at_best_val
     if config.scene.eval_split == "val":

@@ -1,4 +1,4 @@
-"""Separate the overrides that decide a run's numbers from those that set its results folder or its launcher."""
+"""Separate the overrides that decide a run's results from those that only set its folder or how it is launched."""
 
 import re
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ _LAUNCH = re.compile(r"[+~]*launch\b")
 
 
 def deciding(overrides: Sequence[str]) -> list[str]:
-    """Return the overrides that decide a run's numbers, sorted: equal for two commands of the same run."""
+    """Return the overrides that decide a run's results, sorted; two commands of the same run have the same ones."""
     return sorted(present_override(one) for one in overrides if not _UNNAMED.match(one))
 
 

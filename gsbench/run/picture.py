@@ -1,4 +1,4 @@
-"""Draw the Gaussians of a finished run by effect set, as one of the evaluated cameras sees them."""
+"""Draw the Gaussians of a finished run in the colours of the effects that they keep, seen by an evaluated camera."""
 
 from pathlib import Path
 
@@ -15,13 +15,13 @@ def draw_run(folder: Path, camera: int, time: float | None, data_root: str | Non
     """Draw `gsbench.effects.picture.draw` of a run: uint8 [H', W', 3] RGB.
 
     Args:
-        folder: of the run; its checkpoint is read.
-        camera: the number of the evaluated view.
-        time: in [0, 1]; None: that of the view.
-        data_root: the folder of the data set; by default that of the run.
+        folder: the folder of the run, which has its checkpoint.
+        camera: the number of the evaluated view whose camera is used.
+        time: the time in [0, 1]; None: the time of this view.
+        data_root: the folder of the data set; by default the one that the run was trained on.
 
     Raises:
-        InputError: there is no run, no data or no such view, or the time is none.
+        InputError: there is no run, no data or no such view, or the time is not in [0, 1].
     """
     if time is not None and not 0 <= time <= 1:
         raise InputError(f"--time: expected 0 to 1, got {time}")

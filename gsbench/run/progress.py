@@ -47,7 +47,7 @@ def encode(progress: Progress) -> bytes:
 
 
 class Reporter:
-    """Writes the progress of a run from inside its training, when it is due."""
+    """Writes the progress of a run during its training, at most once in EVERY seconds."""
 
     def __init__(self, folder: Path, overrides: list[str], steps: int) -> None:
         """Report at once that the run in `folder`, which has `steps` steps, has started."""
@@ -73,7 +73,7 @@ class Reporter:
             return
 
     def end(self) -> None:
-        """Remove the report of this run, as its process leaves it."""
+        """Remove the progress file of this run, because its process ends the run."""
         (self.folder / FILE_NAME).unlink(missing_ok=True)
 
 
@@ -92,7 +92,7 @@ def is_alive(progress: Progress) -> bool:
 def born(pid: int) -> int | None:
     """Return when a process of this machine started, in clock ticks since boot; None if there is no such process.
 
-    It distinguishes a process from a later one with the same process id.
+    The start distinguishes a process from a later process with the same id.
     """
     try:
         after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

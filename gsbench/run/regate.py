@@ -1,4 +1,4 @@
-"""Gate the model of a finished run, and write the result as a separate run beside the old one."""
+"""Remove effects from the Gaussians of a finished run, and write the result as a separate run beside the old one."""
 
 import copy
 from pathlib import Path
@@ -17,15 +17,18 @@ from gsbench.train.checkpoint import Checkpoint
 
 
 def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
-    """Gate a finished run as `effects.gate=end` would have, but by halves too; return the new run's record and folder.
+    """Remove effects as `effects.gate=end` does, but also time or direction alone.
+
+    Return the new run's record and folder.
 
     Args:
-        folder: of the run; it is not changed.
-        budget_db: PSNR on val that the gate may cost.
-        data_root: the folder of the data set; by default that of the run.
+        folder: the folder of the run, which is not changed.
+        budget_db: how many dB of PSNR on val this may cost.
+        data_root: the folder of the data set; by default the one that the run was trained on.
 
     Raises:
-        InputError: there is no finished run, it was already gated at its end, or the data are gone or have changed.
+        InputError: there is no finished run, effects were already removed at its end, or the data are gone or have
+            changed.
     """
     path = folder / checkpoint.FILE_NAME
     if not path.exists():

@@ -1,4 +1,4 @@
-"""Resolve the config that a run trains by: model=auto becomes a model with time, or one without it."""
+"""Resolve the config of a training: model=auto becomes a model that depends on time, or one that does not."""
 
 import sys
 from dataclasses import dataclass, field, replace
@@ -44,7 +44,7 @@ def with_candidate(config: Config, name: str) -> Config:
 
 @dataclass(frozen=True)
 class Resolved:
-    """The config that a run trains by."""
+    """The config of a training, after model=auto was replaced by the chosen model, and how it was chosen."""
 
     config: Config
     screen: TimeScreen | None = None  # what chose the model of model=auto
@@ -52,15 +52,15 @@ class Resolved:
 
 
 def before_scene(config: Config) -> Config:
-    """Return the config that can be checked before the scene is loaded: of model=auto the candidate of more effects."""
+    """Return a config to check before the scene is loaded: for model=auto the candidate that depends on time."""
     return with_candidate(config, "moving") if is_auto(config) else config
 
 
 def resolve(this: Run, scene: Scene) -> Resolved:
     """Choose the model of model=auto by the training views of a scene, and print the reason; other configs stay.
 
-    Where the test of time is undecided, time is simulated: 7DGS on a static scene costs seconds, but 6DGS on a moving
-    scene loses the motion.
+    If the test whether the scene changes is undecided, the model depends on time: 7DGS on a static scene costs seconds,
+    but 6DGS on a moving scene loses the motion.
 
     Raises:
         InputError: as `with_candidate`.

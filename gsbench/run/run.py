@@ -36,7 +36,7 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
     """Do the run of a composed config of one scene, or keep its earlier result.
 
     Args:
-        composed: the config.
+        composed: the config of one scene, as Hydra composed it.
         choices: the choice of each config group, for the run's name; see `identify`.
         overrides: the overrides of its command line, for the record.
 
@@ -45,7 +45,7 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
 
     Raises:
         InputError: the run has no name that can be a folder, or its folder cannot be written.
-        UnrecordedError: its record cannot be written.
+        UnrecordedError: the record of the run cannot be written.
         Stopped: the process was told to end; the checkpoint is saved.
     """
     this = identify(composed, choices, overrides)
@@ -61,7 +61,7 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
 
 
 def _is_claimed(this: Run, mine: Progress) -> bool:
-    """Claim a run for this process; where another process does it, print that and return False.
+    """Claim a run for this process; if another process does this run, print that and return False.
 
     Raises:
         InputError: the claim cannot be written.
@@ -138,7 +138,7 @@ def reason_of(error: Exception, folder: Path) -> str:
 
 
 def write(record: Record, folder: Path) -> None:
-    """Write the record of a run; if it did not end well, an earlier record that did is kept as STALE."""
+    """Write the record of a run; if the run failed, the record of an earlier success is kept as STALE."""
     path, stale = folder / records.FILE_NAME, folder / STALE
     if record.status == "ok":
         records.write(record, path)

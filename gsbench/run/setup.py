@@ -17,8 +17,8 @@ def build(config: Config) -> GaussianModel:
     """Build the model of a config, without Gaussians yet.
 
     Raises:
-        InputError: as `models.build`, an option has a key of its own, or the model cannot have the gates
-            that the config asks for.
+        InputError: as `models.build`, an option has a key of its own, or effects cannot be removed from this model
+            although the config asks for it.
     """
     own: dict[str, Any] = {
         "module": config.model.module,

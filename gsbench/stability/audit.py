@@ -44,7 +44,7 @@ class Audit:
 
     @property
     def broken(self) -> list[Cell]:
-        """Return the cells where a default breaks its bound."""
+        """Return the results in which a default setting breaks its error bound."""
         return [cell for cell in self.cells if cell.is_default and not cell.holds]
 
 
@@ -63,7 +63,7 @@ def run(million: int = MILLION, *, long: bool = False, short: bool = False) -> A
     """Run the whole audit, with a progress bar on stderr.
 
     Args:
-        million: the number of hard slices.
+        million: the number of random hard slices, by default a million.
         long: train for 2,000 steps instead of 150, and use as many hard slices for each factor order.
         short: judge only the defaults, with few slices and steps, one seed and no costs.
     """
@@ -133,7 +133,10 @@ def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Step]]:
 
 
 def hard_slices(audit: Audit, order: str, N: int) -> None:
-    """Slice N random 7D factors with diagonals down to 1e-5; the errors of a cell are 99.9th percentiles."""
+    """Slice N random 7D Gaussians whose factors have diagonals down to 1e-5.
+
+    Return 99.9th percentiles of the errors.
+    """
     hard = population.draw(torch.Generator().manual_seed(SEED), N, order)
     known = population.truth(hard, order)
     audit.verified[order] = population.verify(hard, order)

@@ -18,7 +18,7 @@ DIFFERENTIABLE = ("means", "factors", "opacities", "colors")
 
 @dataclass(frozen=True)
 class Picture:
-    """The exact image, and which of its pixels are sure."""
+    """The exact image, and which of its pixels are not at a threshold, so that rounding cannot change them much."""
 
     image: Tensor  # [C, H, W, D]
     alpha: Tensor  # [C, H, W, 1]
@@ -49,8 +49,8 @@ def render(
         colors: [N, D] or [C, N, D].
         viewmats: [C, 4, 4].
         Ks: [C, 3, 3].
-        width: of the images, pixels.
-        height: of the images, pixels.
+        width: width of the images, pixels.
+        height: height of the images, pixels.
         offsets2d: [C, N, 2] moves the projected means, pixels.
         background: colour [D].
         options: near, far, eps2d and antialias.

@@ -58,12 +58,12 @@ class Cell:
 
     @property
     def is_default(self) -> bool:
-        """Tell whether it belongs to a default; the other schemes are for comparison."""
+        """Tell whether the result is that of a default setting; other slicing schemes are only for comparison."""
         return self.scheme in ("square_root", "-")
 
     @property
     def holds(self) -> bool:
-        """Tell whether it keeps its bound: nothing is bad, and both errors are below their bounds."""
+        """Tell whether both errors are within their bounds, and no number is NaN, infinite or otherwise wrong."""
         gradient = math.isnan(self.bound.gradient) or self.gradient <= self.bound.gradient
         return self.bad == 0 and self.forward <= self.bound.forward and gradient
 
@@ -89,10 +89,10 @@ def case(area: str, *subjects: str, forward: float = 1e-4, gradient: float = 1e-
     """Decorate a builder so that CASES lists its case under its name.
 
     Args:
-        area: one of AREAS.
-        subjects: the models that are tested with it.
-        forward: bound of the error of the result.
-        gradient: bound of the error of the gradient.
+        area: the part of gsbench that the case tests, one of AREAS.
+        subjects: the models that are tested with the case.
+        forward: the largest error allowed in the result.
+        gradient: the largest error allowed in the gradient.
     """
 
     def enter(build: Callable[..., Any]) -> Case:

@@ -21,7 +21,7 @@ COPIES = 1024  # of a case's Gaussians, for its timing
 
 @dataclass
 class ColorInputs:
-    """Gaussians of one model, with the place and the time of a query."""
+    """Gaussians of one model, with the camera centre and the time for which colours are computed."""
 
     model: str
     means: Tensor  # [COUNT, 3]
@@ -70,7 +70,7 @@ def far_in_time(g: Generator, severity: float, model: str) -> ColorInputs:
 
 
 def judge(found: Case, backends: list[str]) -> Iterator[Cell]:
-    """Judge every model and backend; errors are relative to the brightest colour or 1, and to each gradient."""
+    """Compare colours and gradients of every model and backend with the exact ones."""
     for model in found.subjects:
         shown = found(model=model)
         g = torch.Generator().manual_seed(1)

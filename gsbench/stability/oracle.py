@@ -56,8 +56,8 @@ def slice_triangular(x: Vector, layout: dict[str, int], order: str, half: float,
         order: the variable of each row of the triangular factor, such as "dddtppp".
         half: the factor in the exponent of f_dir.
         log_lambda: ln lambda_d ("direction") and ln lambda_t ("time").
-        center: of the camera.
-        time: of the query; None for 6DGS.
+        center: the camera's centre.
+        time: the time at which to slice; None for 6DGS.
         relative: whether entries of shape are in units of their row's diagonal.
     """
     raw = _unpack(x, layout)
@@ -147,9 +147,9 @@ def colors(x: Vector, layout: dict[str, int], center: Sequence[float], waves: in
     Args:
         x: means, times and sh.
         layout: their names, and how many numbers each has.
-        center: of the camera.
+        center: the camera's centre.
         waves: frequencies in time, with the constant one.
-        time: of the query.
+        time: the time at which to compute the colours.
     """
     raw = _unpack(x, layout)
     dx, dy, dz = unit([m - mpf(c) for m, c in zip(raw["means"], center, strict=True)])

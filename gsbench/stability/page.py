@@ -48,7 +48,7 @@ def verdict(audit: Audit) -> str:
 
 
 def conditions(audit: Audit) -> list[str]:
-    """State where and how it was measured."""
+    """State on which machine and how the audit was measured."""
     checks = ", ".join(f"{value:.0e} ({order})" for order, value in audit.verified.items())
     return [
         f"{processor_name()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the end; commit {git_commit()}; "
@@ -107,7 +107,7 @@ def _number(x: float) -> str:
 
 
 def costs(audit: Audit) -> list[str]:
-    """Make the table of the costs of square_root beside the schemes that subtract."""
+    """Make the table of the time of square_root beside schur and cholesky, which subtract covariances."""
     lines = [
         "## what safety costs", "",
         "Milliseconds of slicing 100,000 7D Gaussians, medians of nine (torch: one). The kernel of `cholesky` does",

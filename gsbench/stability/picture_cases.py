@@ -185,7 +185,7 @@ def alpha_at_its_limits(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending", forward=1e-3, gradient=NO_GRADIENT)
 def transmittance_at_the_stop(g: Generator, severity: float) -> list[Arguments]:
-    """Blend four of alpha 0.9, which leave 1e-4: the fourth may be blended or not, which changes at most 9e-4."""
+    """Blend four Gaussians of alpha 0.9, which leave 1e-4: the fourth may be left out, which changes at most 9e-4."""
     made = crowd(g, 6, 1.0)
     made["factors"] = 1e4 * torch.eye(3).repeat(6, 1, 1)
     return [made | {"opacities": torch.full((6,), 0.9 * severity + 0.5 * (1 - severity))}]

@@ -21,7 +21,7 @@ ImageTruth = tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]
 
 
 def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
-    """Yield a cell for each backend: the worst of the images of a case."""
+    """Yield a result for each backend: the largest errors over the images of a case."""
     pictures = case()
     truths = [(alone if case.area == "projection" else together)(arguments) for arguments in pictures]
     if case.bound.gradient != case.bound.gradient:  # every pixel is at a threshold, and these are judged

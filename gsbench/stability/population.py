@@ -91,7 +91,10 @@ def weights(N: int) -> tuple[Floats, Floats]:
 
 
 def truth(hard: Hard, order: str) -> PopulationTruth:
-    """Compute means, covariances and the gradient of the loss w . mean / |mean| + <W, cov> / |cov|, in float64."""
+    """Compute means, covariances and the gradient of a loss in float64. The loss is w .
+
+    Mean / |mean| + <W, cov> / |cov| with the random `weights` w and W.
+    """
     w, W = weights(len(hard))
     chunks = [slice(i, i + CHUNK) for i in range(0, len(hard), CHUNK)]
     parts = [_truth(hard.rows(rows), order, w[rows].T, W[rows].transpose(1, 2, 0)) for rows in chunks]
@@ -101,7 +104,7 @@ def truth(hard: Hard, order: str) -> PopulationTruth:
 
 
 def _truth(hard: Hard, order: str, w: Floats, W: Floats) -> tuple[Floats, Floats, Floats]:
-    """Compute `truth` with the Gaussians along the last axis of every array."""
+    """Compute `truth` from arrays whose last axis counts the Gaussians."""
     L, q = np.ascontiguousarray(factor(hard).transpose(1, 2, 0)), conditioned(order)
     p = [i for i in range(7) if i not in q]
     Q, R = gram_schmidt(L[q + p])  # L = R^T Q^T
@@ -202,11 +205,11 @@ def judge(hard: Hard, known: PopulationTruth, order: str, scheme: str, backend: 
     """Measure the errors of 7DGS in float32 on hard slices.
 
     Args:
-        hard: the Gaussians.
-        known: their exact slices.
-        order: of the triangular factor.
-        scheme: of slicing.
-        backend: by name.
+        hard: the Gaussians to slice.
+        known: the exact slices of these Gaussians.
+        order: the order of rows in the triangular factor.
+        scheme: the slicing scheme.
+        backend: the name of the backend.
     """
     model = all_seen(order, scheme, backend)
     w, W = weights(len(hard))

@@ -39,7 +39,7 @@ class SliceTruth:
 
 
 def judge(case: Case, backends: list[str], schemes: Sequence[str] = SCHEMES) -> Iterator[Cell]:
-    """Judge every model, scheme and backend."""
+    """Compare the slices of every model, scheme and backend with the exact ones."""
     for model in case.subjects:
         observed = case(model=model)
         known = truth(observed)

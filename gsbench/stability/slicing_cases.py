@@ -19,7 +19,7 @@ ALL = ("4dgs", "6dgs", "7dgs")
 
 @dataclass
 class Observed:
-    """Gaussians of one model, with the place and the time of a query."""
+    """Gaussians of one model, with the camera centre and the time at which they are sliced."""
 
     model: str
     raw: dict[str, Tensor]  # float32, by the model's own names

@@ -31,7 +31,7 @@ def measure(path: Path) -> dict[str, Floats]:
 
 
 def failures(path: Path) -> dict[str, tuple[float, float]]:
-    """Measure the schemes that subtract on the Gaussians of a checkpoint, in float32.
+    """Measure the errors of schur and cholesky, which subtract covariances, on a checkpoint's Gaussians, in float32.
 
     For each scheme, return the share of covariances that are indefinite and the 99th percentile of relative errors.
     """

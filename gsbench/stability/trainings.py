@@ -24,7 +24,7 @@ SEEDS = (0, 1, 2)  # of the trainings whose drift is measured
 
 
 def judge(case: Case, backend: str, **more: Any) -> Iterator[Cell]:
-    """Yield a cell for each model: error 0 for a training that ends as it should, else 1."""
+    """Yield a result for each model: error 0 for a training that ends as it should, else 1."""
     for name in case.subjects:
         training: Training = case(model=name, **more)
         start, end, bad, note = time.perf_counter(), 1.0, 1.0, ""

@@ -24,7 +24,7 @@ MOST_COMMANDS = 20  # of runs that no sweep requested
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Return 0 if no run failed or is lost, 1 if one did, and 2 if the folder is no experiment."""
+    """Return 0 if no run failed or is lost, 1 if a run failed or is lost, and 2 if the folder is no experiment."""
     parser = argparse.ArgumentParser(prog="python -m gsbench.sweep", description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
     shown = commands.add_parser("status", help="show which runs are done, running, queued, planned, failed or lost")

@@ -22,7 +22,7 @@ NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{
 
 
 def expand(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line with `--multirun` first, and with the scenes of the experiment as an axis.
+    """Return the words of a command line with `--multirun` first, and with all scenes in place of scene=all.
 
     A command line that names one scene, asks for information or has a fault is left as it is: Hydra explains the fault.
 

@@ -1,7 +1,7 @@
 """Write the runs that a sweep requests to `results/<experiment>/.sweep/<time>/plan.json`, and find such plans.
 
-A run is identified by those of its overrides that decide its numbers (`identity`). Its record and its progress file
-hold the same overrides. So they are matched without composing a config, which takes 0.1 s.
+A run is identified by the overrides that decide its results (`identity`). Its record and its progress file hold the
+same overrides. So runs are matched with files without composing a config, which takes 0.1 s.
 """
 
 import json
@@ -42,7 +42,7 @@ class Ended:
 
 
 def identity(overrides: Sequence[str]) -> Identity:
-    """Reduce the overrides of a run to those that decide its numbers."""
+    """Reduce the overrides of a run to those that decide its results."""
     return tuple(deciding(overrides))
 
 

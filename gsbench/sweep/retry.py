@@ -41,9 +41,9 @@ def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfi
     """Launch the `broken` runs again, wait for them as the first command did, and return how many there were.
 
     Args:
-        experiment: as it was read just now.
+        experiment: the state of the experiment, read just before.
         more: overrides of `launch`, such as more memory.
-        task: does a run of a composed config.
+        task: the function that does the run of a composed config.
 
     A group of runs that cannot be launched is reported on stderr, and the other groups are launched. The folder in
     which its command was given may be gone, or an override may no longer be known.

@@ -38,7 +38,7 @@ class RunStatus:
 
 @dataclass
 class RequestedRun:
-    """A run with the newest plan that requests it."""
+    """A run that a command requested, with the newest plan that lists the run."""
 
     overrides: list[str]  # all of them, as Hydra launches it
     plan: Plan
@@ -125,7 +125,7 @@ def _judge(experiment: Experiment, one: Identity) -> RunStatus:
 
 
 def _kept(experiment: Experiment, requested: RequestedRun | None) -> Outcome | None:
-    """Find the record of a run that was kept as it was, with the overrides of the command that made it."""
+    """Find the record of a run that was kept although other overrides made it, by the outcome that the sweep wrote."""
     if requested is None or requested.ended is None or requested.ended.record is None:
         return None
     return experiment.traces.by_path.get(experiment.folder.parent / requested.ended.record)
@@ -159,7 +159,7 @@ def _launching(requested: RequestedRun, queue: Queue) -> bool:
 
 
 def _explained(experiment: Experiment, one: Identity, run: RunStatus, endings: dict[str, str]) -> RunStatus:
-    """Add to a run on Slurm without a record how its job ended, where it is lost, and the telling line of its log."""
+    """Add to a Slurm run without a record how its job ended, and the line of its log that tells the cause."""
     if run.state not in BROKEN or run.job is None or run.record is not None:
         return run
     parts = [run.reason or ""]
@@ -173,9 +173,9 @@ def _explained(experiment: Experiment, one: Identity, run: RunStatus, endings: d
 
 
 def _told(log: Path) -> str:
-    """Return the last line of a log that names a cause, else the last that reports an error, else the last line.
+    """Return the last line of a log that names a cause, else the last that reports an error, else the last one.
 
-    Where a log reports no error but an exit code, its first other line is returned: the shell's message.
+    If a log reports only an exit code, its first other line is returned, which is the shell's message.
     """
     if not log.is_file():  # reading a pipe would block
         return "(no log)"

@@ -69,7 +69,7 @@ def _files(folders: list[Path]) -> Iterator[Path]:
 
 
 def _outcome(path: Path) -> tuple[list[str], Outcome]:
-    """Read only what a status needs of a record, which is much faster than validating all of it."""
+    """Read from a record only what its status needs, which is much faster than to validate the whole record."""
     written = path.stat().st_mtime
     try:
         plain: Any = json.loads(read_file(path, str(path), MAX_JSON))

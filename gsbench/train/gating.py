@@ -1,4 +1,4 @@
-"""Gate the model of a training: once after its densification, so that the rest is faster, and at the end."""
+"""Remove effects that Gaussians do not need: once after densification, so that the rest is faster, and at the end."""
 
 import copy
 import time
@@ -44,28 +44,28 @@ Shape = tuple[dict[str, Tensor], EffectSets | None]  # raw parameters and effect
 
 
 def shape_of(model: GaussianModel) -> Shape:
-    """Return the Gaussians of a model, for `become`."""
+    """Return all tensors of a model's Gaussians, from which `become` restores them."""
     return {name: x.data for name, x in model.splats.items()}, model.effect_sets
 
 
 def become(model: GaussianModel, shape: Shape) -> None:
-    """Give a model other Gaussians."""
+    """Replace the Gaussians of a model by those that `shape_of` returned."""
     for name, value in shape[0].items():
         model.splats[name].data = value
     model.effect_sets = shape[1]
 
 
 class Gating:
-    """The gates of one training."""
+    """The removal of effects (time, direction, AGR) from Gaussians in one training."""
 
     def __init__(self, rows: Rows, scene: Scene, renderer: Renderer, config: Config) -> None:
-        """Gate the model of `rows`; all followers of its rows follow the gate.
+        """Prepare for the model of `rows`; whatever is kept for each of its rows follows the changes.
 
         Args:
-            rows: of the training.
+            rows: the rows (Gaussians) of the training.
             scene: its views are used to predict errors and to measure losses.
-            renderer: of the training.
-            config: says which gates run, and what they may cost.
+            renderer: renders views as the training does.
+            config: says when effects are removed, and how much PSNR this may cost.
         """
         self.rows = rows
         self.model = rows.model
@@ -87,7 +87,7 @@ class Gating:
                 self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
 
     def in_training(self, step: int) -> bool:
-        """Gate before a step, and tell whether that was done; LOSS_IN_TRAINING bounds the immediate loss."""
+        """Remove effects before a step if this is due, within LOSS_IN_TRAINING dB; tell whether it was done."""
         if len(self.model) < LEAST_IN_TRAINING:
             self.notes.append(f"at step {step} the model has {len(self.model)} Gaussians: of fewer than "
                               f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
@@ -97,14 +97,14 @@ class Gating:
         return self._gate(step, most, VIEWS_IN_TRAINING, by_halves=False)
 
     def slows_agr(self, step: int) -> float:
-        """Return the factor of AGR's rate at a step: after a gate in training it falls log-linearly to LAST_RATE."""
+        """Return the factor of AGR's learning rate: it falls log-linearly to LAST_RATE after effects were removed."""
         if not self.gates or self.gates[0].step is None:
             return 1.0
         begun, iterations = self.gates[0].step, self.config.train.iterations
         return float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))
 
     def at_end(self, by_halves: bool) -> bool:
-        """Gate the finished model within `effects.budget_db`, and tell whether that was done."""
+        """Remove effects from the finished model within `effects.budget_db`, and tell whether that was done."""
         return self._gate(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
 
     def now(self) -> Shape:
@@ -112,7 +112,7 @@ class Gating:
         return shape_of(self.model)
 
     def compare(self, ungated: Shape, views: list[View]) -> None:
-        """Measure on the evaluated `views` what the gate at the end changed, and what freezing direction would."""
+        """Measure on `views` what the removal of effects changed, and what freezing direction would change."""
         if self.gates and self.gates[-1].step is None:
             before = copy.deepcopy(self.model)
             become(before, ungated)
@@ -124,7 +124,7 @@ class Gating:
             self.direction = Direction(share_with_direction(self.model), loss, *times)
 
     def _beside(self, one: GaussianModel, other: GaussianModel, views: list[View]) -> tuple[float, list[float]]:
-        """Return by how much the other model's PSNR on views is lower, and the median frame times of both in ms."""
+        """Return how much lower the other model's PSNR on views is, and the median frame times of both models in ms."""
         count = max(self.config.protocol.renders, len(views))
         frames = [lambda i, model=model: self.renderer.image(model, views[i % len(views)]) for model in (one, other)]
         times = time_in_turns(frames, count, synchroniser(self.config.device))

@@ -36,7 +36,7 @@ from gsbench.train.thinning import blend_weights, heaviest
 
 @dataclass
 class Best:
-    """PSNR on the evaluated split at the best moments of the training, dB."""
+    """PSNR on the evaluated split at the iterations that were best on val or on test, dB."""
 
     val: float = -math.inf  # the best on val so far ..
     eval_at_best_val: float | None = None  # .. and what the evaluated split had then
@@ -50,10 +50,10 @@ class Trainer:
         """Prepare the training.
 
         Args:
-            model: initialised and on `config.device`.
-            scene: gives the training and the val views.
-            views: the evaluated split.
-            config: the recipe.
+            model: the initialised model on `config.device`.
+            scene: the scene, which has the training and the val views.
+            views: the views of the evaluated split.
+            config: the config of the run.
 
         Raises:
             InputError: a training image has a value that is not finite.
@@ -92,9 +92,9 @@ class Trainer:
         """Train to the end, or until `goes_on()` says no after a step; `step` tells which.
 
         Args:
-            save: is given the state every `checkpoint_minutes` and once at the end.
-            label: names the run in the progress bar.
-            goes_on: is asked after every step.
+            save: called with the state every `checkpoint_minutes` and once at the end.
+            label: the name of the run in the progress bar.
+            goes_on: called after every step; False stops the training.
 
         Raises:
             DivergedError: a loss or gradient was not finite; the last saved state is from before that step.
@@ -131,11 +131,13 @@ class Trainer:
         save(self.state_dict())
 
     def gate_at_end(self, by_halves: bool = False) -> None:
-        """Gate the finished model, and measure what that changed; the measuring counts as no time of the training.
+        """Remove effects from the finished model, and measure what this changed.
+
+        The measuring does not count as training time.
 
         Args:
-            by_halves: whether time or direction alone may be frozen: it saves bytes and no time of a frame, and nearly
-                doubles the seconds of the gate (docs/effects.md).
+            by_halves: whether time alone or direction alone may be frozen. This saves bytes but no frame time, and
+                nearly doubles the seconds (docs/effects.md).
         """
         self.model.set_active(self.schedule.active(self.step - 1))
         ungated = self.gating.now()

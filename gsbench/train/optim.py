@@ -32,11 +32,11 @@ class Optimizer:
         """Make a parameter group for each name of `model.groups()`.
 
         Args:
-            model: initialised.
-            config: has the learning rates.
-            train: has the length of the run, and the length that the rates are stated for.
-            extent: of the scene, world units.
-            kind: one of OPTIMIZERS.
+            model: the initialised model.
+            config: the model's config, with the learning rates.
+            train: the config with the length of the run, and the length that the rates are stated for.
+            extent: the scene's extent, world units.
+            kind: the optimizer, one of OPTIMIZERS.
 
         Raises:
             InputError: a parameter has no learning rate, or a rate is for a parameter that no variant of the model has.
@@ -68,10 +68,10 @@ class Optimizer:
         Where `adam.found_inf` [] is 1, nothing is updated.
 
         Args:
-            step: counted from 0.
+            step: number of the step, counted from 0.
             drawn: the Gaussians that some view of the batch sees, which `sparse_adam` needs; the others have no
                 gradient.
-            slowed: a factor of AGR's rate.
+            slowed: factor of AGR's learning rate.
         """
         by_kernel = []
         for group in self.adam.param_groups:

@@ -32,7 +32,7 @@ class Pyramid:
 def reduced(view: View, factor: int) -> View:
     """Average every factor x factor block of a view's image; incomplete blocks at the right and below are dropped.
 
-    Pixel centres are at +0.5, so the first two rows of K are divided by the factor.
+    Pixel centres are at +0.5, so the first two rows of the intrinsics K are divided by the factor.
     """
     camera = view.camera
     width, height = camera.width // factor, camera.height // factor

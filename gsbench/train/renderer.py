@@ -27,7 +27,7 @@ class Renderer:
 
     @torch.no_grad()
     def psnr(self, model: GaussianModel, views: Sequence[View]) -> float:
-        """Measure the mean PSNR of a model over views, which are rendered side by side, dB."""
+        """Measure the mean PSNR of a model over views in dB; several views are rendered at the same time."""
 
         def of_view(view: View) -> float:
             return psnr(self.image(model, view), view.image)

@@ -47,7 +47,7 @@ class Rows:
         """Keep `rows` [M] of the model, in their order; a row may be repeated.
 
         Args:
-            rows: indices of the rows before.
+            rows: indices of the rows to keep, as they are numbered before the call.
             fresh: which of them are new Gaussians, [M] bool; by default none.
         """
         self.model.select(rows)

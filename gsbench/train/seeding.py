@@ -9,10 +9,10 @@ def batch(step: int, views: int, batch_size: int, seed: int) -> list[int]:
     The result depends only on the arguments, so a resumed run sees the same views as an uninterrupted one.
 
     Args:
-        step: counted from 0.
+        step: number of the step, counted from 0.
         views: the number of training views.
-        batch_size: views in a step.
-        seed: of the run.
+        batch_size: number of views in a step.
+        seed: seed of the run.
     """
     chosen = []
     for position in range(step * batch_size, (step + 1) * batch_size):

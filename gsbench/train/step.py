@@ -100,12 +100,12 @@ class Seen(NamedTuple):
 
 
 class Step:
-    """See views, and leave the gradient of their mean loss in the model's parameters."""
+    """Render views, and leave the gradient of their mean loss in the model's parameters."""
 
     def __init__(
         self, model: GaussianModel, background: Tensor, ssim_weight: float, antialias: bool, stages: StageClock
     ) -> None:
-        """Train `model` before a background colour [3]; its time goes to `stages`."""
+        """Prepare steps of `model` over a background colour [3]; `stages` sums the seconds of each stage."""
         self.model = model
         self.background = background
         self.ssim_weight = ssim_weight
@@ -140,7 +140,7 @@ class Step:
     def _by_workers(
         self, views: Sequence[View], sources: list[nn.Parameter], sums: list[Sums], bounds: list[int]
     ) -> list[Seen]:
-        """Let each worker see the views between its two `bounds`."""
+        """Let each worker render the views between its two `bounds`."""
         started = time.perf_counter()
         workers = len(bounds) - 1
         clocks = [StageClock() for _ in range(workers)]
@@ -154,7 +154,7 @@ class Step:
         return seen
 
     def _see(self, view: View, sources: list[nn.Parameter], sums: Sums, views: int, stages: StageClock) -> Seen:
-        """See one view of a batch; its gradients are added to `sums`."""
+        """Render one view of a batch and add the gradients of its loss to `sums`."""
         with Tape() as tape:
             with stages("slice"):
                 query = Query.of(view.camera, view.time)

@@ -25,7 +25,7 @@ QUALITY = {True: 75, False: 95}  # of the JPEG while something moves, and at res
 
 
 class Client:
-    """One browser. It has its own choices; the models are shared."""
+    """One browser of the viewer. A browser has its own choices; all browsers share the models."""
 
     def __init__(
         self, client: viser.ClientHandle, renderers: Sequence[FrameRenderer], scene: Scene | str, most_cost: float
@@ -34,9 +34,9 @@ class Client:
 
         Args:
             client: the browser, as viser has it.
-            renderers: of the models that can be shown, one or more of one scene.
-            scene: with the training views; or why there are none.
-            most_cost: nanoseconds of a Gaussian that have the brightest colour.
+            renderers: the renderers of the models that can be shown, one or more of one scene.
+            scene: the scene with its training views, or a text that says why there are none.
+            most_cost: the nanoseconds of a Gaussian that is drawn in the brightest colour.
         """
         self.client = client
         self.controls = Controls(client, renderers, scene)
@@ -61,7 +61,7 @@ class Client:
         self.changed.set()
 
     def _work(self) -> None:
-        """Render whenever something changes, and once more when it no longer does, until the browser leaves."""
+        """Render after each change of controls or camera, and in full when changes end, until the browser leaves."""
         while True:
             playing = self.controls.play.value
             changed = self.changed.wait(FRAME_S if playing else None if self.rests else REST_S)
@@ -121,11 +121,11 @@ def camera_at(position: np.ndarray, wxyz: np.ndarray, fov: float, width: int, he
     """Return the camera of a pose in viser's convention.
 
     Args:
-        position: [3], world units.
+        position: the camera's position [3], world units.
         wxyz: quaternion of the rotation from the camera, in OpenCV axes, to the world.
-        fov: vertical, radians.
-        width: pixels.
-        height: pixels.
+        fov: the vertical field of view, radians.
+        width: width of the image, pixels.
+        height: height of the image, pixels.
     """
     R = rotation(torch.tensor(wxyz, dtype=torch.float64)[None])[0]
     viewmat = torch.eye(4, dtype=torch.float64)

@@ -36,8 +36,8 @@ class Controls:
 
         Args:
             client: the browser, as viser has it.
-            renderers: of the models that can be shown, one or more of one scene.
-            scene: with the training views; or why there are none.
+            renderers: the renderers of the models that can be shown, one or more of one scene.
+            scene: the scene with its training views, or a text that says why there are none.
         """
         self.client = client
         self.changed = threading.Event()
@@ -126,12 +126,12 @@ class Controls:
         self.changed.set()
 
     def _hold(self, on: bool) -> None:
-        """Hold the time of the slices, or release it to the slider."""
+        """Hold the time of the shown Gaussians, or let the slider change it."""
         self._held = self.now if on else None
         self.changed.set()
 
     def _freeze(self, on: bool) -> None:
-        """Hold the viewpoint of the slices, or release it to the camera."""
+        """Hold the viewpoint from which Gaussians are computed, or let it follow the camera."""
         position = torch.tensor(np.asarray(self.client.camera.position), dtype=torch.float32)
         self._frozen = position if on else None
         self.changed.set()
@@ -183,7 +183,7 @@ class Controls:
         ]
 
     def request(self, colours: str) -> FrameRequest:
-        """Return the request for a frame now, in some colours."""
+        """Return the request for a frame by the present choices, with Gaussians in the given colours."""
         return self._request_at(self.now, colours)
 
     def request_of(self, view: View) -> FrameRequest:

@@ -50,7 +50,7 @@ class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
     up_direction: Three
 
     def is_usable(self) -> bool:
-        """Tell whether an image can be rendered from there."""
+        """Tell whether an image can be rendered from this pose."""
         lengths = (*self.position, *self.look_at, *self.up_direction)
         return (
             all(abs(length) <= FURTHEST for length in lengths)  # which NaN is not
@@ -107,7 +107,7 @@ def is_known(message: object) -> bool:
 
 
 class Connection(ServerConnection):
-    """A browser's connection that passes only known messages; others can stop viser or fill its memory."""
+    """A browser's connection that passes only known messages; other messages could stop viser or fill its memory."""
 
     async def recv(self, decode: bool | None = None) -> Any:
         """Wait for the next known message."""
@@ -124,7 +124,7 @@ class Door:
 
         Args:
             host: the address or the name to listen on.
-            port: the first to be tried.
+            port: the first port to try.
 
         Raises:
             InputError: the host cannot be listened on, or no port is free.

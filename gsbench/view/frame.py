@@ -38,7 +38,7 @@ class FrameCost(NamedTuple):
     ms: dict[str, float]  # by stage, in their order
 
     def of(self, part: str) -> float:
-        """Return the milliseconds of the slice or of the raster."""
+        """Return the milliseconds of a frame's slicing or of its rasterization."""
         return sum(ms for stage, ms in self.ms.items() if part_of(stage) == part)
 
 
@@ -49,7 +49,7 @@ class Frame(NamedTuple):
     costs: tuple[FrameCost, ...]  # of each model in it
 
     def ms(self, part: str) -> float:
-        """Return the milliseconds of the slices or of the rasters."""
+        """Return the milliseconds of slicing or of rasterization, summed over the models in the image."""
         return sum(cost.of(part) for cost in self.costs)
 
 
@@ -60,8 +60,9 @@ class FrameRenderer:
         """Take a run; nothing is rendered yet.
 
         Args:
-            run: with the model.
-            most_cost: nanoseconds of a Gaussian that have the brightest colour, the same for all compared models.
+            run: the run with the model to render.
+            most_cost: the nanoseconds of a Gaussian that is drawn in the brightest colour, the same for all compared
+                models.
         """
         self.run = run
         self.name = f"{run.folder.parent.name} {run.folder.name}"  # such as "7dgs seed0"
@@ -101,7 +102,7 @@ class FrameRenderer:
             return image[0], watch.ms
 
     def _active(self, request: FrameRequest) -> ActiveComponents:
-        """Return the active components at the end of the training, less what is switched off."""
+        """Return the model's active components (such as AGR), without those that the controls switch off."""
         trained = self.trained_active
         degree = min(request.sh_degree, trained.sh_degree)
         return replace(trained, refine=request.agr and trained.refine, sh_degree=degree)

@@ -26,9 +26,9 @@ class Frusta:
         """Prepare the frusta.
 
         Args:
-            client: the browser.
-            scene: whose training views are shown.
-            go_to: called with the position, the quaternion and the time of a frustum that is clicked on.
+            client: the browser, as viser has it.
+            scene: the scene whose training views are shown.
+            go_to: the function to call when a frustum is clicked on, with its position, quaternion and time.
         """
         self.client, self.scene, self.go_to = client, scene, go_to
         self.handles: list[viser.CameraFrustumHandle] = []

@@ -1,4 +1,4 @@
-"""Convert the slice of a model at a query to trained 3D Gaussians as 3DGS stores them."""
+"""Convert the 3D Gaussians of a model at a camera and a time to the form in which 3DGS stores trained Gaussians."""
 
 import math
 
@@ -22,10 +22,10 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
     """Slice a model and return the Gaussians that are drawn: those that are not culled by their opacity.
 
     Args:
-        model: initialised.
-        query: the viewpoint and the time of the slice.
-        keep_harmonics: whether colours stay harmonics of the direction; else each is the colour seen from the query's
-            viewpoint, as a harmonic of degree 0.
+        model: the initialised model.
+        query: the viewpoint and the time at which to slice.
+        keep_harmonics: whether colours stay harmonics of the direction; else each colour is the one seen from the
+            query's viewpoint, as a harmonic of degree 0.
 
     Raises:
         InputError: harmonics are requested but the model's geometry or colours depend on the viewpoint; the slice has
@@ -53,7 +53,7 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
 def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:
     """Decompose covariances F F^T = R S^2 R^T: ln S [N, 3] and the quaternions wxyz [N, 4] of the rotations R.
 
-    The left singular vectors of F are the axes; where they are left-handed, one is negated.
+    The left singular vectors of F are the axes. If they are left-handed, one of them is negated.
     """
     axes, sizes, _ = torch.linalg.svd(factors.double())
     axes[:, :, 2] *= torch.where(torch.linalg.det(axes) < 0, -1.0, 1.0)[:, None]

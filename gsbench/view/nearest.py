@@ -46,11 +46,13 @@ class TrainingViews:
         self._times = torch.tensor([view.time or 0.0 for view in scene.train])  # [V]
 
     def nearest(self, camera: Camera, time: float | None) -> Nearest:
-        """Find the view with the least distance in extents plus angle in radians; among equal ones, in time.
+        """Find the view with the least sum of distance (in scene extents) and angle (radians).
+
+        If equal, the nearest in time.
 
         Args:
-            camera: that looks at the scene.
-            time: in [0, 1]; None if the scene has none.
+            camera: the camera to which the nearest view is searched.
+            time: the time in [0, 1]; None if the scene has no time.
         """
         distances = (self._centers - camera.center).norm(dim=-1)
         angles = torch.arccos((self._forwards @ camera.viewmat[2, :3]).clamp(-1, 1))
@@ -64,9 +66,9 @@ def compare(renderer: FrameRenderer, view: View, request: FrameRequest) -> ViewC
     """Render a view's camera and measure the image as the run was measured.
 
     Args:
-        renderer: of the model.
-        view: to be compared with.
-        request: the query and the effects.
+        renderer: the renderer of the model.
+        view: the training view to compare with.
+        request: what to render: the camera, the time and the effects that are on.
     """
     view = view.to("cpu")
     image = renderer.image(view.camera, request)

@@ -35,11 +35,11 @@ def cost_table(costs: Sequence[FrameCost], width: int, height: int) -> str:
 
 
 def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
-    """Write the legend of the Gaussians' colours where they are not the models' own.
+    """Write the legend of the Gaussians' colours if these show effects or costs instead of the models' own colours.
 
     Args:
-        shown: the images.
-        most_cost: nanoseconds that have the brightest colour.
+        shown: the images on the screen.
+        most_cost: the nanoseconds of a Gaussian that is drawn in the brightest colour.
     """
     text = ""
     if by_effect_set := {renderer.name: renderer.counts for renderer, colours in shown if colours == CLASS}:

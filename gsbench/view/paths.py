@@ -54,9 +54,9 @@ def around(run: LoadedRun, azimuth: float, elevation: float) -> Camera:
     """Return a camera that looks at the middle of a model from the distance of its scene's cameras.
 
     Args:
-        run: of the model.
-        azimuth: radians, about the axis `UP`.
-        elevation: radians, above the horizon.
+        run: the run of the model.
+        azimuth: the angle about the axis `UP`, radians.
+        elevation: the angle above the horizon, radians.
     """
     flat = math.cos(elevation)
     towards = torch.tensor([flat * math.sin(azimuth), -flat * math.cos(azimuth), math.sin(elevation)])

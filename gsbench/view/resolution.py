@@ -16,7 +16,7 @@ class Resolution:
         self._slice_ms = 0.0
 
     def took(self, pixels: int, slice_ms: float, raster_ms: float) -> None:
-        """Learn from a frame; a slice takes the same time for any number of pixels."""
+        """Learn from a frame's milliseconds; slicing takes the same time for any number of pixels."""
         self._ms_per_pixel, self._slice_ms = raster_ms / max(1, pixels), slice_ms
 
     def size(self, width: int, height: int, moving: bool) -> tuple[int, int]:

@@ -24,7 +24,7 @@ class StageWatch(Tape):
     """
 
     def __init__(self, device: str) -> None:
-        """Begin without stages."""
+        """Start with no stage measured."""
         super().__init__()
         self._laps = Laps(device)
 

@@ -25,10 +25,10 @@ class Viewer:
         """Start the server.
 
         Args:
-            runs: one or more, of one scene.
+            runs: the runs whose models are shown, one or more, of one scene.
             host: the address to listen on.
-            port: to listen on, or the next free one.
-            data_root: the folder of the data set, where it has moved.
+            port: the port to listen on; if it is in use, the next free one is taken.
+            data_root: the folder of the data set, if it has moved.
 
         Raises:
             InputError: the runs are of different scenes, or the host cannot be listened on.

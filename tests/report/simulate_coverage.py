@@ -1,4 +1,4 @@
-"""Simulates differences of known truth, counts how often an interval holds it, prints the table of docs/statistics.md.
+"""Simulates differences of known truth, counts how often an interval holds it, and prints a table of the coverage.
 
 python tests/report/simulate_coverage.py
 """

@@ -54,11 +54,11 @@ def write(
     """Write the page of `records`, which lie in `folder`, and return its path.
 
     Args:
-        records: at least one.
-        folder: where the records and their pictures are, and where the page goes.
+        records: the records to show, at least one.
+        folder: the folder that has the records and their pictures; the page is written there.
         faults: the records that are left out, and why.
         reload: seconds after which an open page loads itself again; 0: never.
-        against: with the runs of another folder; None: with none.
+        against: the comparison with another folder; None if there is none.
     """
     path = folder / FILE_NAME
     write_atomically(path, render(records, folder, faults, reload=reload, against=against).encode())
@@ -73,7 +73,7 @@ def render(
     reload: int = 0,
     against: Comparison | None = None,
 ) -> str:
-    """Return the page as HTML; arguments as in `write`."""
+    """Return the page as HTML; the arguments are those of `write`."""
     found = groups(records)
     look = styles(sorted({name for group in found for name in group.series}))
     runs, scenes = Runs(), MOST_SCENES // len(found)
@@ -107,7 +107,7 @@ def render(
 
 
 def _own(name: str) -> Markup:
-    """Return a file beside this module, which is part of the page as it is."""
+    """Return the text of a file beside this module that is copied into the page."""
     return Markup((resources.files(__package__) / name).read_text())
 
 

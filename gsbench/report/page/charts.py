@@ -164,7 +164,7 @@ def differences(rows: list[Difference], x: str) -> Panel:
 
 @dataclass(frozen=True)
 class Bar:
-    """A whole with its parts, in order."""
+    """A stacked bar: its name and the sizes of its parts, in order."""
 
     label: str
     parts: Sequence[float]

@@ -33,7 +33,7 @@ class DataTable:
 
     @property
     def shown(self) -> list[list[str]]:
-        """Return the first rows as text."""
+        """Return the first rows of the table as text, for the page."""
         return [
             [show(value, column) for value, column in zip(row, self.columns, strict=True)]
             for row in self.rows[:MOST_ROWS]
@@ -41,7 +41,7 @@ class DataTable:
 
     @property
     def hidden(self) -> int:
-        """Return the number of rows that only the file has."""
+        """Return the number of rows that are not on the page but only in the CSV file."""
         return max(0, len(self.rows) - MOST_ROWS)
 
     @property
@@ -57,7 +57,7 @@ class DataTable:
 
 
 def show(value: Value, column: Column) -> str:
-    """Write a cell as it is shown."""
+    """Format a value of the table as the page shows it."""
     if value is None:
         return "–"
     if isinstance(value, float):
@@ -77,7 +77,7 @@ class PageFigure:
 
 @dataclass(frozen=True)
 class Tab:
-    """Drawings that are shown together."""
+    """Drawings that a tab of the page shows together."""
 
     label: str
     drawings: list[PageFigure]
@@ -125,12 +125,12 @@ class Runs:
         self._numbers: dict[tuple[str, ...], int] = {}
 
     def of_record(self, group: Group, record: Record) -> int:
-        """Return the number of a single run."""
+        """Return the number under which the page lists a single run."""
         facts = _facts(*(group.value(record, q) for q in ("psnr", "seconds", "ms", "mb")))
         return self._number((messages.run_name(record),), facts, [record])
 
     def of_configuration(self, group: Group, configuration: Configuration, scenes: list[str]) -> int:
-        """Return the number of the runs of a configuration on some scenes, by their means."""
+        """Return the number under which the page lists the runs of a configuration on some scenes."""
         runs = [r for s in scenes for r in configuration.runs.get(s, [])]
         seeds = messages.count(len({r.seed for r in runs}), "seed")
         where = scenes[0] if len(scenes) == 1 else f"mean of {messages.count(len(scenes), 'scene')}"
@@ -166,7 +166,7 @@ class Canvas:
 
 
 def _facts(psnr: float, seconds: float, ms: float, mb: float) -> str:
-    """Write the quality and the costs of a point, without unknown ones."""
+    """Write the PSNR and the costs of a point; unknown values are left out."""
     known = [
         (psnr, f"{messages.plain(psnr)} dB"),
         (seconds, messages.duration(seconds)),

@@ -1,4 +1,4 @@
-"""Write the sections on the cost of quality: the model to use for each budget, and the frontier of every model."""
+"""Write the sections on the cost of quality: the best model for each budget, and each model's PSNR by cost."""
 
 import math
 from dataclasses import dataclass
@@ -83,7 +83,7 @@ def _answer(points: list[FrontierPoint], family: Family, cost: str, budget: floa
 
 
 def _compared(choice: f.BudgetChoice) -> str:
-    """Say how the chosen model compares with the others that fit: ahead, not told apart, or behind."""
+    """Say whether the chosen model is significantly better than each other model within the budget."""
     others = len(choice.ahead) + len(choice.level) + len(choice.behind) + len(choice.unknown)
     if not others:
         return "No other model fits."
@@ -105,7 +105,7 @@ def _named(points: list[FrontierPoint]) -> str:
 
 
 def _told(configuration: Configuration) -> str:
-    """Describe a configuration within its series by its length and the rest of its variant."""
+    """Describe a configuration of a model by its iterations and its other settings."""
     length = f"{configuration.iterations:,} iterations, " if configuration.iterations else ""
     is_gated = configuration.series != configuration.model
     told = [name for name, known in (("iterations", length), ("gate", is_gated)) if known]
@@ -213,7 +213,7 @@ def _paper(record: Record, cost: str) -> tuple[float, float] | None:
 
 
 def _frontier_words(group: Group, points: list[FrontierPoint]) -> list[str]:
-    """Say which point is chosen, which points are beaten by their means, and which lengths of training they have."""
+    """Say which point is chosen, and which points are beaten by a cheaper and better one."""
     if not points:
         return ["No run has finished, so there is nothing to compare."]
     best, scenes, split = f.ranked(points)[0], group.basis, _split(group)
@@ -230,7 +230,7 @@ def _frontier_words(group: Group, points: list[FrontierPoint]) -> list[str]:
 
 
 def _beaten_words(points: list[FrontierPoint]) -> str:
-    """Say how many points are beaten by another; only means are compared, so no difference is claimed."""
+    """Say how many points are beaten by a cheaper and better one; means are compared, without significance."""
     timed = [p for p in points if not math.isnan(p.cost["seconds"])]
     beaten = f.beaten(timed, "seconds")
     if len(points) == 1:

@@ -18,7 +18,7 @@ MOST_RESETS = 4  # that are marked
 
 
 def of(record: Record) -> list[tuple[int, str]]:
-    """Return steps and the letters of their events, by rising step; nothing if the config cannot be read."""
+    """Return the steps with a letter for each event, such as an opacity reset; nothing if the config cannot be read."""
     try:
         steps = _steps(record)
     except (InputError, KeyError, TypeError, AttributeError, ArithmeticError):

@@ -11,12 +11,12 @@ LONGEST_NOTE = 700
 
 
 def paper_tables(group: Group) -> list[layout.Table]:
-    """Return the table of the runs at the common variant, with the rows of the paper."""
+    """Return the table of the runs with the settings that most runs share, with the rows of the paper."""
     return tables.build(_compared(group), machine=group.machine)
 
 
 def _compared(group: Group) -> list[Record]:
-    """Return the runs at the common variant; all if none has finished."""
+    """Return the runs with the settings that most runs share; all runs if none has finished."""
     return [r for r in group.records if r.variant == group.variant] or group.records
 
 

@@ -69,7 +69,7 @@ def places(folder: Path, name: str) -> dict[Path, Path]:
 
 
 def images(of: list[tuple[str, Path]]) -> list[Image]:
-    """Return pictures with their captions, the first ones in less than IMAGES_BUDGET bytes; damaged ones are left out.
+    """Return as many pictures, with captions, as fit into IMAGES_BUDGET bytes; damaged files are left out.
 
     Pictures that do not fit are first compressed more, then left out.
     """
@@ -108,7 +108,7 @@ def cut_strip(path: Path) -> list[StripRow]:
 
 
 def _row_height(body: Pixels) -> int:
-    """Return the height of a row: where the first line begins that is grey from side to side, as gaps are."""
+    """Return the height of a row of images: the first line of pixels that is all grey is the gap below the row."""
     grey = (body == body[:, :1, :1]).all((1, 2))
     inside = [y for y in range(1, len(body) - GAP) if grey[y : y + GAP].all() and (body[y : y + GAP] == 200).all()]
     return inside[0] if inside else len(body)

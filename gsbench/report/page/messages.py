@@ -79,7 +79,7 @@ def interval(of: Estimate, digits: int = 2, *, sign: bool = False) -> str:
 
 
 def over(of: Estimate) -> str:
-    """Say what an interval generalises to."""
+    """Say whether an interval holds for other scenes, or only for other seeds and views."""
     return {"scenes": "scenes like these", "": "–"}.get(of.over, f"{of.over}, on {count(of.scenes, 'scene')}")
 
 

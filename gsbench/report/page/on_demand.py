@@ -1,4 +1,4 @@
-"""Write the section on effects on demand: whether and why time was simulated, and which Gaussians the gates left."""
+"""Write the section on effects on demand: why a model depends on time, and which effects the Gaussians keep."""
 
 import math
 from collections import Counter
@@ -30,7 +30,7 @@ NAMES = EFFECT_SETS | {REMOVED: "removed"}
 
 
 def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection | None:
-    """Describe the decisions, and draw the effect sets and the harmonics of the Gaussians; None without decisions."""
+    """Describe the decisions, and draw how many Gaussians keep which effects and harmonics; None without decisions."""
     found = decided(group)
     if not found:
         return None
@@ -61,7 +61,7 @@ def _sentence(one: Decided) -> str:
 
 
 def _screen_words(runs: list[Record]) -> str:
-    """Say whether time was simulated, the reason in the first run, and the decisions of other seeds."""
+    """Say whether the model depends on time, the reason in the first run, and the decisions of other seeds."""
     screens = _screens(runs)
     if not screens:
         return ""
@@ -84,7 +84,7 @@ def _screens(runs: list[Record]) -> list[TimeScreen]:
 
 
 def _gate_words(one: Decided) -> list[str]:
-    """Say which Gaussians the gates left, and what the gate at the end changed."""
+    """Say which effects the Gaussians keep, and what their removal after the training changed."""
     if not one.gated:
         return ["No gate has changed a Gaussian."]
     kept = [f"{one.rows[name]:,.0f} {said}" for name, said in EFFECT_SETS.items() if one.rows[name] >= 0.5]
@@ -104,7 +104,7 @@ def _gate_words(one: Decided) -> list[str]:
 
 
 def _change(of: Estimate, unit: str, digits: int) -> str:
-    """Write a change with its interval, where there is one."""
+    """Format a change with its interval, if it has one."""
     interval = f" ({messages.interval(of, digits, sign=True)})" if of.over else ""
     return f"{messages.signed(of.mean, digits)} {unit}{interval}"
 
@@ -133,7 +133,7 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
 
 
 def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
-    """Draw a bar of effect sets and a bar of degrees for each scene and model."""
+    """Draw for each scene and model how many Gaussians keep which effects, and which degrees their harmonics have."""
     label = lambda one: messages.shorten_middle(f"{one.scene}, {one.name}", LONGEST_LABEL, LABEL_END)  # noqa: E731
     effect_sets = [
         charts.Bar(label(one), _shares([one.rows[name] for name in NAMES]), f"{one.left:,.0f} of {one.before:,.0f}")
@@ -176,7 +176,7 @@ def _swatches() -> list[Swatch]:
 
 
 def _images(found: list[Decided], folder: Path) -> list[Image]:
-    """Show the picture by effect set of the first seed of each scene and model, as many as there is room for."""
+    """Show pictures of Gaussians in the colours of their effects, for the first seed of each scene and model."""
     places = gallery.places(folder, OLD_PICTURE) | gallery.places(folder, PICTURE)
     paths = [next((p for r in one.runs if (p := places.get(r.path))), None) for one in found]
     captions = [f"{one.scene}, {one.name}" for one in found]

@@ -46,12 +46,12 @@ RC: dict[Any, Any] = {
 
 
 def model_colour(index: int) -> str:
-    """Return the stand-in of a model's colour."""
+    """Return the placeholder of a model's colour, which the page's style sheet replaces."""
     return f"#0200{index:02x}"
 
 
 def stage_colour(index: int) -> str:
-    """Return the stand-in of a stage's colour."""
+    """Return the placeholder of the colour of a training stage, which the page's style sheet replaces."""
     return f"#0300{index:02x}"
 
 
@@ -101,7 +101,10 @@ class Panel:
             self.axes.annotate(text, (x, row), color=colour, fontsize=FONT, bbox=box, **place)
 
     def svg(self, name: str, alt: str) -> str:
-        """Return the drawing as an element for HTML; `name` keeps its ids apart from those of other drawings."""
+        """Return the drawing as an SVG element.
+
+        `name` is part of its ids, so that drawings of a page do not share ids.
+        """
         circles = "".join(self._hit(*hit) for hit in self.hits)
         raw = io.StringIO()
         with mpl.rc_context(RC):
@@ -127,7 +130,7 @@ def _font(found: re.Match[str]) -> str:
 
 
 def _variable(colour: str) -> str:
-    """Name the variable for a stand-in colour."""
+    """Name the variable of the style sheet for a placeholder colour."""
     kind = {"02": "model-", "03": "stage-"}.get(colour[1:3])
     return f"{kind}{int(colour[5:], 16)}" if kind else VARIABLES.get(colour, "ink")
 

@@ -10,7 +10,7 @@ from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, P
 
 
 def quality_section(group: Group, canvas: Canvas) -> PageSection:
-    """Say how long each model needs for the targets, and draw the performance profile."""
+    """Say how long each model trains to reach given values of PSNR, and draw the performance profile."""
     targets = f.targets(group)
     if not targets:
         text = "No target: no finished run has PSNR on val and training seconds, or all reach the same."
@@ -57,7 +57,7 @@ def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
 
 
 def anytime_section(group: Group, canvas: Canvas) -> PageSection:
-    """Draw PSNR on val while training, for each scene, at the common variant."""
+    """Draw PSNR on val over the training, for each scene, of runs with the settings that most runs share."""
     drawings: list[PageFigure] = []
     rows: list[list[Value]] = []
     tails: dict[str, list[float]] = {}
@@ -117,7 +117,7 @@ def _when(step: int, steps: list[int], seconds: list[float]) -> float:
 
 
 def _anytime_words(tails: dict[str, list[float]]) -> list[str]:
-    """Say which models end below the best they had on val."""
+    """Say which models end with a lower PSNR on val than they had earlier."""
     lost = {m: fmean(losses) for m, losses in tails.items() if fmean(losses) >= 0.05}
     if not lost:
         return ["Every model ends within 0.05 dB of the best it had on val: none overfits visibly by its last step."]

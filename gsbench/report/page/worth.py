@@ -24,7 +24,7 @@ NESTED = "Nested: 7dgs_nodir, which is 7dgs less direction and nothing else, in 
 
 
 def effects_section(group: Group, family: Family, canvas: Canvas) -> PageSection:
-    """Price time, direction, AGR and their interactions in every unit, where the cells were run."""
+    """Show what time, direction, AGR and their interactions gain and cost, as far as the models were run."""
     cube = compare.cube(group, family)
     notes = []
     if cube.missing:
@@ -172,7 +172,7 @@ def _slowest_words(parts: dict[str, dict[str, float]], names: list[str]) -> str:
 
 
 def _stage_seconds(group: Group, model: str) -> dict[str, float]:
-    """Return the mean seconds of each of STAGES over scenes and seeds, and those of all else."""
+    """Return the mean seconds of each of STAGES over scenes and seeds, and the seconds of all other work."""
     (configuration,) = (c for c in group.main_configurations if c.model == model)
     scenes = [s for s in group.covered or configuration.runs if s in configuration.runs]
     runs = [[r for r in configuration.runs[s] if r.cost and not math.isnan(group.value(r, "seconds"))] for s in scenes]
@@ -240,7 +240,7 @@ def _pair_row(group: Group, pair: Pair) -> list[Value]:
 
 
 def _pair_words(group: Group, found: list[Pair]) -> list[str]:
-    """Say how many pairs are told apart, and name those that are not."""
+    """Say how many pairs of models differ significantly, and name the pairs that do not."""
     if all(math.isnan(p.p_holm) for p in found):
         first = found[0]
         by = f"by {messages.plain(first.difference.mean)} dB"

@@ -27,10 +27,10 @@ class Densification(ABC):
         """Prepare the rule for a training, and follow its rows.
 
         Args:
-            rows: of the model, which is initialised.
-            config: thresholds.
+            rows: the rows (Gaussians) of the initialised model.
+            config: the thresholds of densification.
             min_opacity: Gaussians of lower opacity may be pruned.
-            views: the number of training views, an epoch.
+            views: the number of training views, which make an epoch.
         """
         self.rows = rows
         self.model = rows.model
@@ -53,18 +53,18 @@ class Densification(ABC):
         Args:
             drawn: which Gaussians were not culled.
             g_means2d: gradient of the loss, a mean over `views`, by the 2D means.
-            width: of the image, pixels.
-            height: of the image, pixels.
-            views: in the batch.
+            width: width of the image, pixels.
+            height: height of the image, pixels.
+            views: number of views in the batch.
         """
 
     @abstractmethod
     def densify(self, generator: torch.Generator, has_reset: bool) -> int:
-        """Do one round; all random numbers come from `generator`.
+        """Do one round of densification: add and remove Gaussians.
 
         Args:
-            generator: of this round.
-            has_reset: whether opacities were reset before.
+            generator: gives all random numbers of this round.
+            has_reset: whether opacities were reset earlier in the training.
 
         Returns:
             How many Gaussians were refused because there would be too many.

@@ -14,7 +14,7 @@ LEAST_PIXELS = 0.05
 
 
 class MinimumScale:
-    """The minimum scale of each Gaussian in space: LEAST_PIXELS in the training camera in which it is largest."""
+    """The minimum scale of each Gaussian: LEAST_PIXELS pixels in the training camera that sees the Gaussian largest."""
 
     def __init__(self, model: GaussianModel, cameras: list[Camera]) -> None:
         """Measure the minimum scales of `model`, which is initialised and on its device, for the training `cameras`."""
