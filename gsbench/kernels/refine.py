@@ -156,6 +156,7 @@ class _Refine(Operation):
                 "outputs": outputs, "widths": tuple(widths), "value_widths": tuple(moved)}  # fmt: skip
 
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
+        self._match(tensors, numbers)
         return [x.new_empty(x.shape) for x in _Inputs.of(tensors).values]
 
 
@@ -200,7 +201,7 @@ def refine(
     """
     if (intervals is None) != (time is None):
         raise InputError("refine: expected intervals and time together, got one of them")
-    nothing = gamma.new_empty(0)
+    nothing = gamma.new_empty(0) if isinstance(gamma, Tensor) else gamma  # what is no tensor is refused with the others
     when = (nothing, nothing) if intervals is None else (intervals, time)
     return _refine(*values, weight_in, bias_in, weight_out, bias_out, units, gamma, *when,
                    EVERY_ROW if rows is None else rows)  # fmt: skip

@@ -5,6 +5,7 @@ The module needs no torch.
 
 import errno
 import re
+import sys
 from pathlib import Path
 
 from gsbench.errors import TooLargeError
@@ -12,6 +13,9 @@ from gsbench.errors import TooLargeError
 # Messages of the library loader, torch, C++, the system's threads and OpenCV where memory runs out.
 WITHOUT_MEMORY = re.compile(r"memory|bad_alloc|bad alloc|failed to map segment|can't start new thread", re.IGNORECASE)
 SMALL = 1 << 26  # bytes; smaller requests are not checked
+# Bytes of address space (`ulimit -v`) that Python, torch and OpenBLAS need to start. With less, torch or the C library
+# ends the process by a signal, at a place that depends on where libraries are loaded.
+LEAST_ADDRESS_SPACE = 1280 << 20
 
 
 def require(size: int, what: str, instead: str) -> None:
@@ -28,6 +32,19 @@ def require(size: int, what: str, instead: str) -> None:
     if free is not None and size > free:
         raise TooLargeError(f"{what} need {size / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are available: "
                             f"{instead}")  # fmt: skip
+
+
+def too_little_address_space() -> str | None:
+    """Tell in words that the process may use too few addresses for torch to be loaded; None if it may use enough."""
+    if sys.platform == "win32":  # it has no such limit
+        return None
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY or limit >= LEAST_ADDRESS_SPACE:
+        return None
+    return (f"this process is limited to {limit >> 20} MiB of address space (ulimit -v), and torch needs "
+            f"{LEAST_ADDRESS_SPACE >> 20} MiB to start: raise the limit")  # fmt: skip
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -7,7 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from gsbench.errors import InputError, one_line, printable
-from gsbench.process.memory import is_out_of_memory
+from gsbench.process.memory import is_out_of_memory, too_little_address_space
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,8 @@ class Problem:
 def do(composed: DictConfig) -> Problem | None:
     """Do a run; return None, or why it did not end well, which is also printed on stderr."""
     chosen = HydraConfig.get()
+    if (too_little := too_little_address_space()) is not None:
+        return _told(composed, Problem(f"out of memory: {too_little}", False))
     try:
         from gsbench.run.run import UnrecordedError, run  # imports torch
     except (ImportError, OSError, MemoryError) as error:

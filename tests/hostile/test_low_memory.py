@@ -49,7 +49,7 @@ def test_an_image_without_memory_is_not_a_damaged_one(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("megabytes", range(300, 1150, 50))
+@pytest.mark.parametrize("megabytes", [300, 400, 700, 1000, 1279, 1280, 1300, 1400, 1600, 2000])
 def test_too_little_memory_is_one_line(megabytes: int, tmp_path: Path) -> None:
     """Catches a stack trace or a signal, wherever the memory ends: as torch is loaded, the scene, in a step."""
     words = overrides(write_moving_square(tmp_path / "data"), tmp_path / "r", "model=7dgs")
@@ -64,7 +64,8 @@ def test_too_little_memory_is_one_line(megabytes: int, tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
     for path in record.find(tmp_path / "r"):
         assert record.read(path).status in ("ok", "failed")
-    if done.returncode and "OpenBLAS error: Memory allocation" not in done.stderr:  # it ends the process by itself
+    assert done.returncode or megabytes >= 1280
+    if done.returncode:
         errors = [line for line in done.stderr.splitlines() if line.startswith("gsbench: error:")]
         assert len(errors) == 1
         assert "out of memory" in errors[0]
