@@ -8,7 +8,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.headers import MAX_ADAM
 from gsbench.kernels.library import library_of
-from gsbench.kernels.operation import address, in_rows
+from gsbench.kernels.operation import address, addresses, in_rows
 from gsbench.kernels.tensors import check_number, check_tensor
 
 
@@ -112,18 +112,14 @@ def adam_all(
         slots = {
             "count": len(parameters[part]),
             "numbers": tuple([x.numel() for x in parameters[part]]),
-            "gradients": _addresses(gradients[part]),
-            "steps": _addresses(steps[part]),
+            "gradients": addresses(gradients[part]),
+            "steps": addresses(steps[part]),
             "rates": tuple(rates[part]),
             "beta1": betas[0],
             "beta2": betas[1],
             "eps": eps,
-            "out.parameters": _addresses(parameters[part]),
-            "out.means": _addresses(means[part]),
-            "out.squares": _addresses(squares[part]),
+            "out.parameters": addresses(parameters[part]),
+            "out.means": addresses(means[part]),
+            "out.squares": addresses(squares[part]),
         }
         library_of("cpu").call("adam_all", slots, parameters[0])
-
-
-def _addresses(tensors: Sequence[Tensor]) -> tuple[int, ...]:
-    return tuple([x.data_ptr() for x in tensors])

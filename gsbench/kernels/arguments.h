@@ -289,23 +289,23 @@ GSB_FIELDS(AdamState, OUTPUTS, parameter, mean, square)
 }  // namespace gsb
 
 // kernel(name, the structures it takes)
-#define GSB_KERNELS(kernel)                                                                        \
-    kernel(slice_triangular, TriangularArgs, Observation)                                        \
-    kernel(slice_triangular_backward, TriangularArgs, ObservationGrads, TriangularGrads)         \
-    kernel(slice_rotated, RotatedArgs, Observation)                                              \
-    kernel(slice_rotated_backward, RotatedArgs, ObservationGrads, RotatedGrads)                  \
-    kernel(slice_static, StaticArgs, StaticSlice)                                                   \
-    kernel(slice_static_backward, StaticArgs, StaticSliceGrads, StaticGrads)                         \
-    kernel(show_colors, ColorArgs, Colors)                                                         \
-    kernel(show_colors_backward, ColorArgs, ShownColors, GivenColors, ColorGrads)                  \
-    kernel(refine, RefineArgs, Refined)                                                            \
-    kernel(refine_backward, RefineArgs, RefinedGrads, RefineGrads)                                 \
-    kernel(project, ProjectArgs, Splats)                                                           \
-    kernel(project_backward, ProjectArgs, SplatGrads, ProjectGrads)                                \
-    kernel(blend, BlendArgs, Picture)                                                              \
-    kernel(blend_backward, BlendArgs, BlendState, PictureGrads, BlendGrads)                        \
-    kernel(flag_values, ValueArgs, ValueFlags)                                                     \
-    kernel(l1_ssim, SimilarityArgs, SimilarityLoss)                                                \
+#define GSB_KERNELS(kernel)                                                                    \
+    kernel(slice_triangular, TriangularArgs, Observation)                                      \
+    kernel(slice_triangular_backward, TriangularArgs, ObservationGrads, TriangularGrads)       \
+    kernel(slice_rotated, RotatedArgs, Observation)                                            \
+    kernel(slice_rotated_backward, RotatedArgs, ObservationGrads, RotatedGrads)                \
+    kernel(slice_static, StaticArgs, StaticSlice)                                              \
+    kernel(slice_static_backward, StaticArgs, StaticSliceGrads, StaticGrads)                   \
+    kernel(show_colors, ColorArgs, Colors)                                                     \
+    kernel(show_colors_backward, ColorArgs, ShownColors, GivenColors, ColorGrads)              \
+    kernel(refine, RefineArgs, Refined)                                                        \
+    kernel(refine_backward, RefineArgs, RefinedGrads, RefineGrads)                             \
+    kernel(project, ProjectArgs, Splats)                                                       \
+    kernel(project_backward, ProjectArgs, SplatGrads, ProjectGrads)                            \
+    kernel(blend, BlendArgs, Picture)                                                          \
+    kernel(blend_backward, BlendArgs, BlendState, PictureGrads, BlendGrads)                    \
+    kernel(flag_values, ValueArgs, ValueFlags)                                                 \
+    kernel(l1_ssim, SimilarityArgs, SimilarityLoss)                                            \
     kernel(adam, AdamArgs, AdamState)
 
 // const A&, const B&, .. of the structures A, B, ..

@@ -280,6 +280,11 @@ def address(x: Tensor | None) -> int:
     return 0 if x is None else x.data_ptr()
 
 
+def addresses(tensors: Sequence[Tensor]) -> tuple[int, ...]:
+    """Return the address of each tensor's first number; the tensors must live as long as for `address`."""
+    return tuple([x.data_ptr() for x in tensors])
+
+
 def first_rows(name: str, count: int, x: Tensor) -> int:
     """Return the number of first rows that an operation changes; `count` may be EVERY_ROW, which means all.
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.headers import HIDDEN, MAX_NETWORKS, MAX_VALUES
 from gsbench.kernels.library import Slots, allocate, library_of
-from gsbench.kernels.operation import EVERY_ROW, Operation, Tensors, address, first_rows, in_rows
+from gsbench.kernels.operation import EVERY_ROW, Operation, Tensors, address, addresses, first_rows, in_rows
 from gsbench.kernels.tensors import check_tensor
 
 
@@ -88,7 +88,7 @@ class _Refine(Operation):
         slots = self._slots(tensors, numbers)
         values = slots["rows"]
         out = [allocate(self._memory, x, x.shape) for x in values]
-        library_of(values[0].device.type).call("refine", slots | {"out.values": _addresses(out)}, values[0])
+        library_of(values[0].device.type).call("refine", slots | {"out.values": addresses(out)}, values[0])
         return out, slots
 
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
@@ -108,7 +108,7 @@ class _Refine(Operation):
         if library.needs_scratch:
             shape = networks, slots["refined"], slots["features"]
             scratch = allocate("gradients of AGR's features", like, shape)
-        slots |= {"given.values": _addresses(dense), "grad.values": _addresses(moved), "grad.scratch": address(scratch)}
+        slots |= {"given.values": addresses(dense), "grad.values": addresses(moved), "grad.scratch": address(scratch)}
         slots |= {f"grad.{key}": g.data_ptr() for key, g in g_weights.items()}
         library.call("refine_backward", slots, like)
         own = _Inputs.of(tensors).of_layers(g_weights)
@@ -120,7 +120,7 @@ class _Refine(Operation):
         given = _Inputs.of(tensors)
         values, weights = in_rows(given.values), given.layers()
         intervals = None if given.intervals is None else given.intervals.contiguous()
-        slots |= {"values": _addresses(values), "intervals": address(intervals), "time": address(given.time),
+        slots |= {"values": addresses(values), "intervals": address(intervals), "time": address(given.time),
                   "rows": values, "layers": weights, "kept": (intervals, given.time)}  # fmt: skip
         return slots | {key: x.data_ptr() for key, x in weights.items()}
 
@@ -158,10 +158,6 @@ class _Refine(Operation):
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
         self._match(tensors, numbers)
         return [x.new_empty(x.shape) for x in _Inputs.of(tensors).values]
-
-
-def _addresses(tensors: Tensors) -> tuple[int, ...]:
-    return tuple([x.data_ptr() for x in tensors])
 
 
 _refine = _Refine()

@@ -12,7 +12,7 @@ namespace gsb {
 inline namespace GSB_ISA {
 namespace {
 
-constexpr int BLOCK = 128;            // Gaussians
+constexpr int BLOCK = 128;             // Gaussians
 constexpr int64_t TASK = 8 * BLOCK;    // of the forward pass
 constexpr int64_t CHUNK = 32 * BLOCK;  // a task of the backward pass; the weights' gradients are summed by chunks
 // Tiles of `product` and `outer`: as many sums as registers hold.
