@@ -148,49 +148,49 @@ GSB_HD inline void with_width(int width, F f) {
     }
 }
 
+// Calls whole<W>(i) for sixteen rows of a block that follow one another from its i-th on, and one(i) for each other row.
+template <class Whole, class One>
+GSB_HD inline void each_row(const Block& block, int width, Whole whole, One one) {
+    with_width(width, [&]<int W>() {
+        for (int i = 0; i < block.count; i += LANES) {
+            if constexpr (W > 0) {
+                if (block.is_whole(i)) {
+                    whole.template operator()<W>(i);
+                    continue;
+                }
+            }
+            for (int k = i; k < i + lanes_from(i, block.count); ++k) one(k);
+        }
+    });
+}
+
 // The block's rows of an array [N, width] as `width` rows of BLOCK; zero past the block's end.
 void load_block(const Block& block, const float* array, int width, float* out) {
     for (int k = 0; k < width; ++k) {
         for (int i = block.count; i < BLOCK; ++i) out[k * BLOCK + i] = 0.0f;
     }
-    with_width(width, [&]<int W>() {
-        for (int i = 0; i < block.count; i += LANES) {
-            const int n = lanes_from(i, block.count);
-            if constexpr (W > 0) {
-                if (block.is_whole(i)) {
-                    Vec columns[W];
-                    load_columns(array + block.at(i) * W, columns);
-                    GSB_UNROLL for (int k = 0; k < W; ++k) columns[k].store(out + k * BLOCK + i);
-                    continue;
-                }
-            }
-            for (int j = i; j < i + n; ++j) {
-                const float* row = array + block.at(j) * width;
-                for (int k = 0; k < width; ++k) out[k * BLOCK + j] = row[k];
-            }
-        }
+    const auto whole = [&]<int W>(int i) {
+        Vec columns[W];
+        load_columns(array + block.at(i) * W, columns);
+        GSB_UNROLL for (int k = 0; k < W; ++k) columns[k].store(out + k * BLOCK + i);
+    };
+    each_row(block, width, whole, [&](int i) {
+        const float* row = array + block.at(i) * width;
+        for (int k = 0; k < width; ++k) out[k * BLOCK + i] = row[k];
     });
 }
 
 // What load_block reads, plus the `width` rows at `moved`, to another array.
 void store_block(const Block& block, const float* moved, const float* array, int width, float* out) {
-    with_width(width, [&]<int W>() {
-        for (int i = 0; i < block.count; i += LANES) {
-            const int n = lanes_from(i, block.count);
-            if constexpr (W > 0) {
-                if (block.is_whole(i)) {
-                    Vec columns[W];
-                    load_columns(array + block.at(i) * W, columns);
-                    GSB_UNROLL for (int k = 0; k < W; ++k) columns[k] += Vec::load(moved + k * BLOCK + i);
-                    store_columns(columns, out + block.at(i) * W);
-                    continue;
-                }
-            }
-            for (int j = i; j < i + n; ++j) {
-                const int64_t at = block.at(j) * width;
-                for (int k = 0; k < width; ++k) out[at + k] = array[at + k] + moved[k * BLOCK + j];
-            }
-        }
+    const auto whole = [&]<int W>(int i) {
+        Vec columns[W];
+        load_columns(array + block.at(i) * W, columns);
+        GSB_UNROLL for (int k = 0; k < W; ++k) columns[k] += Vec::load(moved + k * BLOCK + i);
+        store_columns(columns, out + block.at(i) * W);
+    };
+    each_row(block, width, whole, [&](int i) {
+        const int64_t at = block.at(i) * width;
+        for (int k = 0; k < width; ++k) out[at + k] = array[at + k] + moved[k * BLOCK + i];
     });
 }
 
