@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # One thread: tests share the machine, and the sums of a run are those of its thread count.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "COLUMNS": "100"}
 IMPORTED = (
-    "torch._dynamo",  # torch's optimizers import it when the first one is made
+    "torch._dynamo",  # torch's optimizers import it, and the time screen has one
     "cv2",
     "gsbench.measure.perceptual",
     "gsbench.models.registry",

@@ -80,7 +80,7 @@ class Trainer:
         self.gating = Gating(self.rows, scene, self.renderer, config)
         self.finite_check = FiniteCheck(config.device)
         if config.device.startswith("cuda"):  # a bad step is found some steps later, and must not be applied until then
-            self.optimizer.adam.found_inf = self.finite_check.skip  # type: ignore[attr-defined]
+            self.optimizer.skip = self.finite_check.skip
         self.curve = Curve()
         self.best = Best()
         self.step = 0

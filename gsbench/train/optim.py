@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,10 +20,13 @@ if TYPE_CHECKING:  # config.py needs hydra, which a machine that checks kernels 
     from gsbench.config import LearningRate, ModelConfig, TrainConfig
 
 OPTIMIZERS = ("adam", "sparse_adam")
+BETAS, EPS = (0.9, 0.999), 1e-15
 
 
 class Optimizer:
-    """torch.optim.Adam over a model's parameter groups (eps 1e-15, as 3DGS).
+    """Adam over a model's parameter groups (eps 1e-15, as 3DGS).
+
+    One call of the CPU's kernel updates its parameters. torch.optim.Adam updates those of a GPU and of the reference.
 
     `adam` moves Gaussians that no view of the batch sees by their remaining momentum. `sparse_adam` leaves them and
     their moments unchanged (Mallick et al. 2024, Taming 3DGS). Where all Gaussians are visible the two are the same.
@@ -48,14 +54,23 @@ class Optimizer:
         for name in config.lr:
             if name not in {*groups, "refinement", "lambda"}:
                 raise InputError(f"model.lr: model '{config.name}' has no '{name}'. {did_you_mean(name, groups)}")
+        self.groups = groups
         self.rates = {name: config.lr[name] for name in groups}
         self.model = model
         self.train = train
         self.extent = extent
         self.is_sparse = kind == "sparse_adam"
-        self.adam = torch.optim.Adam(
-            [{"params": parameters, "name": name} for name, parameters in groups.items()], lr=0.0, eps=1e-15, fused=True
-        )
+        # Of each parameter, named as torch.optim.Adam names them.
+        self.moments: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
+        self.skip: Tensor | None = None  # a GPU's finite check, [] 1 if a step is to change nothing
+
+    @cached_property
+    def torch_adam(self) -> torch.optim.Adam:
+        """torch's Adam over the same groups and moments. Made when it is needed: it takes a second to import."""
+        groups = [{"params": parameters, "name": name} for name, parameters in self.groups.items()]
+        adam = torch.optim.Adam(groups, lr=0.0, betas=BETAS, eps=EPS, fused=True)
+        adam.state = self.moments
+        return adam
 
     def step(
         self,
@@ -65,7 +80,7 @@ class Optimizer:
     ) -> None:
         """Update the parameters that have a gradient, at the rates of this step, and drop the gradients.
 
-        Where `adam.found_inf` [] is 1, nothing is updated.
+        If `skip` [] is 1, nothing is updated.
 
         Args:
             step: number of the step, counted from 0.
@@ -73,33 +88,40 @@ class Optimizer:
                 gradient.
             slowed: factor of AGR's learning rate.
         """
-        by_kernel = []
-        for group in self.adam.param_groups:
-            group["lr"] = rate_at(self.rates[group["name"]], step, self.train, self.extent)
-            if group["name"] == "refinement":
-                group["lr"] *= slowed
-            if self.is_sparse and group["name"] in self.model.splats:
+        rates = self.rates_at(step, slowed)
+        by_kernel: list[tuple[nn.Parameter, float]] = []
+        rest_has_gradients = False
+        for name, parameters in self.groups.items():
+            if self.is_sparse and name in self.model.splats:
                 assert drawn is not None
-                self._step_rows(group, drawn)
-            by_kernel += [(p, group["lr"]) for p in group["params"] if p.grad is not None and self._is_native(p)]
+                self._step_rows(parameters[0], rates[name], drawn)
+            for parameter in parameters:
+                if parameter.grad is not None and self._is_native(parameter):
+                    by_kernel.append((parameter, rates[name]))
+                elif parameter.grad is not None:
+                    rest_has_gradients = True
         if by_kernel:
             self._step_all(by_kernel)
-        if any(p.grad is not None for group in self.adam.param_groups for p in group["params"]):
-            self.adam.step()  # parameters on a GPU, or those of the reference
-            self.adam.zero_grad(set_to_none=True)
+        if rest_has_gradients:
+            for group in self.torch_adam.param_groups:
+                group["lr"] = rates[group["name"]]
+            if self.skip is not None:
+                self.torch_adam.found_inf = self.skip  # type: ignore[attr-defined]
+            self.torch_adam.step()
+            self.torch_adam.zero_grad(set_to_none=True)
+
+    def rates_at(self, step: int, slowed: float = 1.0) -> dict[str, float]:
+        """Return the learning rate of each group at a step; `slowed` is a factor of AGR's."""
+        rates = {name: rate_at(rate, step, self.train, self.extent) for name, rate in self.rates.items()}
+        return {name: rate * slowed if name == "refinement" else rate for name, rate in rates.items()}
 
     def _is_native(self, parameter: Tensor) -> bool:
         """Tell whether the kernel of the CPU updates a parameter."""
-        return parameter.device.type == "cpu" and self.model.backend.serves(parameter) and self._skip is None
-
-    @property
-    def _skip(self) -> Tensor | None:
-        """Return a GPU's finite check, [] 1 where nothing is to be updated; reading it would wait for the GPU."""
-        return getattr(self.adam, "found_inf", None)
+        return parameter.device.type == "cpu" and self.model.backend.serves(parameter) and self.skip is None
 
     def _state_of(self, parameter: Tensor) -> dict[str, Tensor]:
-        """Return the moments of a parameter, zero at first, in the layout of torch.optim.Adam."""
-        state: dict[str, Tensor] = self.adam.state[parameter]
+        """Return the moments of a parameter, zero at first."""
+        state = self.moments[parameter]
         if not state:
             state["step"] = torch.zeros((), device=parameter.device)
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
@@ -112,31 +134,28 @@ class Optimizer:
         states = [self._state_of(p) for p, _ in rated]
         steps, means, squares = ([state[key] for state in states] for key in ("step", "exp_avg", "exp_avg_sq"))
         torch._foreach_add_(steps, 1)
-        betas, eps = self.adam.defaults["betas"], self.adam.defaults["eps"]
-        adam_all(parameters, gradients, means, squares, steps, rates, list(betas), eps)
+        adam_all(parameters, gradients, means, squares, steps, rates, list(BETAS), EPS)
         for parameter, _ in rated:
             parameter.grad = None
 
-    def _step_rows(self, group: dict[str, Any], drawn: Tensor) -> None:
-        """Update the rows `drawn`, unless the step is to be skipped."""
-        (parameter,) = group["params"]
+    def _step_rows(self, parameter: nn.Parameter, rate: float, drawn: Tensor) -> None:
+        """Update the rows `drawn` of a parameter with a gradient, unless the step is to be skipped."""
         if parameter.grad is None:
             return
-        if self._skip is not None:
-            drawn = drawn & (self._skip == 0)
+        if self.skip is not None:
+            drawn = drawn & (self.skip == 0)
         state = self._state_of(parameter)
-        state["step"] += 1 if self._skip is None else 1 - self._skip
+        state["step"] += 1 if self.skip is None else 1 - self.skip
         update = adam if self.model.backend.serves(parameter) else adam_reference
         moments = state["exp_avg"], state["exp_avg_sq"]
         with torch.no_grad():
-            update(parameter, parameter.grad, *moments, drawn, group["lr"], list(group["betas"]), group["eps"],
-                   state["step"])  # fmt: skip
+            update(parameter, parameter.grad, *moments, drawn, rate, list(BETAS), EPS, state["step"])
         parameter.grad = None
 
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
         """Move Adam's moments as `model.select(rows)` moved the Gaussians; those of `fresh` rows become zero."""
         for parameter in self.model.splats.values():
-            state = self.adam.state.get(parameter, {})
+            state = self.moments.get(parameter, {})
             for name in ("exp_avg", "exp_avg_sq"):
                 if name in state:
                     moments = state[name][rows]
@@ -146,14 +165,12 @@ class Optimizer:
     def forget(self, parameter: Tensor) -> None:
         """Zero the moments of a parameter that was set directly, as 3DGS does after an opacity reset."""
         for name in ("exp_avg", "exp_avg_sq"):
-            if parameter in self.adam.state:
-                self.adam.state[parameter][name].zero_()
+            if parameter in self.moments:
+                self.moments[parameter][name].zero_()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the moments and the number of steps of every parameter, for the checkpoint."""
-        return {f"{group['name']}.{i}": dict(self.adam.state[parameter])
-                for group in self.adam.param_groups for i, parameter in enumerate(group["params"])
-                if parameter in self.adam.state}  # fmt: skip
+        return {key: dict(self.moments[parameter]) for key, parameter in self._keyed() if parameter in self.moments}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from the `state_dict` of a checkpoint, once the model's parameters are loaded.
@@ -161,17 +178,23 @@ class Optimizer:
         Raises:
             InputError: moments are not of this model's parameters.
         """
-        self.adam.state.clear()
-        own = {f"{group['name']}.{i}": p for group in self.adam.param_groups for i, p in enumerate(group["params"])}
+        self.moments.clear()
+        own = dict(self._keyed())
         for name, moments in state.items():
             if name not in own:
                 raise InputError(f"checkpoint: expected moments of {', '.join(own)}, got some of {name!r:.80}")
             parameter = own[name]
-            self.adam.state[parameter] = {
+            self.moments[parameter] = {
                 "step": tensor(moments, "step", (), torch.float32),
                 "exp_avg": tensor(moments, "exp_avg", parameter.shape, parameter.dtype),
                 "exp_avg_sq": tensor(moments, "exp_avg_sq", parameter.shape, parameter.dtype),
             }
+
+    def _keyed(self) -> Iterator[tuple[str, nn.Parameter]]:
+        """Yield the parameters with their keys in a checkpoint: the group's name and a number."""
+        for name, parameters in self.groups.items():
+            for i, parameter in enumerate(parameters):
+                yield f"{name}.{i}", parameter
 
 
 def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) -> float:

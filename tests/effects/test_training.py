@@ -145,11 +145,11 @@ def test_agr_slows_down_after_a_gate(words: tuple[str, ...]) -> None:
     """Catches a gated training whose AGR swings to the end, an ungated one that is slowed, and rates of others."""
     one, rates = trainer(*words), []
 
-    def note(step: int, drawn: torch.Tensor, slowed: float = 1.0) -> None:
-        original(step, drawn, slowed)
-        rates.append({group["name"]: group["lr"] for group in one.optimizer.adam.param_groups})
+    def note(step: int, slowed: float = 1.0) -> dict[str, float]:
+        rates.append(original(step, slowed))
+        return rates[-1]
 
-    original, one.optimizer.step = one.optimizer.step, note
+    original, one.optimizer.rates_at = one.optimizer.rates_at, note
     end(one)
     agr, others = [rate["refinement"] for rate in rates], [rate["opacities"] for rate in rates]
     assert agr[0] == agr[59] == pytest.approx(2e-4)

@@ -3,12 +3,14 @@
 import math
 import re
 from dataclasses import fields, replace
+from typing import Any
 
 import pytest
 import torch
 
 from gsbench.config import PenaltiesConfig
 from gsbench.errors import InputError
+from gsbench.kernels.adam import adam_all
 from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
@@ -94,7 +96,7 @@ def test_opacities_are_reset_when_the_schedule_says() -> None:
     for step in (0, 1):
         fitted.run(lambda _: None, "a step", goes_on=lambda: False)
         assert (torch.sigmoid(opacities).max().item() <= ceiling * 1.001) == (step == 1)
-    state = fitted.optimizer.adam.state[opacities]
+    state = fitted.optimizer.moments[opacities]
     assert not state["exp_avg"].any()
     assert not state["exp_avg_sq"].any()
 
@@ -171,16 +173,22 @@ def test_children_of_every_densification_are_drawn_anew() -> None:
     assert drawn[0] == drawn[3]
 
 
-def test_rates_fall_in_the_optimizer() -> None:
-    """Catches rates that are set once: the optimizer's own are those of the step."""
-    fitted = trainer("7dgs")
+def test_rates_fall_in_the_optimizer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches rates that are set once, or given to another parameter: those of a step reach Adam."""
+    fitted, given = trainer("7dgs"), {}
+
+    def note(parameters: list[torch.Tensor], *arguments: Any) -> None:
+        given.update({p.data_ptr(): rate for p, rate in zip(parameters, arguments[4], strict=True)})
+        adam_all(parameters, *arguments)
+
+    monkeypatch.setattr("gsbench.train.optim.adam_all", note)
     for step in (0, 50, 99):
         fitted.step = step
         fitted._descend()
-        rates = {group["name"]: group["lr"] for group in fitted.optimizer.adam.param_groups}
-        for name, rate in fitted.config.model.lr.items():
-            if name in rates:
-                assert rates[name] == rate_at(rate, step, fitted.config.train, fitted.scene.extent)
+        for name, parameters in fitted.model.groups().items():
+            rate = rate_at(fitted.config.model.lr[name], step, fitted.config.train, fitted.scene.extent)
+            assert all(given[p.data_ptr()] == rate for p in parameters if p.data_ptr() in given), name
+        assert len(given) >= 10
 
 
 def test_what_is_long_in_time_is_split_along_its_path() -> None:
@@ -317,10 +325,10 @@ def test_the_lightest_gaussians_go_and_moments_follow() -> None:
     weights = blend_weights(model, fitted.scene.train, antialias=False)
     kept = weights.argsort(descending=True, stable=True)[: round(N / 2)].sort().values
     means = model.splats["means"].detach().clone()
-    moments = fitted.optimizer.adam.state[model.splats["means"]]["exp_avg"].clone()
+    moments = fitted.optimizer.moments[model.splats["means"]]["exp_avg"].clone()
     fitted._thin()
     assert torch.equal(model.splats["means"], means[kept])
-    assert torch.equal(fitted.optimizer.adam.state[model.splats["means"]]["exp_avg"], moments[kept])
+    assert torch.equal(fitted.optimizer.moments[model.splats["means"]]["exp_avg"], moments[kept])
     assert len(fitted.minimum_scale.least) == len(fitted.density.unseen) == len(kept)
     at = max(fitted.schedule.scaled(15_600), fitted.schedule.densify_stop)
     assert [step for step in range(100) if fitted.schedule.thins(step)] == [at - 1]
