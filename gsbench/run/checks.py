@@ -41,6 +41,7 @@ RANGES = {  # of numbers that the schema types but does not bound, both ends inc
     "train.sh_every": (1, ENDLESS),
     "train.refine_from": (0, ENDLESS),
     "train.lambda_from": (0, ENDLESS),
+    "train.cooldown_from": (0, ENDLESS),
     "train.densify.start": (0, ENDLESS),
     "train.densify.stop": (0, ENDLESS),
     "train.densify.every": (1, ENDLESS),

@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # config.py needs hydra, which a machine that checks kernels 
 
 OPTIMIZERS = ("adam", "sparse_adam")
 BETAS, EPS = (0.9, 0.999), 1e-15
+COOLED = 0.1  # share of a learning rate that is left at the end of a cooldown
 
 
 class Optimizer:
@@ -202,12 +203,15 @@ def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) ->
 
     A `per_run` rate is multiplied by sqrt(recipe_iterations / iterations). The length of an Adam step is its rate,
     whatever the size of the gradient. The steps of a run add up in proportion to its length where gradients keep their
-    sign, and to its square root where they are noise. The root improved every model (docs/tuning.md).
+    sign, and to its square root where they are noise. The root improved every model (docs/tuning.md). From
+    `cooldown_from` on, a rate also falls linearly to COOLED of itself.
     """
     scale = extent if rate.per_extent else 1.0
     if rate.per_run:
         scale *= math.sqrt(train.recipe_iterations / train.iterations)
     progress = step / train.iterations
+    if train.cooldown_from is not None and (begin := train.cooldown_from / train.recipe_iterations) < progress:
+        scale *= 1 - (1 - COOLED) * (progress - begin) / (1 - begin)
     if rate.end is None:
         return rate.start * scale
     return float(rate.start ** (1 - progress) * rate.end**progress * scale)

@@ -58,6 +58,17 @@ def test_rates_of_short_runs() -> None:
     assert rate_at(LearningRate(1e-3, per_run=True), 0, TrainConfig(iterations=300), 5) == pytest.approx(1e-2)
 
 
+def test_all_rates_fall_to_a_tenth_in_a_cooldown() -> None:
+    """Catches a cooldown that begins at a step of this run, forgets constant rates or ends elsewhere."""
+    train = TrainConfig(iterations=100, recipe_iterations=1000, cooldown_from=800)
+    for rate in (LearningRate(0.05), LearningRate(1.6e-4, 1.6e-6)):
+        plain = [rate_at(rate, step, TrainConfig(iterations=100, recipe_iterations=1000), 5) for step in range(101)]
+        cooled = [rate_at(rate, step, train, 5) for step in range(101)]
+        assert cooled[:81] == plain[:81]
+        assert cooled[90] / plain[90] == pytest.approx(0.55)
+        assert cooled[100] / plain[100] == pytest.approx(0.1)
+
+
 def test_a_copied_gaussian_does_not_inherit_momentum() -> None:
     """Catches moments left at the wrong rows: kept rows keep theirs, in the new order, fresh ones start at zero."""
     model, optimizer = fitted()
