@@ -1,4 +1,4 @@
-"""Average over the seeds the decisions about the effects of a scene and of its Gaussians."""
+"""Average over seeds which effects (time, view direction, AGR) a scene's model and its Gaussians keep."""
 
 import math
 import re
@@ -20,7 +20,10 @@ DEGREES = 4  # of harmonics: 0, 1, 2, 3
 
 @dataclass(frozen=True)
 class Decided:
-    """The decisions about effects (time, direction, AGR) on a scene for one configuration, averaged over the seeds."""
+    """Which effects (time, view direction, AGR) Gaussians keep in one configuration on one scene, averaged over seeds.
+
+    A configuration is a model with its settings. The step that removes effects from Gaussians is called a gate.
+    """
 
     scene: str
     configuration: Configuration
@@ -40,17 +43,20 @@ class Decided:
 
     @property
     def before(self) -> float:
-        """Return the number of Gaussians before any effect was removed."""
+        """Return the number of Gaussians before any effect or Gaussian was removed."""
         return sum(self.rows.values())
 
     @property
     def left(self) -> float:
-        """Return the number of Gaussians after the last removal of effects."""
+        """Return the number of Gaussians that remain after the last removal."""
         return self.before - self.rows.get(REMOVED, 0.0)
 
 
 def decided(group: Group) -> list[Decided]:
-    """Return the decisions by scene and configuration; none where every Gaussian has every effect."""
+    """Return which effects (time, view direction, AGR) Gaussians keep, for each scene and configuration.
+
+    A configuration is a model with its settings. The list is empty if every Gaussian has every effect of its model.
+    """
     configurations = [c for c in group.configurations if c.on_demand]
     shared = Counter(c.series for c in configurations)
     names = [c.series if shared[c.series] == 1 else c.name for c in configurations]
@@ -94,22 +100,22 @@ def _ends(gates: list[Gate]) -> bool:
 
 
 def _rows(gates: list[Gate], name: str) -> int:
-    """Count the Gaussians by the effects that they keep at the end, and those that were removed."""
+    """Count the Gaussians that keep a set of effects at the end; for the name "removed", count those removed."""
     of = gates if name == REMOVED else gates[-1:]
     return sum(max(0, gate.rows.get(name, 0)) for gate in of)
 
 
 def _of_degree(gate: Gate, degree: int) -> int:
-    """Count the Gaussians whose harmonics have a degree, with any number of waves."""
+    """Count the Gaussians whose colours have spherical harmonics of the given degree, with any time dependence."""
     return sum(max(0, n) for name, n in gate.orders.items() if re.match(rf"degree {degree}\b", name))
 
 
 def _less(before: float | None, after: float | None) -> float:
-    """Return the change of a value: `after` minus `before`."""
+    """Return the change of a value, `after` minus `before`; NaN if one of the two is missing."""
     return math.nan if before is None or after is None else after - before
 
 
 def _mean(values: list[float]) -> Estimate:
-    """Estimate a mean over seeds, without the missing ones."""
+    """Estimate a mean over seeds with its interval; missing values (NaN) are left out."""
     known = np.array([value for value in values if math.isfinite(value)])
     return estimate([known[:, None]] if len(known) else [], generalise=False)

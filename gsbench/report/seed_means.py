@@ -1,4 +1,4 @@
-"""Average quantities over seeds and scenes, each with its interval (gsbench.report.intervals)."""
+"""Average measured quantities over seeds and scenes, with 95 % intervals (gsbench.report.intervals)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,9 @@ SPREAD = conditions.SPREAD  # every table has the same
 
 
 def mean(runs: Mapping[str, Sequence[Record]], key: str) -> Estimate:
-    """Estimate the mean of a quantity over scenes, of its mean over seeds; NaN if it is missing from a run or scene.
+    """Estimate a quantity's mean over seeds and then over scenes, with its interval over seeds.
+
+    The mean is NaN if the quantity is missing from a run, or if a scene has no run.
 
     Args:
         runs: finished runs by scene.

@@ -1,4 +1,4 @@
-"""Compute the steps at which the schedule of a run changed its training, from the config in its record."""
+"""Find the steps at which the schedule changed a run's training, from the configuration in its record."""
 
 from typing import Any
 
@@ -18,7 +18,10 @@ MOST_RESETS = 4  # that are marked
 
 
 def of(record: Record) -> list[tuple[int, str]]:
-    """Return the steps with a letter for each event, such as an opacity reset; nothing if the config cannot be read."""
+    """Return the steps of training events, such as an opacity reset, with a letter for each event.
+
+    The list is empty if the configuration cannot be read.
+    """
     try:
         steps = _steps(record)
     except (InputError, KeyError, TypeError, AttributeError, ArithmeticError):
@@ -42,7 +45,10 @@ def _steps(record: Record) -> list[tuple[int, str]]:
 
 
 def _rates(record: Record) -> dict[str, Any]:
-    """Return the learning rates of the run's model; of model=auto those of the chosen candidate (run/resolve.py)."""
+    """Return the learning rates of a run's model from its configuration.
+
+    If the run chose its model automatically (model=auto), these are the rates of the chosen one (run/resolve.py).
+    """
     model = record.provenance.config["model"]
     if model.get("candidates"):
         model = model["candidates"]["moving" if record.effects.time else "static"]

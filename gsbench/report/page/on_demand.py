@@ -1,4 +1,7 @@
-"""Write the section on effects on demand: why a model depends on time, and which effects the Gaussians keep."""
+"""Write the section of the HTML report on effects on demand: which effects the Gaussians keep, and why.
+
+The effects are time, view direction and AGR (the neural refinement of Gaussians).
+"""
 
 import math
 from collections import Counter
@@ -30,7 +33,10 @@ NAMES = EFFECT_SETS | {REMOVED: "removed"}
 
 
 def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection | None:
-    """Describe the decisions, and draw how many Gaussians keep which effects and harmonics; None without decisions."""
+    """Make the section on which effects (time, view direction, AGR) Gaussians keep; None if no run chose effects.
+
+    The figures show how many Gaussians keep which effects, and the degrees of their spherical harmonics.
+    """
     found = decided(group)
     if not found:
         return None
@@ -55,13 +61,13 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection
 
 
 def _sentence(one: Decided) -> str:
-    """Describe the decisions on a scene for a model."""
+    """Describe which effects (time, view direction, AGR) a model and its Gaussians keep on a scene."""
     parts = [_screen_words(one.runs), *_gate_words(one)]
     return f"On {one.scene}, {one.name}: {' '.join(part for part in parts if part)}"
 
 
 def _screen_words(runs: list[Record]) -> str:
-    """Say whether the model depends on time, the reason in the first run, and the decisions of other seeds."""
+    """Say whether the model depends on time, why the first run decided so, and whether other seeds agree."""
     screens = _screens(runs)
     if not screens:
         return ""
@@ -84,7 +90,7 @@ def _screens(runs: list[Record]) -> list[TimeScreen]:
 
 
 def _gate_words(one: Decided) -> list[str]:
-    """Say which effects the Gaussians keep, and what their removal after the training changed."""
+    """Say which effects the Gaussians keep, and how the removal of the others after training changed PSNR and time."""
     if not one.gated:
         return ["No gate has changed a Gaussian."]
     kept = [f"{one.rows[name]:,.0f} {said}" for name, said in EFFECT_SETS.items() if one.rows[name] >= 0.5]
@@ -104,13 +110,13 @@ def _gate_words(one: Decided) -> list[str]:
 
 
 def _change(of: Estimate, unit: str, digits: int) -> str:
-    """Format a change with its interval, if it has one."""
+    """Format the change of a value, with its interval if there is one."""
     interval = f" ({messages.interval(of, digits, sign=True)})" if of.over else ""
     return f"{messages.signed(of.mean, digits)} {unit}{interval}"
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
-    """List what could not be decided, equal notes of seeds once, and what the numbers do not contain."""
+    """List what could not be decided and what the numbers leave out; equal notes of several seeds are merged."""
     named: dict[str, list[int]] = {}
     for one in found:
         for run in one.runs:
@@ -133,7 +139,7 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
 
 
 def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
-    """Draw for each scene and model how many Gaussians keep which effects, and which degrees their harmonics have."""
+    """Draw for each scene and model how many Gaussians keep which effects, and the SH degrees of their colours."""
     label = lambda one: messages.shorten_middle(f"{one.scene}, {one.name}", LONGEST_LABEL, LABEL_END)  # noqa: E731
     effect_sets = [
         charts.Bar(label(one), _shares([one.rows[name] for name in NAMES]), f"{one.left:,.0f} of {one.before:,.0f}")
@@ -153,7 +159,7 @@ def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
 
 
 def _stage(degree: int) -> int:
-    """Return the colour of a degree: more harmonics stand out more from the page, in both themes."""
+    """Return the colour number of an SH degree; higher degrees have a stronger contrast with the background."""
     return DEGREES - 1 - degree
 
 
@@ -169,14 +175,17 @@ def _mean_degree(one: Decided) -> str:
 
 
 def _swatches() -> list[Swatch]:
-    """Name the colours of both drawings."""
+    """Return the colour legend of two figures: Gaussians by the effects that they keep, and by SH degree."""
     effect_sets = [Swatch(said, f"model-{MODELS.index(EFFECT_SET_LIKE[name])}") for name, said in EFFECT_SETS.items()]
     degrees = [Swatch(f"degree {i}", f"stage-{_stage(i)}") for i in range(DEGREES)]
     return [*effect_sets, Swatch(NAMES[REMOVED], "line"), *degrees]
 
 
 def _images(found: list[Decided], folder: Path) -> list[Image]:
-    """Show pictures of Gaussians in the colours of their effects, for the first seed of each scene and model."""
+    """Return an image for each scene and model in which Gaussians are coloured by the effects that they keep.
+
+    The image is that of the first seed that has one.
+    """
     places = gallery.places(folder, OLD_PICTURE) | gallery.places(folder, PICTURE)
     paths = [next((p for r in one.runs if (p := places.get(r.path))), None) for one in found]
     captions = [f"{one.scene}, {one.name}" for one in found]

@@ -1,8 +1,8 @@
-"""Give every model a colour and a marker, the same in all figures, for the light and the dark theme.
+"""Give every model one colour and one marker, the same in all figures, for the light and the dark theme.
 
-The first hues are those of Okabe and Ito, which readers with the common colour deficiencies can distinguish. They are
-darkened for a white page and lightened for a black one, to a contrast of at least 4.5:1. Markers distinguish the models
-without colour.
+The first hues come from the palette of Okabe and Ito, which readers with common colour deficiencies can distinguish.
+Each hue is darkened for a white page and lightened for a black page, so that its contrast is at least 4.5:1. The
+markers distinguish the models without colour.
 """
 
 from dataclasses import dataclass
@@ -28,14 +28,17 @@ STAGES_DARK = ("#c9e0f5", "#a3c6e6", "#7ba8cf", "#588ab3", "#3f6e95", "#2c5373",
 
 @dataclass(frozen=True)
 class Style:
-    """The style of a model: the number of its colour, and its marker as matplotlib's letter."""
+    """The style of a model in figures: the number of its colour and its matplotlib marker."""
 
     colour: int
     marker: str
 
 
 def styles(models: list[str]) -> dict[str, Style]:
-    """Return the style of each model; a known model always has the same, other models take the rest in turn."""
+    """Return the style (colour and marker) of each model.
+
+    A model in MODELS always has the same style. Other models get the remaining styles in alphabetical order.
+    """
     others = sorted(set(models) - set(MODELS))
     spare = range(len(MODELS), len(LIGHT))
     free = [*spare, *(i for i, m in enumerate(MODELS) if m not in models)]
