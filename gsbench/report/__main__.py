@@ -1,4 +1,4 @@
-"""Print the table of a folder of records and write it there, with a page (``python -m gsbench.report RESULTS_DIR``)."""
+"""Print the result table of a folder of run records and write it there (``python -m gsbench.report RESULTS_DIR``)."""
 
 import argparse
 import sys
@@ -65,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _compared(records: list[Record], folder: Path, other: Path) -> Comparison:
-    """Compare these records with those of another folder, and print which of the other records cannot be read."""
+    """Compare the records of one folder with those of another, and print which of the other records cannot be read."""
     theirs, faults = tables.load(other)
     for fault in faults:
         print(f"gsbench.report: left out: {fault}", file=sys.stderr)

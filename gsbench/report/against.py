@@ -29,9 +29,11 @@ SAME_LOAD = 0.5  # mean loads further apart than this make seconds of two runs i
 
 @dataclass(frozen=True)
 class Limit:
-    """The largest difference of two means that counts as equal, and the widest interval that can show equality.
+    """Two limits for the comparison of two means: `equal` and `widest`.
 
-    If `relative` is true, both limits are fractions of the mean in the second folder.
+    Means whose difference is at most `equal` count as equal. A larger difference that is not significant also counts as
+    equal, but only if the 95 % interval is no wider than ± `widest`. If `relative` is true, both limits are fractions
+    of the mean in the second folder.
     """
 
     equal: float
@@ -227,7 +229,7 @@ def _squares(*samples: list[float]) -> tuple[float, int]:
 
 
 def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
-    """Return the reason why two samples of runs cannot be compared at all, or an empty string if they can."""
+    """Return the reason why two sets of runs cannot be compared at all, or an empty string if they can."""
     if not ours or not theirs:
         return f"no run finished {'here' if not ours else 'there'}"
     first = theirs[0]
@@ -246,7 +248,7 @@ def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
 
 
 def _other_machine(ours: list[Record], theirs: list[Record]) -> str:
-    """Return the reason why the times of two samples of runs cannot be compared, or an empty string if they can.
+    """Return the reason why the times of two sets of runs cannot be compared, or an empty string if they can.
 
     Times are comparable if all were measured on one machine under about the same load.
     """
@@ -264,7 +266,7 @@ def _other_machine(ours: list[Record], theirs: list[Record]) -> str:
 
 
 def _judge(found: Judged, limit: Limit, p: float) -> Judged:
-    """Decide whether two means agree, differ, or allow no decision; RULE states the criteria."""
+    """Decide whether two means agree, differ, or allow no decision, by the criteria in the constant RULE."""
     if found.reason:
         return found
     unit = abs(fmean(found.theirs)) if limit.relative else 1.0

@@ -1,6 +1,7 @@
-"""Compare models in pairs, and compute what each effect (time, view direction, AGR) gains in dB and costs.
+"""Compare models in pairs, and compute what each effect gains in dB and what it costs.
 
-The costs are training seconds, milliseconds per frame and bytes. AGR is the neural refinement of Gaussians.
+The effects are time, view direction and AGR (the neural refinement of Gaussians). The costs are training seconds,
+milliseconds per frame and bytes.
 """
 
 import itertools
@@ -88,7 +89,7 @@ def _views(group: Group, configuration: Configuration, scene: str) -> dict[str, 
 
 @dataclass(frozen=True)
 class Price:
-    """What an effect (time, view direction or AGR) gains in PSNR and costs in time and memory.
+    """What an effect (time, view direction or neural refinement) gains in PSNR and costs in time and memory.
 
     An interaction of effects is stored in the same way: it is the change of one effect's gain when another is added.
     """
@@ -102,9 +103,9 @@ class Price:
 
 @dataclass(frozen=True)
 class Cube:
-    """The eight models with each combination of time, view direction and AGR, and what these effects gain and cost.
+    """The eight models with each combination of three effects, and what these effects gain and cost.
 
-    Models that were not run are missing.
+    The effects are time, view direction and AGR (neural refinement). Models that were not run are missing.
     """
 
     cells: dict[Cell, Configuration]
@@ -116,9 +117,10 @@ class Cube:
 
 
 def priced(group: Group) -> list[Weights]:
-    """Return the weighted sums of models that give the gain of each effect (time, direction, AGR) and interaction.
+    """Return the weighted sums of models that give the gain of each effect and of each interaction of effects.
 
-    `cube` tests each of these sums in PSNR, training seconds, milliseconds per frame and MB.
+    The effects are time, view direction and AGR (neural refinement). `cube` tests each of these sums in PSNR, training
+    seconds, milliseconds per frame and MB.
     """
     cells, own, _ = _filled(group)
     return [_sum(of, weights) for _, weights in _contrasts() for of in (cells, own) if weights.keys() <= of.keys()]
@@ -127,10 +129,10 @@ def priced(group: Group) -> list[Weights]:
 def cube(group: Group, family: Family) -> Cube:
     """Compute what time, view direction and AGR gain and cost, from the eight models with and without them.
 
-    The gain of an effect is the difference of two models that differ only in this effect. It is computed with each of
-    the other two effects on or off, which gives 12 differences. The interaction of two effects is the difference of two
-    such gains, which gives 6. The interaction of all three effects is the difference of two interactions. An effect's
-    mean over the other effects needs all eight models.
+    AGR is the neural refinement of Gaussians. The gain of an effect is the difference of two models that differ only in
+    this effect. It is computed with each of the other two effects on or off, which gives 12 differences. The
+    interaction of two effects is the difference of two such gains, which gives 6. The interaction of all three effects
+    is the difference of two interactions. An effect's mean over the other effects needs all eight models.
 
     Args:
         group: the run records of one experiment.
@@ -151,11 +153,11 @@ def cube(group: Group, family: Family) -> Cube:
 
 
 def _filled(group: Group) -> tuple[dict[Cell, Configuration], dict[Cell, Configuration], list[str]]:
-    """Find the model that was run for each combination of time, view direction and AGR.
+    """Find the model that was run for each combination of time, view direction and AGR (neural refinement).
 
     Returns:
-        The configuration for each combination; the same dictionary with the models of NESTED in their places; and the
-        names of models left out because another model has the same combination of effects.
+        The model of each combination. The same, but with the models in NESTED (7dgs without view direction) instead of
+        others. The names of the models left out because another model has the same combination.
     """
     cells: dict[Cell, Configuration] = {}
     left_out = []
@@ -168,7 +170,7 @@ def _filled(group: Group) -> tuple[dict[Cell, Configuration], dict[Cell, Configu
 
 
 def is_single(name: str) -> bool:
-    """Tell whether a name denotes one effect between two models, not an interaction or a mean over models."""
+    """Tell whether the name of a gain stands for a single effect, not for an interaction or a mean over models."""
     return " × " not in name and MEAN not in name
 
 
@@ -178,16 +180,15 @@ def _cell(configuration: Configuration) -> Cell:
 
 
 def _words(cell: Cell) -> str:
-    """Name a combination of effects (time, direction, AGR), such as "time + AGR", or "no effect"."""
+    """Name a combination of the effects time, direction and AGR (neural refinement), such as "time + AGR"."""
     on = [name for name, has in zip(FACTORS, cell, strict=True) if has]
     return " + ".join(on) or "no effect"
 
 
 def _contrasts() -> list[tuple[str, dict[Cell, float]]]:
-    """Return the name of every effect and interaction, and the weights of the models whose weighted sum it is.
+    """Return every effect and every interaction of effects: its name, and the weights of models in its weighted sum.
 
-    The effects are time, view direction and AGR. Single effects come before interactions. The mean of an effect over
-    the others follows the effect's four differences.
+    The effects are time, view direction and AGR (neural refinement). Single effects come before interactions.
     """
     found = []
     for size in (1, 2, 3):

@@ -84,7 +84,7 @@ def _machine(record: Record) -> str:
 
 
 def _load(records: list[Record]) -> list[str]:
-    """Return a footnote on the load of the machine that most runs used; empty if no record of a run has a load."""
+    """Return a footnote on the load of the machine that most runs used; an empty list if no record has the load."""
     machine = Counter(r.provenance.machine for r in records).most_common(1)[0][0]
     costs = [r.cost for r in records if r.cost and r.provenance.machine == machine]
     loads = [cost.load for cost in costs if cost.load is not None]
@@ -113,12 +113,12 @@ def _seeds(records: list[Record], spread: str) -> str:
 
 
 def _goes_with_scene(records: list[Record], get: Get) -> bool:
-    """Tell whether all runs on the same scene have the same value; runs on different scenes may differ."""
+    """Tell whether a setting depends only on the scene, so that all runs on a scene have the same value."""
     return len({(r.scene, get(r)) for r in records}) == len({r.scene for r in records})
 
 
 def _by_scene(records: list[Record], get: Get) -> str:
-    """List the values of a setting in all runs; a value that not all scenes have is followed by its scenes."""
+    """List the values of a setting in all runs, each followed by its scenes if not all scenes have it."""
     every = {record.scene for record in records}
     scenes: dict[str, set[str]] = {}
     for record in records:

@@ -22,8 +22,8 @@ def psnr_val(record: Record) -> float:
     """Return the PSNR in dB on the validation views at the end of a run; NaN if it was not measured.
 
     If the run was evaluated on the validation views, this is its final PSNR. Otherwise it is the last value of the
-    training curve. The curve ends before effects (time, view direction, AGR) are removed from the Gaussians of the
-    finished model, so the PSNR that this removal costs is subtracted.
+    training curve. The curve ends before effects (time, view direction, neural refinement) are removed from the
+    Gaussians of the finished model, so the PSNR that this removal costs is subtracted.
     """
     if record.protocol.get("eval_split") == "val":
         return _number((record.metrics or {}).get("psnr"))
@@ -57,9 +57,9 @@ class Configuration:
 
     @property
     def on_demand(self) -> bool:
-        """Tell whether a run chose the effects (time, view direction, AGR) of its Gaussians automatically.
+        """Tell whether a run chose the effects of its Gaussians automatically, so that some Gaussians may lack some.
 
-        Some Gaussians may then lack effects that the model has.
+        The effects are time, view direction and neural refinement.
         """
         return any(r.on_demand for runs in self.runs.values() for r in runs)
 
@@ -119,7 +119,8 @@ class Group:
     def series(self) -> list[str]:
         """Return the names of the report's curves.
 
-        Each model has one curve. Its runs from which effects (time, view direction, AGR) were removed have another one.
+        Each model has one curve. Its runs from which effects (time, view direction, neural refinement) were removed
+        have another one.
         """
         return sorted({self.series_of(r) for r in self.records})
 
@@ -127,8 +128,9 @@ class Group:
         """Return the name of the report's curve that a run belongs to.
 
         Runs of a model with different training lengths and sizes share a curve. The setting `effects.gate` says when
-        effects (time, view direction, AGR) are removed from Gaussians that do not need them. Runs whose setting differs
-        from the model's default have a curve of their own, unless all runs of the group have the same setting.
+        effects (time, view direction, neural refinement) are removed from Gaussians that do not need them. Runs whose
+        setting differs from the model's default have a curve of their own, unless all runs of the group have the same
+        setting.
         """
         own = gating(record)
         return f"{record.model}, {own}" if own and len(self._gatings) > 1 else record.model
@@ -148,7 +150,7 @@ class Group:
 
     @cached_property
     def main_configurations(self) -> list[Configuration]:
-        """Return for each model the configuration whose settings most models share."""
+        """Return one configuration for each model: the one with the settings that most models share."""
         return [c for c in self.configurations if c.variant == self.variant]
 
     @cached_property
@@ -191,7 +193,7 @@ class Group:
 
     @cached_property
     def elsewhere(self) -> int:
-        """Return the number of finished runs that were not made on the machine of most runs."""
+        """Return the number of finished runs that were made on another machine than most runs."""
         return sum(r.provenance.machine != self.machine for r in self.finished)
 
     def value(self, record: Record, quantity: str) -> float:
@@ -251,7 +253,8 @@ def groups(records: list[Record]) -> list[Group]:
 def gating(record: Record) -> str:
     """Return the setting `effects.gate` of a run as text, such as "gate=end"; "" if it is the model's default.
 
-    The setting says when effects (time, view direction, AGR) are removed from Gaussians that do not need them.
+    The setting says when effects (time, view direction, neural refinement) are removed from Gaussians that do not need
+    them.
     """
     config = record.provenance.config
     effects, model = (part if isinstance(part := config.get(name), dict) else {} for name in ("effects", "model"))

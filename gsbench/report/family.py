@@ -72,7 +72,10 @@ def _tested(group: Group, quantity: str, contrasts: Iterable[Weights]) -> dict[K
 
 
 def _key(weights: Weights) -> tuple[Key, float]:
-    """Return a key for a weighted sum that ignores the order and the overall sign of its terms, and return the sign."""
+    """Return a key for a weighted sum, and the sign of the sum.
+
+    The key does not depend on the order of the terms, and it is the same if all terms change their sign.
+    """
     terms = sorted((c.model, c.variant, weight) for weight, c in weights)
     sign = math.copysign(1.0, terms[0][2])
     return tuple((model, variant, sign * weight) for model, variant, weight in terms), sign

@@ -1,4 +1,4 @@
-"""Compute each model's Pareto frontier of PSNR and cost, the best model in a budget, and the time to reach a PSNR."""
+"""Compute Pareto frontiers of PSNR and cost, the best model within a budget, and the time to reach a PSNR."""
 
 import math
 from collections.abc import Sequence
@@ -30,8 +30,8 @@ class FrontierPoint:
     def series(self) -> str:
         """Return the name of the report's curve that has this point.
 
-        The name is the model, or the model with a note if effects (time, view direction, AGR) were removed from
-        Gaussians.
+        The name is the model. If effects (time, view direction, neural refinement) were removed from its Gaussians, the
+        name says so.
         """
         return self.configuration.series
 
@@ -87,24 +87,24 @@ class BudgetChoice:
 
 
 def has_val(of: Sequence[FrontierPoint]) -> bool:
-    """Tell whether every point has a PSNR on the validation views.
+    """Tell whether the PSNR on the validation views is known for every model that is compared.
 
-    If so, the best point can be chosen on these views, and its PSNR can be shown on other views.
+    If so, the best model can be chosen on these views, and its PSNR can be shown on other views.
     """
     return bool(of) and not any(math.isnan(p.val) for p in of)
 
 
 def ranked(of: Sequence[FrontierPoint]) -> list[FrontierPoint]:
-    """Return points by falling PSNR on the validation views.
+    """Sort points (models with their mean PSNR and cost) by falling PSNR on the validation views.
 
-    If a point has no such PSNR, all points are sorted by PSNR on the evaluated views.
+    If this PSNR is not known for all points, they are sorted by PSNR on the evaluated views.
     """
     on_val = has_val(of)
     return sorted(of, key=lambda p: -(p.val if on_val else p.psnr.mean))
 
 
 def contest(of: Sequence[FrontierPoint], cost: str, budget: float) -> list[FrontierPoint]:
-    """Return each model's best point among those that cost at most `budget`, sorted by falling PSNR."""
+    """Return each model's best result among those that cost at most `budget`, sorted by falling PSNR."""
     best: dict[str, FrontierPoint] = {}
     for point in ranked(of):
         if point.cost[cost] <= budget:
@@ -119,12 +119,12 @@ def contested(of: Sequence[FrontierPoint]) -> list[Weights]:
 
 
 def choose(of: Sequence[FrontierPoint], cost: str, budget: float, family: Family) -> BudgetChoice | None:
-    """Choose the point with the best PSNR among those that cost at most `budget`; None if no point does.
+    """Choose the model with the best PSNR among those that cost at most `budget`; None if no model does.
 
-    The chosen point is compared with each other model's best point within the budget, paired by seed and view.
+    The chosen model is compared with the best result of each other model within the budget, paired by seed and view.
 
     Args:
-        of: the points from which to choose.
+        of: the points (models with their mean PSNR and cost) from which to choose.
         cost: the cost that the budget limits: "seconds" of training, "ms" per frame or "mb" of parameters.
         budget: the limit in seconds, milliseconds or MB.
         family: the p-values of the report, adjusted for all its comparisons; it must include those of `contested`.

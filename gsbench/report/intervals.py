@@ -2,8 +2,8 @@
 
 With three seeds, the interval of a percentile bootstrap is much too narrow. First, resampling three values gives only
 two thirds of their variance. Second, its quantiles are those of a normal distribution (about 2 standard errors), while
-Student's t has 4.3. This module therefore estimates the variance over scenes, seeds and views separately, and applies
-Student's t to each. The simulations are in docs/statistics.md.
+Student's t needs 4.3 for three values. This module therefore estimates the variance over scenes, seeds and views
+separately, and applies Student's t to each. The simulations are in docs/statistics.md.
 
 - With three or more scenes, the means of the scenes are a sample of similar scenes. Their variance includes that of
   seeds and views. Student's t with (scenes - 1) degrees of freedom is exact if these means are normal.

@@ -1,4 +1,4 @@
-"""Average over seeds which effects (time, view direction, AGR) a scene's model and its Gaussians keep."""
+"""Average over seeds how many Gaussians keep which effects (time, view direction, neural refinement)."""
 
 import math
 import re
@@ -20,9 +20,9 @@ DEGREES = 4  # of harmonics: 0, 1, 2, 3
 
 @dataclass(frozen=True)
 class Decided:
-    """Which effects (time, view direction, AGR) Gaussians keep in one configuration on one scene, averaged over seeds.
+    """How many Gaussians of a model keep which effects (time, view direction, neural refinement) on a scene.
 
-    A configuration is a model with its settings. The step that removes effects from Gaussians is called a gate.
+    The numbers are means over seeds. The step that removes effects from Gaussians is called a gate.
     """
 
     scene: str
@@ -53,9 +53,10 @@ class Decided:
 
 
 def decided(group: Group) -> list[Decided]:
-    """Return which effects (time, view direction, AGR) Gaussians keep, for each scene and configuration.
+    """Return how many Gaussians keep which effects (time, view direction, neural refinement).
 
-    A configuration is a model with its settings. The list is empty if every Gaussian has every effect of its model.
+    The list has one entry for each scene and each model with its settings. It is empty if no run removed an effect or
+    chose its effects automatically.
     """
     configurations = [c for c in group.configurations if c.on_demand]
     shared = Counter(c.series for c in configurations)
@@ -100,7 +101,10 @@ def _ends(gates: list[Gate]) -> bool:
 
 
 def _rows(gates: list[Gate], name: str) -> int:
-    """Count the Gaussians that keep a set of effects at the end; for the name "removed", count those removed."""
+    """Count the Gaussians that have a certain set of effects at the end, such as time without view direction.
+
+    For the name "removed", count all Gaussians that were removed.
+    """
     of = gates if name == REMOVED else gates[-1:]
     return sum(max(0, gate.rows.get(name, 0)) for gate in of)
 

@@ -16,7 +16,7 @@ _NOT_OF_THE_RECIPE = ("iterations", "downscale", "eval_split", "protocol", "best
 
 
 class ModelRecipe(NamedTuple):
-    """The model, the experiment and the training settings that all runs of a table row share; they differ in seed."""
+    """The model, the experiment and the training settings that the runs of a table row have in common."""
 
     model: str
     experiment: str
@@ -60,8 +60,8 @@ class Sorted:
 def sort(records: list[Record]) -> Sorted:
     """Sort run records into those with the 7DGS paper's protocol, those with another protocol, and those on other data.
 
-    Other data are scenes that stand in for scenes of the paper. Records are skipped without a message if their model is
-    not one of the five in MODELS, or if their data neither are nor replace a data set of the paper.
+    Other data are scenes that stand in for scenes of the paper. A record is skipped without a message if its model is
+    not one of the five in MODELS, or if it belongs to no data set of the paper.
     """
     at_paper: dict[str, list[Record]] = {name: [] for name in PROTOCOLS}
     pools: dict[tuple[str, str, str, str, int], Pool] = {}  # images of a data set may differ in size by scene

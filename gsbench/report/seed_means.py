@@ -20,7 +20,7 @@ def mean(runs: Mapping[str, Sequence[Record]], key: str) -> Estimate:
 
     Args:
         runs: finished runs by scene.
-        key: the quantity, a column of `gsbench.report.tables.tidy`.
+        key: the name of the quantity, such as "psnr".
     """
     scenes = [np.array([[_number(quantities(run).get(key))] for run in seeds]) for seeds in runs.values()]
     if any(len(scene) == 0 or np.isnan(scene).any() for scene in scenes):

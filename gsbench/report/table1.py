@@ -28,7 +28,10 @@ Line = dict[str, Any]  # of the CSV
 
 
 def build(found: Sorted) -> tuple[list[Table], list[Line]]:
-    """Make a table for each data set of the paper and for each group of runs at another protocol, and the CSV lines."""
+    """Make the tables in the format of Table 1 of the 7DGS paper, and the lines of the CSV file.
+
+    There is a table for each data set of the paper, and one for each group of runs with another protocol or other data.
+    """
     made: list[Table] = []
     lines: list[Line] = []
     for dataset, records in found.paper.items():
@@ -91,7 +94,10 @@ class _Table1Builder:
         self.marks: list[str] = []
 
     def make(self, title: str, scenes: list[str], notes: list[str]) -> Table:
-        """Make a section for every scene that has a run, and an average over the scenes that all models finished."""
+        """Make the table: a section for every scene that has a run, and an average over scenes.
+
+        The average is over the scenes that all models finished.
+        """
         sections = [self._scene(s) for s in scenes if any(r.scene == s for r in self.records)]
         if len(sections) > 1:
             sections.append(self._average(scenes))

@@ -80,7 +80,7 @@ def tidy(records: list[Record]) -> pd.DataFrame:
 
 
 def quantities(r: Record) -> dict[str, Any]:
-    """Return the quantities of a run record by name, as `tidy` shows them; a missing number is None."""
+    """Return the quantities of a run record in a dictionary by name; a missing number is None."""
     flat: dict[str, Any] = {
         name: getattr(r, name) for name in ("experiment", "dataset", "scene", "model", "variant", "seed")
     }

@@ -30,7 +30,7 @@ started: list[Path] = []  # the folders of the plans of this process
 
 
 class WritePlan(Callback):
-    """Hydra callback that writes plan.json when a sweep starts, and `ended/<number>.json` beside it when a run ends."""
+    """A Hydra callback that writes plan.json when a sweep starts, and `ended/<number>.json` when a run ends."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the plan of the sweep, and print the command that shows the status of its runs."""

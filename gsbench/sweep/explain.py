@@ -34,8 +34,8 @@ def explain(error: Exception) -> str:
 def raised_by_library(error: Exception) -> bool:
     """Tell whether Hydra or a launcher's library raised an error itself, for example because of wrong settings.
 
-    If a run in another process fails, the launcher's library raises the run's error again. That error has a cause,
-    which holds the original stack, so it does not count as an error of the library.
+    If a run in another process fails, the launcher's library raises the run's error again. Such an error has a cause,
+    which holds the original traceback. It does not count as an error of the library.
     """
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
     return error.__cause__ is None and str(frame.f_globals.get("__name__")).partition(".")[0] in LIBRARIES

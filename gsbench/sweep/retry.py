@@ -1,4 +1,4 @@
-"""Launch the runs of an experiment again that failed, were lost or never started, with the launcher they had."""
+"""Relaunch those runs of an experiment that failed, were lost or never started, with their original launcher."""
 
 import os
 import sys
@@ -38,7 +38,7 @@ def broken(experiment: Experiment) -> list[RequestedRun]:
 
 
 def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfig], Any]) -> int:
-    """Launch the runs again that failed, were lost or never started; wait for them and return how many there were.
+    """Relaunch the runs that failed, were lost or never started; wait for them, and return their number.
 
     Args:
         experiment: the state of the experiment, read just before.

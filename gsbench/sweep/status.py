@@ -93,7 +93,7 @@ def _judge(experiment: Experiment, one: Identity) -> RunStatus:
     """Determine the state of a run.
 
     The first of these that exists decides: its live process, its record, its job in Slurm's queue, and a command that
-    can still start it. Otherwise the run failed or is lost.
+    can still start the run. Otherwise the run failed or is lost.
     """
     requested = experiment.requested.get(one)
     _, progress = experiment.traces.progress.get(one, (None, None))
@@ -129,7 +129,7 @@ def _judge(experiment: Experiment, one: Identity) -> RunStatus:
 
 
 def _kept(experiment: Experiment, requested: RequestedRun | None) -> Outcome | None:
-    """Return the outcome of a requested run whose record was made with other overrides, or None.
+    """Return the outcome of a requested run whose record was made with other overrides; None if there is none.
 
     The sweep stored the path of this record when the run ended.
     """

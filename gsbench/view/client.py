@@ -36,7 +36,7 @@ class Client:
             client: viser's handle of the browser.
             renderers: the renderers of the models that can be shown, at least one, all of one scene.
             scene: the scene with its training views, or a text that says why there are none.
-            most_cost: the nanoseconds that a Gaussian may add to a frame; such a Gaussian has the brightest colour.
+            most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
         """
         self.client = client
         self.controls = Controls(client, renderers, scene)

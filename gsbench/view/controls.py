@@ -61,7 +61,7 @@ class Controls:
         self.play.on_update(self._start_clock)
 
     def _add_effects(self) -> None:
-        """Add controls that switch off single effects of the models, such as time, view direction and AGR."""
+        """Add controls that switch off effects of the models: time, view direction and AGR (neural refinement)."""
         gui, renderers = self.client.gui, self._renderers.values()
         degree = max(renderer.trained_active.sh_degree for renderer in renderers)
         with gui.add_folder("effects"):
@@ -126,12 +126,12 @@ class Controls:
         self.changed.set()
 
     def _hold(self, on: bool) -> None:
-        """Keep the Gaussians at the present time, or let the time slider change them again."""
+        """Keep showing the Gaussians of the present time, or let the time slider change them again."""
         self._held = self.now if on else None
         self.changed.set()
 
     def _freeze(self, on: bool) -> None:
-        """Keep the Gaussians as they are for the present viewpoint, or let them follow the camera again."""
+        """Keep showing the Gaussians computed for the present viewpoint, or let them follow the camera again."""
         position = torch.tensor(np.asarray(self.client.camera.position), dtype=torch.float32)
         self._frozen = position if on else None
         self.changed.set()
@@ -165,12 +165,12 @@ class Controls:
 
     @property
     def wiped(self) -> float:
-        """Return the part of the image width, in [0, 1], that shows the first of two images in the layout "wipe"."""
+        """Return the fraction of the image width, in [0, 1], at which a wipe between two images has its edge."""
         return _within(self.wipe.value, 0.0, 1.0)
 
     @property
     def layout(self) -> str:
-        """Return the arrangement of the images: one image, two side by side, or one wiped over the other."""
+        """Return the layout of the images: one image, two side by side, or a wipe between two."""
         return self.mode.value if self.mode.value in (SIDE, WIPE) else ONE
 
     def shown(self) -> list[ShownImage]:

@@ -231,7 +231,7 @@ def _answer(status: HTTPStatus, text: str) -> Response:
 
 
 def _silent() -> logging.Logger:
-    """Return a silent logger for `websockets`, which otherwise prints a stack trace for every client without HTTP."""
+    """Return a silent logger for `websockets`, which otherwise prints a traceback if a client does not speak HTTP."""
     logger = logging.getLogger("gsbench.view.door")
     logger.propagate = False
     logger.addHandler(logging.NullHandler())

@@ -22,7 +22,7 @@ EVERY_DEGREE = 3  # of the harmonics
 
 
 class FrameRequest(NamedTuple):
-    """What a browser requests of a model's frame, apart from the camera: the time, the effects and the colours."""
+    """The settings of a frame that a browser requests, apart from the camera: the time, the effects and the colours."""
 
     time: float | None  # in [0, 1]; None where the scene has none
     center: torch.Tensor | None = None  # [3] the viewpoint of the slice; None: that of the camera
@@ -56,7 +56,8 @@ class Frame(NamedTuple):
 class FrameRenderer:
     """Renders the frames of one run's model, one frame at a time.
 
-    The renderer switches effects (such as AGR) of the model on and off for each frame, so frames cannot overlap.
+    The renderer switches effects of the model, such as the neural refinement, on and off for each frame. Therefore it
+    cannot render two frames at once.
     """
 
     def __init__(self, run: LoadedRun, most_cost: float) -> None:
@@ -64,8 +65,8 @@ class FrameRenderer:
 
         Args:
             run: the run with the model to render.
-            most_cost: the nanoseconds that a Gaussian may add to a frame. Such a Gaussian has the brightest colour. The
-                value is the same for all models that are compared.
+            most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
+                The value is the same for all models that are compared.
         """
         self.run = run
         self.name = f"{run.folder.parent.name} {run.folder.name}"  # such as "7dgs seed0"
@@ -109,7 +110,9 @@ class FrameRenderer:
             return image[0], watch.ms
 
     def _active(self, request: FrameRequest) -> ActiveComponents:
-        """Return the active parts of the model (such as AGR), without those that the browser switches off."""
+        """Return the active parts of the model, such as the neural refinement, without those that the user switches
+        off.
+        """
         trained = self.trained_active
         degree = min(request.sh_degree, trained.sh_degree)
         return replace(trained, refine=request.agr and trained.refine, sh_degree=degree)

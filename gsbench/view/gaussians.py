@@ -1,4 +1,4 @@
-"""Convert a model, sliced at a camera centre and a time, to 3D Gaussians in the format of trained 3DGS models."""
+"""Convert a model, at a camera centre and a time, to 3D Gaussians in the format of trained 3DGS models."""
 
 import math
 
@@ -19,11 +19,11 @@ LARGEST_OPACITY = 1 - 2**-24  # the largest float32 below 1, whose logit is fini
 
 
 def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = False) -> TrainedGaussians:
-    """Slice a model at a viewpoint and a time, and return those 3D Gaussians whose opacity is large enough to be drawn.
+    """Compute a model's 3D Gaussians at a viewpoint and a time, and return those with enough opacity to be drawn.
 
     Args:
         model: the initialised model.
-        query: the viewpoint and the time at which to slice.
+        query: the viewpoint and the time at which to compute the Gaussians (a slice of the model).
         keep_harmonics: whether colours stay spherical harmonics of the view direction. Otherwise each Gaussian has the
             constant colour that is seen from the query's viewpoint.
 
@@ -62,13 +62,16 @@ def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def has_harmonics(model: GaussianModel) -> bool:
-    """Tell whether the geometry of a model does not depend on the view direction, and its colours are SH."""
+    """Tell whether a model's geometry does not depend on view direction and its colours are spherical harmonics."""
     own = type(model).shade in (GaussianModel.shade, Gaussians4DModel.shade)
     return own and "direction" not in model.observes
 
 
 def harmonics_at(model: GaussianModel, query: Query) -> Tensor:
-    """Return the SH coefficients of the colours at the time of a query, [N, K, 3], up to the degree in use."""
+    """Return the spherical harmonics coefficients of the colours at a certain time, [N, K, 3].
+
+    Only the degrees that are in use are returned.
+    """
     used = (model.active.sh_degree + 1) ** 2
     sh0, shN = model.splats["sh0"], model.splats["shN"]
     if not isinstance(model, Gaussians4DModel):

@@ -39,7 +39,7 @@ def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
 
     Args:
         shown: the images on the screen.
-        most_cost: the nanoseconds that a Gaussian may add to a frame; such a Gaussian has the brightest colour.
+        most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
     """
     text = ""
     if by_effect_set := {renderer.name: renderer.counts for renderer, colours in shown if colours == CLASS}:

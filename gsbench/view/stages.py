@@ -1,4 +1,7 @@
-"""Time the stages of a frame: AGR, conditioning and colours of the slice; projection, binning and blending."""
+"""Time the stages of slicing (AGR, conditioning, colours) and of rasterization (projection, binning, blending).
+
+Slicing computes the conditional 3D Gaussians at a time and a viewpoint. AGR is their neural refinement.
+"""
 
 from collections.abc import Sequence
 from typing import Any

@@ -10,9 +10,9 @@ LONGEST = 400  # characters of the line
 
 
 def against_section(comparison: Comparison, group: Group) -> PageSection:
-    """Make the section that shows the runs of two folders side by side, for each model, scene and seed of a group.
+    """Make the section that shows the runs of two folders side by side, for each model, scene and seed.
 
-    The section also has the differences of the means and the verdicts.
+    The section also has the differences of the means and the verdicts. It covers one experiment on one data set.
     """
     own = [row for row in comparison.rows if (row.experiment, row.dataset) == (group.experiment, group.dataset)]
     columns = [Column("scene"), Column("run"), *(Column(c.title) for c in COLUMNS)]

@@ -1,4 +1,4 @@
-"""Draw the figures of the HTML report; each kind of figure has a function that takes numbers and returns a panel."""
+"""Draw the figures of the HTML report; each kind of figure has a function that takes numbers and returns a drawing."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ ROW = 38  # units of a row with its label above it
 
 @dataclass(frozen=True)
 class Mark:
-    """A point of a figure, with an interval in y and the number of the run that it shows."""
+    """A point of a figure, with a confidence interval along y and the number of the run that it shows."""
 
     x: float
     y: float

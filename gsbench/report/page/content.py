@@ -170,7 +170,7 @@ class Runs:
 
 @dataclass(frozen=True)
 class Canvas:
-    """What the figures of one experiment share: the list of runs, the style of each model, and a prefix for SVG ids."""
+    """The state that the figures of one experiment share: list of runs, styles of the models, and a prefix for SVG ids."""
 
     name: str  # keeps the ids of its drawings apart from those of others
     runs: Runs

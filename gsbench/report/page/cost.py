@@ -45,7 +45,7 @@ def answers(group: Group, family: Family) -> list[BudgetAnswer]:
 
 
 def basis_words(group: Group, family: Family) -> str:
-    """Describe the data from which the best model for each budget follows, and how models are chosen and compared."""
+    """Describe on which scenes and views the best model for each budget was chosen, and how models are compared."""
     scenes = group.basis
     if not scenes:
         return "Nothing has finished yet."

@@ -47,7 +47,7 @@ def _steps(record: Record) -> list[tuple[int, str]]:
 def _rates(record: Record) -> dict[str, Any]:
     """Return the learning rates of a run's model from its configuration.
 
-    If the run chose its model automatically (model=auto), these are the rates of the chosen one (run/resolve.py).
+    If the run chose its model automatically (model=auto), these are the rates of the model that was chosen.
     """
     model = record.provenance.config["model"]
     if model.get("candidates"):

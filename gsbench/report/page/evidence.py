@@ -1,4 +1,4 @@
-"""Write the parts of the HTML report on evidence: result tables, protocol, failed runs and the command of each run."""
+"""Write the parts of the HTML report that document the runs: result tables, protocol, failed runs and commands."""
 
 from gsbench.measure.record import Record
 from gsbench.report import layout, tables

@@ -121,7 +121,7 @@ def _row_height(body: Pixels) -> int:
 
 
 def _enlargement(parts: list[Pixels]) -> int:
-    """Return the integer factor by which images were enlarged through repeated pixels, or 1 if they were not."""
+    """Return the integer factor by which images were enlarged without interpolation, or 1 if they were not enlarged."""
     for factor in range(8, 1, -1):
         if all(not (p.shape[0] % factor or p.shape[1] % factor) and _blocks(p, factor) for p in parts):
             return factor

@@ -73,7 +73,7 @@ def budget(seconds: float) -> str:
 
 
 def interval(of: Estimate, digits: int = 2, *, sign: bool = False) -> str:
-    """Format a 95 % interval and say what it generalises to, such as seeds; return NO_SPREAD if there is none."""
+    """Format a 95 % interval and say for what it holds, such as other seeds; return NO_SPREAD if there is none."""
     write = signed if sign else plain
     return f"95 % {write(of.low, digits)} to {write(of.high, digits)} over {of.over}" if of.over else NO_SPREAD
 
@@ -84,7 +84,7 @@ def over(of: Estimate) -> str:
 
 
 def scope(of: Estimate) -> str:
-    """Return a sentence with the number of compared scenes and with what the intervals generalise to."""
+    """Return a sentence with the number of compared scenes, which also says whether intervals hold for other scenes."""
     scenes = {1: "One scene", 2: "Two scenes"}.get(of.scenes, count(of.scenes, "scene"))
     if not of.over:
         return f"{scenes}, one seed: no interval is known."

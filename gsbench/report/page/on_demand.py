@@ -1,6 +1,7 @@
 """Write the section of the HTML report on effects on demand: which effects the Gaussians keep, and why.
 
-The effects are time, view direction and AGR (the neural refinement of Gaussians).
+The effects are time, view direction and AGR (the neural refinement of Gaussians). A Gaussian keeps only the effects
+that it needs.
 """
 
 import math
@@ -33,9 +34,10 @@ NAMES = EFFECT_SETS | {REMOVED: "removed"}
 
 
 def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection | None:
-    """Make the section on which effects (time, view direction, AGR) Gaussians keep; None if no run chose effects.
+    """Make the section on which effects the Gaussians keep; None if no run chose effects.
 
-    The figures show how many Gaussians keep which effects, and the degrees of their spherical harmonics.
+    The effects are time, view direction and neural refinement. The figures show how many Gaussians keep which effects,
+    and the degrees of their spherical harmonics.
     """
     found = decided(group)
     if not found:
@@ -61,7 +63,7 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection
 
 
 def _sentence(one: Decided) -> str:
-    """Describe which effects (time, view direction, AGR) a model and its Gaussians keep on a scene."""
+    """Describe which effects (time, view direction, neural refinement) a model and its Gaussians keep on a scene."""
     parts = [_screen_words(one.runs), *_gate_words(one)]
     return f"On {one.scene}, {one.name}: {' '.join(part for part in parts if part)}"
 
@@ -90,7 +92,10 @@ def _screens(runs: list[Record]) -> list[TimeScreen]:
 
 
 def _gate_words(one: Decided) -> list[str]:
-    """Say which effects the Gaussians keep, and how the removal of the others after training changed PSNR and time."""
+    """Say which effects (time, view direction, neural refinement) Gaussians keep, and what removing the others changed.
+
+    The text gives the change of PSNR and of the milliseconds per frame.
+    """
     if not one.gated:
         return ["No gate has changed a Gaussian."]
     kept = [f"{one.rows[name]:,.0f} {said}" for name, said in EFFECT_SETS.items() if one.rows[name] >= 0.5]
@@ -116,7 +121,10 @@ def _change(of: Estimate, unit: str, digits: int) -> str:
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
-    """List what could not be decided and what the numbers leave out; equal notes of several seeds are merged."""
+    """List the notes on the choice of effects: what could not be decided, and what the numbers leave out.
+
+    Equal notes of several seeds are merged.
+    """
     named: dict[str, list[int]] = {}
     for one in found:
         for run in one.runs:
@@ -139,7 +147,10 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
 
 
 def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
-    """Draw for each scene and model how many Gaussians keep which effects, and the SH degrees of their colours."""
+    """Draw two stacked bars for each scene and model: Gaussians by the effects that they keep, and by SH degree.
+
+    The effects are time, view direction and neural refinement.
+    """
     label = lambda one: messages.shorten_middle(f"{one.scene}, {one.name}", LONGEST_LABEL, LABEL_END)  # noqa: E731
     effect_sets = [
         charts.Bar(label(one), _shares([one.rows[name] for name in NAMES]), f"{one.left:,.0f} of {one.before:,.0f}")
@@ -175,16 +186,16 @@ def _mean_degree(one: Decided) -> str:
 
 
 def _swatches() -> list[Swatch]:
-    """Return the colour legend of two figures: Gaussians by the effects that they keep, and by SH degree."""
+    """Return the legend of the colours for sets of effects, such as "static", and for SH degrees."""
     effect_sets = [Swatch(said, f"model-{MODELS.index(EFFECT_SET_LIKE[name])}") for name, said in EFFECT_SETS.items()]
     degrees = [Swatch(f"degree {i}", f"stage-{_stage(i)}") for i in range(DEGREES)]
     return [*effect_sets, Swatch(NAMES[REMOVED], "line"), *degrees]
 
 
 def _images(found: list[Decided], folder: Path) -> list[Image]:
-    """Return an image for each scene and model in which Gaussians are coloured by the effects that they keep.
+    """Return images in which each Gaussian has the colour of the effects that it keeps, such as time.
 
-    The image is that of the first seed that has one.
+    There is one image for each scene and model, from the first seed that has one.
     """
     places = gallery.places(folder, OLD_PICTURE) | gallery.places(folder, PICTURE)
     paths = [next((p for r in one.runs if (p := places.get(r.path))), None) for one in found]

@@ -28,9 +28,9 @@ NESTED = "Nested: 7dgs_nodir, which is 7dgs less direction and nothing else, in 
 
 
 def effects_section(group: Group, family: Family, canvas: Canvas) -> PageSection:
-    """Make the section on what time, view direction, AGR and their interactions gain in PSNR and cost.
+    """Make the section on what time, view direction and AGR (neural refinement) gain in PSNR and cost.
 
-    Effects for which a model was not run are left out.
+    The section includes interactions of these effects. It leaves out effects for which a model was not run.
     """
     cube = compare.cube(group, family)
     notes = []
@@ -88,7 +88,10 @@ def _cells(price: Price, unit: str) -> tuple[Value, ...]:
 
 
 def _scope(cube: Cube, family: Family) -> list[str]:
-    """Say what the intervals of the gains generalise to, and for how many comparisons the p-values are adjusted."""
+    """Say whether the intervals of the effects' gains hold for other scenes or only for other seeds.
+
+    The text also says for how many comparisons the p-values are adjusted.
+    """
     fewest = min((price.costs["psnr"] for price in cube.prices), key=lambda of: of.scenes)
     if not family.size():
         return [messages.scope(fewest)]
@@ -101,7 +104,10 @@ def _scope(cube: Cube, family: Family) -> list[str]:
 
 
 def _effect_words(cube: Cube) -> list[str]:
-    """Say which effect raises PSNR most and what it costs, which effects are not significant, and how they interact."""
+    """Say which effect (time, view direction, neural refinement) raises PSNR most, and what it costs.
+
+    The text also says which effects are not significant and how effects interact.
+    """
     single = [p for p in cube.prices if compare.is_single(p.name)]
     best = max(single, key=lambda p: p.costs["psnr"].mean)
     gain, seconds = best.costs["psnr"], best.costs["seconds"]
