@@ -23,8 +23,8 @@ from gsbench.report.configurations import OF_THE_MACHINE, QUANTITIES
 from gsbench.report.intervals import LEVEL, Estimate, Spread, holm
 
 AGREES, DIFFERS, UNTOLD = "agrees", "differs", "cannot be told"
-MEASURING = ("eval_split", "quantise", "resolution", "background", "downscale")  # of a record's protocol
-SAME_LOAD = 0.5  # mean loads further apart than this make seconds of two runs incomparable
+MEASURING = ("eval_split", "quantise", "resolution", "background", "downscale")  # settings of a run's evaluation
+SAME_LOAD = 0.5  # if the mean loads of two machines differ more, times are not compared
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Limit:
     relative: bool = True
 
 
-LIMITS = {  # by quantities of gsbench.report.configurations, and those below
+LIMITS = {  # by quantity; most are those of gsbench.report.configurations
     "psnr": Limit(0.01, 1.0, relative=False),  # dB
     "seconds": Limit(0.25, 0.5),
     "ms": Limit(0.25, 0.5),
@@ -67,7 +67,7 @@ class Judged:
 
     ours: list[float]  # by run
     theirs: list[float]
-    reason: str = ""  # why it cannot be told
+    reason: str = ""  # why there is no verdict
     verdict: str = UNTOLD
     difference: Estimate = NONE
     p_holm: float = math.nan

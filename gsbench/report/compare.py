@@ -14,24 +14,24 @@ from gsbench.report.configurations import Configuration, Group, Values, is_ablat
 from gsbench.report.family import Family, Tested, Weights
 from gsbench.report.intervals import Estimate
 
-Cell = tuple[bool, bool, bool]  # simulates time, direction, AGR
+Cell = tuple[bool, bool, bool]  # whether a model has time, view direction and AGR (neural refinement)
 FACTORS = ("time", "direction", "AGR")
 MEAN = "mean over the others"
 PRICES = ("psnr", "seconds", "ms", "mb")
-PUBLISHED = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")  # first where two models simulate the same effects
-NESTED = ("7dgs_nodir", "7dgs_nodir_agr")  # 7dgs less direction: differ from it in nothing else, as 4dgs does
+PUBLISHED = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")  # preferred if two models have the same effects
+NESTED = ("7dgs_nodir", "7dgs_nodir_agr")  # 7dgs without direction; 4dgs differs from 7dgs in more
 
 
 @dataclass(frozen=True)
 class Pair:
     """The difference in PSNR between two models, both with the settings that most runs of the experiment share."""
 
-    better: Configuration  # by its mean; by name where they tie
+    better: Configuration  # the one with the higher mean PSNR
     other: Configuration
     difference: Estimate  # dB
     improvement: float  # the probability that a run of `better` beats one of `other` on a view they share
-    p_holm: float  # of no difference, adjusted for all comparisons of the report; NaN where no spread is known
-    differs: bool  # whether the pair is told apart
+    p_holm: float  # adjusted for all comparisons of the report; NaN if the spread over seeds is not known
+    differs: bool  # whether the difference is significant
 
 
 def paired(group: Group) -> list[Weights]:
@@ -96,9 +96,9 @@ class Price:
 
     name: str
     order: int  # 1: an effect, 2 and 3: an interaction
-    models: str  # the sum of models it is computed from
+    models: str  # the weighted sum of models from which it is computed, as text
     costs: dict[str, Estimate]  # by PRICES
-    told: dict[str, bool]  # by PRICES: whether it is told from nothing among all comparisons of the report
+    told: dict[str, bool]  # by PRICES: whether it is significant after adjustment for all comparisons
 
 
 @dataclass(frozen=True)
@@ -110,10 +110,10 @@ class Cube:
 
     cells: dict[Cell, Configuration]
     prices: list[Price]
-    nested: list[Price]  # of effects within one parametrisation, with a model of NESTED in the place of another's
-    missing: list[str]  # the cells that no finished run fills, in words
-    left_out: list[str]  # models that simulate the same effects as one that is used
-    on_demand: list[str]  # models whose Gaussians do not all have the effects, so that they price none
+    nested: list[Price]  # the same with the models of NESTED, which share one parametrisation
+    missing: list[str]  # combinations of effects for which no run has finished, as text
+    left_out: list[str]  # models with the same effects as a model in `cells`
+    on_demand: list[str]  # models whose Gaussians lack some effects, so they are not compared
 
 
 def priced(group: Group) -> list[Weights]:

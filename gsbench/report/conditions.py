@@ -45,7 +45,7 @@ def _stated(records: list[Record], spread: str) -> list[str]:
     data: dict[str, Get] = {printable(records[0].dataset): _data}
     notes = []
     for title, facts in (("protocol", protocol), ("data", data)):
-        # both may differ between scenes (lego is measured on val), but not within a scene, unless a variant says so
+        # Both may differ between scenes (lego is measured on val). Within a scene only a variant may change them.
         stated = [f"{printable(name)} {_by_scene(records, get)}" for name, get in facts.items()]
         notes.append(f"{title}: {'; '.join(stated)}")
         for name, get in facts.items():

@@ -38,11 +38,11 @@ QUANTITIES: dict[str, Callable[[Record], float]] = {
     "seconds": lambda r: r.cost.train_s if r.cost else math.nan,  # of training
     "cpu_s": lambda r: _number(r.cost.train_cpu_s if r.cost else None),  # of all threads in those seconds
     "load": lambda r: _number(r.cost.load if r.cost else None),  # of the machine
-    "ms": lambda r: r.cost.render_ms.p50 if r.cost else math.nan,  # a frame, median
+    "ms": lambda r: r.cost.render_ms.p50 if r.cost else math.nan,  # median of the milliseconds per frame
     "mb": lambda r: r.cost.bytes / 1e6 if r.cost else math.nan,  # of the model's parameters
 }
-GATES = ("off", "end", "both")  # of effects.gate
-OF_THE_MACHINE = ("seconds", "cpu_s", "ms")  # quantities that compare only between runs of one machine
+GATES = ("off", "end", "both")  # values of the setting effects.gate: when effects are removed from Gaussians
+OF_THE_MACHINE = ("seconds", "cpu_s", "ms")  # quantities that can be compared only between runs on one machine
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ class Configuration:
     """The finished runs of one model with the same settings, on all scenes and with all seeds."""
 
     model: str
-    variant: str  # empty: as the experiment has it
+    variant: str  # settings that differ from the experiment's own; empty if none does
     runs: dict[str, list[Record]]  # by scene, in order of the seeds
-    name: str  # the model, and its variant where not all runs have the same
-    series: str  # the model, and how its Gaussians were gated where not all runs were alike: `Group.series_of`
+    name: str  # the model, and its variant if the runs of the group have several
+    series: str  # the name of its curve in figures: `Group.series_of`
 
     @property
     def on_demand(self) -> bool:

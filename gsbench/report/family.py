@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from gsbench.report.configurations import Configuration, Group
 from gsbench.report.intervals import LEVEL, Estimate, estimate, holm
 
-Weights = list[tuple[float, Configuration]]  # of a sum of configurations, such as one minus another
+Weights = list[tuple[float, Configuration]]  # a weighted sum of configurations, such as one minus another
 Key = tuple[tuple[str, str, float], ...]
 
 
@@ -16,7 +16,7 @@ class Tested:
     """The estimated difference between models, and its p-value after adjustment for all comparisons of the report."""
 
     difference: Estimate
-    p: float  # of no difference, after Holm for the whole family; NaN where no spread is known
+    p: float  # adjusted with Holm's method for all comparisons; NaN if the spread is not known
 
     @property
     def known(self) -> bool:

@@ -12,9 +12,9 @@ from gsbench.report.family import Family, Weights
 from gsbench.report.intervals import Estimate, estimate
 
 COSTS = ("seconds", "ms", "mb")
-BUDGETS = (("seconds", 10.0), ("seconds", 60.0), ("seconds", 600.0), ("ms", 1000 / 60))  # that a report answers
+BUDGETS = (("seconds", 10.0), ("seconds", 60.0), ("seconds", 600.0), ("ms", 1000 / 60))  # answered in each report
 STEPS = (2.0, 1.0, 0.5, 0.2, 0.1)  # dB between two targets
-FEWEST_TARGETS = 3  # of a scene
+FEWEST_TARGETS = 3  # for one scene
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class FrontierPoint:
 
     configuration: Configuration
     psnr: Estimate  # dB, the evaluated split; the interval is over seeds, on these scenes and views
-    val: float  # dB, PSNR on val; NaN where a run does not tell
+    val: float  # PSNR on the validation views, dB; NaN if a run lacks it
     cost: dict[str, float]  # by COSTS; NaN where it is missing
 
     @property
@@ -79,11 +79,11 @@ class BudgetChoice:
     """The best model within a cost budget, and the other models to which it was compared on the evaluated views."""
 
     point: FrontierPoint
-    on_val: bool  # whether it was chosen on val; otherwise on what is shown, as some runs have no PSNR on val
-    ahead: list[FrontierPoint]  # those that it is told to be ahead of
-    level: list[FrontierPoint]  # those that it is not told apart from
-    behind: list[FrontierPoint]  # those that it is told to be behind
-    unknown: list[FrontierPoint]  # those of which no spread is known
+    on_val: bool  # whether it was chosen on validation views; otherwise on the evaluated views
+    ahead: list[FrontierPoint]  # models that are significantly worse
+    level: list[FrontierPoint]  # models that do not differ significantly
+    behind: list[FrontierPoint]  # models that are significantly better
+    unknown: list[FrontierPoint]  # models without a known spread over seeds
 
 
 def has_val(of: Sequence[FrontierPoint]) -> bool:
@@ -151,7 +151,7 @@ class Target:
     scene: str
     rule: str
     psnr: float  # dB
-    seconds: dict[str, float]  # by model; infinite: never
+    seconds: dict[str, float]  # by model; infinite if the model never reaches the target
 
 
 def targets(group: Group) -> list[Target]:

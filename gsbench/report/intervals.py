@@ -25,7 +25,7 @@ from scipy import special
 
 Values = npt.NDArray[np.float64]
 LEVEL = 0.95
-LEAST_SCENES = 3  # from which on an interval is one of scenes like these
+LEAST_SCENES = 3  # the fewest scenes for an interval that holds for similar scenes
 LEAST_P = 1e-12
 
 
@@ -49,7 +49,7 @@ class Estimate:
 
     mean: float  # NaN: nothing was measured
     scenes: int
-    seeds: int  # the fewest of a scene
+    seeds: int  # the smallest number of seeds of a scene
     over: str  # what the interval generalises to: "scenes", "seeds and views", "seeds"; "" without an interval
     levels: tuple[Spread, ...] = ()  # their half widths add in squares
     floor: Spread | None = None  # the interval is not narrower than this one
@@ -79,7 +79,7 @@ class Estimate:
             return math.nan
         if self._half(LEVEL) == 0:
             return 1.0 if self.mean == 0 else 0.0
-        low, high = math.log(LEAST_P), 0.0  # halved in the logarithm; scipy.optimize would take a second to import
+        low, high = math.log(LEAST_P), 0.0  # bisection of log p; importing scipy.optimize would take a second
         for _ in range(60):
             middle = (low + high) / 2
             if self._half(-math.expm1(middle)) > abs(self.mean):

@@ -15,8 +15,8 @@ class QuantityColumn:
 
     key: str
     title: str
-    digits: int | None  # after the point; None: 2 below ten, else 1
-    paper: str = ""  # the field of PaperRow that is the same quantity
+    digits: int | None  # decimals; None: two below ten, otherwise one
+    paper: str = ""  # the field of PaperRow with the same quantity
 
     def show(self, mean: float, std: float = math.nan) -> str:
         """Format a number as ``mean``, as ``mean ± std`` if a spread is given, or as a dash if the mean is NaN."""
@@ -32,8 +32,8 @@ class Row:
 
     label: str
     cells: dict[str, str]  # by QuantityColumn.key
-    seeds: str = ""  # how many
-    best: bool = False  # whether its first column is the best that was measured
+    seeds: str = ""  # number of seeds
+    best: bool = False  # whether its first column (PSNR) has the best measured value
 
 
 @dataclass(frozen=True)

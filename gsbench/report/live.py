@@ -8,7 +8,7 @@ from gsbench.measure import record as files
 from gsbench.report import tables
 from gsbench.report.page import build
 
-EVERY = 5.0  # seconds between two looks at the folder, and between two loads of the open page
+EVERY = 5.0  # seconds after which the folder is read again and an open report reloads itself
 
 State = frozenset[tuple[Path, int]]
 

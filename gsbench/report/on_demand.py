@@ -15,7 +15,7 @@ from gsbench.report.configurations import Configuration, Group
 from gsbench.report.intervals import Estimate, estimate
 
 REMOVED = "removed"
-DEGREES = 4  # of harmonics: 0, 1, 2, 3
+DEGREES = 4  # of spherical harmonics: 0, 1, 2, 3
 
 
 @dataclass(frozen=True)
@@ -27,19 +27,19 @@ class Decided:
 
     scene: str
     configuration: Configuration
-    name: str  # of the configuration: as short as tells it from the others here
-    runs: list[Record]  # those that chose effects, in order of the seeds
-    gated: int  # how many of them a gate has changed: the numbers below are theirs
-    rows: dict[str, float]  # Gaussians at the end by effect set, and how many all gates removed
-    degrees: list[float]  # Gaussians at the end by the degree of their harmonics
-    views: str  # that the change of PSNR was measured on
-    psnr: Estimate  # change by the gate at the end, dB
-    ms: Estimate  # change of the median frame by the gate at the end
+    name: str  # a short name of the configuration that no other one has
+    runs: list[Record]  # runs that chose effects, in order of the seeds
+    gated: int  # number of runs in which a gate removed effects; the numbers below are of these
+    rows: dict[str, float]  # number of Gaussians by the effects that they have at the end, and of those removed
+    degrees: list[float]  # number of Gaussians by SH degree at the end
+    views: str  # the views on which the change of PSNR was measured
+    psnr: Estimate  # change of PSNR by the gate after training, dB
+    ms: Estimate  # change of the median milliseconds per frame by the gate after training
     ms_before: float
     mb_before: float  # of the model before the first gate
     mb: float
-    predicted: float  # change of PSNR that the gate at the end foresaw, dB
-    asleep: float  # share of AGR's work that a frame leaves out, as the Gaussians cannot be seen at its time
+    predicted: float  # change of PSNR that the gate after training predicted, dB
+    asleep: float  # share of Gaussians that AGR skips in a frame, as they cannot be seen at its time
 
     @property
     def before(self) -> float:

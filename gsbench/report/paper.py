@@ -18,10 +18,10 @@ class Protocol:
     """The settings with which the 7DGS paper trained and tested on a data set (section "implementation details")."""
 
     scenes: tuple[str, ...]  # as conf/exp names them
-    sizes: dict[str, str]  # of the images, by scene, "*" for all others
+    sizes: dict[str, str]  # image size by scene, "*" for all other scenes
     batch_size: int
-    splits: dict[str, str]  # by scene, "*" for all others
-    frames: int | None = None  # of each scene; None: the data set has its own list
+    splits: dict[str, str]  # evaluated split by scene, "*" for all other scenes
+    frames: int | None = None  # of each scene; None if the data set defines its frames
     iterations: int = 30_000
 
 
@@ -68,7 +68,7 @@ class MethodRow:
     psnr: float
     ssim: float | None
     lpips: float | None
-    reproduced_by_paper: bool  # rather than quoted from the method's own paper
+    reproduced_by_paper: bool  # false if quoted from the method's own paper
 
 
 def paper_row(dataset: str, scene: str, model: str) -> PaperRow | None:

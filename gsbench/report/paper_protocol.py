@@ -11,7 +11,8 @@ from gsbench.report.configurations import iterations, without
 from gsbench.report.paper import PROTOCOLS
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
-# Words of a variant that change what is measured, or that the heading of a table says, but not how a model is trained.
+# Settings of a variant that do not belong to a model's training settings: they change what is measured, or the heading
+# of a table names them.
 _NOT_OF_THE_RECIPE = ("iterations", "downscale", "eval_split", "protocol", "best_on_test", "curve_points")
 
 
@@ -20,7 +21,7 @@ class ModelRecipe(NamedTuple):
 
     model: str
     experiment: str
-    recipe: str  # how it was trained otherwise than its experiment does; "" for nothing
+    recipe: str  # training settings that differ from the experiment's own; "" if none does
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Pool:
 
     dataset: str
     experiment: str
-    steps: int  # of training; 0 where the records do not say
+    steps: int  # iterations of training; 0 if the records lack them
     runs: list[Record] = field(default_factory=list)
 
     @property
@@ -52,9 +53,9 @@ class Sorted:
     """The run records of a folder, sorted by whether they can be compared with the results of the 7DGS paper."""
 
     paper: dict[str, list[Record]]  # by data set: runs at the paper's protocol
-    other_protocol: list[Pool]  # a data set of the paper: the pool that is nearest to its protocol
-    other_data: list[Pool]  # stand-ins for scenes of the paper: of each data set the pool of most effort
-    left_out: dict[str, list[str]]  # by data set of the paper: what is in no table, in words
+    other_protocol: list[Pool]  # for each data set of the paper, the runs nearest to its protocol
+    other_data: list[Pool]  # runs on data that stand in for the paper's: those of most effort
+    left_out: dict[str, list[str]]  # by data set of the paper: the runs that are in no table, as text
 
 
 def sort(records: list[Record]) -> Sorted:
@@ -64,7 +65,7 @@ def sort(records: list[Record]) -> Sorted:
     not one of the five in MODELS, or if it belongs to no data set of the paper.
     """
     at_paper: dict[str, list[Record]] = {name: [] for name in PROTOCOLS}
-    pools: dict[tuple[str, str, str, str, int], Pool] = {}  # images of a data set may differ in size by scene
+    pools: dict[tuple[str, str, str, str, int], Pool] = {}  # by downscaling, as image sizes differ between scenes
     for r in records:
         named = r.protocol.get("paper_dataset")
         if not isinstance(named, str) or named not in PROTOCOLS or r.model not in MODELS:

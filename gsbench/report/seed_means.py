@@ -10,7 +10,7 @@ from gsbench.report import conditions
 from gsbench.report.intervals import Estimate, estimate
 from gsbench.report.tables import quantities
 
-SPREAD = conditions.SPREAD  # every table has the same
+SPREAD = conditions.SPREAD  # the same in every table
 
 
 def mean(runs: Mapping[str, Sequence[Record]], key: str) -> Estimate:

@@ -15,7 +15,7 @@ from gsbench.report.seed_means import SPREAD, mean
 from gsbench.report.tables import LEAKS, OF_THE_MACHINE, of_one_machine
 
 COLUMNS = [*tables.COLUMNS[:1], QuantityColumn(LEAKS, LEAKS, 2, "psnr"), *tables.COLUMNS[1:]]
-SEEDS = 3  # the fewest for an interval that holds
+SEEDS = 3  # the fewest seeds for a valid interval
 
 PAPER = (
     "Table 1 of the 7DGS paper (ICCV 2025). Its PSNR is the best on test seen during training, which leaks: like stands"
@@ -23,8 +23,8 @@ PAPER = (
 )
 OTHER_DATA = "Rendered for this project in place of the paper's scenes; the paper's rows are not shown."
 
-Runs = dict[str, list[Record]]  # finished ones by scene
-Line = dict[str, Any]  # of the CSV
+Runs = dict[str, list[Record]]  # finished runs by scene
+Line = dict[str, Any]  # a line of the CSV file
 
 
 def build(found: Sorted) -> tuple[list[Table], list[Line]]:
@@ -115,7 +115,7 @@ class _Table1Builder:
         return Section(scene, _with_best(rows), notes)
 
     def _average(self, scenes: list[str]) -> Section:
-        own = [one for one in self.recipes if not one.recipe]  # another recipe is often tried on one scene only
+        own = [one for one in self.recipes if not one.recipe]  # other settings are often tried on one scene only
         runs = {one: found for one in own if (found := finished(self.records, one, scenes))}
         covered = [s for s in scenes if runs and all(s in found for found in runs.values())]
         title = f"average over {len(covered)} of {len(scenes)} scenes"

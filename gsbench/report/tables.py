@@ -19,7 +19,7 @@ from gsbench.report.configurations import groups
 from gsbench.report.intervals import over_seeds
 from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
 
-LEAKS = "psnr_best_on_test (leaks)"  # its title always says that it leaks
+LEAKS = "psnr_best_on_test (leaks)"  # the title says that test views leak into the choice of the iteration
 COLUMNS = (  # their keys are columns of `tidy`
     QuantityColumn("psnr", "PSNR", 2, "psnr"),
     QuantityColumn("ssim", "SSIM", 3, "ssim"),
@@ -28,10 +28,10 @@ COLUMNS = (  # their keys are columns of `tidy`
     QuantityColumn("fps", "FPS", None, "fps"),
     QuantityColumn("num_gaussians", "#Gaussians", 0, "num_gaussians"),
 )
-OF_THE_MACHINE = ("train_min", "fps")  # columns that compare only between runs of one machine
-COSTS = ("fps", "num_gaussians", "bytes", "peak_memory", "train_cpu_s", "load")  # of a record, as it has them
+OF_THE_MACHINE = ("train_min", "fps")  # columns that can be compared only between runs on one machine
+COSTS = ("fps", "num_gaussians", "bytes", "peak_memory", "train_cpu_s", "load")  # costs that are copied from a record
 TRAIN = QuantityColumn("psnr_train", "PSNR train", 2)  # shown on request
-EXTRA_COLUMNS = (QuantityColumn("lpips_vgg", "LPIPS-VGG", 3), QuantityColumn(LEAKS, LEAKS, 2))  # where a run has them
+EXTRA_COLUMNS = (QuantityColumn("lpips_vgg", "LPIPS-VGG", 3), QuantityColumn(LEAKS, LEAKS, 2))  # if a run has them
 
 PAPER = (
     "Table 1 of the 7DGS paper (ICCV 2025): 30,000 iterations at half resolution (Technicolor: full), PSNR is the best "
@@ -135,7 +135,7 @@ class _TableBuilder:
         self.machine = machine
         self.scenes = sorted({r.scene for r in records})
         variants = {r.variant for r in records}
-        self.common = variants.pop() if len(variants) == 1 else ""  # said once, below the table
+        self.common = variants.pop() if len(variants) == 1 else ""  # the settings of all runs; stated below the table
         self.models = sorted({self._name(r) for r in records})
         flat = [quantities(r) for r in records]
         shown = [COLUMNS[0], *([TRAIN] if train else []), *COLUMNS[1:]]

@@ -15,10 +15,10 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.measure.renamed import present_override
 
 MULTIRUN = ("-m", "--multirun")
-SCENES_DEPEND_ON = ("exp", "data.scenes")  # the overrides that say which scenes there are
+SCENES_DEPEND_ON = ("exp", "data.scenes")  # the overrides on which the list of scenes depends
 INFORM = ("-h", "--help", "--hydra-help", "--version", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion")
 
-NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{'\"].*|")  # what Hydra reads as a value
+NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{'\"].*|")  # Hydra parses these as values
 
 
 def expand(words: Sequence[str]) -> list[str]:

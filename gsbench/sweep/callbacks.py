@@ -26,7 +26,7 @@ from gsbench.run.progress import born
 from gsbench.sweep import plan
 from gsbench.sweep.plan import Ended, Plan
 
-started: list[Path] = []  # the folders of the plans of this process
+started: list[Path] = []  # the folders of the plans that this process wrote
 
 
 class WritePlan(Callback):
@@ -75,7 +75,7 @@ def plan_of(runs: Sequence[Sequence[str]], config: DictConfig) -> Plan:
 
 def ended(config: DictConfig, results: Path) -> Ended:
     """Return the outcome of a run that ended in this process: the path of its record, or why there is none."""
-    from gsbench.run.identity import identify  # torch is loaded where a run was done
+    from gsbench.run.identity import identify  # imports torch, which the run has loaded already
 
     composed = copy.deepcopy(config)
     with read_write(composed), open_dict(composed):

@@ -14,7 +14,7 @@ from gsbench.sweep import plan
 from gsbench.sweep.plan import identity
 from gsbench.sweep.status import BROKEN, GOING, RunStatus, read, status
 
-LIBRARIES = ("submitit", "joblib")  # that Hydra's launchers use
+LIBRARIES = ("submitit", "joblib")  # used by Hydra's launchers
 POLL = 10.0  # seconds between two looks at Slurm's queue
 
 

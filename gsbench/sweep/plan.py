@@ -27,9 +27,9 @@ class Plan:
     launcher: str  # of Hydra: basic, joblib or submitit_slurm
     runs: list[list[str]]  # the overrides of each run, in the order of the tasks of a job array
     hydra: list[str]  # overrides of Hydra's own config
-    cwd: str  # where the command was given: relative paths in overrides start there
+    cwd: str  # the folder of the command; relative paths in overrides start there
     host: str
-    pid: int  # of the process that launches
+    pid: int  # of the process that launches the runs
     born: int | None  # when that process started: gsbench.run.progress.born
     started: float  # unix seconds
 
@@ -38,7 +38,7 @@ class Plan:
 class Ended:
     """The outcome of one run of a sweep, written by the process that executed the run."""
 
-    record: str | None  # path of its record, relative to the folder of all results; None where it has no record
+    record: str | None  # path of its record, relative to the folder of all results; None if it has no record
     reason: str | None  # why it has no record
 
 

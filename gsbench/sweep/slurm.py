@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from gsbench.errors import one_line
 
-SECONDS = 30  # for an answer; after that Slurm counts as down
+SECONDS = 30  # time limit for an answer of Slurm
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def endings(jobs: Iterable[str]) -> dict[str, str]:
     for line in done.stdout.splitlines():
         name, state, code = line.split("|")
         job, _, step = name.partition(".")
-        if job in asked and (not step or state == "OUT_OF_MEMORY"):  # the step knows of memory what its job does not
+        if job in asked and (not step or state == "OUT_OF_MEMORY"):  # only a job's step reports lack of memory
             found[job] = state if state == "OUT_OF_MEMORY" or code == "0:0" else f"{state}, exit {code}"
     return found
 

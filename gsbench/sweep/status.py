@@ -59,7 +59,7 @@ class Experiment:
 
 def read(folder: Path) -> Experiment:
     """Read the plans and the run files of an experiment, and ask Slurm once for the jobs that they name."""
-    # An experiment may name parts of itself, as +exp=tuning +trial=fast does: results/tuning.fast
+    # An experiment may have parts in other folders: +exp=tuning +trial=fast writes to results/tuning.fast.
     parts = [folder, *sorted(folder.parent.glob(f"{folder.name}.*"))]
     found = Experiment(folder)
     for path in plan.find(folder):
@@ -82,7 +82,7 @@ def status(experiment: Experiment) -> list[RunStatus]:
              **dict.fromkeys(experiment.traces.progress)}  # fmt: skip
     judged = {one: _judge(experiment, one) for one in known}
     kept = {run.record for one, run in judged.items() if one in experiment.requested and run.record is not None}
-    # A run whose record has other overrides than the request is not a second run.
+    # A requested run may have a record with other overrides; such a record is not counted as a second run.
     judged = {one: run for one, run in judged.items() if one in experiment.requested or run.record not in kept}
     lost = {run.job for run in judged.values() if run.state == "lost" and run.job}
     endings = slurm.endings(lost)
@@ -99,7 +99,7 @@ def _judge(experiment: Experiment, one: Identity) -> RunStatus:
     _, progress = experiment.traces.progress.get(one, (None, None))
     outcome = experiment.traces.outcomes.get(one) or _kept(experiment, requested)
     if outcome and progress and progress.updated <= outcome.written:
-        progress = None  # left over from before the record
+        progress = None  # the progress file is older than the record
     if progress:
         alive = _alive(progress, experiment.queue)
         if alive:
@@ -158,7 +158,7 @@ def _running(one: Identity, progress: Progress, alive: str) -> RunStatus:
 
 def _launching(requested: RequestedRun, queue: Queue) -> bool:
     """Tell whether the command that requested a run can still start it."""
-    if requested.job is not None:  # Slurm decides about it
+    if requested.job is not None:  # only Slurm can still start it
         return queue.silent is not None
     if requested.plan.host == socket.gethostname():
         return requested.plan.born is not None and born(requested.plan.pid) == requested.plan.born

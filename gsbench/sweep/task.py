@@ -15,7 +15,7 @@ class Problem:
     """The reason why a run did not end well, and whether the run was refused before it started."""
 
     reason: str
-    is_refused: bool  # whether the request cannot be run, so that nothing was run and nothing recorded
+    is_refused: bool  # whether the settings are invalid, so that nothing was run or recorded
 
 
 def do(composed: DictConfig) -> Problem | None:
@@ -36,7 +36,7 @@ def do(composed: DictConfig) -> Problem | None:
         problem = Problem(f"{record.status}: {record.reason}", False)
     except InputError as error:
         problem = Problem(str(error), not isinstance(error, UnrecordedError))
-    except MemoryError as error:  # not even a record fitted
+    except MemoryError as error:  # there was not enough memory to write a record
         problem = Problem(f"out of memory: {one_line(error)}", False)
     return _told(composed, problem)
 

@@ -21,7 +21,7 @@ class Outcome:
     """The outcome of a run, read from its record."""
 
     path: Path
-    status: str  # as in the record; `failed` where the record is damaged
+    status: str  # as in the record; `failed` if the record is damaged
     reason: str | None
     psnr: float | None
     written: float  # unix seconds
@@ -50,7 +50,7 @@ def read(folders: list[Path]) -> Traces:
             try:
                 one = progress.read(path)
             except InputError:
-                continue  # the run has ended and removed it just now, or it is damaged and the run looks lost
+                continue  # the run has just removed it, or it is damaged; then the run counts as lost
             of = identity(one.overrides)
             if of not in found.progress or found.progress[of][1].updated < one.updated:
                 found.progress[of] = path, one

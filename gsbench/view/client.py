@@ -19,9 +19,9 @@ from gsbench.view.panel import comparison, cost_table, legend
 from gsbench.view.resolution import Resolution
 from gsbench.view.stages import RASTER, SLICE
 
-REST_S = 0.2  # without a change, after which a frame is rendered again with all pixels
-FRAME_S = 1 / 30  # least time between two frames while a clip is played
-QUALITY = {True: 75, False: 95}  # of the JPEG while something moves, and at rest
+REST_S = 0.2  # seconds without a change after which a frame is rendered with all pixels
+FRAME_S = 1 / 30  # seconds between two frames while the scene is played
+QUALITY = {True: 75, False: 95}  # JPEG quality while something moves (True) and at rest (False)
 
 
 class Client:
@@ -75,7 +75,7 @@ class Client:
             if moving:
                 self.rests = False
             self.changed.clear()
-            if self.left:  # tested after the event is cleared: a later `leave` ends the next wait
+            if self.left:  # tested after `clear`, so that a later call of `leave` ends the next wait
                 return
             self.controls.advance()
             try:

@@ -15,10 +15,10 @@ from gsbench.scenes import Scene, View
 from gsbench.view.frame import CLASS, COLOURS, IMAGE, FrameRenderer, FrameRequest
 from gsbench.view.frusta import Frusta
 
-PLAYED_S = 4.0  # a clip takes that long
+PLAYED_S = 4.0  # seconds in which the time goes from 0 to 1
 ONE, SIDE, WIPE = "one image", "side by side", "wipe"
 NEAREST = "nearest training view"
-PANEL = {"x": 15.0, "y": -15.0, "width": 400.0}  # pixels: where it floats, from the left and from the bottom
+PANEL = {"x": 15.0, "y": -15.0, "width": 400.0}  # position in pixels from the left and the bottom
 
 
 class ShownImage(NamedTuple):
@@ -43,8 +43,8 @@ class Controls:
         self.changed = threading.Event()
         self._renderers = {renderer.name: renderer for renderer in renderers}
         self._has_time = renderers[0].run.scene.has_time
-        self._frozen: torch.Tensor | None = None  # the place that slices are seen from
-        self._held: float | None = None  # the time that slices are of
+        self._frozen: torch.Tensor | None = None  # viewpoint for which Gaussians are computed; None: the camera
+        self._held: float | None = None  # time for which Gaussians are computed; None: the slider's
         self._played_at = time.monotonic()
         self.costs = client.gui.add_html("")
         self._add_time()

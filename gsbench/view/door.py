@@ -25,9 +25,9 @@ from websockets.http11 import Request, Response
 
 from gsbench.errors import InputError, one_line
 
-MOST_BROWSERS = 16  # at once; each has a thread that renders for it
-MOST_BYTES = 4096  # of a message; those of the page have some 300
-MOST_PORTS = 1000  # that are tried
+MOST_BROWSERS = 16  # connected at once; each has a thread that renders for it
+MOST_BYTES = 4096  # of a message; messages of the page have about 300
+MOST_PORTS = 1000  # ports that are tried
 FURTHEST = 1e9  # world units from the origin
 MOST_PIXELS = 16384  # of a side of a browser's window
 FIELDS_OF_VIEW = 0.01, 3.1  # radians
@@ -53,7 +53,7 @@ class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
         """Tell whether an image can be rendered from this camera pose."""
         lengths = (*self.position, *self.look_at, *self.up_direction)
         return (
-            all(abs(length) <= FURTHEST for length in lengths)  # which NaN is not
+            all(abs(length) <= FURTHEST for length in lengths)  # false for NaN
             and 0.9 < math.hypot(*self.wxyz) < 1.1
             and FIELDS_OF_VIEW[0] <= self.fov <= FIELDS_OF_VIEW[1]
             and all(0 <= pixels <= MOST_PIXELS for pixels in (self.image_width, self.image_height))
@@ -129,7 +129,7 @@ class Door:
         Raises:
             InputError: it is not possible to listen on this host, or no port is free.
         """
-        with ThreadPoolExecutor(1) as pool:  # in a notebook this thread has a loop of its own
+        with ThreadPoolExecutor(1) as pool:  # a notebook has an event loop in the main thread
             addresses, self.port = pool.submit(asyncio.run, _free(host, port)).result()
         self._hosts = {host.lower(), *addresses}
         self._is_open = any(ipaddress.ip_address(address).is_unspecified for address in addresses)
@@ -214,7 +214,7 @@ async def _free(host: str, port: int) -> tuple[list[str], int]:
     for tried in range(port, min(port + MOST_PORTS, 65536)):
         try:
             server = await loop.create_server(asyncio.Protocol, host, tried)
-        except (OSError, ValueError) as error:  # ValueError: no name at all
+        except (OSError, ValueError) as error:  # ValueError: not a valid name
             if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
                 continue
             raise InputError(f"{asked}, port {tried}: {one_line(error)}") from None

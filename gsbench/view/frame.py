@@ -18,16 +18,16 @@ from gsbench.view.stages import RASTER, SLICE, StageWatch, part_of
 
 DIVIDER = (255, 255, 255)  # RGB of the line between two models
 IMAGE, CLASS, COST = COLOURS = ("image", "class", "cost")  # meanings of the Gaussians' colours
-EVERY_DEGREE = 3  # of the harmonics
+EVERY_DEGREE = 3  # the highest SH degree of any model
 
 
 class FrameRequest(NamedTuple):
     """The settings of a frame that a browser requests, apart from the camera: the time, the effects and the colours."""
 
-    time: float | None  # in [0, 1]; None where the scene has none
-    center: torch.Tensor | None = None  # [3] the viewpoint of the slice; None: that of the camera
-    agr: bool = True  # whether AGR acts, in a model that has it
-    sh_degree: int = EVERY_DEGREE  # of the harmonics, at most
+    time: float | None  # in [0, 1]; None if the scene is static
+    center: torch.Tensor | None = None  # [3], viewpoint for which Gaussians are computed; None: the camera's
+    agr: bool = True  # whether AGR (neural refinement) is on, if the model has it
+    sh_degree: int = EVERY_DEGREE  # highest SH degree of the colours
     colours: str = IMAGE
 
 
@@ -72,7 +72,7 @@ class FrameRenderer:
         self.name = f"{run.folder.parent.name} {run.folder.name}"  # such as "7dgs seed0"
         self.trained_active = run.model.active
         self.has_agr = run.model.refinement is not None
-        self.counts = run.model.count_by_effects()  # of Gaussians, by effect set
+        self.counts = run.model.count_by_effects()  # number of Gaussians by the set of their effects
         background = torch.tensor(run.scene.background).to(run.config.device)
         self._backgrounds = {IMAGE: background, CLASS: torch.ones_like(background), COST: torch.zeros_like(background)}
         self._colors = {CLASS: effect_set_colors(run.model), COST: cost_colors(run.model, most_cost)}
@@ -110,9 +110,7 @@ class FrameRenderer:
             return image[0], watch.ms
 
     def _active(self, request: FrameRequest) -> ActiveComponents:
-        """Return the active parts of the model, such as the neural refinement, without those that the user switches
-        off.
-        """
+        """Return the active parts of the model, such as neural refinement, without those that the user switches off."""
         trained = self.trained_active
         degree = min(request.sh_degree, trained.sh_degree)
         return replace(trained, refine=request.agr and trained.refine, sh_degree=degree)

@@ -12,9 +12,9 @@ from gsbench.measure.images import to_bytes
 from gsbench.measure.quality import evenly
 from gsbench.scenes import Scene, View
 
-MOST = 100  # frusta; evenly spaced among the training views where there are more
+MOST = 100  # frusta; if there are more training views, evenly spaced ones are shown
 THUMBNAIL = 96  # pixels of the longer side
-SIZE = 0.06  # of a frustum, extents
+SIZE = 0.06  # of a frustum, in scene extents
 
 GoTo = Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64], float | None], None]
 

@@ -14,7 +14,7 @@ from gsbench.models.query import Query
 from gsbench.scenes.points import SH_C0
 from gsbench.scenes.trained import TrainedGaussians
 
-LEAST_SCALE = 1e-20  # world units; a slice that is flat to the last bit still has a logarithm
+LEAST_SCALE = 1e-20  # world units; keeps the logarithm of a zero scale finite
 LARGEST_OPACITY = 1 - 2**-24  # the largest float32 below 1, whose logit is finite
 
 
@@ -39,7 +39,7 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
             raise InputError(f"PLY: expected a slice without shapes, got one of {type(model).__name__} that has them: "
                              f"3DGS' PLY has no field for them; export images or a video")  # fmt: skip
         means, factors, opacities, colors = (part.detach().cpu() for part in tensors_of(seen))
-        drawn = opacities >= ALPHA_MIN  # the rasterizer skips an alpha below it, and no alpha is above the opacity
+        drawn = opacities >= ALPHA_MIN  # the rasterizer skips smaller alphas, and alpha is at most the opacity
         if not drawn.any():
             raise InputError("no Gaussian can be seen at this time and from this place: choose others")
         sh = harmonics_at(model, query).cpu()[drawn] if keep_harmonics else (colors[drawn, None] - 0.5) / SH_C0

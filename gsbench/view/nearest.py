@@ -12,8 +12,8 @@ from gsbench.measure.quality import psnr, quantise
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view.frame import FrameRenderer, FrameRequest
 
-SAME = 1e-3  # extents and radians: views nearer to each other than this differ only in time
-MOST_WIDTH = 480  # pixels of an image that is shown; larger ones are made smaller
+SAME = 1e-3  # in extents plus radians; closer views count as the same viewpoint
+MOST_WIDTH = 480  # width in pixels to which larger images are reduced
 
 
 class Nearest(NamedTuple):
@@ -21,7 +21,7 @@ class Nearest(NamedTuple):
 
     view: View
     distance: float  # world units
-    degrees: float  # between the directions in which the two look
+    degrees: float  # angle between the view directions
 
 
 class ViewComparison(NamedTuple):

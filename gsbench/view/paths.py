@@ -15,10 +15,10 @@ from gsbench.scenes import Camera
 
 UP = (0.0, 0.0, 1.0)  # of Blender's layout: D-NeRF, 7DGS-PBR, the embedded scenes
 ELEVATION = math.radians(25)  # of an orbit above the horizon
-HIGHEST = math.radians(60)  # where a spiral ends
+HIGHEST = math.radians(60)  # elevation at the end of a spiral
 TURNS = 2  # of a spiral
 FIELD_OF_VIEW = 0.69  # radians, horizontal; D-NeRF's camera_angle_x
-FAR_AWAY = 1e4  # extents; from there all directions are one to 1e-4
+FAR_AWAY = 1e4  # in scene extents; view directions then differ by at most about 1e-4 radians
 
 Shot = tuple[Camera, float | None]  # a frame of a film: its camera and its time
 

@@ -2,7 +2,7 @@
 
 import math
 
-MOVING_MS = 40.0  # what a frame may take while the camera moves
+MOVING_MS = 40.0  # time limit of a frame while the camera moves
 LEAST_PIXELS = 96 * 96
 MOST_PIXELS = 1280 * 960  # of a frame at rest; a larger window shows it enlarged
 

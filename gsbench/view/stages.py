@@ -13,7 +13,7 @@ from gsbench.measure.speed import Laps
 
 SLICE, RASTER = "slice", "raster"
 STAGES = {SLICE: ("AGR", "conditioning", "colours"), RASTER: ("projection", "binning", "blending")}
-# By the name of an operation: the stage that ends with it, and the stage that ends before it.
+# By the name of a kernel operation: the stage that ends after it, and the stage that ends before it.
 _ENDS = {"refine": "AGR", "show_colors": "colours", "project": "projection", "blend": "blending"}
 _FOLLOWS = {"show_colors": "conditioning", "blend": "binning"}
 

@@ -49,7 +49,7 @@ class Viewer:
         with door.guard():
             self.server = viser.ViserServer(host, door.port, label=f"gsbench: {first.scene.name}", verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
-        self.server.gui.main_panel.dock_right()  # beside the images, not above them
+        self.server.gui.main_panel.dock_right()  # beside the images instead of on top of them
         self._stand(first)
         self.server.on_client_disconnect(self._in_turn(self._forget))
         self.server.on_client_connect(self._in_turn(self._welcome))

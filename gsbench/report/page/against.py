@@ -6,7 +6,7 @@ from gsbench.report.configurations import Group
 from gsbench.report.page import messages
 from gsbench.report.page.content import Column, DataTable, PageSection, Value
 
-LONGEST = 400  # characters of the line
+LONGEST = 400  # characters of the summary
 
 
 def against_section(comparison: Comparison, group: Group) -> PageSection:

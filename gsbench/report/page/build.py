@@ -23,8 +23,8 @@ from gsbench.report.page.palette import DARK, LIGHT, STAGES_DARK, STAGES_LIGHT, 
 from gsbench.report.page.svg import marker
 
 FILE_NAME = "report.html"
-MOST_FAULTS = 20  # that are listed
-MOST_SCENES = 8  # that have drawings of their own, over all experiments of the page
+MOST_FAULTS = 20  # faulty records that are listed
+MOST_SCENES = 8  # scenes with figures of their own, over all experiments of the report
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLoca
 from gsbench.report.page.palette import Style
 from gsbench.report.page.svg import INK, LANE, MUTED, PAPER, Panel, model_colour, stage_colour
 
-LOG_FROM = 5.0  # the ratio of the largest to the smallest value from which an axis is logarithmic
-ROW = 38  # units of a row with its label above it
+LOG_FROM = 5.0  # an axis is logarithmic if its largest value is this many times its smallest
+ROW = 38  # height in pixels of a row with its label above it
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Mark:
 
     x: float
     y: float
-    run: int  # the number of the run or configuration that it stands for
+    run: int  # the number of its run in the list of runs of the report
     low: float = math.nan
     high: float = math.nan
 
@@ -31,8 +31,8 @@ class FrontierCurve:
     """The points of one model in a figure of PSNR against cost."""
 
     style: Style
-    best: Sequence[Mark]  # the frontier, joined
-    beaten: Sequence[Mark] = ()  # finished, but not on the model's frontier
+    best: Sequence[Mark]  # the Pareto frontier, joined by a line
+    beaten: Sequence[Mark] = ()  # means that are not on the model's Pareto frontier
     runs: Sequence[Mark] = ()  # the single runs behind the means
     paper: Sequence[Mark] = ()  # the paper's own numbers, on other hardware
 
@@ -138,7 +138,7 @@ class Difference:
     mean: float
     low: float
     high: float
-    strong: bool  # drawn filled: its interval does not hold zero
+    strong: bool  # whether it is significant; it is then drawn filled
     note: str = ""
 
 

@@ -12,7 +12,7 @@ from gsbench.report.page import messages
 from gsbench.report.page.palette import Style
 
 Value = str | float | int | None
-MOST_ROWS = 60  # of a table on the page; its CSV has all
+MOST_ROWS = 60  # rows of a table that the report shows; the CSV file has all
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class PageSection:
     sentences: list[str]
     tabs: list[Tab] = field(default_factory=list)
     table: DataTable | None = None
-    beside: bool = False  # the table stands open beside the drawings
+    beside: bool = False  # whether the table is shown beside the figures
     legend: bool = False
     notes: list[str] = field(default_factory=list)
     swatches: list[Swatch] = field(default_factory=list)  # a legend of colours
@@ -170,12 +170,12 @@ class Runs:
 
 @dataclass(frozen=True)
 class Canvas:
-    """The state that the figures of one experiment share: list of runs, styles of the models, and a prefix for SVG ids."""
+    """The state that the figures of one experiment share: the list of runs, the models' styles and an SVG prefix."""
 
-    name: str  # keeps the ids of its drawings apart from those of others
+    name: str  # prefix of the SVG ids, different for each experiment
     runs: Runs
     look: dict[str, Style]  # by `Configuration.series`
-    scenes: int  # that have drawings of their own
+    scenes: int  # number of scenes with figures of their own
 
 
 def _facts(psnr: float, seconds: float, ms: float, mb: float) -> str:

@@ -14,8 +14,8 @@ from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, P
 from gsbench.report.page.palette import Style
 
 AXES = (("seconds", "training seconds"), ("ms", "ms a frame"), ("mb", "MB of the model"))
-MOST_RUNS = 300  # that are drawn singly in a panel
-MOST_NAMED = 3  # models in a list of an answer
+MOST_RUNS = 300  # single runs that are drawn in a figure
+MOST_NAMED = 3  # models that a sentence names
 INTERVALS = (
     "The 95 % interval of a model's own PSNR is over seeds: what other seeds would give on these scenes and views. "
     "It does not tell whether two models differ; the section “Is it a difference?” does."
@@ -27,7 +27,7 @@ class BudgetAnswer:
     """The best model within a budget of time, as text for the HTML report."""
 
     budget: str
-    model: str  # empty: none fits
+    model: str  # empty if no model is within the budget
     value: str
     interval: str
     detail: str
@@ -201,7 +201,7 @@ def _curve(
     single: list[charts.Mark] = []
     theirs: list[charts.Mark] = []
     if len(scenes) == 1:
-        gated = any(p.configuration.on_demand for p in points)  # the paper's models are not
+        gated = any(p.configuration.on_demand for p in points)  # models of the paper keep all effects
         own = [r for p in points for r in p.configuration.runs[scenes[0]]]
         if len(own) > len(points) and len(own) <= MOST_RUNS // max(1, len(group.series)):
             pairs = [(group.value(r, cost), group.value(r, "psnr"), runs.of_record(group, r)) for r in own]

@@ -14,7 +14,7 @@ MEANING = {
     "D": "densification ends",
     "L": "λ starts to be learned",
 }
-MOST_RESETS = 4  # that are marked
+MOST_RESETS = 4  # opacity resets that are marked
 
 
 def of(record: Record) -> list[tuple[int, str]]:
@@ -25,7 +25,7 @@ def of(record: Record) -> list[tuple[int, str]]:
     try:
         steps = _steps(record)
     except (InputError, KeyError, TypeError, AttributeError, ArithmeticError):
-        return []  # a record of another gsbench, whose config has other keys
+        return []  # a record of another version of gsbench, with other config keys
     letters: dict[int, str] = {}
     for step, letter in sorted(steps):
         letters[step] = letters.get(step, "") + letter

@@ -14,7 +14,7 @@ from gsbench.report.page.messages import shorten
 
 FILE_NAME = "pictures.png"
 BUDGET = 900_000  # bytes of all images as text, which leaves the page below 2 MB
-IMAGES_BUDGET = 300_000  # of `images`, beside those
+IMAGES_BUDGET = 300_000  # bytes of the images of `images`, in addition to BUDGET
 IMAGE_SIDE = 960  # pixels
 STEPS = ((400, 92, 3), (400, 85, 3), (320, 80, 3), (256, 75, 3), (256, 75, 1), (160, 70, 1), (96, 60, 1), (48, 50, 1))
 

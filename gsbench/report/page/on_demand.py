@@ -19,13 +19,13 @@ from gsbench.report.page.content import Canvas, Column, DataTable, Image, PageFi
 from gsbench.report.page.palette import EFFECT_SET_LIKE, MODELS
 from gsbench.report.page.svg import LINE, model_colour, stage_colour
 
-PICTURE, OLD_PICTURE = "effect_sets.png", "classes.png"  # runs of before have the old name
-MOST_SAID = 12  # scenes and models that have a sentence
+PICTURE, OLD_PICTURE = "effect_sets.png", "classes.png"  # older runs have the old name
+MOST_SAID = 12  # scenes and models that are described in a sentence
 MOST_BARS = 24
 MOST_NOTES = 12
 LONGEST_REASON = 200
-LONGEST_LABEL = 32  # of a bar, which has a number beside it
-LABEL_END = 15  # characters of its end, which tell lengths and capacities apart
+LONGEST_LABEL = 32  # characters of the label of a bar, which has a number beside it
+LABEL_END = 15  # characters at its end, which differ between training lengths and sizes
 IN_TRAINING = (
     "What the gate in training changed is not in these dB and ms, as the training goes on after it: the frontier has "
     "runs with and without gates, where both were run."

@@ -17,12 +17,12 @@ from matplotlib.figure import Figure
 from matplotlib.markers import MarkerStyle
 from matplotlib.ticker import NullLocator
 
-WIDTH = 360  # units of a panel, about pixels: a phone shows it unscaled
+WIDTH = 360  # width of a figure in pixels, which fits on the screen of a phone
 FONT = 11.5
 INK, MUTED, LINE, PAPER = "#010101", "#010102", "#010103", "#010104"
 VARIABLES = {INK: "ink", MUTED: "muted", LINE: "line", PAPER: "paper"}
-LANE = 17  # units of a row below the axes
-HIT = 9  # radius of what answers to a pointer
+LANE = 17  # height in pixels of a row below the axes
+HIT = 9  # radius in pixels of the area that reacts to the pointer
 RC: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "gsbench",  # the same numbers give the same file
@@ -61,14 +61,14 @@ class Panel:
     """A figure with one pair of axes; `hits` are the points that show the name of a run under the pointer."""
 
     height: int
-    left: int = 38  # units left of the axes
+    left: int = 38  # pixels left of the axes
     top: int = 24
-    lanes: int = 0  # rows below the axes, for `lane`
+    lanes: int = 0  # number of rows below the axes, for events
     width: int = WIDTH
     hits: list[tuple[float, float, int]] = field(default_factory=list)  # data coordinates, number of the run
     figure: Figure = field(init=False)
     axes: Axes = field(init=False)
-    below: Axes = field(init=False)  # the lanes, on the same x axis
+    below: Axes = field(init=False)  # the axes of these rows, with the same x axis
 
     def __post_init__(self) -> None:
         with mpl.rc_context(RC):

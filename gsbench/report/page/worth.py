@@ -18,7 +18,7 @@ from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, P
 UNITS = (("psnr", "dB", 2), ("seconds", "training s", 1), ("ms", "ms a frame", 2), ("mb", "MB", 2))
 STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer", "screen", "gate")  # each has a colour
 REST = "other"
-MOST_PAIRS = 28  # that are drawn: those of eight models
+MOST_PAIRS = 28  # pairs that are drawn, as many as eight models have
 PARAMETRISATION = (
     "4dgs is another parametrisation of a Gaussian than 7dgs without direction, so direction given time is priced "
     "across the two."
