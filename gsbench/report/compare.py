@@ -35,7 +35,7 @@ class Pair:
 
 
 def paired(group: Group) -> list[Weights]:
-    """Return the differences between models that `pairs` tests, as weighted sums of two models.
+    """Return the differences between models that `pairs` tests, as weighted sums of two models' results.
 
     All models have the settings that most runs share. An ablation (a model with one part changed) is compared with the
     full models, but not with other ablations.
@@ -49,7 +49,7 @@ def pairs(group: Group, family: Family) -> list[Pair]:
 
     Args:
         group: the run records of one experiment.
-        family: the p-values of the report, adjusted for all its comparisons; it must include those of `paired`.
+        family: the adjusted p-values of all comparisons in the report, including those from `paired`.
     """
     found = []
     for (_, a), (_, b) in paired(group):
@@ -89,7 +89,7 @@ def _views(group: Group, configuration: Configuration, scene: str) -> dict[str, 
 
 @dataclass(frozen=True)
 class Price:
-    """What an effect (time, view direction or neural refinement) gains in PSNR and costs in time and memory.
+    """The gain of an effect (time, view direction or neural refinement) in PSNR, and its cost in time and memory.
 
     An interaction of effects is stored in the same way: it is the change of one effect's gain when another is added.
     """
@@ -117,7 +117,7 @@ class Cube:
 
 
 def priced(group: Group) -> list[Weights]:
-    """Return the weighted sums of models that give the gain of each effect and of each interaction of effects.
+    """Return the weighted sums of models' results that give the gain of each effect and of each interaction.
 
     The effects are time, view direction and AGR (neural refinement). `cube` tests each of these sums in PSNR, training
     seconds, milliseconds per frame and MB.
@@ -136,7 +136,7 @@ def cube(group: Group, family: Family) -> Cube:
 
     Args:
         group: the run records of one experiment.
-        family: the p-values of the report, adjusted for all its comparisons; it must include those of `priced`.
+        family: the adjusted p-values of all comparisons in the report, including those from `priced`.
     """
     cells, own, left_out = _filled(group)
     every: list[Cell] = list(itertools.product((False, True), (False, True), (False, True)))
@@ -186,7 +186,7 @@ def _words(cell: Cell) -> str:
 
 
 def _contrasts() -> list[tuple[str, dict[Cell, float]]]:
-    """Return every effect and every interaction of effects: its name, and the weights of models in its weighted sum.
+    """Return the name of every effect and interaction, and the weights of models' results whose sum it is.
 
     The effects are time, view direction and AGR (neural refinement). Single effects come before interactions.
     """
@@ -212,7 +212,7 @@ def _given(name: str, held: list[int], values: tuple[bool, ...]) -> str:
 def _weights(
     varied: tuple[int, ...], held: list[int], given: list[tuple[bool, ...]], share: float
 ) -> dict[Cell, float]:
-    """Return the signed weights of the models whose weighted sum is an effect or an interaction of effects.
+    """Return the weights of models, so that the weighted sum of their results is an effect or an interaction.
 
     For the effect of time alone, the model with time has weight 1 and the model without any effect has weight -1.
 
@@ -231,7 +231,10 @@ def _weights(
 
 
 def _price(family: Family, cells: dict[Cell, Configuration], name: str, weights: dict[Cell, float]) -> Price | None:
-    """Compute a weighted sum of models in dB, seconds, ms and MB; None if a model is missing or they share no scene."""
+    """Compute a weighted sum of models' results in dB, seconds, ms and MB.
+
+    The result is None if a model was not run, or if the models share no scene.
+    """
     if not weights.keys() <= cells.keys():
         return None
     sums = _sum(cells, weights)
@@ -247,5 +250,5 @@ def _price(family: Family, cells: dict[Cell, Configuration], name: str, weights:
 
 
 def _sum(cells: dict[Cell, Configuration], weights: dict[Cell, float]) -> Weights:
-    """Return the weight and the configuration of each model in a weighted sum, positive weights first."""
+    """Return the models of a weighted sum with their weights, positive weights first."""
     return sorted(((w, cells[cell]) for cell, w in weights.items()), key=lambda term: (-term[0], term[1].model))

@@ -150,7 +150,7 @@ class Group:
 
     @cached_property
     def main_configurations(self) -> list[Configuration]:
-        """Return one configuration for each model: the one with the settings that most models share."""
+        """Return each model with the settings that most models share (one configuration for each model)."""
         return [c for c in self.configurations if c.variant == self.variant]
 
     @cached_property
@@ -162,7 +162,7 @@ class Group:
         return [c for c in self.configurations if _common(c.variant) == _common(self.variant)]
 
     def label(self, configuration: Configuration) -> str:
-        """Return a name for a compared configuration: its model, and its settings if they are not the common ones."""
+        """Return a name for a compared model, and its settings in brackets if they are not the common ones."""
         model, variant = configuration.model, configuration.variant
         return model if variant == self.variant else f"{model} ({variant or 'default'})"
 
@@ -179,8 +179,8 @@ class Group:
     def basis(self) -> list[str]:
         """Return the scenes over which the report averages its conclusions.
 
-        These are the scenes that every model finished. If there is no such scene, it is the scene that most
-        configurations finished.
+        These are the scenes that every model finished. If there is no such scene, it is the one scene that most models
+        and settings finished.
         """
         if self.covered or not self.configurations:
             return self.covered
@@ -206,24 +206,24 @@ class Group:
         return QUANTITIES[quantity](record)
 
     def sample(self, configuration: Configuration, scene: str, quantity: str) -> Values:
-        """Return the values of a quantity for the runs of a configuration on a scene, one for each seed that has it."""
+        """Return the values of a quantity for a model with its settings on a scene, one for each seed that has it."""
         values = np.array([self.value(r, quantity) for r in configuration.runs.get(scene, [])])
         return values[np.isfinite(values)]
 
     def contrast(self, weights: list[tuple[float, Configuration]], quantity: str) -> list[Values]:
-        """Return a weighted sum of configurations, paired by seed and view, as one array [seeds, views] for each scene.
+        """Return a weighted sum of models' results as one array [seeds, views] for each scene.
 
-        For example, the weights 1 and -1 give the difference of two models. Only the scenes, seeds and views are used
-        that all configurations have. PSNR has one column for each view. Other quantities, and PSNR from records without
-        values for each view, have one column.
+        For example, the weights 1 and -1 give the difference of two models. The results are paired: only those scenes,
+        seeds and views are used that all models in the sum have. PSNR has one column for each view. Other quantities,
+        and PSNR from records without values for each view, have one column.
         """
         scenes = [s for s in self.scenes if all(s in c.runs for _, c in weights)]
         return [paired for s in scenes if (paired := self._paired(weights, s, quantity)).size]
 
     def _paired(self, weights: list[tuple[float, Configuration]], scene: str, quantity: str) -> Values:
-        """Return the weighted sum of configurations on one scene, [seeds, views].
+        """Return the weighted sum of models' results on one scene, [seeds, views].
 
-        The array is empty if the configurations share no seed or no view.
+        The array is empty if the models share no seed or no view.
         """
         by_seed = [{r.seed: s for r in c.runs[scene] if (s := self.scores(r, quantity))} for _, c in weights]
         seeds = sorted(set.intersection(*map(set, by_seed)))
@@ -263,7 +263,7 @@ def gating(record: Record) -> str:
 
 
 def is_ablated(variant: str) -> bool:
-    """Tell whether a variant changes one part of a model, through a configuration file of conf/ablation."""
+    """Tell whether a variant (a text of settings) changes one part of a model, through a file in conf/ablation."""
     return any(word.startswith("ablation=") and word != "ablation=none" for word in variant.split(","))
 
 

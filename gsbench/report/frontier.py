@@ -127,7 +127,7 @@ def choose(of: Sequence[FrontierPoint], cost: str, budget: float, family: Family
         of: the points (models with their mean PSNR and cost) from which to choose.
         cost: the cost that the budget limits: "seconds" of training, "ms" per frame or "mb" of parameters.
         budget: the limit in seconds, milliseconds or MB.
-        family: the p-values of the report, adjusted for all its comparisons; it must include those of `contested`.
+        family: the adjusted p-values of all comparisons in the report, including those from `contested`.
     """
     found = contest(of, cost, budget)
     if not found:
@@ -157,8 +157,8 @@ class Target:
 def targets(group: Group) -> list[Target]:
     """Return the PSNR targets of every scene, and the training seconds that each model needs to reach them.
 
-    PSNR is measured on the validation views. A model's seconds are those of its fastest finished configuration whose
-    mean PSNR over seeds reaches the target. Nothing is interpolated between different training lengths.
+    PSNR is measured on the validation views. A model's seconds are those of its fastest finished settings whose mean
+    PSNR over seeds reaches the target. Nothing is interpolated between different training lengths.
     """
     found = []
     for scene in group.scenes:
@@ -186,9 +186,9 @@ def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, fl
 def round_numbers(low: float, high: float) -> list[float]:
     """Return round PSNR values above `low` and up to `high`, as targets for training.
 
-    The values are multiples of one step. The step is the widest of STEPS that gives at least FEWEST_TARGETS values. If
-    no step does, the values of the finest step are returned. Round values favour no model, since none is a model's own
-    PSNR.
+    The values are multiples of 2, 1, 0.5, 0.2 or 0.1 dB, namely of the largest of these steps that gives at least three
+    values. If no step does, the multiples of 0.1 dB are returned. Round values favour no model, since none is a model's
+    own PSNR.
     """
     found: list[float] = []
     for step in STEPS:
@@ -201,8 +201,8 @@ def round_numbers(low: float, high: float) -> list[float]:
 def profile(of: Sequence[Target]) -> dict[str, Values]:
     """Return for each model its sorted ratios of training time to the fastest model's time, one for each target.
 
-    Only targets that some model reaches are used. The share of ratios up to tau is the performance profile of Dolan and
-    More (2002). A ratio is infinite if the model never reaches the target or has no run on its scene.
+    Only targets that some model reaches are used. The share of ratios up to a factor tau is the performance profile of
+    Dolan and More (2002). A ratio is infinite if the model never reaches the target or has no run on its scene.
     """
     models = sorted({m for target in of for m in target.seconds})
     solved = [t for t in of if math.isfinite(min(t.seconds.values()))]

@@ -48,7 +48,7 @@ class Decided:
 
     @property
     def left(self) -> float:
-        """Return the number of Gaussians that remain after the last removal."""
+        """Return the number of Gaussians that remain after all removals."""
         return self.before - self.rows.get(REMOVED, 0.0)
 
 

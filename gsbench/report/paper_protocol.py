@@ -149,7 +149,7 @@ def _pixels(size: str) -> int:
 
 
 def _part(config: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return a section of a run's configuration; it is empty if the record lacks the section."""
+    """Return a section of a run's config, such as "train"; it is empty if the record lacks the section."""
     part = config.get(name)
     return part if isinstance(part, dict) else {}
 

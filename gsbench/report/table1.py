@@ -56,7 +56,10 @@ def _other_protocol(runs: list[Record]) -> str:
 
 
 def missing(dataset: str, records: list[Record]) -> str:
-    """Return a line that lists the scenes, models and seeds which a data set still lacks at the paper's protocol."""
+    """Return a line that lists which scenes, models and seeds of a data set still have to be run.
+
+    The line covers only runs with the protocol of the 7DGS paper.
+    """
     own = [r for r in records if r.status == "ok" and not model_recipe(r).recipe]
     scenes = paper.PROTOCOLS[dataset].scenes
     seeds = {(s, m): len({r.seed for r in own if (r.scene, r.model) == (s, m)}) for s in scenes for m in MODELS}

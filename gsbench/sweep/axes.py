@@ -18,7 +18,7 @@ MULTIRUN = ("-m", "--multirun")
 SCENES_DEPEND_ON = ("exp", "data.scenes")  # the overrides on which the list of scenes depends
 INFORM = ("-h", "--help", "--hydra-help", "--version", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion")
 
-NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{'\"].*|")  # Hydra parses these as values
+NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{'\"].*|")  # values for Hydra
 
 
 def expand(words: Sequence[str]) -> list[str]:
@@ -74,7 +74,7 @@ def _check_group(name: str, choices: str) -> None:
 def scenes_of(overrides: list[str]) -> list[str] | None:
     """Return the scenes of an experiment, and make each one a choice of the config group `scene`.
 
-    The result is None if Hydra cannot compose the configuration.
+    The result is None if Hydra cannot compose the config.
     """
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):

@@ -1,4 +1,4 @@
-"""Explain in one line why Hydra or OmegaConf rejects a command line or a configuration."""
+"""Explain in one line why Hydra or OmegaConf rejects a command line or a config."""
 
 import traceback
 

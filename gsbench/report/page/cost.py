@@ -38,7 +38,7 @@ def answers(group: Group, family: Family) -> list[BudgetAnswer]:
 
     Args:
         group: the run records of one experiment.
-        family: the p-values of the report, adjusted for all its comparisons.
+        family: the adjusted p-values of all comparisons in the report.
     """
     points = f.points(group, group.basis)
     return [_answer(points, family, cost, budget) for cost, budget in f.BUDGETS]

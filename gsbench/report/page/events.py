@@ -1,4 +1,4 @@
-"""Find the steps at which the schedule changed a run's training, from the configuration in its record."""
+"""Find the steps at which the schedule changed a run's training, from the config in its record."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ MOST_RESETS = 4  # opacity resets that are marked
 def of(record: Record) -> list[tuple[int, str]]:
     """Return the steps of training events, such as an opacity reset, with a letter for each event.
 
-    The list is empty if the configuration cannot be read.
+    The list is empty if the config in the run's record cannot be read.
     """
     try:
         steps = _steps(record)
@@ -45,7 +45,7 @@ def _steps(record: Record) -> list[tuple[int, str]]:
 
 
 def _rates(record: Record) -> dict[str, Any]:
-    """Return the learning rates of a run's model from its configuration.
+    """Return the learning rates of a run's model from the config in its record.
 
     If the run chose its model automatically (model=auto), these are the rates of the model that was chosen.
     """

@@ -67,7 +67,7 @@ def _strips(records: list[Record], folder: Path) -> dict[str, dict[str, tuple[Re
 
 
 def places(folder: Path, name: str) -> dict[Path, Path]:
-    """Find all files with a certain name below a folder of results, with the path of their run as key."""
+    """Return all files with a certain name below a folder of results, in a dictionary by the path of their run."""
     return {Path(*path.parts[-5:-1]): path for path in sorted(folder.resolve().rglob(name))}
 
 

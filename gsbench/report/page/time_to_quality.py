@@ -40,7 +40,10 @@ def quality_section(group: Group, canvas: Canvas) -> PageSection:
 
 
 def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
-    """Say which models reach most PSNR targets, which are most often the fastest, and what only one model reaches."""
+    """Say which models reach most PSNR targets, and which are most often the fastest.
+
+    The text also says how many targets only one model reaches.
+    """
     reached = {m: sum(math.isfinite(t.seconds.get(m, math.inf)) for t in targets) for m in models}
     fastest = {m: sum(t.seconds.get(m, math.inf) == min(t.seconds.values()) for t in targets) for m in models}
     most = [m for m in models if reached[m] == max(reached.values())]
