@@ -104,7 +104,8 @@ class Comparison:
     def verdict(self) -> str:
         """Return the overall verdict of the comparison, which depends on PSNR only.
 
-        The folders differ if PSNR differs for any model and scene. They agree if PSNR agrees for all models and scenes.
+        The folders differ if PSNR differs for at least one model on one scene. They agree if PSNR agrees for all models
+        and scenes.
         """
         if self.of("psnr", DIFFERS):
             return DIFFERS

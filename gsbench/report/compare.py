@@ -45,7 +45,7 @@ def paired(group: Group) -> list[Weights]:
 
 
 def pairs(group: Group, family: Family) -> list[Pair]:
-    """Compare every two models on the scenes that both have finished, and sort by falling PSNR difference.
+    """Compare every two models on the scenes that both have finished; return the pairs by falling difference.
 
     Args:
         group: the run records of one experiment.
@@ -131,8 +131,8 @@ def cube(group: Group, family: Family) -> Cube:
 
     AGR is the neural refinement of Gaussians. The gain of an effect is the difference of two models that differ only in
     this effect. It is computed with each of the other two effects on or off, which gives 12 differences. The
-    interaction of two effects is the difference of two such gains, which gives 6. The interaction of all three effects
-    is the difference of two interactions. An effect's mean over the other effects needs all eight models.
+    interaction of two effects is the difference of two such gains, which gives 6 interactions. The interaction of all
+    three effects is the difference of two interactions. An effect's mean over the other effects needs all eight models.
 
     Args:
         group: the run records of one experiment.

@@ -62,7 +62,7 @@ def sort(records: list[Record]) -> Sorted:
     """Sort run records into those with the 7DGS paper's protocol, those with another protocol, and those on other data.
 
     Other data are scenes that stand in for scenes of the paper. A record is skipped without a message if its model is
-    not one of the five in MODELS, or if it belongs to no data set of the paper.
+    not one of the five in MODELS, or if its data neither belong to the paper nor stand in for its data.
     """
     at_paper: dict[str, list[Record]] = {name: [] for name in PROTOCOLS}
     pools: dict[tuple[str, str, str, str, int], Pool] = {}  # by downscaling, as image sizes differ between scenes
