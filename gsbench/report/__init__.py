@@ -1,1 +1,1 @@
-"""Make tables and an HTML page from the records of runs; this package needs no torch."""
+"""Make result tables and an HTML report from the records of training runs; this package does not need PyTorch."""

@@ -1,10 +1,14 @@
-"""Compare the runs of two folders of records, such as this machine's with published ones, and judge each quantity.
+"""Compare the runs in two folders of records, and judge for each quantity whether the folders agree.
 
-Runs are compared where model, variant, scene, data, training and measuring are equal. Another machine or instruction
-set rounds differently, and a training with other rounding ends like a training with another seed. So the runs of a
-model on a scene are two samples, and their means are compared by the spread over seeds (Student's t, Holm over all
-rows). A few seeds do not give a reliable spread. So it is pooled over the models and scenes of an experiment, and the
-row's own spread counts if it is larger. Thus one run can be compared with three.
+For example, this compares the results of this machine with published results. Runs are compared if their model, scene,
+data, training settings and evaluation settings are equal. Another machine or instruction set rounds floating-point
+numbers differently, and different rounding changes the result of a training as much as another seed does. Therefore the
+runs of one model on one scene form two samples, one for each folder. Student's t compares the two means, and Holm's
+method adjusts the p-values for all models and scenes.
+
+A few seeds do not give a reliable variance. Therefore the variance over seeds is pooled over the models and scenes of
+an experiment. If the variance of the compared runs themselves is larger, it is used instead. With the pooled variance,
+even one run can be compared with three.
 """
 
 import math
@@ -19,15 +23,17 @@ from gsbench.report.configurations import OF_THE_MACHINE, QUANTITIES
 from gsbench.report.intervals import LEVEL, Estimate, Spread, holm
 
 AGREES, DIFFERS, UNTOLD = "agrees", "differs", "cannot be told"
-MEASURING = ("eval_split", "quantise", "resolution", "background", "downscale")  # of a record's protocol
-SAME_LOAD = 0.5  # mean loads further apart than this make seconds of two runs incomparable
+MEASURING = ("eval_split", "quantise", "resolution", "background", "downscale")  # settings of a run's evaluation
+SAME_LOAD = 0.5  # if the mean loads of two machines differ more, times are not compared
 
 
 @dataclass(frozen=True)
 class Limit:
-    """The largest difference of two means that count as equal, and the widest interval that can show this.
+    """Two limits for the comparison of two means: `equal` and `widest`.
 
-    If the limit is relative, both numbers are parts of the mean in the second folder.
+    Means whose difference is at most `equal` count as equal. A larger difference that is not significant also counts as
+    equal, but only if the 95 % interval is no wider than ± `widest`. If `relative` is true, both limits are fractions
+    of the mean in the second folder.
     """
 
     equal: float
@@ -35,7 +41,7 @@ class Limit:
     relative: bool = True
 
 
-LIMITS = {  # by quantities of gsbench.report.configurations, and those below
+LIMITS = {  # by quantity; most are those of gsbench.report.configurations
     "psnr": Limit(0.01, 1.0, relative=False),  # dB
     "seconds": Limit(0.25, 0.5),
     "ms": Limit(0.25, 0.5),
@@ -57,11 +63,11 @@ NONE = Estimate(math.nan, 0, 0, "")
 
 @dataclass(frozen=True)
 class Judged:
-    """A quantity of a model on a scene: the mean in the first folder less that in the second, and the verdict."""
+    """One quantity (such as PSNR) of a model on a scene in two folders: the values, their difference and a verdict."""
 
     ours: list[float]  # by run
     theirs: list[float]
-    reason: str = ""  # why it cannot be told
+    reason: str = ""  # why there is no verdict
     verdict: str = UNTOLD
     difference: Estimate = NONE
     p_holm: float = math.nan
@@ -69,7 +75,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class ComparedRuns:
-    """A model with its variant on a scene, in both folders."""
+    """The runs of one model variant on one scene in two folders, with the verdict on each quantity."""
 
     experiment: str
     dataset: str
@@ -82,7 +88,7 @@ class ComparedRuns:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The comparison of two folders."""
+    """The comparison of the runs in two folders; it also lists the models and scenes that only one folder has."""
 
     ours: str  # the folder
     theirs: str
@@ -91,19 +97,23 @@ class Comparison:
     only_theirs: list[str]
 
     def of(self, quantity: str, verdict: str) -> list[ComparedRuns]:
-        """List the rows in which a quantity has a given verdict."""
+        """List the compared models and scenes for which a quantity has the given verdict."""
         return [row for row in self.rows if row.judged[quantity].verdict == verdict]
 
     @property
     def verdict(self) -> str:
-        """Return the verdict of the whole: it differs if PSNR differs in any row, and agrees if it agrees in all."""
+        """Return the overall verdict of the comparison, which depends on PSNR only.
+
+        The folders differ if PSNR differs for at least one model on one scene. They agree if PSNR agrees for all models
+        and scenes.
+        """
         if self.of("psnr", DIFFERS):
             return DIFFERS
         return AGREES if self.rows and len(self.of("psnr", AGREES)) == len(self.rows) else UNTOLD
 
     @property
     def line(self) -> str:
-        """Return the result of the comparison in one line."""
+        """Return a summary of the comparison in one line of text."""
         head = f"{self.ours} against {self.theirs}: {self.verdict}."
         if not self.rows:
             return f"{head} No model and scene is in both."
@@ -131,12 +141,12 @@ class Comparison:
 
 
 def compare(ours: Sequence[Record], theirs: Sequence[Record], names: tuple[str, str]) -> Comparison:
-    """Compare the runs of two folders.
+    """Compare the runs of two folders for each model and scene that both folders have.
 
     Args:
-        ours: records of the first folder.
-        theirs: records of the second folder.
-        names: the names of the two folders.
+        ours: run records of the first folder.
+        theirs: run records of the second folder.
+        names: the names of the two folders, for messages.
     """
     here, there = _by_configuration(ours), _by_configuration(theirs)
     rows = [_row(here[key], there[key]) for key in sorted(here.keys() & there.keys())]
@@ -165,12 +175,12 @@ def _by_configuration(records: Sequence[Record]) -> RunsByConfiguration:
 
 
 def _missing(of: RunsByConfiguration, other: RunsByConfiguration) -> list[str]:
-    """List the models on scenes that only the first folder has."""
+    """List the models and scenes that only the first folder has."""
     return [f"{model} {variant}".rstrip() + f" on {scene}" for _, _, scene, model, variant in sorted(of.keys() - other)]
 
 
 def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> ComparedRuns:
-    """Pair the runs of a model on a scene in both folders: each quantity's values, or why it cannot be compared."""
+    """Collect the values of a model on a scene from both folders, and the reasons why some cannot be compared."""
     first = next(iter(ours.values()))
     mine, other = ([r for r in runs.values() if r.status == "ok"] for runs in (ours, theirs))
     why = _incomparable(mine, other)
@@ -186,14 +196,18 @@ def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> ComparedRuns:
 
 
 def value(record: Record, quantity: str) -> float:
-    """Read a quantity of LIMITS from a record; NaN if it is missing."""
+    """Read a quantity, such as PSNR or training seconds, from the record of a run; NaN if it is missing."""
     if quantity == "gaussians":
         return record.cost.num_gaussians if record.cost else math.nan
     return QUANTITIES[quantity](record)
 
 
 def differences(rows: list[Judged], limit: Limit) -> list[Estimate]:
-    """Estimate the difference of the means in each row, with the spread over seeds pooled over the rows."""
+    """Estimate the difference between the two folders' means for each model and scene, with an interval.
+
+    The variance over seeds is pooled over all given models and scenes. The variance of a single model and scene is used
+    instead if it is larger.
+    """
     units = [abs(fmean(row.theirs)) if limit.relative else 1.0 for row in rows]
     samples = [[[v / (unit or 1.0) for v in runs] for runs in (row.ours, row.theirs)]
                for row, unit in zip(rows, units, strict=True)]  # fmt: skip
@@ -210,13 +224,13 @@ def differences(rows: list[Judged], limit: Limit) -> list[Estimate]:
 
 
 def _squares(*samples: list[float]) -> tuple[float, int]:
-    """Return the sum of squares about the means of some samples, and its degrees of freedom."""
+    """Return the sum of squared deviations of the samples from their means, and its degrees of freedom."""
     squares = sum(variance(sample) * (len(sample) - 1) for sample in samples if len(sample) > 1)
     return squares, sum(len(sample) - 1 for sample in samples)
 
 
 def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
-    """Return why no quantity of two samples of runs can be compared; "" if quantities can be compared."""
+    """Return the reason why two sets of runs cannot be compared at all, or an empty string if they can."""
     if not ours or not theirs:
         return f"no run finished {'here' if not ours else 'there'}"
     first = theirs[0]
@@ -235,7 +249,10 @@ def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
 
 
 def _other_machine(ours: list[Record], theirs: list[Record]) -> str:
-    """Return why seconds cannot be compared; "" if all were measured on one machine under one load."""
+    """Return the reason why the times of two sets of runs cannot be compared, or an empty string if they can.
+
+    Times are comparable if all were measured on one machine under about the same load.
+    """
     here, there = ({r.provenance.machine for r in runs} for runs in (ours, theirs))
     if here != there or len(here) > 1:
         named = [printable("; ".join(sorted(machines)))[:200] for machines in (here, there)]
@@ -250,7 +267,7 @@ def _other_machine(ours: list[Record], theirs: list[Record]) -> str:
 
 
 def _judge(found: Judged, limit: Limit, p: float) -> Judged:
-    """Decide by RULE whether two means agree, differ, or cannot be told."""
+    """Decide whether two means agree, differ, or allow no decision, by the criteria in the constant RULE."""
     if found.reason:
         return found
     unit = abs(fmean(found.theirs)) if limit.relative else 1.0
@@ -266,6 +283,6 @@ def _judge(found: Judged, limit: Limit, p: float) -> Judged:
 
 
 def _places(rows: list[ComparedRuns]) -> str:
-    """Name the first few of a list of (model, scene) pairs."""
+    """Return a text that names the first three models with their scenes, and counts the others."""
     named = [f"{printable(row.model)} on {printable(row.scene)}" for row in rows[:3]]
     return ", ".join(named) + (f" and {len(rows) - 3} more" if len(rows) > 3 else "")

@@ -1,4 +1,4 @@
-"""Write a comparison of two folders of records as a table for the terminal and the page, and as JSON."""
+"""Write a comparison of two folders of run records as a table for the terminal and the report, and as JSON."""
 
 import json
 import math
@@ -21,7 +21,11 @@ COLUMNS = [
 
 
 def tables(of: Comparison) -> list[Table]:
-    """Make a table with the values of both folders for each scene, model and seed, and each model's difference."""
+    """Make a table that compares the runs of two folders, with one section for each scene.
+
+    A section has one row for each model and seed with the values of both folders. Two further rows give each model's
+    mean difference and the verdict.
+    """
     scenes = sorted({(row.experiment, row.dataset, row.scene) for row in of.rows})
     several = len({scene[:2] for scene in scenes}) > 1
     sections = []
@@ -37,7 +41,7 @@ def tables(of: Comparison) -> list[Table]:
 
 
 def lines(row: ComparedRuns) -> list[Row]:
-    """Make the lines of a model on a scene: its seeds, the differences with their intervals, the verdicts."""
+    """Make the table rows for a model on a scene: one for each seed, one with differences and one with verdicts."""
     made = []
     for seed in sorted(row.ours.keys() | row.theirs.keys()):
         pair = row.ours.get(seed), row.theirs.get(seed)
@@ -53,7 +57,7 @@ def _shown(record: Record | None, column: QuantityColumn) -> str:
 
 
 def _difference(found: Judged, column: QuantityColumn) -> str:
-    """Show a difference with half its interval."""
+    """Format a difference of means, followed by half the width of its interval if this is known."""
     mean, half = found.difference.mean, found.difference.half
     if math.isnan(mean):
         return EMPTY
@@ -62,7 +66,7 @@ def _difference(found: Judged, column: QuantityColumn) -> str:
 
 
 def _reasons(rows: list[ComparedRuns]) -> list[str]:
-    """List the reasons for the verdict "cannot be told", equal reasons once."""
+    """List the reasons why quantities cannot be judged; all models with the same reason share one line."""
     titles = {c.key: c.title for c in COLUMNS}
     why: dict[str, dict[str, list[str]]] = {}
     for row in rows:
@@ -78,7 +82,10 @@ def _reasons(rows: list[ComparedRuns]) -> list[str]:
 
 
 def write_json(of: Comparison, path: Path) -> None:
-    """Write a comparison as JSON, atomically; an unknown number is null."""
+    """Write a comparison of two folders of run records to a JSON file; an unknown number becomes null.
+
+    The file is replaced atomically, so a reader never sees a half-written one.
+    """
     content = {
         "ours": of.ours,
         "theirs": of.theirs,

@@ -1,4 +1,7 @@
-"""Make texts from records safe as cells of CSV: spreadsheets run formulas, and terminals obey control characters."""
+"""Make texts from run records safe for CSV files.
+
+A spreadsheet would compute a text that begins like a formula, and a terminal would obey control characters in it.
+"""
 
 from typing import Any
 
@@ -8,9 +11,10 @@ _FORMULA = "=+-@"  # a spreadsheet computes a text that begins with one of these
 
 
 def cell(value: Any) -> Any:
-    """Return a value for CSV: a text is put on one line, escaped, and quoted by ' if it begins like a formula.
+    """Return a value that is safe in a CSV cell.
 
-    Numbers, which may be negative, and other values are unchanged.
+    A text is put on one line, and its control characters are escaped. If it begins like a spreadsheet formula, a ' is
+    put before it. Numbers and other values are returned unchanged.
     """
     if not isinstance(value, str):
         return value

@@ -1,4 +1,8 @@
-"""Compare models pair by pair, and say what each effect gains in dB and costs in seconds, milliseconds and bytes."""
+"""Compare models in pairs, and compute what each effect gains in dB and what it costs.
+
+The effects are time, view direction and AGR (the neural refinement of Gaussians). The costs are training seconds,
+milliseconds per frame and bytes.
+"""
 
 import itertools
 import math
@@ -10,41 +14,42 @@ from gsbench.report.configurations import Configuration, Group, Values, is_ablat
 from gsbench.report.family import Family, Tested, Weights
 from gsbench.report.intervals import Estimate
 
-Cell = tuple[bool, bool, bool]  # simulates time, direction, AGR
+Cell = tuple[bool, bool, bool]  # whether a model has time, view direction and AGR (neural refinement)
 FACTORS = ("time", "direction", "AGR")
 MEAN = "mean over the others"
 PRICES = ("psnr", "seconds", "ms", "mb")
-PUBLISHED = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")  # first where two models simulate the same effects
-NESTED = ("7dgs_nodir", "7dgs_nodir_agr")  # 7dgs less direction: differ from it in nothing else, as 4dgs does
+PUBLISHED = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")  # preferred if two models have the same effects
+NESTED = ("7dgs_nodir", "7dgs_nodir_agr")  # 7dgs without direction; 4dgs differs from 7dgs in more
 
 
 @dataclass(frozen=True)
 class Pair:
-    """How much better one model is than another, with the settings that most runs of the experiment share."""
+    """The difference in PSNR between two models, both with the settings that most runs of the experiment share."""
 
-    better: Configuration  # by its mean; by name where they tie
+    better: Configuration  # the one with the higher mean PSNR
     other: Configuration
     difference: Estimate  # dB
     improvement: float  # the probability that a run of `better` beats one of `other` on a view they share
-    p_holm: float  # of no difference, adjusted for all comparisons of the report; NaN where no spread is known
-    differs: bool  # whether the pair is told apart
+    p_holm: float  # adjusted for all comparisons of the report; NaN if the spread over seeds is not known
+    differs: bool  # whether the difference is significant
 
 
 def paired(group: Group) -> list[Weights]:
-    """Return the differences that `pairs` needs: of every two models with the settings that most runs share.
+    """Return the differences between models that `pairs` tests, as weighted sums of two models' results.
 
-    An ablation is compared with the full models, not with other ablations.
+    All models have the settings that most runs share. An ablation (a model with one part changed) is compared with the
+    full models, but not with other ablations.
     """
     every = itertools.combinations(group.compared, 2)
     return [[(1.0, a), (-1.0, b)] for a, b in every if not (is_ablated(a.variant) and is_ablated(b.variant))]
 
 
 def pairs(group: Group, family: Family) -> list[Pair]:
-    """Compare the models that share a scene on the runs that both have finished; the largest difference comes first.
+    """Compare every two models on the scenes that both have finished; return the pairs by falling difference.
 
     Args:
-        group: the records of one experiment.
-        family: the adjusted comparisons of the report; it holds those of `paired`.
+        group: the run records of one experiment.
+        family: the adjusted p-values of all comparisons in the report, including those from `paired`.
     """
     found = []
     for (_, a), (_, b) in paired(group):
@@ -59,10 +64,11 @@ def pairs(group: Group, family: Family) -> list[Pair]:
 
 
 def improvement(group: Group, a: Configuration, b: Configuration) -> float:
-    """Return the probability that a run of `a` has a higher PSNR than one of `b` on the same view of the same scene.
+    """Return the probability that a run of `a` has a higher PSNR than a run of `b` on the same view of the same scene.
 
-    Every run of `a` is compared with every run of `b`; equal values count half; scenes count equally. Agarwal et al.
-    2021 (arXiv 2108.13264) compare runs so; here it is done for each view. NaN if they share no view.
+    Every run of `a` is compared with every run of `b`. Equal values count one half, and all scenes have the same
+    weight. This is the probability of improvement of Agarwal et al. 2021 (arXiv 2108.13264), computed for each view.
+    The result is NaN if `a` and `b` share no view.
     """
     shares = []
     for scene in sorted(set(a.runs) & set(b.runs)):
@@ -75,7 +81,7 @@ def improvement(group: Group, a: Configuration, b: Configuration) -> float:
 
 
 def _views(group: Group, configuration: Configuration, scene: str) -> dict[str, Values]:
-    """Return the PSNR of a configuration on a scene by view, [seeds]; views that a seed lacks are left out."""
+    """Return the PSNR of a model on a scene: for each view an array over the seeds, without views that a seed lacks."""
     runs = [group.scores(r, "psnr") for r in configuration.runs[scene]]
     common = set.intersection(*map(set, runs))
     return {view: np.array([scores[view] for scores in runs]) for view in common}
@@ -83,43 +89,54 @@ def _views(group: Group, configuration: Configuration, scene: str) -> dict[str, 
 
 @dataclass(frozen=True)
 class Price:
-    """The gain in dB and the cost of an effect, or of the interaction of several."""
+    """The gain of an effect (time, view direction or neural refinement) in PSNR, and its cost in time and memory.
+
+    An interaction of effects is stored in the same way: it is the change of one effect's gain when another is added.
+    """
 
     name: str
     order: int  # 1: an effect, 2 and 3: an interaction
-    models: str  # the sum of models it is computed from
+    models: str  # the weighted sum of models from which it is computed, as text
     costs: dict[str, Estimate]  # by PRICES
-    told: dict[str, bool]  # by PRICES: whether it is told from nothing among all comparisons of the report
+    told: dict[str, bool]  # by PRICES: whether it is significant after adjustment for all comparisons
 
 
 @dataclass(frozen=True)
 class Cube:
-    """The eight models with and without time, direction and AGR, as far as they were run."""
+    """The eight models with each combination of three effects, and what these effects gain and cost.
+
+    The effects are time, view direction and AGR (neural refinement). Models that were not run are missing.
+    """
 
     cells: dict[Cell, Configuration]
     prices: list[Price]
-    nested: list[Price]  # of effects within one parametrisation, with a model of NESTED in the place of another's
-    missing: list[str]  # the cells that no finished run fills, in words
-    left_out: list[str]  # models that simulate the same effects as one that is used
-    on_demand: list[str]  # models whose Gaussians do not all have the effects, so that they price none
+    nested: list[Price]  # the same with the models of NESTED, which share one parametrisation
+    missing: list[str]  # combinations of effects for which no run has finished, as text
+    left_out: list[str]  # models with the same effects as a model in `cells`
+    on_demand: list[str]  # models whose Gaussians lack some effects, so they are not compared
 
 
 def priced(group: Group) -> list[Weights]:
-    """Return the weighted sums of models that `cube` needs, for each quantity of PRICES."""
+    """Return the weighted sums of models' results that give the gain of each effect and of each interaction.
+
+    The effects are time, view direction and AGR (neural refinement). `cube` tests each of these sums in PSNR, training
+    seconds, milliseconds per frame and MB.
+    """
     cells, own, _ = _filled(group)
     return [_sum(of, weights) for _, weights in _contrasts() for of in (cells, own) if weights.keys() <= of.keys()]
 
 
 def cube(group: Group, family: Family) -> Cube:
-    """Compute what time, direction and AGR gain and cost, from the eight models with and without them.
+    """Compute what time, view direction and AGR gain and cost, from the eight models with and without them.
 
-    An effect is priced with each of the other two on or off (12 differences). An interaction of two effects is the
-    difference of two such prices (6), and that of three effects is the difference of two interactions. The mean effects
-    need all eight cells.
+    AGR is the neural refinement of Gaussians. The gain of an effect is the difference of two models that differ only in
+    this effect. It is computed with each of the other two effects on or off, which gives 12 differences. The
+    interaction of two effects is the difference of two such gains, which gives 6 interactions. The interaction of all
+    three effects is the difference of two interactions. An effect's mean over the other effects needs all eight models.
 
     Args:
-        group: the records of one experiment.
-        family: the adjusted comparisons of the report; it holds those of `priced`.
+        group: the run records of one experiment.
+        family: the adjusted p-values of all comparisons in the report, including those from `priced`.
     """
     cells, own, left_out = _filled(group)
     every: list[Cell] = list(itertools.product((False, True), (False, True), (False, True)))
@@ -136,11 +153,11 @@ def cube(group: Group, family: Family) -> Cube:
 
 
 def _filled(group: Group) -> tuple[dict[Cell, Configuration], dict[Cell, Configuration], list[str]]:
-    """Find the runs of the eight models with and without time, direction and AGR (the cells).
+    """Find the model that was run for each combination of time, view direction and AGR (neural refinement).
 
     Returns:
-        The configuration of each cell, the same with the models of NESTED, and the models left out because another
-        model has the same effects.
+        The model of each combination. The same, but with the models in NESTED (7dgs without view direction) instead of
+        others. The names of the models left out because another model has the same combination.
     """
     cells: dict[Cell, Configuration] = {}
     left_out = []
@@ -153,7 +170,7 @@ def _filled(group: Group) -> tuple[dict[Cell, Configuration], dict[Cell, Configu
 
 
 def is_single(name: str) -> bool:
-    """Tell whether a price is that of one effect, in models whose other effects are stated."""
+    """Tell whether the name of a gain stands for a single effect, not for an interaction or a mean over models."""
     return " × " not in name and MEAN not in name
 
 
@@ -163,13 +180,16 @@ def _cell(configuration: Configuration) -> Cell:
 
 
 def _words(cell: Cell) -> str:
-    """Name the effects (time, direction, AGR) of one of the eight models."""
+    """Name a combination of the effects time, direction and AGR (neural refinement), such as "time + AGR"."""
     on = [name for name, has in zip(FACTORS, cell, strict=True) if has]
     return " + ".join(on) or "no effect"
 
 
 def _contrasts() -> list[tuple[str, dict[Cell, float]]]:
-    """Return the name and the weights of every effect and interaction: effects first, then means over the others."""
+    """Return the name of every effect and interaction, and the weights of models' results whose sum it is.
+
+    The effects are time, view direction and AGR (neural refinement). Single effects come before interactions.
+    """
     found = []
     for size in (1, 2, 3):
         for varied in itertools.combinations(range(3), size):
@@ -184,7 +204,7 @@ def _contrasts() -> list[tuple[str, dict[Cell, float]]]:
 
 
 def _given(name: str, held: list[int], values: tuple[bool, ...]) -> str:
-    """Name an effect with the other effects of the compared models, as in "direction given time"."""
+    """Name an effect together with the other effects that both compared models have, as in "direction, with time"."""
     on = [FACTORS[i] for i, value in zip(held, values, strict=True) if value]
     return f"{name}, with {' and '.join(on)}" if on else f"{name} alone" if len(held) == 2 else name
 
@@ -192,7 +212,16 @@ def _given(name: str, held: list[int], values: tuple[bool, ...]) -> str:
 def _weights(
     varied: tuple[int, ...], held: list[int], given: list[tuple[bool, ...]], share: float
 ) -> dict[Cell, float]:
-    """Return the signed weights of the models whose weighted sum is an effect or an interaction of effects."""
+    """Return the weights of models, so that the weighted sum of their results is an effect or an interaction.
+
+    For the effect of time alone, the model with time has weight 1 and the model without any effect has weight -1.
+
+    Args:
+        varied: indices in FACTORS of the effects that are switched on and off.
+        held: indices of the other effects.
+        given: the on/off states of the other effects over which the sum runs.
+        share: the absolute weight of each model.
+    """
     weights = {}
     for values in given:
         for on in itertools.product((False, True), repeat=len(varied)):
@@ -202,7 +231,10 @@ def _weights(
 
 
 def _price(family: Family, cells: dict[Cell, Configuration], name: str, weights: dict[Cell, float]) -> Price | None:
-    """Compute a difference of models in dB, seconds, ms and MB; None if a model is missing or they share no scene."""
+    """Compute a weighted sum of models' results in dB, seconds, ms and MB.
+
+    The result is None if a model was not run, or if the models share no scene.
+    """
     if not weights.keys() <= cells.keys():
         return None
     sums = _sum(cells, weights)
@@ -218,5 +250,5 @@ def _price(family: Family, cells: dict[Cell, Configuration], name: str, weights:
 
 
 def _sum(cells: dict[Cell, Configuration], weights: dict[Cell, float]) -> Weights:
-    """Return the configurations of a weighted sum with their weights, positive weights first."""
+    """Return the models of a weighted sum with their weights, positive weights first."""
     return sorted(((w, cells[cell]) for cell, w in weights.items()), key=lambda term: (-term[0], term[1].model))

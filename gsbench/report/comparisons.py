@@ -1,4 +1,4 @@
-"""Gather all comparisons that a report makes of an experiment, so that their p-values are adjusted together."""
+"""Gather all comparisons that a report makes in an experiment, so that their p-values are adjusted together."""
 
 from gsbench.report import compare, frontier
 from gsbench.report.configurations import Group
@@ -6,7 +6,7 @@ from gsbench.report.family import Family
 
 
 def comparisons(group: Group) -> Family:
-    """Return all comparisons of an experiment: pairs of models, prices of effects, and the choices for budgets."""
+    """Return all comparisons of an experiment: pairs of models, gains of effects, and best models within budgets."""
     prices = compare.priced(group)
     contested = frontier.contested(frontier.points(group, group.basis))
     psnr = [*compare.paired(group), *prices, *contested]

@@ -1,4 +1,4 @@
-"""State the conditions under which the rows of a table were measured, and warn if they differ."""
+"""State the conditions under which the results of a table were measured, and warn if they differ between runs."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -23,14 +23,14 @@ Get = Callable[[Record], str]
 
 
 def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:
-    """List footnotes on protocol, data, machine, commit, versions and seeds; warnings come first.
+    """List the footnotes of a table on protocol, data, machine, commit, versions and seeds; warnings come first.
 
-    The footnotes describe the finished runs, as only these have numbers. A failed run may have stopped before it knew
-    its backend or its data. If no run finished, there is no warning, as nothing is compared.
+    The footnotes describe the finished runs, because only these have results. If no run finished, they describe the
+    failed runs and contain no warning. A failed run may have stopped before its backend or its data was known.
 
     Args:
-        records: the records of one table.
-        spread: what ± means in this table.
+        records: the run records of one table.
+        spread: the text that explains the sign ± in this table.
     """
     finished = [r for r in records if r.status == "ok"]
     notes = _stated(finished or records, spread)
@@ -38,14 +38,14 @@ def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:
 
 
 def _stated(records: list[Record], spread: str) -> list[str]:
-    """List the footnotes of runs that are compared."""
+    """List the footnotes on the conditions of the given runs, with a warning for each condition that differs."""
     names = sorted({name for r in records for name in r.protocol} - {"paper_dataset"})
     protocol: dict[str, Get] = {name: partial(_protocol, name=name) for name in names}
     protocol["iterations"] = _iterations
     data: dict[str, Get] = {printable(records[0].dataset): _data}
     notes = []
     for title, facts in (("protocol", protocol), ("data", data)):
-        # both may differ between scenes (lego is measured on val), but not within a scene, unless a variant says so
+        # Both may differ between scenes (lego is measured on val). Within a scene only a variant may change them.
         stated = [f"{printable(name)} {_by_scene(records, get)}" for name, get in facts.items()]
         notes.append(f"{title}: {'; '.join(stated)}")
         for name, get in facts.items():
@@ -74,7 +74,7 @@ def _iterations(record: Record) -> str:
 
 
 def _data(record: Record) -> str:
-    """Return the first digits of the data's fingerprint, or the text that stands for a fingerprint not computed."""
+    """Return the first digits of the hash of a run's data, or the text that the record has instead of a hash."""
     of = printable(record.provenance.data_hash)
     return of if " " in of else of[:8]
 
@@ -84,7 +84,7 @@ def _machine(record: Record) -> str:
 
 
 def _load(records: list[Record]) -> list[str]:
-    """Describe the load of the machine of most runs, if the records have it."""
+    """Return a footnote on the load of the machine that most runs used; an empty list if no record has the load."""
     machine = Counter(r.provenance.machine for r in records).most_common(1)[0][0]
     costs = [r.cost for r in records if r.cost and r.provenance.machine == machine]
     loads = [cost.load for cost in costs if cost.load is not None]
@@ -113,12 +113,12 @@ def _seeds(records: list[Record], spread: str) -> str:
 
 
 def _goes_with_scene(records: list[Record], get: Get) -> bool:
-    """Tell whether all runs of a scene have the same value, so that values differ only between scenes."""
+    """Tell whether a setting depends only on the scene, so that all runs on a scene have the same value."""
     return len({(r.scene, get(r)) for r in records}) == len({r.scene for r in records})
 
 
 def _by_scene(records: list[Record], get: Get) -> str:
-    """Show the values of all runs, each with its scenes unless all scenes have it."""
+    """List the values of a setting in all runs, each followed by its scenes if not all scenes have it."""
     every = {record.scene for record in records}
     scenes: dict[str, set[str]] = {}
     for record in records:
@@ -129,7 +129,7 @@ def _by_scene(records: list[Record], get: Get) -> str:
 
 
 def _differ(what: str, records: list[Record], get: Get) -> str:
-    """Warn that the compared runs differ, and list the runs of each value."""
+    """Return a warning that the compared runs differ in a setting, with the names of the runs for each value."""
     runs: dict[str, list[str]] = {}
     for record in records:
         runs.setdefault(get(record), []).append("/".join(record.path.parts[1:]))

@@ -1,7 +1,7 @@
-"""Group the records of an experiment by model, variant and scene, and read quantities from them.
+"""Group the run records of an experiment by model, variant and scene, and read measured quantities from them.
 
-A configuration is a model with a variant, such as another length or capacity. Its runs differ only in scene and seed;
-in a figure it is one point.
+A configuration is a model with a variant (settings that differ from the experiment, such as another training length).
+The runs of a configuration differ only in scene and seed. A configuration is one point in a figure.
 """
 
 import math
@@ -19,9 +19,11 @@ Values = npt.NDArray[np.float64]
 
 
 def psnr_val(record: Record) -> float:
-    """Return the PSNR on val at the end of the run, dB; NaN if it was not measured.
+    """Return the PSNR in dB on the validation views at the end of a run; NaN if it was not measured.
 
-    The training curve ends before effects are removed from the finished model, so the loss by this is subtracted.
+    If the run was evaluated on the validation views, this is its final PSNR. Otherwise it is the last value of the
+    training curve. The curve ends before effects (time, view direction, neural refinement) are removed from the
+    Gaussians of the finished model, so the PSNR that this removal costs is subtracted.
     """
     if record.protocol.get("eval_split") == "val":
         return _number((record.metrics or {}).get("psnr"))
@@ -36,69 +38,75 @@ QUANTITIES: dict[str, Callable[[Record], float]] = {
     "seconds": lambda r: r.cost.train_s if r.cost else math.nan,  # of training
     "cpu_s": lambda r: _number(r.cost.train_cpu_s if r.cost else None),  # of all threads in those seconds
     "load": lambda r: _number(r.cost.load if r.cost else None),  # of the machine
-    "ms": lambda r: r.cost.render_ms.p50 if r.cost else math.nan,  # a frame, median
+    "ms": lambda r: r.cost.render_ms.p50 if r.cost else math.nan,  # median of the milliseconds per frame
     "mb": lambda r: r.cost.bytes / 1e6 if r.cost else math.nan,  # of the model's parameters
 }
-GATES = ("off", "end", "both")  # of effects.gate
-OF_THE_MACHINE = ("seconds", "cpu_s", "ms")  # quantities that compare only between runs of one machine
+GATES = ("off", "end", "both")  # values of the setting effects.gate: when effects are removed from Gaussians
+OF_THE_MACHINE = ("seconds", "cpu_s", "ms")  # quantities that can be compared only between runs on one machine
 
 
 @dataclass(frozen=True)
 class Configuration:
-    """The finished runs of a model with the same settings."""
+    """The finished runs of one model with the same settings, on all scenes and with all seeds."""
 
     model: str
-    variant: str  # empty: as the experiment has it
+    variant: str  # settings that differ from the experiment's own; empty if none does
     runs: dict[str, list[Record]]  # by scene, in order of the seeds
-    name: str  # the model, and its variant where not all runs have the same
-    series: str  # the model, and how its Gaussians were gated where not all runs were alike: `Group.series_of`
+    name: str  # the model, and its variant if the runs of the group have several
+    series: str  # the name of its curve in figures: `Group.series_of`
 
     @property
     def on_demand(self) -> bool:
-        """Tell whether effects were chosen, so that not all Gaussians have all effects."""
+        """Tell whether a run chose the effects of its Gaussians automatically, so that some Gaussians may lack some.
+
+        The effects are time, view direction and neural refinement.
+        """
         return any(r.on_demand for runs in self.runs.values() for r in runs)
 
     @property
     def iterations(self) -> int | None:
-        """Return the length of training, if all runs have the same."""
+        """Return the number of training iterations, or None if the runs differ in it."""
         lengths = {iterations(r) for runs in self.runs.values() for r in runs}
         return lengths.pop() if len(lengths) == 1 else None
 
 
 @dataclass(frozen=True)
 class Group:
-    """The records of one experiment on one data set."""
+    """The run records of one experiment on one data set."""
 
     records: list[Record]  # sorted by scene, model, variant, seed
 
     @property
     def experiment(self) -> str:
-        """Return the experiment's name."""
+        """Return the name of the experiment."""
         return self.records[0].experiment
 
     @property
     def dataset(self) -> str:
-        """Return the data set's name."""
+        """Return the name of the data set."""
         return self.records[0].dataset
 
     @cached_property
     def finished(self) -> list[Record]:
-        """Return the runs that are ok."""
+        """Return the records of the runs that finished without error."""
         return [r for r in self.records if r.status == "ok"]
 
     @cached_property
     def scenes(self) -> list[str]:
-        """Return the scenes of all runs, also of those that failed."""
+        """Return the scene names of all runs, failed runs included."""
         return sorted({r.scene for r in self.records})
 
     @cached_property
     def models(self) -> list[str]:
-        """Return the models of all runs, also of those that failed."""
+        """Return the model names of all runs, failed runs included."""
         return sorted({r.model for r in self.records})
 
     @cached_property
     def configurations(self) -> list[Configuration]:
-        """List the configurations that finished on some scene, by name; a model without variant comes first."""
+        """List the configurations (a model with its settings) that finished on at least one scene, sorted by name.
+
+        A model with the experiment's own settings comes before its variants.
+        """
         runs: dict[tuple[str, str], dict[str, list[Record]]] = {}
         for r in self.finished:
             runs.setdefault((r.model, r.variant), {}).setdefault(r.scene, []).append(r)
@@ -109,14 +117,20 @@ class Group:
 
     @cached_property
     def series(self) -> list[str]:
-        """Name the curves of the report: one for each model, and one for its runs from which effects were removed."""
+        """Return the names of the report's curves.
+
+        Each model has one curve. Its runs from which effects (time, view direction, neural refinement) were removed
+        have another one.
+        """
         return sorted({self.series_of(r) for r in self.records})
 
     def series_of(self, record: Record) -> str:
-        """Name the curve of the report that a run belongs to.
+        """Return the name of the report's curve that a run belongs to.
 
-        Runs of a model with other lengths and sizes share a curve. Runs from which effects were removed
-        (`effects.gate`) have a curve of their own, unless this holds for all runs.
+        Runs of a model with different training lengths and sizes share a curve. The setting `effects.gate` says when
+        effects (time, view direction, neural refinement) are removed from Gaussians that do not need them. Runs whose
+        setting differs from the model's default have a curve of their own, unless all runs of the group have the same
+        setting.
         """
         own = gating(record)
         return f"{record.model}, {own}" if own and len(self._gatings) > 1 else record.model
@@ -127,39 +141,46 @@ class Group:
 
     @cached_property
     def variant(self) -> str:
-        """Return the variant at which models are compared: that of most runs, preferably one without ablation."""
+        """Return the settings with which models are compared: those that most models have.
+
+        Settings without an ablation (a change of one part of a model) are preferred.
+        """
         shared = Counter(c.variant for c in self.configurations)
         return min(shared, key=lambda variant: (-shared[variant], is_ablated(variant), variant), default="")
 
     @cached_property
     def main_configurations(self) -> list[Configuration]:
-        """Return the configuration of every model with the settings that most runs share."""
+        """Return each model with the settings that most models share (one configuration for each model)."""
         return [c for c in self.configurations if c.variant == self.variant]
 
     @cached_property
     def compared(self) -> list[Configuration]:
-        """Return the configurations that are compared in pairs.
+        """Return the configurations (a model with its settings) that the report compares in pairs.
 
-        These have the settings that most runs share, apart from ablations and the removal of effects.
+        Their settings are those that most models share. Only ablations and the removal of effects may differ.
         """
         return [c for c in self.configurations if _common(c.variant) == _common(self.variant)]
 
     def label(self, configuration: Configuration) -> str:
-        """Name a compared configuration: its model, and in brackets its variant if it is not the common one."""
+        """Return a name for a compared model, and its settings in brackets if they are not the common ones."""
         model, variant = configuration.model, configuration.variant
         return model if variant == self.variant else f"{model} ({variant or 'default'})"
 
     @cached_property
     def covered(self) -> list[str]:
-        """Return the scenes over which averages are taken, those that every model finished with the common settings."""
+        """Return the scenes over which averages are taken.
+
+        Every model has finished these scenes with the settings that most runs share.
+        """
         main = self.main_configurations
         return [s for s in self.scenes if main and all(s in c.runs for c in main)]
 
     @cached_property
     def basis(self) -> list[str]:
-        """Return the scenes over which the report averages its answers.
+        """Return the scenes over which the report averages its conclusions.
 
-        These are the scenes that every model finished (`covered`), or else the scene with most configurations.
+        These are the scenes that every model finished. If there is no such scene, it is the one scene that most models
+        and settings finished.
         """
         if self.covered or not self.configurations:
             return self.covered
@@ -167,38 +188,42 @@ class Group:
 
     @cached_property
     def machine(self) -> str:
-        """Return the machine of most runs; seconds of other machines are left out."""
+        """Return the machine on which most runs were made; times from other machines are left out."""
         return Counter(r.provenance.machine for r in self.finished or self.records).most_common(1)[0][0]
 
     @cached_property
     def elsewhere(self) -> int:
-        """Return the number of finished runs on other machines."""
+        """Return the number of finished runs that were made on another machine than most runs."""
         return sum(r.provenance.machine != self.machine for r in self.finished)
 
     def value(self, record: Record, quantity: str) -> float:
-        """Read one of QUANTITIES from a record; NaN if it is missing or measured on another machine."""
+        """Read a quantity, such as PSNR, from a run's record; NaN if it is missing.
+
+        A time is also NaN if it was measured on another machine than the one that most runs used.
+        """
         if quantity in OF_THE_MACHINE and record.provenance.machine != self.machine:
             return math.nan
         return QUANTITIES[quantity](record)
 
     def sample(self, configuration: Configuration, scene: str, quantity: str) -> Values:
-        """Return a quantity of a configuration's runs on a scene, [seeds], without the missing ones."""
+        """Return the values of a quantity for a model with its settings on a scene, one for each seed that has it."""
         values = np.array([self.value(r, quantity) for r in configuration.runs.get(scene, [])])
         return values[np.isfinite(values)]
 
     def contrast(self, weights: list[tuple[float, Configuration]], quantity: str) -> list[Values]:
-        """Return a paired weighted sum of configurations, [seeds, views] for each scene that all of them have.
+        """Return a weighted sum of models' results as one array [seeds, views] for each scene.
 
-        Only the seeds and views count that all configurations have on the scene. PSNR is paired view by view. Other
-        quantities, and PSNR of records without views, have one column.
+        For example, the weights 1 and -1 give the difference of two models. The results are paired: only those scenes,
+        seeds and views are used that all models in the sum have. PSNR has one column for each view. Other quantities,
+        and PSNR from records without values for each view, have one column.
         """
         scenes = [s for s in self.scenes if all(s in c.runs for _, c in weights)]
         return [paired for s in scenes if (paired := self._paired(weights, s, quantity)).size]
 
     def _paired(self, weights: list[tuple[float, Configuration]], scene: str, quantity: str) -> Values:
-        """Return the weighted sum on one scene, [seeds, views].
+        """Return the weighted sum of models' results on one scene, [seeds, views].
 
-        Empty if the configurations share no seed or no view.
+        The array is empty if the models share no seed or no view.
         """
         by_seed = [{r.seed: s for r in c.runs[scene] if (s := self.scores(r, quantity))} for _, c in weights]
         seeds = sorted(set.intersection(*map(set, by_seed)))
@@ -210,7 +235,7 @@ class Group:
         return total
 
     def scores(self, record: Record, quantity: str) -> dict[str, float]:
-        """Return a quantity by view; a single value if the quantity is not measured by view."""
+        """Return a quantity of a run for each view, or a single value if the quantity is not measured for each view."""
         if quantity == "psnr" and record.per_view:
             return {v.name: v.psnr for v in record.per_view if v.psnr is not None}
         value = self.value(record, quantity)
@@ -218,7 +243,7 @@ class Group:
 
 
 def groups(records: list[Record]) -> list[Group]:
-    """Return a group for every experiment and data set, sorted by name."""
+    """Group run records by experiment and data set, and sort the groups by name."""
     found: dict[tuple[str, str], list[Record]] = {}
     for r in sorted(records, key=lambda r: (r.experiment, r.dataset, r.scene, r.model, r.variant, r.seed)):
         found.setdefault((r.experiment, r.dataset), []).append(r)
@@ -226,7 +251,11 @@ def groups(records: list[Record]) -> list[Group]:
 
 
 def gating(record: Record) -> str:
-    """Return when effects were removed in a run, as its variant writes it; "" if this is the model's default."""
+    """Return the setting `effects.gate` of a run as text, such as "gate=end"; "" if it is the model's default.
+
+    The setting says when effects (time, view direction, neural refinement) are removed from Gaussians that do not need
+    them.
+    """
     config = record.provenance.config
     effects, model = (part if isinstance(part := config.get(name), dict) else {} for name in ("effects", "model"))
     gate = effects.get("gate", "off")
@@ -234,22 +263,27 @@ def gating(record: Record) -> str:
 
 
 def is_ablated(variant: str) -> bool:
-    """Tell whether a variant changes one part of a model, by a file of conf/ablation."""
+    """Tell whether a variant (a text of settings) changes one part of a model, through a file in conf/ablation."""
     return any(word.startswith("ablation=") and word != "ablation=none" for word in variant.split(","))
 
 
 def without(variant: str, *names: str) -> str:
-    """Return a variant without some settings, each named by the last part of its key."""
+    """Return a variant (a text such as "train.iterations=500,model.x=1") without some of its settings.
+
+    Args:
+        variant: settings with their values, separated by commas.
+        names: the settings to leave out, each named by the last part of its key, such as "iterations".
+    """
     return ",".join(word for word in variant.split(",") if word.partition("=")[0].rpartition(".")[2] not in names)
 
 
 def _common(variant: str) -> str:
-    """Return a variant without its settings of ablations and of the removal of effects."""
+    """Return a variant (a text of settings) without the settings for ablations and for the removal of effects."""
     return without(variant, "gate", "budget_db", "ablation")
 
 
 def iterations(record: Record) -> int | None:
-    """Return the length of training, which old or foreign records may not hold."""
+    """Return the number of training iterations from a run's record, or None if the record does not hold it."""
     train = record.provenance.config.get("train")
     value = train.get("iterations") if isinstance(train, dict) else None
     return value if isinstance(value, int) else None

@@ -1,4 +1,4 @@
-"""Adjust the p-values of all comparisons of a report together, so that no two of its sections disagree."""
+"""Adjust the p-values of all comparisons in a report together, so that its sections reach the same conclusions."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -7,53 +7,56 @@ from dataclasses import dataclass, replace
 from gsbench.report.configurations import Configuration, Group
 from gsbench.report.intervals import LEVEL, Estimate, estimate, holm
 
-Weights = list[tuple[float, Configuration]]  # of a sum of configurations, such as one minus another
+Weights = list[tuple[float, Configuration]]  # a weighted sum of configurations, such as one minus another
 Key = tuple[tuple[str, str, float], ...]
 
 
 @dataclass(frozen=True)
 class Tested:
-    """A difference of configurations with its interval, and its p-value corrected for all comparisons of the report."""
+    """The estimated difference between models, and its p-value after adjustment for all comparisons of the report."""
 
     difference: Estimate
-    p: float  # of no difference, after Holm for the whole family; NaN where no spread is known
+    p: float  # adjusted with Holm's method for all comparisons; NaN if the spread is not known
 
     @property
     def known(self) -> bool:
-        """Tell whether a spread is known, so that a difference can be tested."""
+        """Tell whether the spread over seeds is known, so that the difference can be tested."""
         return not math.isnan(self.p)
 
     @property
     def told(self) -> bool:
-        """Tell whether the difference is significant: the rule behind "told apart" and "ahead"."""
+        """Tell whether the difference is significant; the report then calls two models "told apart" or one "ahead"."""
         return self.p < 1 - LEVEL
 
 
 class Family:
-    """All comparisons of one experiment that a report makes; in each quantity they are adjusted together."""
+    """All comparisons that a report makes in one experiment; the p-values of each quantity are adjusted together."""
 
     def __init__(self, group: Group, asked: Mapping[str, Iterable[Weights]]) -> None:
-        """Estimate every difference once, and adjust the p-values of each quantity together.
+        """Estimate every difference once, and adjust the p-values of each quantity (such as PSNR) together.
 
         Args:
-            group: the records of one experiment.
-            asked: the differences (weighted sums of configurations) by quantity of `configurations.QUANTITIES`. A
-                difference that is asked for twice, or with the opposite sign, counts once.
+            group: the run records of one experiment.
+            asked: for each quantity, the differences to test. A difference is a weighted sum of models' results, such
+                as one minus another. If a difference is given twice, or with the opposite sign, it counts once.
         """
         self._found = {quantity: _tested(group, quantity, contrasts) for quantity, contrasts in asked.items()}
 
     def of(self, weights: Weights, quantity: str = "psnr") -> Tested:
-        """Return one of the estimated differences, with the sign of these weights.
+        """Return one of the estimated differences, with the sign that the given weights have.
 
         Raises:
-            KeyError: this difference was not asked for.
+            KeyError: the difference was not among those given to the constructor.
         """
         key, sign = _key(weights)
         found = self._found[quantity][key]
         return found if sign > 0 else replace(found, difference=_turned(found.difference))
 
     def size(self, quantity: str = "psnr") -> int:
-        """Return how many comparisons are adjusted together: those of which a spread is known."""
+        """Return the number of comparisons whose p-values are adjusted together.
+
+        A comparison whose spread is not known has no p-value and does not count.
+        """
         return sum(tested.known for tested in self._found.get(quantity, {}).values())
 
 
@@ -68,7 +71,10 @@ def _tested(group: Group, quantity: str, contrasts: Iterable[Weights]) -> dict[K
 
 
 def _key(weights: Weights) -> tuple[Key, float]:
-    """Return a key that does not depend on the order and the sign of a contrast's terms, and the sign."""
+    """Return a key for a weighted sum, and the sign of the sum.
+
+    The key does not depend on the order of the terms, and it is the same if all terms change their sign.
+    """
     terms = sorted((c.model, c.variant, weight) for weight, c in weights)
     sign = math.copysign(1.0, terms[0][2])
     return tuple((model, variant, sign * weight) for model, variant, weight in terms), sign

@@ -1,4 +1,4 @@
-"""Find each model's best PSNR by cost (its frontier), the best model within a budget, and the time to reach a PSNR."""
+"""Compute Pareto frontiers of PSNR and cost, the best model within a budget, and the time to reach a PSNR."""
 
 import math
 from collections.abc import Sequence
@@ -12,28 +12,32 @@ from gsbench.report.family import Family, Weights
 from gsbench.report.intervals import Estimate, estimate
 
 COSTS = ("seconds", "ms", "mb")
-BUDGETS = (("seconds", 10.0), ("seconds", 60.0), ("seconds", 600.0), ("ms", 1000 / 60))  # that a report answers
+BUDGETS = (("seconds", 10.0), ("seconds", 60.0), ("seconds", 600.0), ("ms", 1000 / 60))  # answered in each report
 STEPS = (2.0, 1.0, 0.5, 0.2, 0.1)  # dB between two targets
-FEWEST_TARGETS = 3  # of a scene
+FEWEST_TARGETS = 3  # for one scene
 
 
 @dataclass(frozen=True)
 class FrontierPoint:
-    """The cost and the quality of a configuration on a scene, or on the mean of scenes."""
+    """The mean cost and the mean PSNR of a model with certain settings, on one scene or averaged over scenes."""
 
     configuration: Configuration
     psnr: Estimate  # dB, the evaluated split; the interval is over seeds, on these scenes and views
-    val: float  # dB, PSNR on val; NaN where a run does not tell
+    val: float  # PSNR on the validation views, dB; NaN if a run lacks it
     cost: dict[str, float]  # by COSTS; NaN where it is missing
 
     @property
     def series(self) -> str:
-        """Return the curve of the report that the point belongs to: the model, or the model with effects removed."""
+        """Return the name of the report's curve that has this point.
+
+        The name is the model. If effects (time, view direction, neural refinement) were removed from its Gaussians, the
+        name says so.
+        """
         return self.configuration.series
 
 
 def points(group: Group, scenes: list[str]) -> list[FrontierPoint]:
-    """Return a point for every configuration that has finished all of `scenes`, averaged over them."""
+    """Return the mean cost and PSNR of every configuration (a model with its settings) that finished all `scenes`."""
     found = []
     for configuration in group.configurations:
         psnr = [group.sample(configuration, s, "psnr")[:, None] for s in scenes]
@@ -45,7 +49,12 @@ def points(group: Group, scenes: list[str]) -> list[FrontierPoint]:
 
 
 def frontier(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
-    """Return the points that have a higher PSNR than all cheaper points, by rising cost."""
+    """Return the points of the Pareto frontier: each has a higher PSNR than all cheaper points.
+
+    Args:
+        of: the points from which to select.
+        cost: the cost to compare: "seconds" of training, "ms" per frame or "mb" of parameters.
+    """
     best: list[FrontierPoint] = []
     for point in sorted(of, key=lambda p: (p.cost[cost], -p.psnr.mean)):
         if not math.isnan(point.cost[cost]) and (not best or point.psnr.mean > best[-1].psnr.mean):
@@ -54,42 +63,48 @@ def frontier(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
 
 
 def beaten(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
-    """Return the points that are beaten by another point in PSNR and cost, see `beats`."""
+    """Return the points that another point dominates: it is no worse in mean PSNR and in cost, and better in one."""
     known = [p for p in of if not math.isnan(p.cost[cost])]
     return [p for p in known if any(beats(q, p, cost) for q in known)]
 
 
 def beats(q: FrontierPoint, p: FrontierPoint, cost: str) -> bool:
-    """Tell whether the means of `q` are at least as good and as cheap as those of `p`, and better in one of the two."""
+    """Tell whether point `q` dominates point `p`: it is no worse in mean PSNR and cost, and better in at least one."""
     as_good = q.psnr.mean >= p.psnr.mean and q.cost[cost] <= p.cost[cost]
     return as_good and (q.psnr.mean > p.psnr.mean or q.cost[cost] < p.cost[cost])
 
 
 @dataclass(frozen=True)
 class BudgetChoice:
-    """The best point within a budget, and its difference to each other model's best point on the evaluated split."""
+    """The best model within a cost budget, and the other models to which it was compared on the evaluated views."""
 
     point: FrontierPoint
-    on_val: bool  # whether it was chosen on val; otherwise on what is shown, as some runs have no PSNR on val
-    ahead: list[FrontierPoint]  # those that it is told to be ahead of
-    level: list[FrontierPoint]  # those that it is not told apart from
-    behind: list[FrontierPoint]  # those that it is told to be behind
-    unknown: list[FrontierPoint]  # those of which no spread is known
+    on_val: bool  # whether it was chosen on validation views; otherwise on the evaluated views
+    ahead: list[FrontierPoint]  # models that are significantly worse
+    level: list[FrontierPoint]  # models that do not differ significantly
+    behind: list[FrontierPoint]  # models that are significantly better
+    unknown: list[FrontierPoint]  # models without a known spread over seeds
 
 
 def has_val(of: Sequence[FrontierPoint]) -> bool:
-    """Tell whether every point has PSNR on val, so that one may be chosen there and shown on the evaluated split."""
+    """Tell whether the PSNR on the validation views is known for every model that is compared.
+
+    If so, the best model can be chosen on these views, and its PSNR can be shown on other views.
+    """
     return bool(of) and not any(math.isnan(p.val) for p in of)
 
 
 def ranked(of: Sequence[FrontierPoint]) -> list[FrontierPoint]:
-    """Return points by falling PSNR on val, or on the evaluated split if `has_val` is false."""
+    """Sort points (models with their mean PSNR and cost) by falling PSNR on the validation views.
+
+    If this PSNR is not known for all points, they are sorted by PSNR on the evaluated views.
+    """
     on_val = has_val(of)
     return sorted(of, key=lambda p: -(p.val if on_val else p.psnr.mean))
 
 
 def contest(of: Sequence[FrontierPoint], cost: str, budget: float) -> list[FrontierPoint]:
-    """Return the best point of each model among those that cost at most `budget`, the best of all first."""
+    """Return each model's best result among those that cost at most `budget`, sorted by falling PSNR."""
     best: dict[str, FrontierPoint] = {}
     for point in ranked(of):
         if point.cost[cost] <= budget:
@@ -98,21 +113,21 @@ def contest(of: Sequence[FrontierPoint], cost: str, budget: float) -> list[Front
 
 
 def contested(of: Sequence[FrontierPoint]) -> list[Weights]:
-    """Return the differences that `choose` needs, for all BUDGETS."""
+    """Return the differences that `choose` tests: for each budget, the best model minus each other model."""
     contests = [contest(of, *budget) for budget in BUDGETS]
     return [[(1.0, found[0].configuration), (-1.0, other.configuration)] for found in contests for other in found[1:]]
 
 
 def choose(of: Sequence[FrontierPoint], cost: str, budget: float, family: Family) -> BudgetChoice | None:
-    """Choose the best point that costs at most `budget`; None if there is none.
+    """Choose the model with the best PSNR among those that cost at most `budget`; None if no model does.
 
-    The best point of each other model within the budget is compared with it, paired over seeds and views.
+    The chosen model is compared with the best result of each other model within the budget, paired by seed and view.
 
     Args:
-        of: the points among which to choose.
-        cost: the cost that the budget limits, one of COSTS.
-        budget: seconds, milliseconds or MB.
-        family: the adjusted comparisons of the report; it holds those of `contested`.
+        of: the points (models with their mean PSNR and cost) from which to choose.
+        cost: the cost that the budget limits: "seconds" of training, "ms" per frame or "mb" of parameters.
+        budget: the limit in seconds, milliseconds or MB.
+        family: the adjusted p-values of all comparisons in the report, including those from `contested`.
     """
     found = contest(of, cost, budget)
     if not found:
@@ -131,19 +146,19 @@ def choose(of: Sequence[FrontierPoint], cost: str, budget: float, family: Family
 
 @dataclass(frozen=True)
 class Target:
-    """A round value of PSNR on val, and the seconds of training that each model needs to reach it on one scene."""
+    """A PSNR on the validation views of a scene, and the training seconds that each model needs to reach it."""
 
     scene: str
     rule: str
     psnr: float  # dB
-    seconds: dict[str, float]  # by model; infinite: never
+    seconds: dict[str, float]  # by model; infinite if the model never reaches the target
 
 
 def targets(group: Group) -> list[Target]:
-    """Return the targets (values of PSNR on val) of every scene, and the seconds that each model needs for them.
+    """Return the PSNR targets of every scene, and the training seconds that each model needs to reach them.
 
-    The seconds are those of the quickest finished configuration whose mean over the seeds reaches the target. Nothing
-    is interpolated between lengths of training.
+    PSNR is measured on the validation views. A model's seconds are those of its fastest finished settings whose mean
+    PSNR over seeds reaches the target. Nothing is interpolated between different training lengths.
     """
     found = []
     for scene in group.scenes:
@@ -159,7 +174,7 @@ def targets(group: Group) -> list[Target]:
 
 
 def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, float]]:
-    """Return the targets of a scene: round values of PSNR between the worst and the best result, and the paper's."""
+    """Return the PSNR targets of a scene: round values between the worst and the best result, and the paper's PSNR."""
     if not reached:
         return []
     rules = [(f"{psnr:g} dB", psnr) for psnr in round_numbers(min(reached), max(reached))]
@@ -169,10 +184,11 @@ def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, fl
 
 
 def round_numbers(low: float, high: float) -> list[float]:
-    """Return the multiples of the widest of STEPS of which FEWEST_TARGETS lie above `low` and up to `high`.
+    """Return round PSNR values above `low` and up to `high`, as targets for training.
 
-    No configuration's own PSNR is a target, so none is favoured. If the range holds fewer multiples of the finest
-    step, those are returned.
+    The values are multiples of 2, 1, 0.5, 0.2 or 0.1 dB, namely of the largest of these steps that gives at least three
+    values. If no step does, the multiples of 0.1 dB are returned. Round values favour no model, since none is a model's
+    own PSNR.
     """
     found: list[float] = []
     for step in STEPS:
@@ -183,10 +199,10 @@ def round_numbers(low: float, high: float) -> list[float]:
 
 
 def profile(of: Sequence[Target]) -> dict[str, Values]:
-    """Return, for each model, its sorted ratios of seconds to the fastest model's, one for each target reached by any.
+    """Return for each model its sorted ratios of training time to the fastest model's time, one for each target.
 
-    The share of ratios up to tau is the performance profile of Dolan and More (2002); "never" is infinite. A model
-    without a run on a target's scene never reaches it.
+    Only targets that some model reaches are used. The share of ratios up to a factor tau is the performance profile of
+    Dolan and More (2002). A ratio is infinite if the model never reaches the target or has no run on its scene.
     """
     models = sorted({m for target in of for m in target.seconds})
     solved = [t for t in of if math.isfinite(min(t.seconds.values()))]
@@ -199,5 +215,5 @@ def _ratio(seconds: float, fastest: float) -> float:
 
 
 def _mean(scenes: list[Values]) -> float:
-    """Return the mean over scenes of the mean over seeds; NaN if a scene has none."""
+    """Return the mean over scenes of the mean over seeds; NaN if a scene has no value."""
     return float(np.mean([s.mean() for s in scenes])) if all(map(len, scenes)) else math.nan

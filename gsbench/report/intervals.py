@@ -1,15 +1,17 @@
-"""Estimate a mean over scenes, seeds and views with a 95 % interval that holds from three seeds on.
+"""Estimate a mean over scenes, seeds and views, with a 95 % confidence interval that is valid from three seeds on.
 
-With three seeds a percentile bootstrap of any hierarchy covers far less than it claims: resampling three values finds
-two thirds of their variance, and its quantiles are those of a normal distribution where Student's t has 4.3 instead of
-2. So the spread of each level is estimated and has its own quantile of t (docs/statistics.md has the simulations):
+With three seeds, the interval of a percentile bootstrap is much too narrow. First, resampling three values gives only
+two thirds of their variance. Second, its quantiles are those of a normal distribution (about 2 standard errors), while
+Student's t needs 4.3 for three values. This module therefore estimates the variance over scenes, seeds and views
+separately, and applies Student's t to each. The simulations are in docs/statistics.md.
 
-- Three scenes and more: the means of the scenes are a sample of scenes like these, and include the spread of seeds and
-  views. t with (scenes - 1) degrees of freedom is exact for normal means.
-- One or two scenes say nothing about others. Seeds and views are crossed: each seed sees the same views. The half
-  widths of seeds and of views, each with its own t, add in squares (MOVER: Zou and Donner 2008). The variance that
-  seeds and views share is subtracted from the seeds once. The interval is at least that of the seeds alone.
-- One seed: no spread is known, and there is no interval.
+- With three or more scenes, the means of the scenes are a sample of similar scenes. Their variance includes that of
+  seeds and views. Student's t with (scenes - 1) degrees of freedom is exact if these means are normal.
+- With one or two scenes, the interval does not hold for other scenes. All seeds see the same views, so seeds and views
+  are crossed factors. Each factor has a half width by Student's t, and the squares of the half widths are added (MOVER:
+  Zou and Donner 2008). The residual variance is contained in both factors, so it is subtracted once from that of the
+  seeds. The interval is never narrower than that of the seeds alone.
+- With one seed, there is no interval, because the variance over seeds is not known.
 """
 
 import math
@@ -23,19 +25,19 @@ from scipy import special
 
 Values = npt.NDArray[np.float64]
 LEVEL = 0.95
-LEAST_SCENES = 3  # from which on an interval is one of scenes like these
+LEAST_SCENES = 3  # the fewest scenes for an interval that holds for similar scenes
 LEAST_P = 1e-12
 
 
 @dataclass(frozen=True)
 class Spread:
-    """The variance of a mean over seeds, views or scenes, and its degrees of freedom."""
+    """The variance of a mean over seeds, views or scenes, with its degrees of freedom."""
 
     variance: float
     freedom: float
 
     def half_width(self, level: float) -> float:
-        """Return half the width of this spread's own interval, by Student's t."""
+        """Return half the width of the confidence interval that this variance gives by itself, with Student's t."""
         if self.variance <= 0:
             return 0.0
         return float(special.stdtrit(self.freedom, (1 + level) / 2)) * math.sqrt(self.variance)
@@ -43,38 +45,41 @@ class Spread:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over scenes with its 95 % interval; without an interval if there is only one seed."""
+    """A mean over scenes with its 95 % interval; with only one seed there is no interval."""
 
     mean: float  # NaN: nothing was measured
     scenes: int
-    seeds: int  # the fewest of a scene
+    seeds: int  # the smallest number of seeds of a scene
     over: str  # what the interval generalises to: "scenes", "seeds and views", "seeds"; "" without an interval
     levels: tuple[Spread, ...] = ()  # their half widths add in squares
     floor: Spread | None = None  # the interval is not narrower than this one
 
     @cached_property
     def half(self) -> float:
-        """Return half the width of the 95 % interval; NaN without one."""
+        """Return half the width of the 95 % interval, or NaN if there is no interval."""
         return self._half(LEVEL) if self.over else math.nan
 
     @property
     def low(self) -> float:
-        """Return the lower end of the interval."""
+        """Return the lower end of the 95 % interval."""
         return self.mean - self.half
 
     @property
     def high(self) -> float:
-        """Return the upper end of the interval."""
+        """Return the upper end of the 95 % interval."""
         return self.mean + self.half
 
     @cached_property
     def p(self) -> float:
-        """Return the two-sided p-value of a mean of zero: one less the level whose interval ends at zero, or NaN."""
+        """Return the two-sided p-value of the hypothesis that the mean is zero; NaN if there is no interval.
+
+        The p-value is 1 minus the confidence level at which the interval ends exactly at zero.
+        """
         if not self.over:
             return math.nan
         if self._half(LEVEL) == 0:
             return 1.0 if self.mean == 0 else 0.0
-        low, high = math.log(LEAST_P), 0.0  # halved in the logarithm; scipy.optimize would take a second to import
+        low, high = math.log(LEAST_P), 0.0  # bisection of log p; importing scipy.optimize would take a second
         for _ in range(60):
             middle = (low + high) / 2
             if self._half(-math.expm1(middle)) > abs(self.mean):
@@ -89,12 +94,13 @@ class Estimate:
 
 
 def estimate(scenes: list[Values], *, generalise: bool = True) -> Estimate:
-    """Estimate the mean over scenes of the mean over seeds and views.
+    """Estimate the mean over scenes of the mean over seeds and views, with its 95 % interval.
 
     Args:
-        scenes: for each scene the values [seeds, views], every seed with the same views; one column if there are no
-            views.
-        generalise: from three scenes on the interval is over scenes like these, otherwise over these scenes.
+        scenes: for each scene an array [seeds, views], in which every seed has the same views. It has one column if the
+            quantity is not measured for each view.
+        generalise: if true and there are at least three scenes, the interval holds for similar scenes; otherwise it
+            holds only for the given scenes.
     """
     if not scenes:
         return Estimate(math.nan, 0, 0, "")
@@ -113,7 +119,7 @@ def estimate(scenes: list[Values], *, generalise: bool = True) -> Estimate:
 
 
 def over_seeds(values: Sequence[float]) -> Estimate:
-    """Estimate the mean of one model's runs on a scene; its interval is over seeds, on this scene and these views.
+    """Estimate the mean of a model's runs on one scene; the interval is over seeds, for this scene and its views.
 
     Args:
         values: one value for each seed.
@@ -122,7 +128,10 @@ def over_seeds(values: Sequence[float]) -> Estimate:
 
 
 def _combined(scenes: list[Spread]) -> Spread:
-    """Return the spread of a mean over scenes, its degrees of freedom after Satterthwaite (1946)."""
+    """Return the variance of a mean over scenes, from the variance of each scene's mean.
+
+    The degrees of freedom follow Satterthwaite (1946).
+    """
     total = sum(s.variance for s in scenes)
     squares = sum(s.variance**2 / s.freedom for s in scenes)
     freedom = total**2 / squares if squares else sum(s.freedom for s in scenes)
@@ -130,7 +139,10 @@ def _combined(scenes: list[Spread]) -> Spread:
 
 
 def _without_rest(scene: Values) -> Spread:
-    """Return the spread over seeds, without the spread over views in each seed (two-way ANOVA)."""
+    """Return the variance of a scene's mean over seeds, minus the residual variance of a two-way ANOVA.
+
+    The two factors of the ANOVA are seeds and views.
+    """
     seeds, views = scene.shape
     rest = scene - scene.mean(1, keepdims=True) - scene.mean(0, keepdims=True) + scene.mean()
     of_rest = (rest**2).sum() / ((seeds - 1) * (views - 1)) / scene.size
@@ -138,7 +150,7 @@ def _without_rest(scene: Values) -> Spread:
 
 
 def holm(p: list[float]) -> list[float]:
-    """Adjust p-values for multiple comparisons, after Holm (1979); NaN is not counted and stays NaN."""
+    """Adjust p-values for multiple comparisons with Holm's method (1979); NaN values are not counted and stay NaN."""
     adjusted = [math.nan] * len(p)
     tested = sorted((value, i) for i, value in enumerate(p) if not math.isnan(value))
     largest = 0.0

@@ -1,4 +1,4 @@
-"""Format tables as Markdown for files and as plain text for a terminal."""
+"""Format result tables as Markdown for files and as plain text for a terminal."""
 
 import math
 import re
@@ -11,15 +11,15 @@ EMPTY = "–"
 
 @dataclass(frozen=True)
 class QuantityColumn:
-    """A quantity of the table and how it is shown."""
+    """A column of a result table: the quantity, its title and its number of digits."""
 
     key: str
     title: str
-    digits: int | None  # after the point; None: 2 below ten, else 1
-    paper: str = ""  # the field of PaperRow that is the same quantity
+    digits: int | None  # decimals; None: two below ten, otherwise one
+    paper: str = ""  # the field of PaperRow with the same quantity
 
     def show(self, mean: float, std: float = math.nan) -> str:
-        """Format ``mean``, or ``mean ± std`` if there is a spread, or a dash if there is no number."""
+        """Format a number as ``mean``, as ``mean ± std`` if a spread is given, or as a dash if the mean is NaN."""
         if math.isnan(mean):
             return EMPTY
         digits = self.digits if self.digits is not None else 1 if mean >= 10 else 2
@@ -28,17 +28,17 @@ class QuantityColumn:
 
 @dataclass(frozen=True)
 class Row:
-    """One line: a model's mean over its seeds, a run that did not finish, or the numbers of the paper."""
+    """A row of a result table: a model's mean over seeds, a run that did not finish, or the numbers of the paper."""
 
     label: str
     cells: dict[str, str]  # by QuantityColumn.key
-    seeds: str = ""  # how many
-    best: bool = False  # whether its first column is the best that was measured
+    seeds: str = ""  # number of seeds
+    best: bool = False  # whether its first column (PSNR) has the best measured value
 
 
 @dataclass(frozen=True)
 class Section:
-    """The rows of one scene, or of the average."""
+    """The rows of a result table for one scene, or for the average over scenes."""
 
     title: str
     rows: list[Row]
@@ -47,7 +47,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Table:
-    """The table of one experiment on one data set."""
+    """The result table of one experiment on one data set."""
 
     title: str
     columns: list[QuantityColumn]
@@ -57,7 +57,10 @@ class Table:
 
 
 def markdown(tables: list[Table]) -> str:
-    """Format tables as Markdown: a heading and a table for every scene, the best PSNR bold, footnotes at the end."""
+    """Format result tables as Markdown.
+
+    Every scene has a heading and a table, in which the best PSNR is bold. The footnotes come last.
+    """
     lines: list[str] = []
     for table in tables:
         lines += [f"# {_escape(table.title)}", ""]
@@ -76,7 +79,10 @@ def markdown(tables: list[Table]) -> str:
 
 
 def terminal(tables: list[Table], width: int = 120) -> str:
-    """Format tables as text of at most `width` columns, the best PSNR starred; columns that do not fit are left out."""
+    """Format result tables as plain text of at most `width` characters per line, with a star at the best PSNR.
+
+    Columns that do not fit are left out, and a footnote names them.
+    """
     lines: list[str] = []
     for table in tables:
         texts = [[_texts(row, table.columns, star="*") for row in section.rows] for section in table.sections]
@@ -102,7 +108,10 @@ def terminal(tables: list[Table], width: int = 120) -> str:
 
 
 def _aligned(texts: list[str], widths: list[int]) -> str:
-    """Align as many of `texts` as there are `widths`, the first to the left and the others to the right."""
+    """Join texts into a line of columns with the given widths: the first is left-aligned, the others are right-aligned.
+
+    Texts for which there is no width are left out.
+    """
     first, *rest = texts[: len(widths)]
     return "  ".join(["  " + first.ljust(widths[0]), *map(str.rjust, rest, widths[1:])]).rstrip()
 
@@ -112,7 +121,7 @@ def _titles(table: Table) -> list[str]:
 
 
 def _texts(row: Row, columns: list[QuantityColumn], star: str = "") -> list[str]:
-    """Return the texts of a row from left to right, with a `star` at the best PSNR."""
+    """Return the texts of a table row from left to right, with `star` behind the PSNR if it is the best."""
     first, *rest = (row.cells.get(c.key, "") for c in columns)
     return [row.label, first + star * row.best, *rest, row.seeds]
 
@@ -126,5 +135,5 @@ def _wrapped(text: str, width: int) -> list[str]:
 
 
 def _escape(text: str) -> str:
-    """Escape text so that Markdown shows it unchanged."""
+    """Escape the special characters of Markdown, so that the text is shown unchanged."""
     return re.sub(r"([\\`*<|\[\]])", r"\\\1", text)

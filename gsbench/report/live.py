@@ -1,4 +1,4 @@
-"""Rewrite the table and the page of a folder whenever a record in it is added or changes."""
+"""Rewrite the result tables and the HTML report of a folder whenever a run record in it is added or changes."""
 
 import time
 from pathlib import Path
@@ -8,16 +8,16 @@ from gsbench.measure import record as files
 from gsbench.report import tables
 from gsbench.report.page import build
 
-EVERY = 5.0  # seconds between two looks at the folder, and between two loads of the open page
+EVERY = 5.0  # seconds after which the folder is read again and an open report reloads itself
 
 State = frozenset[tuple[Path, int]]
 
 
 def watch(folder: Path, *, train: bool = False, every: float = EVERY) -> int:
-    """Write ``table.md``, ``table.csv`` and ``report.html`` as records arrive, until Ctrl-C; return the exit code.
+    """Rewrite ``table.md``, ``table.csv`` and ``report.html`` whenever run records arrive, until Ctrl-C; return 0.
 
-    A folder without records, or with a damaged record, is reported once and read again later. The page reloads itself
-    in the browser until `watch` ends.
+    If the folder has no record or only damaged ones, the reason is printed, and the function keeps waiting. The report
+    reloads itself in the browser until the function ends.
 
     Args:
         folder: the folder where records are or will be.
@@ -40,7 +40,10 @@ def watch(folder: Path, *, train: bool = False, every: float = EVERY) -> int:
 
 
 def _state(folder: Path) -> State:
-    """Return the records with their times of writing; a record that is replaced meanwhile counts as absent."""
+    """Return the paths of all run records with their modification times.
+
+    A record is skipped if it disappears during the search, for example because it is being replaced.
+    """
     found = set()
     for path in files.find(folder) if folder.is_dir() else []:
         try:
@@ -51,7 +54,7 @@ def _state(folder: Path) -> State:
 
 
 def _written(folder: Path, train: bool, reload: int) -> str:
-    """Write all files and return a line that counts the records; if writing fails, return the reason."""
+    """Write the tables and the report, and return a line that counts the run records; on failure return the reason."""
     try:
         records, faults = tables.load(folder)
         if not records:

@@ -1,4 +1,4 @@
-"""Average over the seeds the decisions about the effects of a scene and of its Gaussians."""
+"""Average over seeds how many Gaussians keep which effects (time, view direction, neural refinement)."""
 
 import math
 import re
@@ -15,42 +15,49 @@ from gsbench.report.configurations import Configuration, Group
 from gsbench.report.intervals import Estimate, estimate
 
 REMOVED = "removed"
-DEGREES = 4  # of harmonics: 0, 1, 2, 3
+DEGREES = 4  # of spherical harmonics: 0, 1, 2, 3
 
 
 @dataclass(frozen=True)
 class Decided:
-    """The decisions about effects (time, direction, AGR) on a scene for one configuration, averaged over the seeds."""
+    """How many Gaussians of a model keep which effects (time, view direction, neural refinement) on a scene.
+
+    The numbers are means over seeds. The step that removes effects from Gaussians is called a gate.
+    """
 
     scene: str
     configuration: Configuration
-    name: str  # of the configuration: as short as tells it from the others here
-    runs: list[Record]  # those that chose effects, in order of the seeds
-    gated: int  # how many of them a gate has changed: the numbers below are theirs
-    rows: dict[str, float]  # Gaussians at the end by effect set, and how many all gates removed
-    degrees: list[float]  # Gaussians at the end by the degree of their harmonics
-    views: str  # that the change of PSNR was measured on
-    psnr: Estimate  # change by the gate at the end, dB
-    ms: Estimate  # change of the median frame by the gate at the end
+    name: str  # a short name of the configuration that no other one has
+    runs: list[Record]  # runs that chose effects, in order of the seeds
+    gated: int  # number of runs in which a gate removed effects; the numbers below are of these
+    rows: dict[str, float]  # number of Gaussians by the effects that they have at the end, and of those removed
+    degrees: list[float]  # number of Gaussians by SH degree at the end
+    views: str  # the views on which the change of PSNR was measured
+    psnr: Estimate  # change of PSNR by the gate after training, dB
+    ms: Estimate  # change of the median milliseconds per frame by the gate after training
     ms_before: float
     mb_before: float  # of the model before the first gate
     mb: float
-    predicted: float  # change of PSNR that the gate at the end foresaw, dB
-    asleep: float  # share of AGR's work that a frame leaves out, as the Gaussians cannot be seen at its time
+    predicted: float  # change of PSNR that the gate after training predicted, dB
+    asleep: float  # share of Gaussians that AGR skips in a frame, as they cannot be seen at its time
 
     @property
     def before(self) -> float:
-        """Return the number of Gaussians before any effect was removed."""
+        """Return the number of Gaussians before any effect or Gaussian was removed."""
         return sum(self.rows.values())
 
     @property
     def left(self) -> float:
-        """Return the number of Gaussians after the last removal of effects."""
+        """Return the number of Gaussians that remain after all removals."""
         return self.before - self.rows.get(REMOVED, 0.0)
 
 
 def decided(group: Group) -> list[Decided]:
-    """Return the decisions by scene and configuration; none where every Gaussian has every effect."""
+    """Return how many Gaussians keep which effects (time, view direction, neural refinement).
+
+    The list has one entry for each scene and each model with its settings. It is empty if no run removed an effect or
+    chose its effects automatically.
+    """
     configurations = [c for c in group.configurations if c.on_demand]
     shared = Counter(c.series for c in configurations)
     names = [c.series if shared[c.series] == 1 else c.name for c in configurations]
@@ -94,22 +101,25 @@ def _ends(gates: list[Gate]) -> bool:
 
 
 def _rows(gates: list[Gate], name: str) -> int:
-    """Count the Gaussians by the effects that they keep at the end, and those that were removed."""
+    """Count the Gaussians that have a certain set of effects at the end, such as time without view direction.
+
+    For the name "removed", count all Gaussians that were removed.
+    """
     of = gates if name == REMOVED else gates[-1:]
     return sum(max(0, gate.rows.get(name, 0)) for gate in of)
 
 
 def _of_degree(gate: Gate, degree: int) -> int:
-    """Count the Gaussians whose harmonics have a degree, with any number of waves."""
+    """Count the Gaussians whose colours have spherical harmonics of the given degree, with any time dependence."""
     return sum(max(0, n) for name, n in gate.orders.items() if re.match(rf"degree {degree}\b", name))
 
 
 def _less(before: float | None, after: float | None) -> float:
-    """Return the change of a value: `after` minus `before`."""
+    """Return the change of a value, `after` minus `before`; NaN if one of the two is missing."""
     return math.nan if before is None or after is None else after - before
 
 
 def _mean(values: list[float]) -> Estimate:
-    """Estimate a mean over seeds, without the missing ones."""
+    """Estimate a mean over seeds with its interval; missing values (NaN) are left out."""
     known = np.array([value for value in values if math.isfinite(value)])
     return estimate([known[:, None]] if len(known) else [], generalise=False)

@@ -1,7 +1,7 @@
-"""Provide the numbers of Tables 1 and 2 of the 7DGS paper and their protocol, for comparison.
+"""Provide the results in Tables 1 and 2 of the 7DGS paper and its protocol, for comparison with measured runs.
 
-Source: Gao et al., "7DGS: Unified Spatial-Temporal-Angular Gaussian Splatting", ICCV 2025. A cell that the paper leaves
-empty is None. The paper's averages are rows of the scene "avg".
+Source: Gao et al., "7DGS: Unified Spatial-Temporal-Angular Gaussian Splatting", ICCV 2025. A cell that is empty in the
+paper is None. The paper's averages over a data set have the scene name "avg".
 """
 
 import csv
@@ -15,13 +15,13 @@ MODELS = {"4dgs": False, "7dgs": True, "7dgs_noagr": False}  # the models of Tab
 
 @dataclass(frozen=True)
 class Protocol:
-    """How the paper trained and tested on a data set (its section "implementation details")."""
+    """The settings with which the 7DGS paper trained and tested on a data set (section "implementation details")."""
 
     scenes: tuple[str, ...]  # as conf/exp names them
-    sizes: dict[str, str]  # of the images, by scene, "*" for all others
+    sizes: dict[str, str]  # image size by scene, "*" for all other scenes
     batch_size: int
-    splits: dict[str, str]  # by scene, "*" for all others
-    frames: int | None = None  # of each scene; None: the data set has its own list
+    splits: dict[str, str]  # evaluated split by scene, "*" for all other scenes
+    frames: int | None = None  # of each scene; None if the data set defines its frames
     iterations: int = 30_000
 
 
@@ -50,7 +50,7 @@ PROTOCOLS = {
 
 @dataclass(frozen=True)
 class PaperRow:
-    """One row of Table 1: a model on a scene."""
+    """One row of Table 1 in the 7DGS paper: the results of a model on a scene."""
 
     psnr: float  # dB, the best on test during training
     ssim: float
@@ -62,23 +62,29 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class MethodRow:
-    """One row of Table 2: a method's average over a data set."""
+    """One row of Table 2 in the 7DGS paper: the average results of a method over a data set."""
 
     method: str
     psnr: float
     ssim: float | None
     lpips: float | None
-    reproduced_by_paper: bool  # rather than quoted from the method's own paper
+    reproduced_by_paper: bool  # false if quoted from the method's own paper
 
 
 def paper_row(dataset: str, scene: str, model: str) -> PaperRow | None:
-    """Return a row of Table 1, such as ``paper_row("D-NeRF", "trex", "7dgs")``; None if the paper has no such row."""
+    """Return a row of the 7DGS paper's Table 1, or None if there is no such row.
+
+    Example: ``paper_row("D-NeRF", "trex", "7dgs")``.
+    """
     return table1().get((dataset, scene.lower(), model))  # Technicolor's folders are named Birthday, ..
 
 
 @cache
 def table1() -> dict[tuple[str, str, str], PaperRow]:
-    """Return Table 1 by data set ("7DGS-PBR", "D-NeRF", "Technicolor"), scene (or "avg") and model."""
+    """Return Table 1 of the 7DGS paper, by data set, scene (or "avg") and model.
+
+    The data sets are "7DGS-PBR", "D-NeRF" and "Technicolor".
+    """
     return {
         (row["dataset"], row["scene"], row["model"]): PaperRow(
             psnr=float(row["psnr_db"]),
@@ -94,7 +100,7 @@ def table1() -> dict[tuple[str, str, str], PaperRow]:
 
 @cache
 def table2() -> dict[str, list[MethodRow]]:
-    """Return Table 2 by data set ("D-NeRF", "Technicolor"), in the paper's order."""
+    """Return Table 2 of the 7DGS paper: for "D-NeRF" and "Technicolor" the rows of all methods in the paper's order."""
     table: dict[str, list[MethodRow]] = {}
     for row in _read("paper_table2.csv"):
         reproduced = row["reproduced_by_paper"] == "yes"
@@ -110,5 +116,5 @@ def _number(cell: str) -> float | None:
 
 
 def _read(name: str) -> list[dict[str, str]]:
-    """Read the rows of a CSV file beside this module."""
+    """Read the rows of a CSV file that lies in the folder of this module."""
     return list(csv.DictReader((resources.files(__package__) / name).read_text().splitlines()))

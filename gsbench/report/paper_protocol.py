@@ -1,4 +1,4 @@
-"""Sort records by whether they follow the 7DGS paper's protocol, so that only comparable runs share a table."""
+"""Sort run records by whether they follow the protocol of the 7DGS paper, so that tables hold only comparable runs."""
 
 import re
 from collections.abc import Sequence
@@ -11,53 +11,61 @@ from gsbench.report.configurations import iterations, without
 from gsbench.report.paper import PROTOCOLS
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
-# Words of a variant that change what is measured, or that the heading of a table says, but not how a model is trained.
+# Settings of a variant that do not belong to a model's training settings: they change what is measured, or the heading
+# of a table names them.
 _NOT_OF_THE_RECIPE = ("iterations", "downscale", "eval_split", "protocol", "best_on_test", "curve_points")
 
 
 class ModelRecipe(NamedTuple):
-    """The model, the experiment and the recipe that the seeds of a table row share."""
+    """The model, the experiment and the training settings that the runs of a table row have in common."""
 
     model: str
     experiment: str
-    recipe: str  # how it was trained otherwise than its experiment does; "" for nothing
+    recipe: str  # training settings that differ from the experiment's own; "" if none does
 
 
 @dataclass(frozen=True)
 class Pool:
-    """Runs of one data set with the same protocol, which may share a table."""
+    """Runs on one data set with the same protocol, which may therefore share a table."""
 
     dataset: str
     experiment: str
-    steps: int  # of training; 0 where the records do not say
+    steps: int  # iterations of training; 0 if the records lack them
     runs: list[Record] = field(default_factory=list)
 
     @property
     def heading(self) -> str:
-        """Return the data set, the sizes of its images and the length of training."""
+        """Return a heading with the data set, the experiment, the image sizes and the training length of these runs."""
         sizes = ", ".join(sorted({_size(r) for r in self.runs}))
         return f"{self.dataset}: experiment {self.experiment}, {sizes}, {self.steps:,} iterations"
 
     @property
     def effort(self) -> int:
-        """Return pixels of the largest image times iterations; runs with more are nearer to the paper."""
+        """Return the pixels of the largest image times the number of training iterations.
+
+        Of two groups of runs, the one with the higher value is closer to the paper's protocol.
+        """
         return self.steps * max(_pixels(_size(r)) for r in self.runs)
 
 
 @dataclass(frozen=True)
 class Sorted:
-    """All records of a folder, sorted by what they may be compared with."""
+    """The run records of a folder, sorted by whether they can be compared with the results of the 7DGS paper."""
 
     paper: dict[str, list[Record]]  # by data set: runs at the paper's protocol
-    other_protocol: list[Pool]  # a data set of the paper: the pool that is nearest to its protocol
-    other_data: list[Pool]  # stand-ins for scenes of the paper: of each data set the pool of most effort
-    left_out: dict[str, list[str]]  # by data set of the paper: what is in no table, in words
+    other_protocol: list[Pool]  # for each data set of the paper, the runs nearest to its protocol
+    other_data: list[Pool]  # runs on data that stand in for the paper's: those of most effort
+    left_out: dict[str, list[str]]  # by data set of the paper: the runs that are in no table, as text
 
 
 def sort(records: list[Record]) -> Sorted:
-    """Sort records of the five models; records that stand for no data set of the paper are left out silently."""
+    """Sort run records into those with the 7DGS paper's protocol, those with another protocol, and those on other data.
+
+    Other data are scenes that stand in for scenes of the paper. A record is skipped without a message if its model is
+    not one of the five in MODELS, or if its data neither belong to the paper nor stand in for its data.
+    """
     at_paper: dict[str, list[Record]] = {name: [] for name in PROTOCOLS}
-    pools: dict[tuple[str, str, str, str, int], Pool] = {}  # images of a data set may differ in size by scene
+    pools: dict[tuple[str, str, str, str, int], Pool] = {}  # by downscaling, as image sizes differ between scenes
     for r in records:
         named = r.protocol.get("paper_dataset")
         if not isinstance(named, str) or named not in PROTOCOLS or r.model not in MODELS:
@@ -86,7 +94,7 @@ def sort(records: list[Record]) -> Sorted:
 
 
 def departure(record: Record) -> str:
-    """Name the settings in which a run departs from the paper's protocol; "" if it follows it."""
+    """Return the names of the settings in which a run differs from the 7DGS paper's protocol; "" if there are none."""
     protocol = PROTOCOLS.get(record.dataset)
     if protocol is None or record.protocol.get("paper_dataset") != record.dataset:
         return "data"
@@ -108,19 +116,19 @@ def departure(record: Record) -> str:
 
 
 def model_recipe(record: Record) -> ModelRecipe:
-    """Return the model and recipe of a run."""
+    """Return the model, the experiment and the training settings of a run, which determine its table row."""
     return ModelRecipe(record.model, record.experiment, without(record.variant, *_NOT_OF_THE_RECIPE))
 
 
 def model_recipes(records: list[Record]) -> list[ModelRecipe]:
-    """List the models and recipes of records, in the order of MODELS."""
+    """List the different models and training settings that occur in run records, in the order of MODELS."""
     return sorted({model_recipe(r) for r in records}, key=lambda one: (MODELS.index(one.model), one))
 
 
 def finished(records: list[Record], one: ModelRecipe, scenes: Sequence[str]) -> dict[str, list[Record]]:
-    """Return the finished runs of a model and recipe by scene, one for each seed.
+    """Return the finished runs of a model with its training settings: for each scene one run for each seed.
 
-    If two runs of a seed differ in `protocol.best_on_test`, the run that has it counts.
+    If a seed has two runs, the run that also measured the best PSNR on test during training is taken.
     """
     found: dict[str, dict[int, Record]] = {}
     for r in sorted(records, key=lambda r: (r.metrics or {}).get("psnr_best_on_test") is not None):
@@ -130,24 +138,24 @@ def finished(records: list[Record], one: ModelRecipe, scenes: Sequence[str]) -> 
 
 
 def _size(record: Record) -> str:
-    """Return the size of a run's images as its record has it, such as "400x400", with control characters escaped."""
+    """Return the image size of a run as a text such as "400x400", with control characters escaped."""
     return printable(record.protocol.get("resolution", "a size not recorded"))
 
 
 def _pixels(size: str) -> int:
-    """Count the pixels of a size such as "400x400"; 0 if the text is not a size."""
+    """Return the number of pixels of a size such as "400x400", or 0 if the text is not a size."""
     numbers = size.split("x")
     return int(numbers[0]) * int(numbers[1]) if re.fullmatch(r"[0-9]{1,6}x[0-9]{1,6}", size) else 0
 
 
 def _part(config: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return a section of a config, empty if a record lacks it."""
+    """Return a section of a run's config, such as "train"; it is empty if the record lacks the section."""
     part = config.get(name)
     return part if isinstance(part, dict) else {}
 
 
 def _count(frames: Any) -> int | None:
-    """Return the number of frames from the first to the last one."""
+    """Return the number of frames in a range [first, last]; None if `frames` is not such a range."""
     if isinstance(frames, list) and len(frames) == 2 and all(isinstance(n, int) for n in frames):
         return int(frames[1] - frames[0] + 1)
     return None

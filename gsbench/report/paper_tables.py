@@ -1,4 +1,4 @@
-"""Write Tables 1 and 2 of the 7DGS paper from records, as Markdown and CSV (``make tables``)."""
+"""Make Tables 1 and 2 of the 7DGS paper from run records, and write them as Markdown and CSV (``make tables``)."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ NAMES = ("table1.md", "table1.csv", "table2.md", "table2.csv")
 
 
 def write(records: list[Record], folder: Path) -> list[Table]:
-    """Write NAMES to `folder` atomically and return the tables that are in them."""
+    """Write Tables 1 and 2 of the 7DGS paper as Markdown and CSV files to `folder`, and return the tables."""
     found = sort(records)
     shown = []
     for name, (tables, lines) in (("table1", table1.build(found)), ("table2", table2.build(found))):

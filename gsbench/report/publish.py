@@ -10,13 +10,14 @@ from gsbench.report import tables
 
 
 def publish(folder: Path, to: Path) -> str:
-    """Copy every record of a folder, such as ``results/mini``, to another one, such as ``results/published/mini``.
+    """Copy every run record of a folder, such as ``results/mini``, to another one, such as ``results/published/mini``.
 
-    A published record of the same run is replaced; other records stay. Return a line that describes the result.
+    A record of the same run in the second folder is replaced, and all others stay. The tables of the second folder are
+    rewritten. The function returns a line that describes the result.
 
     Raises:
-        InputError: a record is damaged or a duplicate, or a run did not finish or has no clean commit; nothing is
-            copied.
+        InputError: a record is damaged or a duplicate, a run did not finish, or its code was not a clean git commit;
+            nothing is copied.
     """
     records, faults = tables.load(folder)
     for r in records:

@@ -1,4 +1,4 @@
-"""Average quantities over seeds and scenes, each with its interval (gsbench.report.intervals)."""
+"""Average measured quantities over seeds and scenes, with 95 % intervals (gsbench.report.intervals)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,15 +10,17 @@ from gsbench.report import conditions
 from gsbench.report.intervals import Estimate, estimate
 from gsbench.report.tables import quantities
 
-SPREAD = conditions.SPREAD  # every table has the same
+SPREAD = conditions.SPREAD  # the same in every table
 
 
 def mean(runs: Mapping[str, Sequence[Record]], key: str) -> Estimate:
-    """Estimate the mean of a quantity over scenes, of its mean over seeds; NaN if it is missing from a run or scene.
+    """Estimate a quantity's mean over seeds and then over scenes, with its interval over seeds.
+
+    The mean is NaN if the quantity is missing from a run, or if a scene has no run.
 
     Args:
         runs: finished runs by scene.
-        key: the quantity, a column of `gsbench.report.tables.tidy`.
+        key: the name of the quantity, such as "psnr".
     """
     scenes = [np.array([[_number(quantities(run).get(key))] for run in seeds]) for seeds in runs.values()]
     if any(len(scene) == 0 or np.isnan(scene).any() for scene in scenes):

@@ -1,4 +1,4 @@
-"""Make Table 1 of the 7DGS paper from records: the paper's row beside each measured one, and their difference."""
+"""Make Table 1 of the 7DGS paper from run records: each measured row, the paper's row, and their difference."""
 
 import math
 from statistics import fmean
@@ -15,7 +15,7 @@ from gsbench.report.seed_means import SPREAD, mean
 from gsbench.report.tables import LEAKS, OF_THE_MACHINE, of_one_machine
 
 COLUMNS = [*tables.COLUMNS[:1], QuantityColumn(LEAKS, LEAKS, 2, "psnr"), *tables.COLUMNS[1:]]
-SEEDS = 3  # the fewest for an interval that holds
+SEEDS = 3  # the fewest seeds for a valid interval
 
 PAPER = (
     "Table 1 of the 7DGS paper (ICCV 2025). Its PSNR is the best on test seen during training, which leaks: like stands"
@@ -23,12 +23,15 @@ PAPER = (
 )
 OTHER_DATA = "Rendered for this project in place of the paper's scenes; the paper's rows are not shown."
 
-Runs = dict[str, list[Record]]  # finished ones by scene
-Line = dict[str, Any]  # of the CSV
+Runs = dict[str, list[Record]]  # finished runs by scene
+Line = dict[str, Any]  # a line of the CSV file
 
 
 def build(found: Sorted) -> tuple[list[Table], list[Line]]:
-    """Make the tables, one for each data set of the paper and each pool of other runs, and the lines of the CSV."""
+    """Make the tables in the format of Table 1 of the 7DGS paper, and the lines of the CSV file.
+
+    There is a table for each data set of the paper, and one for each group of runs with another protocol or other data.
+    """
     made: list[Table] = []
     lines: list[Line] = []
     for dataset, records in found.paper.items():
@@ -47,13 +50,16 @@ def build(found: Sorted) -> tuple[list[Table], list[Line]]:
 
 
 def _other_protocol(runs: list[Record]) -> str:
-    """Say why the paper's rows are not beside these runs."""
+    """Return a note that says how these runs differ from the paper's protocol, so its rows are not shown."""
     what = sorted({word for r in runs for word in departure(r).split(", ")})
     return f"Measured otherwise than in the paper (in {', '.join(what)}), so the paper's rows are not shown."
 
 
 def missing(dataset: str, records: list[Record]) -> str:
-    """List in one line the scenes, models and seeds that a data set lacks at the paper's protocol."""
+    """Return a line that lists which scenes, models and seeds of a data set still have to be run.
+
+    The line covers only runs with the protocol of the 7DGS paper.
+    """
     own = [r for r in records if r.status == "ok" and not model_recipe(r).recipe]
     scenes = paper.PROTOCOLS[dataset].scenes
     seeds = {(s, m): len({r.seed for r in own if (r.scene, r.model) == (s, m)}) for s in scenes for m in MODELS}
@@ -70,7 +76,7 @@ def missing(dataset: str, records: list[Record]) -> str:
 
 
 def _left_out(pools: list[str]) -> list[str]:
-    """Name the runs that are in none of the tables."""
+    """Return a footnote that names the runs which appear in no table; an empty list if there are none."""
     if not pools:
         return []
     shown = "; ".join(map(printable, pools[:5])) + (f"; and {len(pools) - 5} more" if len(pools) > 5 else "")
@@ -78,7 +84,7 @@ def _left_out(pools: list[str]) -> list[str]:
 
 
 class _Table1Builder:
-    """Makes the table of one data set, and adds its numbers to the lines of the CSV."""
+    """Makes the table of one data set like Table 1 of the 7DGS paper, and adds its numbers to the CSV lines."""
 
     def __init__(self, dataset: str, records: list[Record], lines: list[Line], kind: str) -> None:
         self.dataset = dataset
@@ -91,7 +97,10 @@ class _Table1Builder:
         self.marks: list[str] = []
 
     def make(self, title: str, scenes: list[str], notes: list[str]) -> Table:
-        """Make a section for every scene with a run, and the average over those that all models finished."""
+        """Make the table: a section for every scene that has a run, and an average over scenes.
+
+        The average is over the scenes that all models finished.
+        """
         sections = [self._scene(s) for s in scenes if any(r.scene == s for r in self.records)]
         if len(sections) > 1:
             sections.append(self._average(scenes))
@@ -109,7 +118,7 @@ class _Table1Builder:
         return Section(scene, _with_best(rows), notes)
 
     def _average(self, scenes: list[str]) -> Section:
-        own = [one for one in self.recipes if not one.recipe]  # another recipe is often tried on one scene only
+        own = [one for one in self.recipes if not one.recipe]  # other settings are often tried on one scene only
         runs = {one: found for one in own if (found := finished(self.records, one, scenes))}
         covered = [s for s in scenes if runs and all(s in found for found in runs.values())]
         title = f"average over {len(covered)} of {len(scenes)} scenes"
@@ -121,7 +130,7 @@ class _Table1Builder:
         return Section(f"{title}: {', '.join(covered)}", _with_best(rows))
 
     def _rows(self, scene: str, one: ModelRecipe, runs: Runs) -> list[Row]:
-        """Make the measured row, the paper's row and their difference; add them to the CSV."""
+        """Make the measured row, the paper's row and the row of their difference, and add the numbers to the CSV."""
         here = {s: [r for r in seeds if r.provenance.machine == self.machine] for s, seeds in runs.items()}
         measured = {c.key: mean(here if c.key in OF_THE_MACHINE else runs, c.key) for c in COLUMNS}
         seeds = min(map(len, runs.values()))
@@ -146,7 +155,10 @@ class _Table1Builder:
         return rows
 
     def _paper(self, model: str, scenes: list[str]) -> dict[str, float]:
-        """Return the paper's numbers by column, averaged over `scenes`; empty if the paper lacks this data set."""
+        """Return the paper's numbers by column, averaged over `scenes`; empty if the paper lacks one of these scenes.
+
+        The result is also empty if the table's runs do not follow the paper's protocol.
+        """
         if self.kind != "paper":
             return {}
         rows = [row for scene in scenes if (row := paper.paper_row(self.dataset, scene, model))]
@@ -156,25 +168,25 @@ class _Table1Builder:
         return {key: math.nan if None in given else fmean(given) for key, given in values.items()}
 
     def _label(self, one: ModelRecipe) -> str:
-        """Name a row by its model, its recipe, and its experiment if experiments differ."""
+        """Return the label of a row: its model, its training settings, and its experiment if the table has several."""
         return " ".join(filter(None, [one.model, one.recipe, f"({one.experiment})" * self.names_experiment]))
 
     def _mark(self, text: str) -> str:
-        """Return the mark of a footnote; equal texts share a mark."""
+        """Return the number of a footnote as text, such as "(1)"; footnotes with equal texts share a number."""
         if text not in self.marks:
             self.marks.append(text)
         return f"({self.marks.index(text) + 1})"
 
 
 def _signed(column: QuantityColumn, difference: float) -> str:
-    """Format a difference with its sign, as many digits as its column has."""
+    """Format a difference with its sign and with as many digits as its column has."""
     if math.isnan(difference):
         return EMPTY
     return ("+" if difference >= 0 else "-") + column.show(abs(difference))
 
 
 def _with_best(rows: list[Row]) -> list[Row]:
-    """Mark the measured rows with the highest final PSNR, compared as rounded in the table."""
+    """Mark the measured rows that have the highest final PSNR after rounding as in the table."""
     shown = {row.cells["psnr"].partition(" ")[0] for row in rows if row.seeds} - {EMPTY}
     best = max(shown, key=float, default=None)
     return [

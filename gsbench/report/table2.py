@@ -1,4 +1,4 @@
-"""Make Table 2 of the 7DGS paper from records: averages over a data set beside those of the quoted methods."""
+"""Make Table 2 of the 7DGS paper from run records: measured averages over a data set and the paper's averages."""
 
 import math
 from typing import Any
@@ -32,9 +32,9 @@ Line = dict[str, Any]
 
 
 def build(found: Sorted) -> tuple[list[Table], list[Line]]:
-    """Make a table for each data set of the paper, and the lines of the CSV.
+    """Make a table for each data set of the 7DGS paper, and the lines of the CSV file.
 
-    A model has a row of numbers only where all scenes of the data set are finished at the paper's protocol.
+    A model has numbers only if all scenes of the data set are finished with the paper's protocol.
     """
     made: list[Table] = []
     lines: list[Line] = []
@@ -51,7 +51,7 @@ def build(found: Sorted) -> tuple[list[Table], list[Line]]:
 
 
 def _published(dataset: str, lines: list[Line], marks: list[str]) -> list[Row]:
-    """Make the rows of the paper's Table 2, or of its Table 1's averages if it has none."""
+    """Make the rows of the paper's Table 2; if it lacks the data set, use the averages of the paper's Table 1."""
     methods = [
         (m.method, "reproduced" if m.reproduced_by_paper else "quoted", m.psnr, m.ssim, m.lpips)
         for m in paper.table2().get(dataset, [])
@@ -73,7 +73,7 @@ def _published(dataset: str, lines: list[Line], marks: list[str]) -> list[Row]:
 
 
 def _measured(dataset: str, records: list[Record], lines: list[Line]) -> list[Row]:
-    """Make a row for every model, without numbers where a scene is not finished."""
+    """Make a row of measured averages for every model; a row has no numbers if a scene is not finished."""
     scenes = paper.PROTOCOLS[dataset].scenes
     rows = []
     found = model_recipes(records)

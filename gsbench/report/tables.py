@@ -1,4 +1,4 @@
-"""Make tables from records: a row for each model and scene, with the row of the paper below it."""
+"""Make result tables from run records: a row for each model and scene, and below it the row of the 7DGS paper."""
 
 import math
 from collections import Counter
@@ -19,7 +19,7 @@ from gsbench.report.configurations import groups
 from gsbench.report.intervals import over_seeds
 from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
 
-LEAKS = "psnr_best_on_test (leaks)"  # its title always says that it leaks
+LEAKS = "psnr_best_on_test (leaks)"  # the title says that test views leak into the choice of the iteration
 COLUMNS = (  # their keys are columns of `tidy`
     QuantityColumn("psnr", "PSNR", 2, "psnr"),
     QuantityColumn("ssim", "SSIM", 3, "ssim"),
@@ -28,10 +28,10 @@ COLUMNS = (  # their keys are columns of `tidy`
     QuantityColumn("fps", "FPS", None, "fps"),
     QuantityColumn("num_gaussians", "#Gaussians", 0, "num_gaussians"),
 )
-OF_THE_MACHINE = ("train_min", "fps")  # columns that compare only between runs of one machine
-COSTS = ("fps", "num_gaussians", "bytes", "peak_memory", "train_cpu_s", "load")  # of a record, as it has them
+OF_THE_MACHINE = ("train_min", "fps")  # columns that can be compared only between runs on one machine
+COSTS = ("fps", "num_gaussians", "bytes", "peak_memory", "train_cpu_s", "load")  # costs that are copied from a record
 TRAIN = QuantityColumn("psnr_train", "PSNR train", 2)  # shown on request
-EXTRA_COLUMNS = (QuantityColumn("lpips_vgg", "LPIPS-VGG", 3), QuantityColumn(LEAKS, LEAKS, 2))  # where a run has them
+EXTRA_COLUMNS = (QuantityColumn("lpips_vgg", "LPIPS-VGG", 3), QuantityColumn(LEAKS, LEAKS, 2))  # if a run has them
 
 PAPER = (
     "Table 1 of the 7DGS paper (ICCV 2025): 30,000 iterations at half resolution (Technicolor: full), PSNR is the best "
@@ -48,10 +48,10 @@ PAPER_LPIPS = (
 
 
 def load(root: Path) -> tuple[list[Record], list[str]]:
-    """Return all records under `root`, and the reasons why others were left out: damaged, or a duplicate of a run.
+    """Return all run records under `root`, and the reasons why damaged or duplicate records were left out.
 
     Raises:
-        InputError: there is no record at all.
+        InputError: the folder is missing or has no record.
     """
     if not root.is_dir():
         raise InputError(f"{root}: expected a folder of results, found none")
@@ -75,12 +75,12 @@ def load(root: Path) -> tuple[list[Record], list[str]]:
 
 
 def tidy(records: list[Record]) -> pd.DataFrame:
-    """Make a data frame with a row for each run and a column for each quantity; missing numbers are empty."""
+    """Make a data frame with a row for each run and a column for each quantity; a missing number is an empty cell."""
     return pd.DataFrame([quantities(record) for record in records])
 
 
 def quantities(r: Record) -> dict[str, Any]:
-    """Flatten a record to quantities by name: those of `tidy`; a missing number is None."""
+    """Return the quantities of a run record in a dictionary by name; a missing number is None."""
     flat: dict[str, Any] = {
         name: getattr(r, name) for name in ("experiment", "dataset", "scene", "model", "variant", "seed")
     }
@@ -98,22 +98,24 @@ def quantities(r: Record) -> dict[str, Any]:
 
 
 def build(records: list[Record], *, train: bool = False, machine: str | None = None) -> list[Table]:
-    """Make a table for every experiment and data set in `records`, sorted by name.
+    """Make a result table for every experiment and data set in `records`, sorted by name.
 
     Args:
-        records: the records of one or more experiments.
+        records: the run records of one or more experiments.
         train: whether to show PSNR on training views too.
-        machine: whose seconds and FPS are shown, by `Provenance.machine`; None: in each table that of most runs.
+        machine: the machine whose training times and FPS are shown; None for the machine of most runs in each table.
     """
     return [_TableBuilder(group.records, train, machine or group.machine).table() for group in groups(records)]
 
 
 def of_one_machine(records: list[Record], machine: str) -> list[str]:
-    """Name the machine whose seconds a table shows, and the runs left out; nothing if all were on one machine.
+    """Return a footnote that names the machine whose times a table shows, and the machines whose times are left out.
+
+    The list is empty if all runs were on one machine.
 
     Args:
-        records: the records of the table.
-        machine: the machine whose seconds are shown; None: that of most runs.
+        records: the run records of the table.
+        machine: the machine whose times are shown.
     """
     others = Counter(r.provenance.machine for r in records if r.status == "ok" and r.provenance.machine != machine)
     if not others:
@@ -126,14 +128,14 @@ def of_one_machine(records: list[Record], machine: str) -> list[str]:
 
 
 class _TableBuilder:
-    """Makes the table of one experiment on one data set, and collects the footnotes of its cells."""
+    """Makes the result table of one experiment on one data set, and collects the footnotes of its cells."""
 
     def __init__(self, records: list[Record], train: bool, machine: str) -> None:
         self.records = records
         self.machine = machine
         self.scenes = sorted({r.scene for r in records})
         variants = {r.variant for r in records}
-        self.common = variants.pop() if len(variants) == 1 else ""  # said once, below the table
+        self.common = variants.pop() if len(variants) == 1 else ""  # the settings of all runs; stated below the table
         self.models = sorted({self._name(r) for r in records})
         flat = [quantities(r) for r in records]
         shown = [COLUMNS[0], *([TRAIN] if train else []), *COLUMNS[1:]]
@@ -148,16 +150,19 @@ class _TableBuilder:
         self.marks: list[str] = []
 
     def _values(self, column: QuantityColumn, seeds: list[dict[str, Any]]) -> list[float]:
-        """Return a column's value of each run; of seconds those of the table's machine, NaN if it has none."""
+        """Return the values of a column for the runs of a model, or NaN if there are none.
+
+        Training times and FPS are only taken from runs on the table's machine.
+        """
         counted = [q for q in seeds if column.key not in OF_THE_MACHINE or q["machine"] == self.machine]
         return [math.nan if q[column.key] is None else float(q[column.key]) for q in counted] or [math.nan]
 
     def _name(self, record: Record) -> str:
-        """Name the row of a run by its model, and by its settings if they differ from those of most runs."""
+        """Return the name of a run's row: the model, and its settings if the runs of the table differ in them."""
         return f"{record.model} {record.variant}" if record.variant != self.common else record.model
 
     def table(self) -> Table:
-        """Make the table: a section for every scene, and their average if there are several."""
+        """Make the table with a section for every scene, and with an average if there are several scenes."""
         first = self.records[0]
         sections = [self._scene(scene) for scene in self.scenes]
         if len(sections) > 1:
@@ -168,19 +173,19 @@ class _TableBuilder:
         return Table(title, self.columns, sections, self.marks, said)
 
     def _no_vgg(self) -> list[str]:
-        """Return the reason why there is no column for LPIPS-VGG, if there is none."""
+        """Return a footnote that says why the table has no column for LPIPS-VGG; an empty list if it has one."""
         shown = any(c.key == "lpips_vgg" for c in self.columns)
         why = {printable(r.missing["lpips_vgg"]) for r in self.records if "lpips_vgg" in r.missing}
         return [f"LPIPS-VGG has no column: {'; '.join(sorted(why))}."] if why and not shown else []
 
     def _mark(self, text: str) -> str:
-        """Return the mark of a footnote; equal texts share a mark."""
+        """Return the number of a footnote as text, such as "(1)"; footnotes with equal texts share a number."""
         if text not in self.marks:
             self.marks.append(text)
         return f"({self.marks.index(text) + 1})"
 
     def _scene(self, scene: str) -> Section:
-        """Make a row for every model with a finished run, for every other run, and for the paper."""
+        """Make the rows of a scene: each model's mean, each run that did not finish, and the paper's results."""
         rows: list[Row] = []
         notes = []
         leader = _leader([self.values[scene, model] for model in self.models if (scene, model) in self.values])
@@ -200,7 +205,7 @@ class _TableBuilder:
         return Section(scene, rows, notes)
 
     def _cell(self, column: QuantityColumn, finished: list[Record]) -> str:
-        """Show the mean and the spread over the seeds, or the reason why a seed lacks the number."""
+        """Format the mean and the interval over seeds; if a run lacks the number, return a dash with a footnote."""
         values = self.values[finished[0].scene, self._name(finished[0])][column.key]
         if not math.isnan(fmean(values)):
             return column.show(fmean(values), over_seeds(values).half)
@@ -211,7 +216,10 @@ class _TableBuilder:
         return f"{EMPTY} " + self._mark(printable(f"{column.title} is empty: {'; '.join(sorted(why))}"))
 
     def _average(self) -> Section:
-        """Average over the scenes that every model has finished, so that all rows average the same scenes."""
+        """Make the rows of averages over the scenes that every model has finished.
+
+        All rows therefore average the same scenes.
+        """
         models = [model for model in self.models if any((scene, model) in self.values for scene in self.scenes)]
         covered = [s for s in self.scenes if models and all((s, model) in self.values for model in models)]
         notes = [f"{model} finished on no scene and is left out" for model in self.models if model not in models]
@@ -233,7 +241,7 @@ class _TableBuilder:
         return Section(f"{title}: {', '.join(covered)}", rows, notes)
 
     def _paper_row(self, scenes: list[str], model: str) -> list[Row]:
-        """Make the paper's row for `model`, averaged over `scenes`; none if the paper lacks one of them."""
+        """Make the row with the paper's results for `model`, averaged over `scenes`; no row if the paper lacks one."""
         runs = [r for r in self.records if self._name(r) == model and r.scene in scenes]
         if any(r.effects.refinement != paper.MODELS.get(r.model) for r in runs):
             return []  # the model has the same name as one of the paper but differs in AGR
@@ -254,18 +262,27 @@ class _TableBuilder:
 
 
 def _shown_psnr(values: dict[str, list[float]]) -> str:
-    """Format the mean PSNR as its column does."""
+    """Format a mean PSNR with as many digits as the table shows."""
     return COLUMNS[0].show(fmean(values[COLUMNS[0].key]))
 
 
 def _leader(rows: list[dict[str, list[float]]]) -> str | None:
-    """Format the highest mean PSNR, so that rows which look equal lead together; None if no row has one."""
+    """Return the highest mean PSNR as the table shows it; None if no row has a PSNR.
+
+    Rows that look equal after rounding are all marked as the best.
+    """
     means = [mean for mean in (fmean(values[COLUMNS[0].key]) for values in rows) if not math.isnan(mean)]
     return COLUMNS[0].show(max(means)) if means else None
 
 
 def write(records: list[Record], folder: Path, *, train: bool = False) -> list[Table]:
-    """Write ``table.md`` and ``table.csv`` to `folder` atomically and return the tables; `train` is as in `build`."""
+    """Write result tables to ``table.md`` and all quantities to ``table.csv`` in `folder`, and return the tables.
+
+    Args:
+        records: the run records of one or more experiments.
+        folder: the folder for the two files.
+        train: whether to show PSNR on training views too.
+    """
     tables = build(records, train=train)
     write_atomically(folder / "table.md", layout.markdown(tables).encode())
     write_atomically(folder / "table.csv", tidy(records).map(cell).rename(columns=cell).to_csv(index=False).encode())

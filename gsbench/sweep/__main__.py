@@ -20,11 +20,16 @@ from gsbench.sweep.plan import identity
 from gsbench.sweep.status import BROKEN, GOING, STATES, RunStatus, read, status
 
 WATCH_SECONDS = 10.0
-MOST_COMMANDS = 20  # of runs that no sweep requested
+MOST_COMMANDS = 20  # commands that are printed for runs outside a sweep
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Return 0 if no run failed or is lost, 1 if a run failed or is lost, and 2 if the folder is no experiment."""
+    """Show the state of an experiment or launch runs again, as the command line says, and return the exit code.
+
+    Returns:
+        0 if no run failed or is lost, 1 if a run failed or is lost, 2 if the folder or an argument is wrong, and 130
+        after Ctrl-C.
+    """
     parser = argparse.ArgumentParser(prog="python -m gsbench.sweep", description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
     shown = commands.add_parser("status", help="show which runs are done, running, queued, planned, failed or lost")
@@ -48,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # the reader has closed the pipe, as `head` does
+    except BrokenPipeError:  # the program that reads the output has ended, such as `head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
 
@@ -64,7 +69,13 @@ def _show(folder: Path, as_json: bool) -> list[RunStatus]:
 
 
 def lines(experiment: Path, runs: Sequence[RunStatus], silent: str | None = None) -> list[str]:
-    """Show the runs of an experiment; `silent` says why Slurm did not answer."""
+    """Return lines of text that show the states of the runs of an experiment.
+
+    Args:
+        experiment: the folder of the experiment.
+        runs: its runs with their states.
+        silent: the reason why Slurm did not answer; None if it did or was not asked.
+    """
     counts = Counter(run.state for run in runs)
     summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
     shown = [f"{experiment}: {len(runs)} runs: {summary}" if runs else f"{experiment}: no run was asked for"]

@@ -1,4 +1,4 @@
-"""Expand a command line before Hydra reads it: scene=all becomes an axis of the sweep with one run for each scene."""
+"""Expand a command line before Hydra reads it: scene=all becomes a sweep with one run for each scene."""
 
 import itertools
 import re
@@ -15,20 +15,21 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.measure.renamed import present_override
 
 MULTIRUN = ("-m", "--multirun")
-SCENES_DEPEND_ON = ("exp", "data.scenes")  # the overrides that say which scenes there are
+SCENES_DEPEND_ON = ("exp", "data.scenes")  # the overrides on which the list of scenes depends
 INFORM = ("-h", "--help", "--hydra-help", "--version", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion")
 
-NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{'\"].*|")  # what Hydra reads as a value
+NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{'\"].*|")  # values for Hydra
 
 
 def expand(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line with `--multirun` first, and with all scenes in place of scene=all.
+    """Return the words of a command line with `--multirun` first, and with all scene names instead of scene=all.
 
-    A command line that names one scene, asks for information or has a fault is left as it is: Hydra explains the fault.
+    Config keys that were renamed are replaced by their present names. Otherwise, a command line stays as it is if it
+    names one scene, asks for information or has an error; Hydra explains the error.
 
     Raises:
-        InputError: a group's choice is a number, the experiment has no scenes, or scene=all stands beside several
-            experiments.
+        InputError: the choice of a config group is a number, the experiment has no scenes, or scene=all is combined
+            with several experiments.
     """
     multirun = any(word in MULTIRUN for word in words)
     words = [_with_present_names(word) for word in words if word not in MULTIRUN]
@@ -50,7 +51,7 @@ def expand(words: Sequence[str]) -> list[str]:
 
 
 def _with_present_names(word: str) -> str:
-    """Return a word with the names that keys have now; a warning tells of one that has changed."""
+    """Return a word of the command line with the present names of config keys; warn if a key was renamed."""
     present = present_override(word)
     if present != word:
         warnings.warn(f"{word}: a key of it was renamed, read as {present}", stacklevel=1)
@@ -58,7 +59,10 @@ def _with_present_names(word: str) -> str:
 
 
 def _check_group(name: str, choices: str) -> None:
-    """Raise InputError for a group's choice that is no name, such as a number; Hydra's own error explains nothing."""
+    """Raise InputError if the choice of a config group is not a name, for example a number.
+
+    Hydra's own error message does not explain this mistake.
+    """
     if not name or not (CONF / name).is_dir():
         return
     for choice in choices.split(","):
@@ -68,7 +72,10 @@ def _check_group(name: str, choices: str) -> None:
 
 
 def scenes_of(overrides: list[str]) -> list[str] | None:
-    """Return the scenes of an experiment and make each one a choice of the group `scene`; None if Hydra fails."""
+    """Return the scenes of an experiment, and make each one a choice of the config group `scene`.
+
+    The result is None if Hydra cannot compose the config.
+    """
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             scenes: list[str] = list(compose("config", overrides).data.scenes)

@@ -1,6 +1,7 @@
-"""Write the plan when Hydra starts a sweep, and the outcome of each run when the run ends.
+"""Write the plan of a sweep when Hydra starts it, and the outcome of each run when the run ends.
 
-Hydra calls `WritePlan` (conf/config.yaml: hydra.callbacks). On Slurm and with joblib it is pickled into every job.
+Hydra calls `WritePlan`, which conf/config.yaml lists under hydra.callbacks. With Slurm and joblib it is pickled into
+every job.
 """
 
 import copy
@@ -25,14 +26,14 @@ from gsbench.run.progress import born
 from gsbench.sweep import plan
 from gsbench.sweep.plan import Ended, Plan
 
-started: list[Path] = []  # the folders of the plans of this process
+started: list[Path] = []  # the folders of the plans that this process wrote
 
 
 class WritePlan(Callback):
-    """Write plan.json when a multirun starts, and `ended/<number>.json` beside it when a run ends."""
+    """A Hydra callback that writes plan.json when a sweep starts, and `ended/<number>.json` when a run ends."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Write the plan and say where it is."""
+        """Write the plan of the sweep, and print the command that shows the status of its runs."""
         planned = plan_of(expand(config), config)
         folder = Path(config.hydra.sweep.dir)
         plan.write(planned, folder)
@@ -41,14 +42,17 @@ class WritePlan(Callback):
         print(f"{len(planned.runs)} runs; their status: python -m gsbench.sweep status {experiment}", file=sys.stderr)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
-        """Write the path of the run's record, as two commands may ask for one run by different overrides."""
+        """Write the outcome of the run, which contains the path of its record.
+
+        The path is stored because two commands may request the same run with different overrides.
+        """
         if config.hydra.mode == RunMode.MULTIRUN:
             folder = Path(config.hydra.sweep.dir)
             plan.write_ended(folder, config.hydra.job.num, ended(config, folder.parents[2]))
 
 
 def expand(config: DictConfig) -> list[list[str]]:
-    """List the overrides of each run of a composed multirun, as Hydra's own sweeper expands them."""
+    """Return the Hydra overrides of each run of a sweep, expanded in the same way as by Hydra's own sweeper."""
     params = [f"{key}={value}" for key, value in (config.hydra.sweeper.params or {}).items()]
     overrides = OverridesParser.create().parse_overrides([*params, *config.hydra.overrides.task])
     (runs,) = BasicSweeper.split_arguments(overrides, None)
@@ -56,7 +60,7 @@ def expand(config: DictConfig) -> list[list[str]]:
 
 
 def plan_of(runs: Sequence[Sequence[str]], config: DictConfig) -> Plan:
-    """Describe a list of runs that this process launches under a composed config."""
+    """Return the plan of a sweep: the runs that this process launches, and how it launches them."""
     return Plan(
         launcher=config.hydra.runtime.choices["hydra/launcher"],
         runs=[list(run) for run in runs],
@@ -70,8 +74,8 @@ def plan_of(runs: Sequence[Sequence[str]], config: DictConfig) -> Plan:
 
 
 def ended(config: DictConfig, results: Path) -> Ended:
-    """Find the record of a run that ended in this process."""
-    from gsbench.run.identity import identify  # torch is loaded where a run was done
+    """Return the outcome of a run that ended in this process: the path of its record, or why there is none."""
+    from gsbench.run.identity import identify  # imports torch, which the run has loaded already
 
     composed = copy.deepcopy(config)
     with read_write(composed), open_dict(composed):

@@ -1,4 +1,4 @@
-"""Explain in one line why Hydra or OmegaConf refuses a command line or a config."""
+"""Explain in one line why Hydra or OmegaConf rejects a command line or a config."""
 
 import traceback
 
@@ -13,7 +13,7 @@ LIBRARIES = ("hydra", "omegaconf", "antlr4", "joblib", "submitit")
 
 
 def explain(error: Exception) -> str:
-    """Explain an error of Hydra or OmegaConf in one line that names the key and the nearest valid one."""
+    """Explain an error of Hydra or OmegaConf in one line that contains the wrong key and the most similar valid key."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         if group == "hydra/launcher":
@@ -32,9 +32,10 @@ def explain(error: Exception) -> str:
 
 
 def raised_by_library(error: Exception) -> bool:
-    """Tell whether Hydra or a launcher's library raised an error itself, as they do for words or settings they misread.
+    """Tell whether Hydra or a launcher's library raised an error itself, for example because of wrong settings.
 
-    An error of a run in another process is raised again by the launcher's library; its stack is its cause.
+    If a run in another process fails, the launcher's library raises the run's error again. Such an error has a cause,
+    which holds the original traceback. It does not count as an error of the library.
     """
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
     return error.__cause__ is None and str(frame.f_globals.get("__name__")).partition(".")[0] in LIBRARIES

@@ -1,4 +1,4 @@
-"""Wait for the last job of a launched sweep, and list the runs that broke.
+"""Wait for the last job of a launched sweep, and list the runs that failed.
 
 Hydra's launchers for Slurm and for several processes stop waiting when the first job or process dies, while others
 still run.
@@ -14,16 +14,17 @@ from gsbench.sweep import plan
 from gsbench.sweep.plan import identity
 from gsbench.sweep.status import BROKEN, GOING, RunStatus, read, status
 
-LIBRARIES = ("submitit", "joblib")  # that Hydra's launchers use
+LIBRARIES = ("submitit", "joblib")  # used by Hydra's launchers
 POLL = 10.0  # seconds between two looks at Slurm's queue
 
 
 def see_through(launch: Callable[[], Any], started: Sequence[Path]) -> list[RunStatus]:
-    """Launch a sweep, wait for its last job, and return those of its runs that broke.
+    """Launch a sweep, wait until its last job has ended, and return the runs that failed or never started.
 
     Args:
-        launch: starts the runs and waits for them; an error of its library may end the wait.
-        started: the folders of the plans that `launch` wrote, read after it returns; empty if nothing was swept.
+        launch: the function that starts the runs and waits for them; an error of the launcher's library does not stop
+            the wait for the other jobs.
+        started: the folders of the plans that `launch` wrote, read after it returns; empty if there was no sweep.
 
     Raises:
         InputError: not one job could be submitted.
@@ -39,7 +40,7 @@ def see_through(launch: Callable[[], Any], started: Sequence[Path]) -> list[RunS
 
 
 def _ended(folder: Path) -> list[RunStatus]:
-    """Wait until no run of a plan has a job that goes on, and return the status of its runs."""
+    """Return the status of a plan's runs, after waiting until all its jobs in Slurm have ended."""
     while True:
         whole = plan.read(folder / plan.FILE_NAME)
         requested = {identity(run) for run in whole.runs}

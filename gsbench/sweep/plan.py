@@ -1,7 +1,8 @@
-"""Write the runs that a sweep requests to `results/<experiment>/.sweep/<time>/plan.json`, and find such plans.
+"""Write the list of a sweep's runs to `results/<experiment>/.sweep/<time>/plan.json`, and find such plans.
 
-A run is identified by the overrides that decide its results (`identity`). Its record and its progress file hold the
-same overrides. So runs are matched with files without composing a config, which takes 0.1 s.
+A run is identified by those of its Hydra overrides that affect its results (`identity`). Its record and its progress
+file contain the same overrides. Therefore runs can be matched with files without composing a Hydra config, which takes
+0.1 s.
 """
 
 import json
@@ -26,50 +27,54 @@ class Plan:
     launcher: str  # of Hydra: basic, joblib or submitit_slurm
     runs: list[list[str]]  # the overrides of each run, in the order of the tasks of a job array
     hydra: list[str]  # overrides of Hydra's own config
-    cwd: str  # where the command was given: relative paths in overrides start there
+    cwd: str  # the folder of the command; relative paths in overrides start there
     host: str
-    pid: int  # of the process that launches
+    pid: int  # of the process that launches the runs
     born: int | None  # when that process started: gsbench.run.progress.born
     started: float  # unix seconds
 
 
 @dataclass(frozen=True)
 class Ended:
-    """The outcome of one run of a plan, written by the process that did the run."""
+    """The outcome of one run of a sweep, written by the process that executed the run."""
 
-    record: str | None  # path of its record, relative to the folder of all results; None where it has no record
+    record: str | None  # path of its record, relative to the folder of all results; None if it has no record
     reason: str | None  # why it has no record
 
 
 def identity(overrides: Sequence[str]) -> Identity:
-    """Reduce the overrides of a run to those that decide its results."""
+    """Return those overrides of a run that affect its results; they identify the run."""
     return tuple(deciding(overrides))
 
 
 def write(plan: Plan, folder: Path) -> Path:
-    """Write a plan into the folder of its sweep and return the file's path."""
+    """Write the plan of a sweep to plan.json in the given folder, and return the path of the file."""
     path = folder / FILE_NAME
     write_atomically(path, (json.dumps(asdict(plan), indent=1) + "\n").encode())
     return path
 
 
 def read(path: Path) -> Plan:
-    """Read a plan; raises InputError that names the file and the field."""
+    """Read the plan of a sweep from its file.
+
+    Raises:
+        InputError: the file is not valid; the message names the file and the field.
+    """
     return parse(Plan, parse_json(read_file(path, str(path), MAX_JSON), str(path)), str(path))
 
 
 def find(experiment: Path) -> list[Path]:
-    """List the plans of an experiment, the oldest first."""
+    """Return the paths of all sweep plans of an experiment, oldest first."""
     return sorted((experiment / FOLDER).glob(f"*/{FILE_NAME}"))
 
 
 def write_ended(folder: Path, number: int, ended: Ended) -> None:
-    """Write the outcome of run `number` of the plan in `folder`."""
+    """Write the outcome of run `number` of the sweep whose plan is in `folder`."""
     write_atomically(folder / ENDED / f"{number}.json", json.dumps(asdict(ended)).encode())
 
 
 def read_ended(folder: Path) -> dict[int, Ended]:
-    """Read the outcomes of the runs of the plan in `folder`, by number; damaged files are skipped."""
+    """Read the outcomes of the runs of the sweep whose plan is in `folder`, by run number; skip damaged files."""
     found = {}
     for path in (folder / ENDED).glob("*.json"):
         try:
@@ -80,9 +85,10 @@ def read_ended(folder: Path) -> dict[int, Ended]:
 
 
 def jobs(folder: Path) -> dict[int, str]:
-    """List the Slurm jobs of the plan in `folder` by the numbers of their runs; submitit makes a folder for each job.
+    """Return the Slurm jobs of the sweep whose plan is in `folder`, by run number.
 
-    A job array has a folder `<array>` and one folder `<array>_<task>` for each task. A single run has no array.
+    The names of the jobs are those of the folders that submitit makes. A job array has a folder `<array>`, and a folder
+    `<array>_<task>` for each task. A single run has one folder `<job>`.
     """
     names = [path.name for path in (folder / JOBS).glob("[0-9]*")]
     tasks = {int(name.partition("_")[2]): name for name in names if re.fullmatch(r"\d+_\d+", name)}

@@ -1,4 +1,4 @@
-"""Launch the runs of an experiment again that failed, were lost or never started, by the launcher they had."""
+"""Relaunch those runs of an experiment that failed, were lost or never started, with their original launcher."""
 
 import os
 import sys
@@ -32,24 +32,25 @@ CONFIG_NAME = "config"
 
 
 def broken(experiment: Experiment) -> list[RequestedRun]:
-    """List the requested runs that ended without a result."""
+    """List the requested runs that failed, were lost or never started."""
     states = {identity(run.overrides): run.state for run in status(experiment)}
     return [run for one, run in experiment.requested.items() if states[one] in BROKEN]
 
 
 def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfig], Any]) -> int:
-    """Launch the `broken` runs again, wait for them as the first command did, and return how many there were.
+    """Relaunch the runs that failed, were lost or never started; wait for them, and return their number.
 
     Args:
         experiment: the state of the experiment, read just before.
-        more: overrides of `launch`, such as more memory.
-        task: the function that does the run of a composed config.
+        more: overrides of the launch settings, such as more memory.
+        task: the function that executes a run from its composed config.
 
-    A group of runs that cannot be launched is reported on stderr, and the other groups are launched. The folder in
-    which its command was given may be gone, or an override may no longer be known.
+    The runs are launched in groups with the same launch settings. If a group cannot be launched, this is printed on
+    stderr, and the other groups are still launched. For example, the folder in which its command was given may be gone,
+    or an override may no longer be known.
 
     Raises:
-        InputError: `more` would change what is run, or is not known.
+        InputError: `more` has an override that is not known or does not belong to the launch settings.
     """
     for one in more:
         if not launches(one):
@@ -74,14 +75,17 @@ def retry(experiment: Experiment, more: Sequence[str], task: Callable[[DictConfi
 
 
 def _launch(requested: RequestedRun) -> list[str]:
-    """Return the overrides of a run that say how it is launched."""
+    """Return those overrides of a run that say how it is launched."""
     return [one for one in requested.overrides if launches(one)]
 
 
 def _relaunch(
     experiment: Experiment, group: list[RequestedRun], more: Sequence[str], task: Callable[[DictConfig], Any]
 ) -> None:
-    """Launch runs that one command requested; they form no grid, so the launcher is called without a sweeper."""
+    """Launch runs of one earlier command again, through Hydra's launcher but without its sweeper.
+
+    The runs do not form a complete grid, so a sweeper could not expand them.
+    """
     first = group[0]
     results = str(experiment.folder.parent.resolve())
     try:
@@ -107,5 +111,5 @@ def _relaunch(
 
 
 def _common(runs: list[list[str]]) -> list[str]:
-    """Return the overrides that all runs share, in their order, from which the launch's config is composed."""
+    """Return the overrides that all runs share, in their order; the config of the launch is composed from them."""
     return [one for one in runs[0] if all(one in run for run in runs)]

@@ -1,4 +1,4 @@
-"""Ask Slurm for the state of jobs in its queue, and how jobs ended that have left the queue."""
+"""Ask Slurm for the states of jobs in its queue, and how jobs ended that have left the queue."""
 
 import shutil
 import subprocess
@@ -7,19 +7,22 @@ from dataclasses import dataclass
 
 from gsbench.errors import one_line
 
-SECONDS = 30  # for an answer; after that Slurm counts as down
+SECONDS = 30  # time limit for an answer of Slurm
 
 
 @dataclass(frozen=True)
 class Queue:
-    """The jobs that Slurm has queued or runs, by `<array>_<task>` or `<job>`; `silent` says why it did not answer."""
+    """The states of the jobs in Slurm's queue, with the job's name `<array>_<task>` or `<job>` as key.
+
+    `silent` is the reason why Slurm did not answer, or None.
+    """
 
     states: dict[str, str]  # the state and, for a pending job, the reason
     silent: str | None = None
 
 
 def queue(jobs: Iterable[str]) -> Queue:
-    """Ask squeue once for the states of `jobs`; without jobs Slurm is not asked."""
+    """Return the states of `jobs` from one call of Slurm's squeue; without jobs, squeue is not called."""
     arrays = sorted({job.partition("_")[0] for job in jobs})
     if not arrays:
         return Queue({})
@@ -36,7 +39,10 @@ def queue(jobs: Iterable[str]) -> Queue:
 
 
 def endings(jobs: Iterable[str]) -> dict[str, str]:
-    """Ask sacct once how jobs ended, such as `OUT_OF_MEMORY` or `FAILED 9:0`; empty if there is no accounting."""
+    """Return how jobs ended, such as `OUT_OF_MEMORY` or `FAILED, exit 9:0`, from one call of Slurm's sacct.
+
+    The result is empty if Slurm keeps no accounts of jobs or does not answer.
+    """
     asked = set(jobs)
     arrays = ",".join(sorted({job.partition("_")[0] for job in asked}))
     if not arrays:
@@ -48,13 +54,13 @@ def endings(jobs: Iterable[str]) -> dict[str, str]:
     for line in done.stdout.splitlines():
         name, state, code = line.split("|")
         job, _, step = name.partition(".")
-        if job in asked and (not step or state == "OUT_OF_MEMORY"):  # the step knows of memory what its job does not
+        if job in asked and (not step or state == "OUT_OF_MEMORY"):  # only a job's step reports lack of memory
             found[job] = state if state == "OUT_OF_MEMORY" or code == "0:0" else f"{state}, exit {code}"
     return found
 
 
 def _ask(*command: str) -> subprocess.CompletedProcess[str] | str:
-    """Run a Slurm command; return its result, or a string that says why there is none."""
+    """Run a Slurm command, and return its result or a text that says why there is none."""
     if shutil.which(command[0]) is None:
         return f"{command[0]} is not on this machine"
     try:

@@ -1,4 +1,4 @@
-"""Decide the state of every run of an experiment from its plans, the traces of its runs and Slurm's queue."""
+"""Determine the state of every run of an experiment, from its plans, the files of its runs and Slurm's queue."""
 
 import re
 import socket
@@ -23,7 +23,7 @@ EFFECT = re.compile(r"\bexited with exit code|\bexit code \d+$", re.IGNORECASE) 
 
 @dataclass(frozen=True)
 class RunStatus:
-    """The state of one run."""
+    """The state of a run (done, running, queued, planned, failed or lost), with details such as the reason."""
 
     overrides: list[str]  # as in its record
     state: str  # one of STATES
@@ -38,7 +38,7 @@ class RunStatus:
 
 @dataclass
 class RequestedRun:
-    """A run that a command requested, with the newest plan that lists the run."""
+    """A run that a command requested, with the newest plan of a sweep that lists the run."""
 
     overrides: list[str]  # all of them, as Hydra launches it
     plan: Plan
@@ -49,7 +49,7 @@ class RequestedRun:
 
 @dataclass
 class Experiment:
-    """The plans, traces and queue of an experiment at one moment."""
+    """The plans of an experiment's sweeps, the files of its runs and Slurm's queue, all read at one time."""
 
     folder: Path
     requested: dict[Identity, RequestedRun] = field(default_factory=dict)
@@ -58,8 +58,8 @@ class Experiment:
 
 
 def read(folder: Path) -> Experiment:
-    """Read the plans and traces of an experiment, and ask Slurm once for the jobs that they name."""
-    # An experiment may name parts of itself, as +exp=tuning +trial=fast does: results/tuning.fast
+    """Read the plans and the run files of an experiment, and ask Slurm once for the jobs that they name."""
+    # An experiment may have parts in other folders: +exp=tuning +trial=fast writes to results/tuning.fast.
     parts = [folder, *sorted(folder.parent.glob(f"{folder.name}.*"))]
     found = Experiment(folder)
     for path in plan.find(folder):
@@ -77,12 +77,12 @@ def read(folder: Path) -> Experiment:
 
 
 def status(experiment: Experiment) -> list[RunStatus]:
-    """Return the state of every requested run, and of every run that left a trace without a plan."""
+    """Return the state of every run that a sweep requested, and of every other run that left a file."""
     known = {**dict.fromkeys(experiment.requested), **dict.fromkeys(experiment.traces.outcomes),
              **dict.fromkeys(experiment.traces.progress)}  # fmt: skip
     judged = {one: _judge(experiment, one) for one in known}
     kept = {run.record for one, run in judged.items() if one in experiment.requested and run.record is not None}
-    # A run whose record has other overrides than the request is not a second run.
+    # A requested run may have a record with other overrides; such a record is not counted as a second run.
     judged = {one: run for one, run in judged.items() if one in experiment.requested or run.record not in kept}
     lost = {run.job for run in judged.values() if run.state == "lost" and run.job}
     endings = slurm.endings(lost)
@@ -90,12 +90,16 @@ def status(experiment: Experiment) -> list[RunStatus]:
 
 
 def _judge(experiment: Experiment, one: Identity) -> RunStatus:
-    """Decide the state of a run by the first that exists: a live process, its record, the queue, the plan."""
+    """Determine the state of a run.
+
+    The first of these that exists decides: its live process, its record, its job in Slurm's queue, and a command that
+    can still start the run. Otherwise the run failed or is lost.
+    """
     requested = experiment.requested.get(one)
     _, progress = experiment.traces.progress.get(one, (None, None))
     outcome = experiment.traces.outcomes.get(one) or _kept(experiment, requested)
     if outcome and progress and progress.updated <= outcome.written:
-        progress = None  # left over from before the record
+        progress = None  # the progress file is older than the record
     if progress:
         alive = _alive(progress, experiment.queue)
         if alive:
@@ -125,14 +129,17 @@ def _judge(experiment: Experiment, one: Identity) -> RunStatus:
 
 
 def _kept(experiment: Experiment, requested: RequestedRun | None) -> Outcome | None:
-    """Find the record of a run that was kept although other overrides made it, by the outcome that the sweep wrote."""
+    """Return the outcome of a requested run whose record was made with other overrides; None if there is none.
+
+    The sweep stored the path of this record when the run ended.
+    """
     if requested is None or requested.ended is None or requested.ended.record is None:
         return None
     return experiment.traces.by_path.get(experiment.folder.parent / requested.ended.record)
 
 
 def _alive(progress: Progress, queue: Queue) -> str | None:
-    """Return the state of a run with a progress file: `RUNNING`, or `PENDING` with a reason; None if it ended."""
+    """Return the state of a run that has a progress file: `RUNNING`, `PENDING` with a reason, or None if it ended."""
     if progress.job is None:
         return "RUNNING" if is_alive(progress) else None
     if queue.silent:
@@ -151,7 +158,7 @@ def _running(one: Identity, progress: Progress, alive: str) -> RunStatus:
 
 def _launching(requested: RequestedRun, queue: Queue) -> bool:
     """Tell whether the command that requested a run can still start it."""
-    if requested.job is not None:  # Slurm decides about it
+    if requested.job is not None:  # only Slurm can still start it
         return queue.silent is not None
     if requested.plan.host == socket.gethostname():
         return requested.plan.born is not None and born(requested.plan.pid) == requested.plan.born
@@ -159,7 +166,10 @@ def _launching(requested: RequestedRun, queue: Queue) -> bool:
 
 
 def _explained(experiment: Experiment, one: Identity, run: RunStatus, endings: dict[str, str]) -> RunStatus:
-    """Add to a Slurm run without a record how its job ended, and the line of its log that tells the cause."""
+    """Add to a failed or lost Slurm run how its job ended, and the line of its log that names the cause.
+
+    Other runs, and runs with a record, are returned unchanged.
+    """
     if run.state not in BROKEN or run.job is None or run.record is not None:
         return run
     parts = [run.reason or ""]
@@ -173,9 +183,11 @@ def _explained(experiment: Experiment, one: Identity, run: RunStatus, endings: d
 
 
 def _told(log: Path) -> str:
-    """Return the last line of a log that names a cause, else the last that reports an error, else the last one.
+    """Return the line of a log that best explains a failure.
 
-    If a log reports only an exit code, its first other line is returned, which is the shell's message.
+    This is the last line that names a cause, such as lack of memory. If there is none, it is the last line that reports
+    an error, or else the last line. If the log reports only an exit code, it is the first other line, which the shell
+    wrote.
     """
     if not log.is_file():  # reading a pipe would block
         return "(no log)"

@@ -1,4 +1,4 @@
-"""Do the run of a config that a sweep composed, in the process or job that the sweep chose."""
+"""Execute one run of a sweep from its composed config, in the process or job that the launcher chose."""
 
 import sys
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ from gsbench.process.memory import is_out_of_memory, too_little_address_space
 
 @dataclass(frozen=True)
 class Problem:
-    """Why a run did not end well."""
+    """The reason why a run did not end well, and whether the run was refused before it started."""
 
     reason: str
-    is_refused: bool  # whether the request cannot be run, so that nothing was run and nothing recorded
+    is_refused: bool  # whether the settings are invalid, so that nothing was run or recorded
 
 
 def do(composed: DictConfig) -> Problem | None:
-    """Do a run; return None, or why it did not end well, which is also printed on stderr."""
+    """Execute a run; return None if it ended well, otherwise the reason, which is also printed on stderr."""
     chosen = HydraConfig.get()
     if (too_little := too_little_address_space()) is not None:
         return _told(composed, Problem(f"out of memory: {too_little}", False))
@@ -36,7 +36,7 @@ def do(composed: DictConfig) -> Problem | None:
         problem = Problem(f"{record.status}: {record.reason}", False)
     except InputError as error:
         problem = Problem(str(error), not isinstance(error, UnrecordedError))
-    except MemoryError as error:  # not even a record fitted
+    except MemoryError as error:  # there was not enough memory to write a record
         problem = Problem(f"out of memory: {one_line(error)}", False)
     return _told(composed, problem)
 

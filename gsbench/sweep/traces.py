@@ -1,4 +1,4 @@
-"""Read the records and progress files that runs left in a folder, without composing a config."""
+"""Read the records and the progress files that runs left in a folder, without composing a Hydra config."""
 
 import json
 import os
@@ -18,10 +18,10 @@ from gsbench.sweep.plan import Identity, identity
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended, by its record."""
+    """The outcome of a run, read from its record."""
 
     path: Path
-    status: str  # as in the record; `failed` where the record is damaged
+    status: str  # as in the record; `failed` if the record is damaged
     reason: str | None
     psnr: float | None
     written: float  # unix seconds
@@ -29,7 +29,7 @@ class Outcome:
 
 @dataclass
 class Traces:
-    """The runs that left a trace."""
+    """The runs that left a record or a progress file."""
 
     outcomes: dict[Identity, Outcome] = field(default_factory=dict)
     by_path: dict[Path, Outcome] = field(default_factory=dict)
@@ -37,7 +37,7 @@ class Traces:
 
 
 def read(folders: list[Path]) -> Traces:
-    """Read every record and progress file in some folders; where a run has two, the newer one counts."""
+    """Read all run records and progress files in some folders; if a run has two of a kind, the newer one counts."""
     found = Traces()
     for path in _files(folders):
         if path.name == RECORD:
@@ -50,7 +50,7 @@ def read(folders: list[Path]) -> Traces:
             try:
                 one = progress.read(path)
             except InputError:
-                continue  # the run has ended and removed it just now, or it is damaged and the run looks lost
+                continue  # the run has just removed it, or it is damaged; then the run counts as lost
             of = identity(one.overrides)
             if of not in found.progress or found.progress[of][1].updated < one.updated:
                 found.progress[of] = path, one
@@ -58,7 +58,7 @@ def read(folders: list[Path]) -> Traces:
 
 
 def _files(folders: list[Path]) -> Iterator[Path]:
-    """Find the records and progress files, except in hidden folders and in those of published records."""
+    """Yield the paths of run records and progress files, except in hidden folders and in published results."""
     for folder in folders:
         for at, below, names in os.walk(folder):
             below[:] = sorted(name for name in below if not name.startswith(".") and name != PUBLISHED)
@@ -69,7 +69,10 @@ def _files(folders: list[Path]) -> Iterator[Path]:
 
 
 def _outcome(path: Path) -> tuple[list[str], Outcome]:
-    """Read from a record only what its status needs, which is much faster than to validate the whole record."""
+    """Read the overrides and the outcome of a run from its record.
+
+    This is much faster than reading and validating the whole record.
+    """
     written = path.stat().st_mtime
     try:
         plain: Any = json.loads(read_file(path, str(path), MAX_JSON))

@@ -1,1 +1,1 @@
-"""Show a model as a film, as files for other programs, and in a browser."""
+"""Show trained models in a browser, and export them as videos, images and files for other programs."""

@@ -11,7 +11,7 @@ from gsbench.errors import InputError, one_line
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Serve until Ctrl-C; return 0, or 2 with one line on stderr."""
+    """Run the viewer until Ctrl-C; return 0, or 2 after an error, which is printed on stderr in one line."""
     made = argparse.ArgumentParser(prog="python -m gsbench.view", description=__doc__)
     made.add_argument("runs", nargs="+", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
     made.add_argument("--host", default="localhost", help="the address to listen on (localhost: this machine only)")
@@ -35,11 +35,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def serve(options: argparse.Namespace) -> None:
-    """Load the runs and serve them.
+    """Load the models of the given runs, and show them in the viewer until the user ends it.
 
     Raises:
         InputError: viser is not installed, a folder has no checkpoint, or the runs are of different scenes.
-        KeyboardInterrupt: the user ends it.
+        KeyboardInterrupt: the user ends the viewer with Ctrl-C.
     """
     if importlib.util.find_spec("viser") is None:
         raise InputError("the viewer needs viser: pip install 'gsbench[view]'")

@@ -1,4 +1,4 @@
-"""Serve one browser of the viewer by a thread that renders its choices until it disconnects."""
+"""Serve one browser of the viewer: a thread renders what the browser requests until the browser disconnects."""
 
 import html
 import math
@@ -19,24 +19,24 @@ from gsbench.view.panel import comparison, cost_table, legend
 from gsbench.view.resolution import Resolution
 from gsbench.view.stages import RASTER, SLICE
 
-REST_S = 0.2  # without a change, after which a frame is rendered again with all pixels
-FRAME_S = 1 / 30  # least time between two frames while a clip is played
-QUALITY = {True: 75, False: 95}  # of the JPEG while something moves, and at rest
+REST_S = 0.2  # seconds without a change after which a frame is rendered with all pixels
+FRAME_S = 1 / 30  # seconds between two frames while the scene is played
+QUALITY = {True: 75, False: 95}  # JPEG quality while something moves (True) and at rest (False)
 
 
 class Client:
-    """One browser of the viewer. A browser has its own choices; all browsers share the models."""
+    """One browser of the viewer. Each browser has its own controls; all browsers share the models."""
 
     def __init__(
         self, client: viser.ClientHandle, renderers: Sequence[FrameRenderer], scene: Scene | str, most_cost: float
     ) -> None:
-        """Show the controls and begin to render.
+        """Show the controls in the browser and start the thread that renders.
 
         Args:
-            client: the browser, as viser has it.
-            renderers: the renderers of the models that can be shown, one or more of one scene.
+            client: viser's handle of the browser.
+            renderers: the renderers of the models that can be shown, at least one, all of one scene.
             scene: the scene with its training views, or a text that says why there are none.
-            most_cost: the nanoseconds of a Gaussian that is drawn in the brightest colour.
+            most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
         """
         self.client = client
         self.controls = Controls(client, renderers, scene)
@@ -52,16 +52,22 @@ class Client:
         self.changed.set()
 
     async def _move(self, _: viser.CameraHandle) -> None:
-        """Record a camera's move, in viser's own thread; for a plain function viser would start another thread."""
+        """Note that the camera has moved.
+
+        The method is async, because viser would call a plain function in another thread.
+        """
         self.changed.set()
 
     def leave(self) -> None:
-        """End the thread of a browser that is gone."""
+        """End the thread of a browser that has disconnected."""
         self.left = True
         self.changed.set()
 
     def _work(self) -> None:
-        """Render after each change of controls or camera, and in full when changes end, until the browser leaves."""
+        """Render a frame after each change of controls or camera, until the browser disconnects.
+
+        When the changes stop, the frame is rendered again with all pixels.
+        """
         while True:
             playing = self.controls.play.value
             changed = self.changed.wait(FRAME_S if playing else None if self.rests else REST_S)
@@ -69,7 +75,7 @@ class Client:
             if moving:
                 self.rests = False
             self.changed.clear()
-            if self.left:  # tested after the event is cleared: a later `leave` ends the next wait
+            if self.left:  # tested after `clear`, so that a later call of `leave` ends the next wait
                 return
             self.controls.advance()
             try:
@@ -81,7 +87,7 @@ class Client:
             self.rests = not moving
 
     def _show(self, moving: bool) -> None:
-        """Render a frame and send it to the browser with its cost and the legend of its colours."""
+        """Render a frame, and send it to the browser with its time and the legend of its colours."""
         camera, controls = self.client.camera, self.controls
         width, height = self.resolution.size(max(1, camera.image_width), max(1, camera.image_height), moving)
         frame = self._frame(width, height)
@@ -93,7 +99,7 @@ class Client:
             controls.legend.content = said
 
     def _frame(self, width: int, height: int) -> Frame:
-        """Render the one or two images that the controls request."""
+        """Render the image of one model, or an image that combines two models, as the controls say."""
         shown, mode = self.controls.shown(), self.controls.layout
         camera = self._camera(max(1, width // 2) if mode == SIDE else width, height)
         first, *others = [renderer.render(camera, self.controls.request(colours)) for renderer, colours in shown]
@@ -102,7 +108,7 @@ class Client:
         return beside(first, others[0]) if mode == SIDE else wiped(first, others[0], self.controls.wiped)
 
     def _compare(self) -> None:
-        """Show the training view nearest to the camera beside the models' renders of it, if the browser requests it."""
+        """Show the training view nearest to the camera, and the models' renders of it, if the browser requests this."""
         if self._views is None or not self.controls.compare.value:
             return
         nearest = self._views.nearest(self._camera(1, 1), self.controls.now)
@@ -112,17 +118,17 @@ class Client:
         self.controls.comparison.content = comparison(nearest, compared)
 
     def _camera(self, width: int, height: int) -> Camera:
-        """Return the browser's camera for an image of that size; the field of view is vertical."""
+        """Return the browser's camera for an image of the given size; the browser's field of view is vertical."""
         seen = self.client.camera
         return camera_at(np.asarray(seen.position), np.asarray(seen.wxyz), seen.fov, width, height)
 
 
 def camera_at(position: np.ndarray, wxyz: np.ndarray, fov: float, width: int, height: int) -> Camera:
-    """Return the camera of a pose in viser's convention.
+    """Return a camera for the pose and the field of view of a camera in viser.
 
     Args:
-        position: the camera's position [3], world units.
-        wxyz: quaternion of the rotation from the camera, in OpenCV axes, to the world.
+        position: the position of the camera [3], world units.
+        wxyz: quaternion of the rotation from camera axes (OpenCV convention) to world axes.
         fov: the vertical field of view, radians.
         width: width of the image, pixels.
         height: height of the image, pixels.

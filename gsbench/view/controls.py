@@ -1,4 +1,4 @@
-"""Show the controls of one browser of the viewer, and turn them into requests for frames."""
+"""Show the controls in one browser of the viewer, and turn their values into requests for frames."""
 
 import math
 import threading
@@ -15,36 +15,36 @@ from gsbench.scenes import Scene, View
 from gsbench.view.frame import CLASS, COLOURS, IMAGE, FrameRenderer, FrameRequest
 from gsbench.view.frusta import Frusta
 
-PLAYED_S = 4.0  # a clip takes that long
+PLAYED_S = 4.0  # seconds in which the time goes from 0 to 1
 ONE, SIDE, WIPE = "one image", "side by side", "wipe"
 NEAREST = "nearest training view"
-PANEL = {"x": 15.0, "y": -15.0, "width": 400.0}  # pixels: where it floats, from the left and from the bottom
+PANEL = {"x": 15.0, "y": -15.0, "width": 400.0}  # position in pixels from the left and the bottom
 
 
 class ShownImage(NamedTuple):
-    """One of the images on the screen."""
+    """An image on the screen: the model that it shows, and what the colours of its Gaussians mean."""
 
     renderer: FrameRenderer  # of the model
     colours: str  # the meaning of its Gaussians' colours
 
 
 class Controls:
-    """The choices of one browser. The event `changed` is set whenever a choice changes."""
+    """The controls of one browser; the event `changed` is set whenever the user changes one."""
 
     def __init__(self, client: viser.ClientHandle, renderers: Sequence[FrameRenderer], scene: Scene | str) -> None:
-        """Show the controls.
+        """Show the controls in the browser.
 
         Args:
-            client: the browser, as viser has it.
-            renderers: the renderers of the models that can be shown, one or more of one scene.
+            client: viser's handle of the browser.
+            renderers: the renderers of the models that can be shown, at least one, all of one scene.
             scene: the scene with its training views, or a text that says why there are none.
         """
         self.client = client
         self.changed = threading.Event()
         self._renderers = {renderer.name: renderer for renderer in renderers}
         self._has_time = renderers[0].run.scene.has_time
-        self._frozen: torch.Tensor | None = None  # the place that slices are seen from
-        self._held: float | None = None  # the time that slices are of
+        self._frozen: torch.Tensor | None = None  # viewpoint for which Gaussians are computed; None: the camera
+        self._held: float | None = None  # time for which Gaussians are computed; None: the slider's
         self._played_at = time.monotonic()
         self.costs = client.gui.add_html("")
         self._add_time()
@@ -53,7 +53,7 @@ class Controls:
         self._add_views(scene)
 
     def _add_time(self) -> None:
-        """Add the slider of time, and the box that moves it."""
+        """Add a slider for the time, and a check box that plays the scene."""
         gui = self.client.gui
         self.time = gui.add_slider("time", 0.0, 1.0, 0.005, 0.0, disabled=not self._has_time)
         self.play = gui.add_checkbox("play", False, disabled=not self._has_time)
@@ -61,7 +61,7 @@ class Controls:
         self.play.on_update(self._start_clock)
 
     def _add_effects(self) -> None:
-        """Add the controls that switch the effects of the models off, one by one."""
+        """Add controls that switch off effects of the models: time, view direction and AGR (neural refinement)."""
         gui, renderers = self.client.gui, self._renderers.values()
         degree = max(renderer.trained_active.sh_degree for renderer in renderers)
         with gui.add_folder("effects"):
@@ -76,7 +76,7 @@ class Controls:
         freeze.on_update(lambda _: self._freeze(freeze.value))
 
     def _add_images(self) -> None:
-        """Add the controls that choose the models, and the meaning of their Gaussians' colours."""
+        """Add controls that select the models, and that select what the colours of their Gaussians mean."""
         gui, names = self.client.gui, list(self._renderers)
         several = len(names) > 1
         self.mode = gui.add_dropdown("show", (ONE, SIDE, WIPE))
@@ -99,7 +99,7 @@ class Controls:
             control.on_update(self._change)
 
     def _add_views(self, scene: Scene | str) -> None:
-        """Add the controls that show the training views, where the data set is present."""
+        """Add controls that show the training views; they are disabled if the data set is not available."""
         gui, why = self.client.gui, scene if isinstance(scene, str) else None
         frusta = gui.add_checkbox("training cameras", False, disabled=why is not None,
                                   hint=why or "click on one to stand there")  # fmt: skip
@@ -126,12 +126,12 @@ class Controls:
         self.changed.set()
 
     def _hold(self, on: bool) -> None:
-        """Hold the time of the shown Gaussians, or let the slider change it."""
+        """Keep showing the Gaussians of the present time, or let the time slider change them again."""
         self._held = self.now if on else None
         self.changed.set()
 
     def _freeze(self, on: bool) -> None:
-        """Hold the viewpoint from which Gaussians are computed, or let it follow the camera."""
+        """Keep showing the Gaussians computed for the present viewpoint, or let them follow the camera again."""
         position = torch.tensor(np.asarray(self.client.camera.position), dtype=torch.float32)
         self._frozen = position if on else None
         self.changed.set()
@@ -141,7 +141,7 @@ class Controls:
         self.changed.set()
 
     def _go_to(self, position: npt.NDArray[np.float64], wxyz: npt.NDArray[np.float64], time: float | None) -> None:
-        """Move to the pose and the time of a training camera."""
+        """Move the browser's camera and time to those of a training view."""
         with self.client.atomic():
             self.client.camera.position, self.client.camera.wxyz = position, wxyz
         if time is not None:
@@ -149,7 +149,7 @@ class Controls:
         self.changed.set()
 
     def advance(self) -> None:
-        """Advance the time slider while a clip is played."""
+        """Move the time slider forward while the scene is played."""
         now = time.monotonic()
         if self.play.value:
             on = (now - self._played_at) / PLAYED_S
@@ -165,16 +165,16 @@ class Controls:
 
     @property
     def wiped(self) -> float:
-        """Return the part of the width that the first image has in a wipe, in [0, 1]."""
+        """Return the fraction of the image width, in [0, 1], at which a wipe between two images has its edge."""
         return _within(self.wipe.value, 0.0, 1.0)
 
     @property
     def layout(self) -> str:
-        """Return the arrangement of the images: ONE, SIDE or WIPE."""
+        """Return the layout of the images: one image, two side by side, or a wipe between two."""
         return self.mode.value if self.mode.value in (SIDE, WIPE) else ONE
 
     def shown(self) -> list[ShownImage]:
-        """Return the one or two images that are shown."""
+        """Return the one or two images that the browser shows."""
         choices = self._choices[:1] if self.layout == ONE else self._choices
         first = next(iter(self._renderers.values()))
         return [
@@ -183,11 +183,11 @@ class Controls:
         ]
 
     def request(self, colours: str) -> FrameRequest:
-        """Return the request for a frame by the present choices, with Gaussians in the given colours."""
+        """Return the request for a frame with the present time and effects, and with Gaussians in the given colours."""
         return self._request_at(self.now, colours)
 
     def request_of(self, view: View) -> FrameRequest:
-        """Return the request for a frame at a training view: the same effects at the view's own time."""
+        """Return the request for a frame at the time of a training view, with the effects that are switched on."""
         return self._request_at(view.time, IMAGE)
 
     def _request_at(self, time: float | None, colours: str) -> FrameRequest:
@@ -199,5 +199,5 @@ class Controls:
 
 
 def _within(value: float, low: float, high: float) -> float:
-    """Return the nearest number in [low, high]; low for NaN."""
+    """Clamp a value to [low, high]; NaN becomes low."""
     return low if math.isnan(value) else min(max(value, low), high)

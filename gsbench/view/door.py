@@ -1,6 +1,6 @@
-"""Guard the viewer's port: refuse requests from other sites, and drop messages that the viewer's page never sends.
+"""Guard the port of the viewer: refuse requests from other web sites, and drop messages that its page never sends.
 
-viser listens by `websockets` but does not pass on the options that this needs. `Door.guard` sets them.
+viser listens with the library `websockets` but cannot pass on the options that this needs. `Door.guard` sets them.
 """
 
 import asyncio
@@ -25,9 +25,9 @@ from websockets.http11 import Request, Response
 
 from gsbench.errors import InputError, one_line
 
-MOST_BROWSERS = 16  # at once; each has a thread that renders for it
-MOST_BYTES = 4096  # of a message; those of the page have some 300
-MOST_PORTS = 1000  # that are tried
+MOST_BROWSERS = 16  # connected at once; each has a thread that renders for it
+MOST_BYTES = 4096  # of a message; messages of the page have about 300
+MOST_PORTS = 1000  # ports that are tried
 FURTHEST = 1e9  # world units from the origin
 MOST_PIXELS = 16384  # of a side of a browser's window
 FIELDS_OF_VIEW = 0.01, 3.1  # radians
@@ -37,7 +37,7 @@ Answer = Response | None | Awaitable[Response | None]
 
 
 class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
-    """The pose of a browser's camera, as viser's page sends it."""
+    """The message with the pose of a browser's camera, as viser's page sends it."""
 
     wxyz: tuple[float, float, float, float]
     position: Three
@@ -50,10 +50,10 @@ class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
     up_direction: Three
 
     def is_usable(self) -> bool:
-        """Tell whether an image can be rendered from this pose."""
+        """Tell whether an image can be rendered from this camera pose."""
         lengths = (*self.position, *self.look_at, *self.up_direction)
         return (
-            all(abs(length) <= FURTHEST for length in lengths)  # which NaN is not
+            all(abs(length) <= FURTHEST for length in lengths)  # false for NaN
             and 0.9 < math.hypot(*self.wxyz) < 1.1
             and FIELDS_OF_VIEW[0] <= self.fov <= FIELDS_OF_VIEW[1]
             and all(0 <= pixels <= MOST_PIXELS for pixels in (self.image_width, self.image_height))
@@ -61,13 +61,13 @@ class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
 
 
 class Values(msgspec.Struct, forbid_unknown_fields=True):
-    """The only property of a control that a browser may change: its value."""
+    """The property of a control that a browser may change: its value."""
 
     value: bool | int | float | str
 
 
 class GuiUpdateMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
-    """A change of a control. `gsbench.view.controls` decides which values it may have."""
+    """The message that the user has changed a control; `gsbench.view.controls` checks the value."""
 
     uuid: str
     updates: Values
@@ -78,7 +78,7 @@ class GuiUpdateMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
 
 
 class SceneNodeClickMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
-    """A click on a training camera."""
+    """The message that the user has clicked on the frustum of a training camera."""
 
     name: str
     instance_index: int | None
@@ -89,7 +89,7 @@ class SceneNodeClickMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True
     owner: str = ""
 
     def is_usable(self) -> bool:
-        """Return True: only the name of the message is read."""
+        """Return True, because the values of this message are not used."""
         return True
 
 
@@ -97,7 +97,7 @@ KNOWN = msgspec.msgpack.Decoder(ViewerCameraMessage | GuiUpdateMessage | SceneNo
 
 
 def is_known(message: object) -> bool:
-    """Tell whether a message is one that the viewer's page sends, with usable values."""
+    """Tell whether a message is one that the viewer's page sends, and whether its values can be used."""
     if not isinstance(message, bytes):
         return False
     try:
@@ -107,29 +107,29 @@ def is_known(message: object) -> bool:
 
 
 class Connection(ServerConnection):
-    """A browser's connection that passes only known messages; other messages could stop viser or fill its memory."""
+    """A browser's connection that passes only known messages; others could stop viser or fill its memory."""
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """Wait for the next known message."""
+        """Wait for the next message that the viewer's page may send; drop all others."""
         while not is_known(message := await super().recv(decode)):
             pass
         return message
 
 
 class Door:
-    """A port to listen on, and the host names that a browser may use for it."""
+    """The port on which the viewer listens, and the host names by which a browser may reach it."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Find a free port.
+        """Find a free port for the viewer.
 
         Args:
             host: the address or the name to listen on.
             port: the first port to try.
 
         Raises:
-            InputError: the host cannot be listened on, or no port is free.
+            InputError: it is not possible to listen on this host, or no port is free.
         """
-        with ThreadPoolExecutor(1) as pool:  # in a notebook this thread has a loop of its own
+        with ThreadPoolExecutor(1) as pool:  # a notebook has an event loop in the main thread
             addresses, self.port = pool.submit(asyncio.run, _free(host, port)).result()
         self._hosts = {host.lower(), *addresses}
         self._is_open = any(ipaddress.ip_address(address).is_unspecified for address in addresses)
@@ -139,13 +139,15 @@ class Door:
 
     @contextmanager
     def guard(self) -> Iterator[None]:
-        """Guard a viser server that is started in this block.
+        """Guard a viser server that is started inside this context.
 
-        viser's thread looks up `websockets.asyncio.server.serve` while its constructor waits for it, and viser has no
-        option for it. So the name is replaced in this block. It is the only place where gsbench changes a library.
+        viser has no option for a check of requests. It looks up the function `websockets.asyncio.server.serve` when its
+        server starts. This context replaces that function by one with the check, and restores it at the end. It is the
+        only place where gsbench changes another library.
 
         Raises:
-            InputError: this version of viser listens in another way, so it would accept requests of every page.
+            InputError: this version of viser does not use that function, so its server would accept requests from any
+                page.
         """
         original = websockets_server.serve
 
@@ -168,10 +170,10 @@ class Door:
             raise InputError("expected a viser that the viewer can guard, such as 1.1.1, got another one: install that")
 
     def admits(self, headers: Headers) -> bool:
-        """Tell whether a request is for this server and from its own page.
+        """Tell whether a request is for this server and comes from its own page.
 
-        A page of another site has another `Origin`. A page whose host name resolves to this machine's address ("DNS
-        rebinding") has that name as `Host`.
+        The page of another site has another `Origin` header. In an attack by "DNS rebinding", the attacker's host name
+        resolves to this machine's address; such a request has that name in its `Host` header.
         """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
@@ -180,7 +182,7 @@ class Door:
         return all(origin.lower() in (f"http://{own}", f"https://{own}") for origin in origins)
 
     def _is_ours(self, host: str) -> bool:
-        """Tell whether `host`, perhaps with a port, is a name of this server; ports differ behind a tunnel."""
+        """Tell whether `host`, with or without a port, is a name of this server; the port may be that of a tunnel."""
         try:
             parts = urlsplit(f"//{host}")
             name = parts.hostname or ""
@@ -195,7 +197,7 @@ class Door:
         return address.is_loopback or self._is_open or name in self._hosts
 
     def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the response to a refused request; None if the request is admitted."""
+        """Return the HTTP response to a request that is refused; None if the request is admitted."""
         if not self.admits(request.headers):
             return _answer(HTTPStatus.FORBIDDEN, "a viewer of gsbench answers its own page alone: see --host")
         if request.headers.get_all("Upgrade") and len(connection.server.connections) >= MOST_BROWSERS:
@@ -204,7 +206,7 @@ class Door:
 
 
 async def _free(host: str, port: int) -> tuple[list[str], int]:
-    """Return the addresses of a host name here, and the first port that is free on all of them."""
+    """Return the addresses of a host name on this machine, and the first port that is free on all of them."""
     asked = f"--host: expected an address or a name of this machine, such as localhost, got {host[:100]!a}"
     if not host or "\0" in host:
         raise InputError(asked)
@@ -212,7 +214,7 @@ async def _free(host: str, port: int) -> tuple[list[str], int]:
     for tried in range(port, min(port + MOST_PORTS, 65536)):
         try:
             server = await loop.create_server(asyncio.Protocol, host, tried)
-        except (OSError, ValueError) as error:  # ValueError: no name at all
+        except (OSError, ValueError) as error:  # ValueError: not a valid name
             if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
                 continue
             raise InputError(f"{asked}, port {tried}: {one_line(error)}") from None
@@ -224,12 +226,12 @@ async def _free(host: str, port: int) -> tuple[list[str], int]:
 
 
 def _answer(status: HTTPStatus, text: str) -> Response:
-    """Write a response of one line."""
+    """Return an HTTP response with one line of text."""
     return Response(status, status.phrase, Headers({"Content-Type": "text/plain"}), f"{text}\n".encode())
 
 
 def _silent() -> logging.Logger:
-    """Return a silent logger for `websockets`, which else writes a stack trace for every peer without HTTP."""
+    """Return a silent logger for `websockets`, which otherwise prints a traceback if a client does not speak HTTP."""
     logger = logging.getLogger("gsbench.view.door")
     logger.propagate = False
     logger.addHandler(logging.NullHandler())
@@ -237,7 +239,7 @@ def _silent() -> logging.Logger:
 
 
 def _say(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Print an error of viser's thread in one line: a value that a control cannot have, or no free file handle."""
+    """Print an error in viser's thread as one line, for example if a control gets an invalid value."""
     error = context.get("exception")
     said = f"{type(error).__name__}: {one_line(error)}" if error else context["message"]
     print(f"gsbench.view: a browser's message or connection was dropped: {said}", file=sys.stderr)

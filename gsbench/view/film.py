@@ -1,4 +1,4 @@
-"""Write the renders of a model along a path of cameras as a video, or as a PNG for each frame."""
+"""Render a model along a path of cameras, and write the frames as a video or as PNG files."""
 
 import os
 import secrets
@@ -19,7 +19,10 @@ CODEC = "vp09"  # VP9, which browsers play; the encoder comes with OpenCV's whee
 
 
 def frames(run: LoadedRun, shots: list[Shot]) -> Generator[Pixels, None, None]:
-    """Render shots one after the other as uint8 [H, W, 3] RGB, with a bar on stderr."""
+    """Yield rendered images, one for each shot (a camera and a time), as uint8 [H, W, 3] RGB.
+
+    A progress bar is shown on stderr.
+    """
     background = torch.tensor(run.scene.background).to(run.config.device)
     with torch.inference_mode(), tqdm(shots, desc=run.scene.name, unit="frame") as bar:
         for camera, time in bar:
@@ -28,10 +31,10 @@ def frames(run: LoadedRun, shots: list[Shot]) -> Generator[Pixels, None, None]:
 
 
 def write_video(images: Iterable[Pixels], path: Path, fps: float) -> None:
-    """Write images of one size as a video; after an error, `path` is unchanged.
+    """Write images of one size as a video; if this fails, an existing file at `path` is unchanged.
 
     Raises:
-        InputError: the folder is not there, or OpenCV cannot write such a file.
+        InputError: the folder does not exist, or OpenCV cannot write this kind of file.
     """
     check_parent(path)
     part = path.with_name(f".{secrets.token_hex(4)}.part{path.suffix}")
@@ -52,7 +55,7 @@ def write_video(images: Iterable[Pixels], path: Path, fps: float) -> None:
 
 
 def write_images(images: Iterable[Pixels], folder: Path) -> None:
-    """Write images as 0000.png, 0001.png, .. into a folder, which is made if its parent exists.
+    """Write images as 0000.png, 0001.png and so on into a folder, which is made if its parent exists.
 
     Raises:
         InputError: the parent folder does not exist.

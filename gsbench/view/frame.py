@@ -1,4 +1,4 @@
-"""Render and time one frame of the viewer: one model as a browser's controls request it, or two models in one image."""
+"""Render and time one frame of the viewer: one model as the browser requests it, or two models in one image."""
 
 import threading
 from dataclasses import replace
@@ -18,32 +18,32 @@ from gsbench.view.stages import RASTER, SLICE, StageWatch, part_of
 
 DIVIDER = (255, 255, 255)  # RGB of the line between two models
 IMAGE, CLASS, COST = COLOURS = ("image", "class", "cost")  # meanings of the Gaussians' colours
-EVERY_DEGREE = 3  # of the harmonics
+EVERY_DEGREE = 3  # the highest SH degree of any model
 
 
 class FrameRequest(NamedTuple):
-    """The request for a frame of a model, without its camera."""
+    """The settings of a frame that a browser requests, apart from the camera: the time, the effects and the colours."""
 
-    time: float | None  # in [0, 1]; None where the scene has none
-    center: torch.Tensor | None = None  # [3] the viewpoint of the slice; None: that of the camera
-    agr: bool = True  # whether AGR acts, in a model that has it
-    sh_degree: int = EVERY_DEGREE  # of the harmonics, at most
+    time: float | None  # in [0, 1]; None if the scene is static
+    center: torch.Tensor | None = None  # [3], viewpoint for which Gaussians are computed; None: the camera's
+    agr: bool = True  # whether AGR (neural refinement) is on, if the model has it
+    sh_degree: int = EVERY_DEGREE  # highest SH degree of the colours
     colours: str = IMAGE
 
 
 class FrameCost(NamedTuple):
-    """The milliseconds of a frame of one model."""
+    """The milliseconds that one model takes for a frame, by stage."""
 
     name: str  # of the model
     ms: dict[str, float]  # by stage, in their order
 
     def of(self, part: str) -> float:
-        """Return the milliseconds of a frame's slicing or of its rasterization."""
+        """Return the milliseconds of slicing (which computes the conditional Gaussians) or of rasterization."""
         return sum(ms for stage, ms in self.ms.items() if part_of(stage) == part)
 
 
 class Frame(NamedTuple):
-    """A rendered image and its cost."""
+    """A rendered image, and the milliseconds that each model in it took."""
 
     image: Pixels  # [H, W, 3] RGB
     costs: tuple[FrameCost, ...]  # of each model in it
@@ -54,38 +54,46 @@ class Frame(NamedTuple):
 
 
 class FrameRenderer:
-    """Renders the frames of one run. It sets the model's effects for each frame, so it renders one frame at a time."""
+    """Renders the frames of one run's model, one frame at a time.
+
+    The renderer switches effects of the model, such as the neural refinement, on and off for each frame. Therefore it
+    cannot render two frames at once.
+    """
 
     def __init__(self, run: LoadedRun, most_cost: float) -> None:
-        """Take a run; nothing is rendered yet.
+        """Prepare to render the model of a run; nothing is rendered yet.
 
         Args:
             run: the run with the model to render.
-            most_cost: the nanoseconds of a Gaussian that is drawn in the brightest colour, the same for all compared
-                models.
+            most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
+                The value is the same for all models that are compared.
         """
         self.run = run
         self.name = f"{run.folder.parent.name} {run.folder.name}"  # such as "7dgs seed0"
         self.trained_active = run.model.active
         self.has_agr = run.model.refinement is not None
-        self.counts = run.model.count_by_effects()  # of Gaussians, by effect set
+        self.counts = run.model.count_by_effects()  # number of Gaussians by the set of their effects
         background = torch.tensor(run.scene.background).to(run.config.device)
         self._backgrounds = {IMAGE: background, CLASS: torch.ones_like(background), COST: torch.zeros_like(background)}
         self._colors = {CLASS: effect_set_colors(run.model), COST: cost_colors(run.model, most_cost)}
         self._lock = threading.Lock()
 
     def render(self, camera: Camera, request: FrameRequest) -> Frame:
-        """Render the image of a camera; raises InputError for an invalid camera."""
+        """Render the image of a camera, and return it with its milliseconds.
+
+        Raises:
+            InputError: the camera is not valid.
+        """
         image, ms = self._timed_image(camera, request)
         shown = inferno(image[..., 0].cpu().numpy()) if request.colours == COST else to_bytes(image.cpu().numpy())
         return Frame(shown, (FrameCost(self.name, ms),))
 
     def image(self, camera: Camera, request: FrameRequest) -> torch.Tensor:
-        """Render the image of a camera as floats, [H, W, 3], to be measured."""
+        """Render the image of a camera as floats, [H, W, 3], from which PSNR can be computed."""
         return self._timed_image(camera, request)[0].cpu()
 
     def _timed_image(self, camera: Camera, request: FrameRequest) -> tuple[torch.Tensor, dict[str, float]]:
-        """Render an image; return it with the milliseconds by stage."""
+        """Render the image of a camera, and return it with the milliseconds of each stage."""
         run, device = self.run, self.run.config.device
         camera = camera.to(device)
         center = camera.center if request.center is None else request.center.to(device)
@@ -102,7 +110,7 @@ class FrameRenderer:
             return image[0], watch.ms
 
     def _active(self, request: FrameRequest) -> ActiveComponents:
-        """Return the model's active components (such as AGR), without those that the controls switch off."""
+        """Return the active parts of the model, such as neural refinement, without those that the user switches off."""
         trained = self.trained_active
         degree = min(request.sh_degree, trained.sh_degree)
         return replace(trained, refine=request.agr and trained.refine, sh_degree=degree)
@@ -116,7 +124,7 @@ def beside(left: Frame, right: Frame) -> Frame:
 
 
 def wiped(left: Frame, right: Frame, part: float) -> Frame:
-    """Show the left `part` in [0, 1] of one frame and the rest of another one of the same size."""
+    """Combine two frames of the same size: `left` up to the fraction `part` of the width, and `right` beyond it."""
     image, edge = right.image.copy(), round(part * right.image.shape[1])
     image[:, :edge] = left.image[:, :edge]
     if 0 < edge < image.shape[1]:

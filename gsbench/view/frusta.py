@@ -1,4 +1,4 @@
-"""Show training cameras as frusta with their images, in one browser of the viewer."""
+"""Show the training cameras as frusta with their images, in one browser of the viewer."""
 
 from collections.abc import Callable
 
@@ -12,29 +12,29 @@ from gsbench.measure.images import to_bytes
 from gsbench.measure.quality import evenly
 from gsbench.scenes import Scene, View
 
-MOST = 100  # frusta; evenly spaced among the training views where there are more
+MOST = 100  # frusta; if there are more training views, evenly spaced ones are shown
 THUMBNAIL = 96  # pixels of the longer side
-SIZE = 0.06  # of a frustum, extents
+SIZE = 0.06  # of a frustum, in scene extents
 
 GoTo = Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64], float | None], None]
 
 
 class Frusta:
-    """The frusta of a scene in one browser; they are made when they are first shown."""
+    """The frusta of a scene's training cameras in one browser; they are made when they are first shown."""
 
     def __init__(self, client: viser.ClientHandle, scene: Scene, go_to: GoTo) -> None:
-        """Prepare the frusta.
+        """Store the scene; the frusta are made when they are first shown.
 
         Args:
-            client: the browser, as viser has it.
+            client: viser's handle of the browser.
             scene: the scene whose training views are shown.
-            go_to: the function to call when a frustum is clicked on, with its position, quaternion and time.
+            go_to: the function to call with the position, quaternion and time of a frustum that the user clicks on.
         """
         self.client, self.scene, self.go_to = client, scene, go_to
         self.handles: list[viser.CameraFrustumHandle] = []
 
     def show(self, visible: bool) -> None:
-        """Show or hide all frusta."""
+        """Show or hide the frusta of all training cameras."""
         if visible and not self.handles:
             views = evenly(self.scene.train, min(MOST, len(self.scene.train)))
             self.handles = [self._add(i, view) for i, view in enumerate(views)]
@@ -42,7 +42,7 @@ class Frusta:
             handle.visible = visible
 
     def _add(self, number: int, view: View) -> viser.CameraFrustumHandle:
-        """Add the frustum of a view."""
+        """Add the frustum of a training view to the viewer."""
         camera = view.to("cpu").camera
         xyzw = Rotation.from_matrix(camera.viewmat[:3, :3].T.double().numpy()).as_quat()
         wxyz, position = np.roll(xyzw, 1), camera.center.double().numpy()
@@ -61,7 +61,7 @@ class Frusta:
 
 
 def thumbnail(view: View) -> npt.NDArray[np.uint8]:
-    """Return a view's image as uint8 [H, W, 3] RGB, made smaller where it is large."""
+    """Return the image of a view as uint8 [H, W, 3] RGB, reduced to THUMBNAIL pixels on its longer side."""
     image = to_bytes(view.image.cpu().numpy())
     factor = THUMBNAIL / max(image.shape[:2])
     if factor >= 1:

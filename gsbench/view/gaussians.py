@@ -1,4 +1,4 @@
-"""Convert the 3D Gaussians of a model at a camera and a time to the form in which 3DGS stores trained Gaussians."""
+"""Convert a model, at a camera centre and a time, to 3D Gaussians in the format of trained 3DGS models."""
 
 import math
 
@@ -14,22 +14,22 @@ from gsbench.models.query import Query
 from gsbench.scenes.points import SH_C0
 from gsbench.scenes.trained import TrainedGaussians
 
-LEAST_SCALE = 1e-20  # world units; a slice that is flat to the last bit still has a logarithm
+LEAST_SCALE = 1e-20  # world units; keeps the logarithm of a zero scale finite
 LARGEST_OPACITY = 1 - 2**-24  # the largest float32 below 1, whose logit is finite
 
 
 def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = False) -> TrainedGaussians:
-    """Slice a model and return the Gaussians that are drawn: those that are not culled by their opacity.
+    """Compute a model's 3D Gaussians at a viewpoint and a time, and return those with enough opacity to be drawn.
 
     Args:
         model: the initialised model.
-        query: the viewpoint and the time at which to slice.
-        keep_harmonics: whether colours stay harmonics of the direction; else each colour is the one seen from the
-            query's viewpoint, as a harmonic of degree 0.
+        query: the viewpoint and the time at which to compute the Gaussians (a slice of the model).
+        keep_harmonics: whether colours stay spherical harmonics of the view direction. Otherwise each Gaussian has the
+            constant colour that is seen from the query's viewpoint.
 
     Raises:
-        InputError: harmonics are requested but the model's geometry or colours depend on the viewpoint; the slice has
-            shapes; or no Gaussian is left, or one is not finite.
+        InputError: spherical harmonics are requested from a model whose geometry or colours depend on the viewpoint in
+            another way, the slice has shapes other than Gaussians, no Gaussian is drawn, or one is not finite.
     """
     if keep_harmonics and not has_harmonics(model):
         raise InputError(f"expected --camera I or --direction X,Y,Z: a slice of {type(model).__name__} depends on it")
@@ -39,7 +39,7 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
             raise InputError(f"PLY: expected a slice without shapes, got one of {type(model).__name__} that has them: "
                              f"3DGS' PLY has no field for them; export images or a video")  # fmt: skip
         means, factors, opacities, colors = (part.detach().cpu() for part in tensors_of(seen))
-        drawn = opacities >= ALPHA_MIN  # the rasterizer skips an alpha below it, and no alpha is above the opacity
+        drawn = opacities >= ALPHA_MIN  # the rasterizer skips smaller alphas, and alpha is at most the opacity
         if not drawn.any():
             raise InputError("no Gaussian can be seen at this time and from this place: choose others")
         sh = harmonics_at(model, query).cpu()[drawn] if keep_harmonics else (colors[drawn, None] - 0.5) / SH_C0
@@ -51,9 +51,9 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
 
 
 def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:
-    """Decompose covariances F F^T = R S^2 R^T: ln S [N, 3] and the quaternions wxyz [N, 4] of the rotations R.
+    """Decompose covariances F F^T = R S^2 R^T into ln S [N, 3] and the quaternions wxyz [N, 4] of the rotations R.
 
-    The left singular vectors of F are the axes. If they are left-handed, one of them is negated.
+    The columns of R are the left singular vectors of F. If they are left-handed, one of them is negated.
     """
     axes, sizes, _ = torch.linalg.svd(factors.double())
     axes[:, :, 2] *= torch.where(torch.linalg.det(axes) < 0, -1.0, 1.0)[:, None]
@@ -62,13 +62,16 @@ def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def has_harmonics(model: GaussianModel) -> bool:
-    """Tell whether a slice of the model is the same from everywhere, and its colours are known harmonics."""
+    """Tell whether a model's geometry does not depend on view direction and its colours are spherical harmonics."""
     own = type(model).shade in (GaussianModel.shade, Gaussians4DModel.shade)
     return own and "direction" not in model.observes
 
 
 def harmonics_at(model: GaussianModel, query: Query) -> Tensor:
-    """Return the harmonics of the colours at a query's time, [N, K, 3]; those not yet in use are left out."""
+    """Return the spherical harmonics coefficients of the colours at a certain time, [N, K, 3].
+
+    Only the degrees that are in use are returned.
+    """
     used = (model.active.sh_degree + 1) ** 2
     sh0, shN = model.splats["sh0"], model.splats["shN"]
     if not isinstance(model, Gaussians4DModel):

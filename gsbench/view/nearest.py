@@ -1,4 +1,4 @@
-"""Compare the renders of models with the training view nearest to a camera, and show the errors."""
+"""Find the training view nearest to a camera, and compare it with the models' renders of this view."""
 
 import math
 from typing import NamedTuple
@@ -12,20 +12,20 @@ from gsbench.measure.quality import psnr, quantise
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view.frame import FrameRenderer, FrameRequest
 
-SAME = 1e-3  # extents and radians: views nearer to each other than this differ only in time
-MOST_WIDTH = 480  # pixels of an image that is shown; larger ones are made smaller
+SAME = 1e-3  # in extents plus radians; closer views count as the same viewpoint
+MOST_WIDTH = 480  # width in pixels to which larger images are reduced
 
 
 class Nearest(NamedTuple):
-    """A training view, and how far it is from a camera."""
+    """The training view nearest to a camera, with its distance and its angle from the camera."""
 
     view: View
     distance: float  # world units
-    degrees: float  # between the directions in which the two look
+    degrees: float  # angle between the view directions
 
 
 class ViewComparison(NamedTuple):
-    """A training view, a model's render of it, and the error."""
+    """The image of a training view, a model's render of it, the error image and the PSNR."""
 
     name: str  # of the model
     truth: Pixels  # [H, W, 3] RGB, as the others
@@ -35,10 +35,10 @@ class ViewComparison(NamedTuple):
 
 
 class TrainingViews:
-    """The training views of a scene, indexed by position and direction."""
+    """The training views of a scene, which can be searched by position and view direction."""
 
     def __init__(self, scene: Scene) -> None:
-        """Take a scene; no image is read."""
+        """Store the cameras and the times of a scene's training views; no image is read."""
         self._views, self._extent = scene.train, max(scene.extent, 1e-12)
         cameras = [view.camera.to("cpu") for view in scene.train]
         self._centers = torch.stack([camera.center for camera in cameras])  # [V, 3]
@@ -46,12 +46,12 @@ class TrainingViews:
         self._times = torch.tensor([view.time or 0.0 for view in scene.train])  # [V]
 
     def nearest(self, camera: Camera, time: float | None) -> Nearest:
-        """Find the view with the least sum of distance (in scene extents) and angle (radians).
+        """Return the training view with the smallest sum of distance (in scene extents) and angle (in radians).
 
-        If equal, the nearest in time.
+        If several views are about equally near, the view nearest in time is returned.
 
         Args:
-            camera: the camera to which the nearest view is searched.
+            camera: the camera for which the nearest view is searched.
             time: the time in [0, 1]; None if the scene has no time.
         """
         distances = (self._centers - camera.center).norm(dim=-1)
@@ -63,12 +63,12 @@ class TrainingViews:
 
 
 def compare(renderer: FrameRenderer, view: View, request: FrameRequest) -> ViewComparison:
-    """Render a view's camera and measure the image as the run was measured.
+    """Render a model from the camera of a training view, and compute the error as in the run's evaluation.
 
     Args:
         renderer: the renderer of the model.
         view: the training view to compare with.
-        request: what to render: the camera, the time and the effects that are on.
+        request: the time at which to render, and the effects that are on.
     """
     view = view.to("cpu")
     image = renderer.image(view.camera, request)
@@ -84,7 +84,7 @@ def compare(renderer: FrameRenderer, view: View, request: FrameRequest) -> ViewC
 
 
 def _small(image: Pixels) -> Pixels:
-    """Shrink an image that is wider than MOST_WIDTH."""
+    """Shrink an image to MOST_WIDTH pixels if it is wider."""
     height, width = image.shape[:2]
     if width <= MOST_WIDTH:
         return image

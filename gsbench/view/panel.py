@@ -1,4 +1,4 @@
-"""Write the HTML of the viewer's panel: a frame's milliseconds by stage, the legend, the errors against a view."""
+"""Write the HTML of the viewer's panel: milliseconds by stage, colour legend, and errors against a training view."""
 
 import base64
 import html
@@ -24,7 +24,7 @@ _BOX = "margin:0 1em 0.5em;font-size:0.75em;line-height:1.35;overflow-wrap:anywh
 
 
 def cost_table(costs: Sequence[FrameCost], width: int, height: int) -> str:
-    """Write the milliseconds of a frame: a column for each model, a row for each stage, and frames a second."""
+    """Write an HTML table of a frame's milliseconds: a column for each model, a row for each stage, and the FPS."""
     rows = [_row("ms", [cost.name for cost in costs], bold=True)]
     for part, stages in STAGES.items():
         rows.append(_row(part, [f"{cost.of(part):.1f}" for cost in costs], bold=True))
@@ -35,11 +35,11 @@ def cost_table(costs: Sequence[FrameCost], width: int, height: int) -> str:
 
 
 def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
-    """Write the legend of the Gaussians' colours if these show effects or costs instead of the models' own colours.
+    """Write the legend of the Gaussians' colours, if the colours stand for effects or costs; otherwise return "".
 
     Args:
         shown: the images on the screen.
-        most_cost: the nanoseconds of a Gaussian that is drawn in the brightest colour.
+        most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
     """
     text = ""
     if by_effect_set := {renderer.name: renderer.counts for renderer, colours in shown if colours == CLASS}:
@@ -57,7 +57,7 @@ def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
 
 
 def comparison(nearest: Nearest, compared: Sequence[ViewComparison]) -> str:
-    """Show a training view beside the models' renders of it, and their errors."""
+    """Write the HTML that shows a training view, the models' renders of this view, and their errors."""
     view = nearest.view
     when = "" if view.time is None else f", time {view.time:.2f}"
     away = f"{nearest.distance:.2f} world units and {nearest.degrees:.0f}° from here"
@@ -75,7 +75,7 @@ def _ms(cost: FrameCost, stage: str) -> str:
 
 
 def _row(label: str, values: Sequence[str], *, bold: bool = False, inside: bool = False, escaped: bool = False) -> str:
-    """Write a row of a table: a label, then a number for each model."""
+    """Write a row of an HTML table: a label, and then a number for each model."""
     weight = "font-weight:600;" if bold else ""
     indent = "padding-left:1em;" if inside else ""
     cells = "".join(f'<td style="{_NUMBER}">{html.escape(value)}</td>' for value in values)
@@ -91,14 +91,14 @@ def _box(content: str) -> str:
 
 
 def _gradient(low: str, high: str) -> str:
-    """Draw the scale of the inferno colours between two words."""
+    """Write the colour scale (inferno) in HTML, between a text for its low end and a text for its high end."""
     stops = ",".join(f"rgb{tuple(color)}" for color in inferno(np.linspace(0, 1, STOPS)[None])[0].tolist())
     bar = f'<span style="flex:1;height:0.8em;background:linear-gradient(to right,{stops})"></span>'
     return f'<div style="display:flex;gap:0.5em;align-items:center">{low}{bar}{html.escape(high)}</div>'
 
 
 def _image(image: npt.NDArray[np.uint8]) -> str:
-    """Embed an image as PNG at the full width of the panel; enlarged pixels stay sharp."""
+    """Embed an image as PNG in HTML at the full width of the panel; enlarged pixels stay sharp."""
     data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
     source = f"data:image/png;base64,{base64.b64encode(data).decode()}"
     return f'<img src="{source}" style="width:100%;display:block;image-rendering:pixelated">'

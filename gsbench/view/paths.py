@@ -1,6 +1,7 @@
-"""Compute the cameras of a film around a model: an orbit or a spiral about its middle, as large as its scene.
+"""Compute camera paths for a video of a model: an orbit or a spiral around its middle.
 
-A checkpoint holds no cameras. It holds the extent, which is about their distance, and the size of the images.
+A checkpoint contains no cameras, but it contains the image size and the scene extent. The cameras have a distance of
+one extent, which is about the distance of the training cameras.
 """
 
 import math
@@ -14,16 +15,16 @@ from gsbench.scenes import Camera
 
 UP = (0.0, 0.0, 1.0)  # of Blender's layout: D-NeRF, 7DGS-PBR, the embedded scenes
 ELEVATION = math.radians(25)  # of an orbit above the horizon
-HIGHEST = math.radians(60)  # where a spiral ends
+HIGHEST = math.radians(60)  # elevation at the end of a spiral
 TURNS = 2  # of a spiral
 FIELD_OF_VIEW = 0.69  # radians, horizontal; D-NeRF's camera_angle_x
-FAR_AWAY = 1e4  # extents; from there all directions are one to 1e-4
+FAR_AWAY = 1e4  # in scene extents; view directions then differ by at most about 1e-4 radians
 
 Shot = tuple[Camera, float | None]  # a frame of a film: its camera and its time
 
 
 def middle(model: GaussianModel) -> Tensor:
-    """Return the middle of a model, [3]: the median of its means, weighted by opacity."""
+    """Return the middle of a model, [3]: the median of the Gaussians' means, weighted by opacity."""
     means = model.splats["means"].detach().cpu()
     order = means.argsort(0)
     weights = torch.sigmoid(model.splats["opacities"].detach().cpu())[order].cumsum(0)  # [N, 3]
@@ -45,13 +46,16 @@ def look_at(eye: Tensor, target: Tensor) -> Tensor:
 
 
 def intrinsics(width: int, height: int) -> Tensor:
-    """Return K [3, 3] of an image of that size with this module's field of view."""
+    """Return the intrinsic matrix K [3, 3] for an image of the given size.
+
+    The horizontal field of view is 0.69 radians, as in D-NeRF.
+    """
     focal = width / 2 / math.tan(FIELD_OF_VIEW / 2)
     return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
 
 
 def around(run: LoadedRun, azimuth: float, elevation: float) -> Camera:
-    """Return a camera that looks at the middle of a model from the distance of its scene's cameras.
+    """Return a camera that looks at the middle of a model from a distance of one scene extent.
 
     Args:
         run: the run of the model.
@@ -66,16 +70,16 @@ def around(run: LoadedRun, azimuth: float, elevation: float) -> Camera:
 
 
 def orbit(run: LoadedRun, frames: int) -> list[Camera]:
-    """Return cameras that go once around a model; the last one does not repeat the first."""
+    """Return cameras on one full circle around a model; the last camera does not repeat the first."""
     return [around(run, 2 * math.pi * i / frames, ELEVATION) for i in range(frames)]
 
 
 def spiral(run: LoadedRun, frames: int) -> list[Camera]:
-    """Return cameras that go twice around a model and rise from the horizon."""
+    """Return cameras on a spiral that goes twice around a model and rises from the horizon."""
     parts = [i / max(1, frames - 1) for i in range(frames)]
     return [around(run, 2 * math.pi * TURNS * part, HIGHEST * part) for part in parts]
 
 
 def far_along(run: LoadedRun, direction: Tensor) -> Tensor:
-    """Return a viewpoint [3] so far away that all of a model is seen along `direction` [3]."""
+    """Return a viewpoint [3] that is so far away that all Gaussians are seen along the same `direction` [3]."""
     return middle(run.model) - FAR_AWAY * run.scene.extent * torch.nn.functional.normalize(direction, dim=0)

@@ -1,4 +1,7 @@
-"""Time the stages of a frame: AGR, conditioning, colours; projection, binning, blending."""
+"""Time the stages of slicing (AGR, conditioning, colours) and of rasterization (projection, binning, blending).
+
+Slicing computes the conditional 3D Gaussians at a time and a viewpoint. AGR is their neural refinement.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,26 +13,27 @@ from gsbench.measure.speed import Laps
 
 SLICE, RASTER = "slice", "raster"
 STAGES = {SLICE: ("AGR", "conditioning", "colours"), RASTER: ("projection", "binning", "blending")}
-# By the name of an operation: the stage that ends with it, and the stage that ends before it.
+# By the name of a kernel operation: the stage that ends after it, and the stage that ends before it.
 _ENDS = {"refine": "AGR", "show_colors": "colours", "project": "projection", "blend": "blending"}
 _FOLLOWS = {"show_colors": "conditioning", "blend": "binning"}
 
 
 class StageWatch(Tape):
-    """Times the slice and the raster of a frame, each by its stages where kernels compute them.
+    """Times the slicing and the rasterization of a frame, and the stages of each if gsbench's kernels compute them.
 
-    ``with StageWatch(device) as watch: ...; watch.end(SLICE); ...; watch.end(RASTER)``. It takes the place of a tape,
-    so each kernel operation reports its begin and end; it records no operation, and there is no gradient. Work that
-    torch computes alone is one stage: the slice, or the raster.
+    Usage: ``with StageWatch(device) as watch: ...; watch.end(SLICE); ...; watch.end(RASTER)``. The watch replaces the
+    tape that records kernel operations for the backward pass. Thus it sees when each operation begins and ends; it
+    records none, so there are no gradients. If torch computes the slicing or the rasterization, it is timed as a single
+    stage.
     """
 
     def __init__(self, device: str) -> None:
-        """Start with no stage measured."""
+        """Start a watch that has not measured any stage yet."""
         super().__init__()
         self._laps = Laps(device)
 
     def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
-        """Run an operation, and end the stages that end with it."""
+        """Run a kernel operation, and stop the time of the stages that end before or after it."""
         if operation.name in _FOLLOWS:
             self._laps.end(_FOLLOWS[operation.name])
         outputs, _ = operation.run(tensors, numbers)
@@ -38,16 +42,19 @@ class StageWatch(Tape):
         return outputs
 
     def end(self, part: str) -> None:
-        """End the slice or the raster; the rest of its time belongs to its last stage, if that stage has run."""
+        """End the slicing or the rasterization.
+
+        The time since its last stage is added to that stage. If no stage was measured, the whole part is one stage.
+        """
         last = STAGES[part][-1]
         self._laps.end(last if self._laps.has(last) else part)
 
     @property
     def ms(self) -> dict[str, float]:
-        """Return the milliseconds by stage."""
+        """Return the milliseconds of each stage that was measured."""
         return {name: 1000 * seconds for name, seconds in self._laps.seconds.items()}
 
 
 def part_of(stage: str) -> str:
-    """Return the part of a frame that a stage belongs to, `slice` or `raster`."""
+    """Return the part of a frame, `slice` or `raster`, to which a stage belongs."""
     return SLICE if stage == SLICE or stage in STAGES[SLICE] else RASTER

@@ -1,4 +1,4 @@
-"""Serve the viewer to browsers, each with its own controls."""
+"""Serve the viewer to several browsers, each with its own controls."""
 
 import asyncio
 from collections.abc import Callable, Sequence
@@ -19,19 +19,19 @@ from gsbench.view.frame import FrameRenderer
 
 
 class Viewer:
-    """A server with the models of one scene."""
+    """A web server that shows the models of one scene in browsers."""
 
     def __init__(self, runs: Sequence[LoadedRun], host: str, port: int, data_root: str | None = None) -> None:
-        """Start the server.
+        """Start the web server.
 
         Args:
-            runs: the runs whose models are shown, one or more, of one scene.
+            runs: the runs whose models are shown, at least one, all of one scene.
             host: the address to listen on.
             port: the port to listen on; if it is in use, the next free one is taken.
             data_root: the folder of the data set, if it has moved.
 
         Raises:
-            InputError: the runs are of different scenes, or the host cannot be listened on.
+            InputError: the runs are of different scenes, or it is not possible to listen on this host.
         """
         door, first = Door(host, port), runs[0]
         for run in runs:
@@ -49,20 +49,20 @@ class Viewer:
         with door.guard():
             self.server = viser.ViserServer(host, door.port, label=f"gsbench: {first.scene.name}", verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
-        self.server.gui.main_panel.dock_right()  # beside the images, not above them
+        self.server.gui.main_panel.dock_right()  # beside the images instead of on top of them
         self._stand(first)
         self.server.on_client_disconnect(self._in_turn(self._forget))
         self.server.on_client_connect(self._in_turn(self._welcome))
 
     def stop(self) -> None:
-        """Stop the server and the threads that render for it."""
+        """Stop the web server and the threads that render for the browsers."""
         for client in list(self.clients.values()):
             client.leave()
         self.server.stop()
         self._porter.shutdown(wait=False)
 
     def _stand(self, run: LoadedRun) -> None:
-        """Place the first camera of every browser where an orbit starts."""
+        """Place the first camera of every browser at the start of an orbit around the model."""
         camera = paths.around(run, 0.0, paths.ELEVATION)
         self.server.scene.set_up_direction(paths.UP)
         start = self.server.initial_camera
@@ -72,7 +72,10 @@ class Viewer:
         start.fov = 2 * float(np.arctan(camera.height / 2 / float(camera.K[1, 1])))
 
     def _in_turn(self, callback: Callable[[viser.ClientHandle], None]) -> Callable[[viser.ClientHandle], Any]:
-        """Run callbacks one after the other, so that no browser is removed before its controls exist."""
+        """Wrap a callback so that callbacks run one after another.
+
+        Otherwise a browser could be removed before its controls exist.
+        """
 
         async def waits(client: viser.ClientHandle) -> None:
             await asyncio.get_running_loop().run_in_executor(self._porter, callback, client)
@@ -89,7 +92,7 @@ class Viewer:
 
 
 def scene_or_reason(run: LoadedRun, data_root: str | None) -> Scene | str:
-    """Load the scene of a run, or return why it cannot be loaded; the model is shown in both cases."""
+    """Return the scene of a run, or the reason why its data cannot be loaded; its model can be shown in both cases."""
     try:
         return scene_of(run, data_root)
     except InputError as error:

@@ -1,1 +1,1 @@
-"""Make one self-contained HTML page of a folder of results, with text, figures, tables and images."""
+"""Make one self-contained HTML report of a folder of run records, with text, figures, tables and images."""

@@ -1,4 +1,4 @@
-"""Write the section that compares the runs of a page with those of another folder, such as published ones."""
+"""Write the section of the HTML report that compares its runs with those of another folder, such as published runs."""
 
 from gsbench.report.against import AGREES, DIFFERS, RULE, UNTOLD, Comparison
 from gsbench.report.against_table import COLUMNS, lines
@@ -6,11 +6,14 @@ from gsbench.report.configurations import Group
 from gsbench.report.page import messages
 from gsbench.report.page.content import Column, DataTable, PageSection, Value
 
-LONGEST = 400  # characters of the line
+LONGEST = 400  # characters of the summary
 
 
 def against_section(comparison: Comparison, group: Group) -> PageSection:
-    """Show the seeds of each model and scene of a group side by side, ours / theirs, with differences and verdicts."""
+    """Make the section that shows the runs of two folders side by side, for each model, scene and seed.
+
+    The section also has the differences of the means and the verdicts. It covers one experiment on one data set.
+    """
     own = [row for row in comparison.rows if (row.experiment, row.dataset) == (group.experiment, group.dataset)]
     columns = [Column("scene"), Column("run"), *(Column(c.title) for c in COLUMNS)]
     rows: list[list[Value]] = [

@@ -1,4 +1,4 @@
-"""Build the page of a folder of records: gather its sections, render the template, write report.html."""
+"""Build the HTML report of a folder of run records: collect its sections, render the template, write report.html."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -23,13 +23,13 @@ from gsbench.report.page.palette import DARK, LIGHT, STAGES_DARK, STAGES_LIGHT, 
 from gsbench.report.page.svg import marker
 
 FILE_NAME = "report.html"
-MOST_FAULTS = 20  # that are listed
-MOST_SCENES = 8  # that have drawings of their own, over all experiments of the page
+MOST_FAULTS = 20  # faulty records that are listed
+MOST_SCENES = 8  # scenes with figures of their own, over all experiments of the report
 
 
 @dataclass(frozen=True)
 class Chapter:
-    """The part of the page on one experiment and data set."""
+    """The part of the HTML report about one experiment on one data set."""
 
     key: str
     title: str
@@ -51,13 +51,13 @@ def write(
     reload: int = 0,
     against: Comparison | None = None,
 ) -> Path:
-    """Write the page of `records`, which lie in `folder`, and return its path.
+    """Write the HTML report of run records to ``report.html`` in their folder, and return its path.
 
     Args:
-        records: the records to show, at least one.
-        folder: the folder that has the records and their pictures; the page is written there.
+        records: the run records to show, at least one.
+        folder: the folder that has the records and their images; the report is written there.
         faults: the records that are left out, and why.
-        reload: seconds after which an open page loads itself again; 0: never.
+        reload: seconds after which an open report reloads itself; 0 for never.
         against: the comparison with another folder; None if there is none.
     """
     path = folder / FILE_NAME
@@ -73,7 +73,7 @@ def render(
     reload: int = 0,
     against: Comparison | None = None,
 ) -> str:
-    """Return the page as HTML; the arguments are those of `write`."""
+    """Return the HTML report as text; the arguments are those of `write`."""
     found = groups(records)
     look = styles(sorted({name for group in found for name in group.series}))
     runs, scenes = Runs(), MOST_SCENES // len(found)
@@ -107,12 +107,12 @@ def render(
 
 
 def _own(name: str) -> Markup:
-    """Return the text of a file beside this module that is copied into the page."""
+    """Return the text of a file in the folder of this module, such as the style sheet, to include it in the report."""
     return Markup((resources.files(__package__) / name).read_text())
 
 
 def _variables(models: tuple[str, ...], stages: tuple[str, ...]) -> Markup:
-    """Return the colours as CSS variables."""
+    """Return the colours of models and of training stages as definitions of CSS variables."""
     named = [f"--model-{i}:{c}" for i, c in enumerate(models)] + [f"--stage-{i}:{c}" for i, c in enumerate(stages)]
     return Markup(";".join(named))
 

@@ -1,4 +1,4 @@
-"""Draw the figures of the page, each kind by a function that takes numbers and returns a panel."""
+"""Draw the figures of the HTML report; each kind of figure has a function that takes numbers and returns a drawing."""
 
 import math
 from collections.abc import Sequence
@@ -11,34 +11,37 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLoca
 from gsbench.report.page.palette import Style
 from gsbench.report.page.svg import INK, LANE, MUTED, PAPER, Panel, model_colour, stage_colour
 
-LOG_FROM = 5.0  # the ratio of the largest to the smallest value from which an axis is logarithmic
-ROW = 38  # units of a row with its label above it
+LOG_FROM = 5.0  # an axis is logarithmic if its largest value is this many times its smallest
+ROW = 38  # height in pixels of a row with its label above it
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A point of a figure."""
+    """A point of a figure, with a confidence interval along y and the number of the run that it shows."""
 
     x: float
     y: float
-    run: int  # the number of the run or configuration that it stands for
+    run: int  # the number of its run in the list of runs of the report
     low: float = math.nan
     high: float = math.nan
 
 
 @dataclass(frozen=True)
 class FrontierCurve:
-    """The marks of one model in a frontier figure."""
+    """The points of one model in a figure of PSNR against cost."""
 
     style: Style
-    best: Sequence[Mark]  # the frontier, joined
-    beaten: Sequence[Mark] = ()  # finished, but not on the model's frontier
+    best: Sequence[Mark]  # the Pareto frontier, joined by a line
+    beaten: Sequence[Mark] = ()  # means that are not on the model's Pareto frontier
     runs: Sequence[Mark] = ()  # the single runs behind the means
     paper: Sequence[Mark] = ()  # the paper's own numbers, on other hardware
 
 
 def frontier(curves: list[FrontierCurve], x: str, y: str = "PSNR, dB") -> Panel:
-    """Draw quality against a cost: means with intervals, joined along each model's frontier, single runs pale."""
+    """Draw PSNR against a cost for several models.
+
+    The means have intervals and are joined along each model's Pareto frontier. Single runs are pale points.
+    """
     panel = Panel(270)
     axes = panel.axes
     across: list[float] = []
@@ -68,7 +71,7 @@ def frontier(curves: list[FrontierCurve], x: str, y: str = "PSNR, dB") -> Panel:
 
 
 def _dots(axes: Axes, marks: Sequence[Mark], style: Style, size: float, **how: Any) -> None:
-    """Draw a model's marker at each mark; those that cover less of their square are drawn larger."""
+    """Draw a model's marker at each point; marker shapes with a small area are drawn larger."""
     area = size * (1.3 if style.marker in "^v<>hP" else 1.0)
     colour: dict[str, Any] = {} if "facecolors" in how else {"c": model_colour(style.colour)}
     axes.scatter([m.x for m in marks], [m.y for m in marks], s=area, marker=style.marker, **colour, **how)
@@ -76,7 +79,7 @@ def _dots(axes: Axes, marks: Sequence[Mark], style: Style, size: float, **how: A
 
 @dataclass(frozen=True)
 class Anytime:
-    """The PSNR of one run or of the mean of its seeds while it trains."""
+    """The PSNR of a run during its training, or the mean PSNR over seeds."""
 
     style: Style
     seconds: Sequence[float]
@@ -86,7 +89,7 @@ class Anytime:
 
 
 def anytime(curves: list[Anytime]) -> Panel:
-    """Draw PSNR on val against the seconds of training so far, with a lane of events below for each curve."""
+    """Draw PSNR on the validation views against training seconds, with the training events of each curve below."""
     panel = Panel(290 + LANE * len(curves), lanes=len(curves))
     axes = panel.axes
     for lane, curve in enumerate(curves):
@@ -108,7 +111,7 @@ def anytime(curves: list[Anytime]) -> Panel:
 
 
 def profile(ratios: dict[str, tuple[Style, Sequence[float]]], problems: int) -> Panel:
-    """Draw performance profiles: the share of targets that a model reaches within a factor of the fastest."""
+    """Draw performance profiles: the share of PSNR targets that a model reaches within a factor of the fastest time."""
     panel = Panel(270)
     axes = panel.axes
     finite = [r for _, values in ratios.values() for r in values if math.isfinite(r)]
@@ -129,18 +132,18 @@ def profile(ratios: dict[str, tuple[Style, Sequence[float]]], problems: int) -> 
 
 @dataclass(frozen=True)
 class Difference:
-    """A difference with its interval, and how it is named."""
+    """A difference between models with its interval and its label, to be drawn in a figure."""
 
     label: str
     mean: float
     low: float
     high: float
-    strong: bool  # drawn filled: its interval does not hold zero
+    strong: bool  # whether it is significant; it is then drawn filled
     note: str = ""
 
 
 def differences(rows: list[Difference], x: str) -> Panel:
-    """Draw differences with their intervals about zero, the name of each above it."""
+    """Draw differences and their intervals on an axis that contains zero, with the label of each above it."""
     panel = Panel(66 + ROW * len(rows), left=2, top=4)
     axes = panel.axes
     for i, row in enumerate(rows):
@@ -164,7 +167,7 @@ def differences(rows: list[Difference], x: str) -> Panel:
 
 @dataclass(frozen=True)
 class Bar:
-    """A stacked bar: its name and the sizes of its parts, in order."""
+    """A stacked bar of a figure: its label, the sizes of its parts from left to right, and a note."""
 
     label: str
     parts: Sequence[float]
@@ -172,7 +175,7 @@ class Bar:
 
 
 def bars(rows: list[Bar], colours: list[str], x: str) -> Panel:
-    """Draw stacked bars, the name of each above it; `colours` are those of the parts."""
+    """Draw stacked bars with the label of each above it; `colours` has one colour for each part of a bar."""
     panel = Panel(66 + ROW * len(rows), left=2, top=4)
     axes = panel.axes
     for i, row in enumerate(rows):
@@ -190,7 +193,7 @@ def bars(rows: list[Bar], colours: list[str], x: str) -> Panel:
 
 
 def stages(rows: list[tuple[str, dict[str, float]]], names: list[str], colours: list[int]) -> Panel:
-    """Draw where the seconds of training go: a bar for each model, a piece in its colour for each stage."""
+    """Draw a stacked bar of training seconds for each model, with one coloured part for each stage of training."""
     found = []
     for label, parts in rows:
         total = sum(parts.values())
@@ -200,7 +203,7 @@ def stages(rows: list[tuple[str, dict[str, float]]], names: list[str], colours: 
 
 
 def _scale_x(axes: Axes, values: Sequence[float]) -> None:
-    """Give the x axis a logarithmic scale where values differ much, round ticks, and room at both ends."""
+    """Set the scale, the ticks and the margins of the x axis; the scale is logarithmic if the values differ much."""
     low, high = (min(values), max(values)) if values else (0.0, 1.0)
     if low > 0 and high / low > LOG_FROM:
         axes.set_xscale("log")
@@ -216,7 +219,7 @@ def _scale_x(axes: Axes, values: Sequence[float]) -> None:
 
 
 def _round_ticks(low: float, high: float) -> list[float]:
-    """Return round numbers in a range, at most seven, evenly spread on a logarithmic axis."""
+    """Return at most seven round numbers in a range, which are evenly spread on a logarithmic axis."""
     for digits in ((1, 2, 5), (1, 3), (1,)):
         first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
         ticks = [d * 10.0**e for e in range(first, last + 1) for d in digits]
@@ -236,5 +239,5 @@ def _ticks(most: int) -> MaxNLocator:
 
 
 def _plain(value: float, _: object) -> str:
-    """Write a tick without powers of ten."""
+    """Format the number at an axis tick without powers of ten."""
     return f"{value:,.0f}" if value >= 1000 else f"{value:g}"

@@ -1,4 +1,4 @@
-"""Define the parts of the page: sections with sentences, figures and tables, and the runs that points link to."""
+"""Define the parts of the HTML report: sections with sentences, figures and tables, and the runs behind the points."""
 
 import base64
 import csv
@@ -12,12 +12,12 @@ from gsbench.report.page import messages
 from gsbench.report.page.palette import Style
 
 Value = str | float | int | None
-MOST_ROWS = 60  # of a table on the page; its CSV has all
+MOST_ROWS = 60  # rows of a table that the report shows; the CSV file has all
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table; `digits` after the point for numbers, None for text."""
+    """A column of a table; `digits` is the number of decimals, or None for text and whole numbers."""
 
     title: str
     digits: int | None = None
@@ -25,7 +25,7 @@ class Column:
 
 @dataclass(frozen=True)
 class DataTable:
-    """Numbers behind a figure, on the page and as a file."""
+    """The numbers behind a figure, shown as a table in the HTML report and offered there as a CSV file."""
 
     name: str  # of the file
     columns: list[Column]
@@ -33,7 +33,7 @@ class DataTable:
 
     @property
     def shown(self) -> list[list[str]]:
-        """Return the first rows of the table as text, for the page."""
+        """Return the first rows of the table as text, for the HTML report."""
         return [
             [show(value, column) for value, column in zip(row, self.columns, strict=True)]
             for row in self.rows[:MOST_ROWS]
@@ -41,12 +41,12 @@ class DataTable:
 
     @property
     def hidden(self) -> int:
-        """Return the number of rows that are not on the page but only in the CSV file."""
+        """Return the number of rows that the HTML report does not show; they are only in the CSV file."""
         return max(0, len(self.rows) - MOST_ROWS)
 
     @property
     def href(self) -> str:
-        """Return the whole table as CSV in a data address."""
+        """Return the whole table as a CSV file in a data URL."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([cell(c.title) for c in self.columns])
@@ -57,7 +57,7 @@ class DataTable:
 
 
 def show(value: Value, column: Column) -> str:
-    """Format a value of the table as the page shows it."""
+    """Format a value of a table as text for the HTML report."""
     if value is None:
         return "–"
     if isinstance(value, float):
@@ -69,7 +69,7 @@ def show(value: Value, column: Column) -> str:
 
 @dataclass(frozen=True)
 class PageFigure:
-    """A panel with its caption."""
+    """A figure of the HTML report as SVG, with its caption."""
 
     caption: str
     svg: str
@@ -77,7 +77,7 @@ class PageFigure:
 
 @dataclass(frozen=True)
 class Tab:
-    """Drawings that a tab of the page shows together."""
+    """The figures that one tab of the HTML report shows together."""
 
     label: str
     drawings: list[PageFigure]
@@ -85,7 +85,7 @@ class Tab:
 
 @dataclass(frozen=True)
 class Swatch:
-    """A colour of a drawing, as a variable of the style sheet, with what it stands for."""
+    """An entry of a colour legend: a name and the CSS variable that holds its colour."""
 
     name: str
     variable: str
@@ -93,7 +93,7 @@ class Swatch:
 
 @dataclass(frozen=True)
 class Image:
-    """An image with its caption; the source is a data URL."""
+    """An image with its caption and its size in pixels; the source is a data URL."""
 
     caption: str
     source: str
@@ -103,14 +103,14 @@ class Image:
 
 @dataclass(frozen=True)
 class PageSection:
-    """A section of the page: sentences, figures and a table."""
+    """A section of the HTML report with sentences, figures, a table and images."""
 
     key: str
     title: str
     sentences: list[str]
     tabs: list[Tab] = field(default_factory=list)
     table: DataTable | None = None
-    beside: bool = False  # the table stands open beside the drawings
+    beside: bool = False  # whether the table is shown beside the figures
     legend: bool = False
     notes: list[str] = field(default_factory=list)
     swatches: list[Swatch] = field(default_factory=list)  # a legend of colours
@@ -118,19 +118,28 @@ class PageSection:
 
 
 class Runs:
-    """Number the runs and configurations behind the points, with the text that is shown when one is pointed at."""
+    """A numbered list of the runs behind the points of all figures.
+
+    The HTML report shows the text of a run when the reader points at its point in a figure.
+    """
 
     def __init__(self) -> None:
         self.entries: list[dict[str, str]] = []
         self._numbers: dict[tuple[str, ...], int] = {}
 
     def of_record(self, group: Group, record: Record) -> int:
-        """Return the number under which the page lists a single run."""
+        """Return the number of a single run in the list of runs that the figures refer to."""
         facts = _facts(*(group.value(record, q) for q in ("psnr", "seconds", "ms", "mb")))
         return self._number((messages.run_name(record),), facts, [record])
 
     def of_configuration(self, group: Group, configuration: Configuration, scenes: list[str]) -> int:
-        """Return the number under which the page lists the runs of a configuration on some scenes."""
+        """Return the number of a model with its settings in the list of runs that the figures refer to.
+
+        Args:
+            group: the run records of one experiment.
+            configuration: the model with its settings, whose runs are averaged.
+            scenes: the scenes over which the runs are averaged.
+        """
         runs = [r for s in scenes for r in configuration.runs.get(s, [])]
         seeds = messages.count(len({r.seed for r in runs}), "seed")
         where = scenes[0] if len(scenes) == 1 else f"mean of {messages.count(len(scenes), 'scene')}"
@@ -143,7 +152,11 @@ class Runs:
         return self._number((group.experiment, group.dataset, name), facts, runs if len(scenes) == 1 else [])
 
     def of_paper(self, record: Record) -> int:
-        """Return the number of the paper's row for the scene and model of a run."""
+        """Return the number of the 7DGS paper's result in the list of runs that the figures refer to.
+
+        Args:
+            record: the record of a run with the same scene and model.
+        """
         name = f"the paper's {record.model} on {record.scene}"
         return self._number((record.dataset, name), "on one V100, its best on test while training", [])
 
@@ -157,16 +170,16 @@ class Runs:
 
 @dataclass(frozen=True)
 class Canvas:
-    """The state that the figures of one experiment share."""
+    """The state that the figures of one experiment share: the list of runs, the models' styles and an SVG prefix."""
 
-    name: str  # keeps the ids of its drawings apart from those of others
+    name: str  # prefix of the SVG ids, different for each experiment
     runs: Runs
     look: dict[str, Style]  # by `Configuration.series`
-    scenes: int  # that have drawings of their own
+    scenes: int  # number of scenes with figures of their own
 
 
 def _facts(psnr: float, seconds: float, ms: float, mb: float) -> str:
-    """Write the PSNR and the costs of a point; unknown values are left out."""
+    """Return a text with the PSNR and the costs of a point; unknown values are left out."""
     known = [
         (psnr, f"{messages.plain(psnr)} dB"),
         (seconds, messages.duration(seconds)),

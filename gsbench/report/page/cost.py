@@ -1,4 +1,4 @@
-"""Write the sections on the cost of quality: the best model for each budget, and each model's PSNR by cost."""
+"""Write the sections of the HTML report on cost: the best model within each budget, and PSNR against cost."""
 
 import math
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, P
 from gsbench.report.page.palette import Style
 
 AXES = (("seconds", "training seconds"), ("ms", "ms a frame"), ("mb", "MB of the model"))
-MOST_RUNS = 300  # that are drawn singly in a panel
-MOST_NAMED = 3  # models in a list of an answer
+MOST_RUNS = 300  # single runs that are drawn in a figure
+MOST_NAMED = 3  # models that a sentence names
 INTERVALS = (
     "The 95 % interval of a model's own PSNR is over seeds: what other seeds would give on these scenes and views. "
     "It does not tell whether two models differ; the section “Is it a difference?” does."
@@ -24,23 +24,28 @@ INTERVALS = (
 
 @dataclass(frozen=True)
 class BudgetAnswer:
-    """The model to use for a budget."""
+    """The best model within a budget of time, as text for the HTML report."""
 
     budget: str
-    model: str  # empty: none fits
+    model: str  # empty if no model is within the budget
     value: str
     interval: str
     detail: str
 
 
 def answers(group: Group, family: Family) -> list[BudgetAnswer]:
-    """Answer which model to use for each budget of training, and for 60 frames a second; `family`: the comparisons."""
+    """Return which model is best for each budget of training time, and for rendering 60 frames per second.
+
+    Args:
+        group: the run records of one experiment.
+        family: the adjusted p-values of all comparisons in the report.
+    """
     points = f.points(group, group.basis)
     return [_answer(points, family, cost, budget) for cost, budget in f.BUDGETS]
 
 
 def basis_words(group: Group, family: Family) -> str:
-    """Describe the data behind the answers, and the rule by which a model is chosen and compared."""
+    """Describe on which scenes and views the best model for each budget was chosen, and how models are compared."""
     scenes = group.basis
     if not scenes:
         return "Nothing has finished yet."
@@ -105,7 +110,7 @@ def _named(points: list[FrontierPoint]) -> str:
 
 
 def _told(configuration: Configuration) -> str:
-    """Describe a configuration of a model by its iterations and its other settings."""
+    """Describe the settings of a model: its number of training iterations, and what else differs from the default."""
     length = f"{configuration.iterations:,} iterations, " if configuration.iterations else ""
     is_gated = configuration.series != configuration.model
     told = [name for name, known in (("iterations", length), ("gate", is_gated)) if known]
@@ -114,7 +119,10 @@ def _told(configuration: Configuration) -> str:
 
 
 def frontier_section(group: Group, canvas: Canvas) -> PageSection:
-    """Draw quality against seconds, milliseconds and megabytes, for the mean of scenes and for each scene."""
+    """Make the section that draws PSNR against training seconds, milliseconds per frame and megabytes of the model.
+
+    The figures show the mean over scenes and each scene.
+    """
     scenes = group.basis
     points = f.points(group, scenes)
     tabs = [_frontier_tab(group, canvas, "f0", _title(scenes), scenes)] if points else []
@@ -141,7 +149,7 @@ def _title(scenes: list[str]) -> str:
 
 
 def _rows(group: Group, scenes: list[str]) -> list[list[Value]]:
-    """Return a row of the table for every point."""
+    """Return a table row for every model and setting that finished the given scenes."""
     points = f.points(group, scenes)
     beaten = f.beaten(points, "seconds")
     return [
@@ -164,7 +172,7 @@ def _rows(group: Group, scenes: list[str]) -> list[list[Value]]:
 
 
 def _frontier_tab(group: Group, canvas: Canvas, key: str, label: str, scenes: list[str]) -> Tab:
-    """Draw the three panels of some scenes."""
+    """Draw three figures for the given scenes: PSNR against training seconds, ms per frame, and MB of the model."""
     points = f.points(group, scenes)
     drawings = []
     for cost, title in AXES:
@@ -185,7 +193,7 @@ def _frontier_tab(group: Group, canvas: Canvas, key: str, label: str, scenes: li
 def _curve(
     group: Group, runs: Runs, style: Style, points: list[FrontierPoint], cost: str, scenes: list[str]
 ) -> charts.FrontierCurve:
-    """Gather the marks of one model in a panel."""
+    """Collect the points of one model for a figure of PSNR against a cost."""
     best = f.frontier(points, cost)
     beaten = [p for p in points if p not in best and not math.isnan(p.cost[cost])]
     of = {id(p): runs.of_configuration(group, p.configuration, scenes) for p in points}
@@ -193,7 +201,7 @@ def _curve(
     single: list[charts.Mark] = []
     theirs: list[charts.Mark] = []
     if len(scenes) == 1:
-        gated = any(p.configuration.on_demand for p in points)  # the paper's models are not
+        gated = any(p.configuration.on_demand for p in points)  # models of the paper keep all effects
         own = [r for p in points for r in p.configuration.runs[scenes[0]]]
         if len(own) > len(points) and len(own) <= MOST_RUNS // max(1, len(group.series)):
             pairs = [(group.value(r, cost), group.value(r, "psnr"), runs.of_record(group, r)) for r in own]
@@ -203,7 +211,10 @@ def _curve(
 
 
 def _paper(record: Record, cost: str) -> tuple[float, float] | None:
-    """Return the position of the paper's row, which was measured on other hardware, if the data are the paper's."""
+    """Return the cost and the PSNR of a model in the 7DGS paper, or None if the run used other data.
+
+    The paper measured the cost on other hardware.
+    """
     row = paper.paper_row(record.dataset, record.scene, record.model)
     if record.protocol.get("paper_dataset") != record.dataset or row is None:
         return None
@@ -213,7 +224,7 @@ def _paper(record: Record, cost: str) -> tuple[float, float] | None:
 
 
 def _frontier_words(group: Group, points: list[FrontierPoint]) -> list[str]:
-    """Say which point is chosen, and which points are beaten by a cheaper and better one."""
+    """Say which model has the highest PSNR, and which points are dominated by a cheaper and better one."""
     if not points:
         return ["No run has finished, so there is nothing to compare."]
     best, scenes, split = f.ranked(points)[0], group.basis, _split(group)
@@ -230,7 +241,10 @@ def _frontier_words(group: Group, points: list[FrontierPoint]) -> list[str]:
 
 
 def _beaten_words(points: list[FrontierPoint]) -> str:
-    """Say how many points are beaten by a cheaper and better one; means are compared, without significance."""
+    """Say how many points are dominated by a cheaper and better point.
+
+    Only means are compared, so some of these differences may not be significant.
+    """
     timed = [p for p in points if not math.isnan(p.cost["seconds"])]
     beaten = f.beaten(timed, "seconds")
     if len(points) == 1:
@@ -253,7 +267,7 @@ def _beaten_words(points: list[FrontierPoint]) -> str:
 
 
 def _lengths(points: list[FrontierPoint]) -> str:
-    """Say which lengths of training the points have."""
+    """Say which training lengths the runs have."""
     lengths = sorted({n for p in points if (n := p.configuration.iterations)})
     if len(lengths) > 1:
         return f"Each point is a finished run: {len(lengths)} lengths, {lengths[0]:,} to {lengths[-1]:,} iterations."

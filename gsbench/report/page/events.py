@@ -1,4 +1,4 @@
-"""Compute the steps at which the schedule of a run changed its training, from the config in its record."""
+"""Find the steps at which the schedule changed a run's training, from the config in its record."""
 
 from typing import Any
 
@@ -14,15 +14,18 @@ MEANING = {
     "D": "densification ends",
     "L": "λ starts to be learned",
 }
-MOST_RESETS = 4  # that are marked
+MOST_RESETS = 4  # opacity resets that are marked
 
 
 def of(record: Record) -> list[tuple[int, str]]:
-    """Return the steps with a letter for each event, such as an opacity reset; nothing if the config cannot be read."""
+    """Return the steps of training events, such as an opacity reset, with a letter for each event.
+
+    The list is empty if the config in the run's record cannot be read.
+    """
     try:
         steps = _steps(record)
     except (InputError, KeyError, TypeError, AttributeError, ArithmeticError):
-        return []  # a record of another gsbench, whose config has other keys
+        return []  # a record of another version of gsbench, with other config keys
     letters: dict[int, str] = {}
     for step, letter in sorted(steps):
         letters[step] = letters.get(step, "") + letter
@@ -42,7 +45,10 @@ def _steps(record: Record) -> list[tuple[int, str]]:
 
 
 def _rates(record: Record) -> dict[str, Any]:
-    """Return the learning rates of the run's model; of model=auto those of the chosen candidate (run/resolve.py)."""
+    """Return the learning rates of a run's model from the config in its record.
+
+    If the run chose its model automatically (model=auto), these are the rates of the model that was chosen.
+    """
     model = record.provenance.config["model"]
     if model.get("candidates"):
         model = model["candidates"]["moving" if record.effects.time else "static"]

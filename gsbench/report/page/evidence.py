@@ -1,4 +1,4 @@
-"""Write the sections on evidence: the tables, the protocol, the failed runs, and every run with its command."""
+"""Write the parts of the HTML report that document the runs: result tables, protocol, failed runs and commands."""
 
 from gsbench.measure.record import Record
 from gsbench.report import layout, tables
@@ -11,17 +11,20 @@ LONGEST_NOTE = 700
 
 
 def paper_tables(group: Group) -> list[layout.Table]:
-    """Return the table of the runs with the settings that most runs share, with the rows of the paper."""
+    """Return the result tables of the runs with the most common settings, and with the rows of the 7DGS paper."""
     return tables.build(_compared(group), machine=group.machine)
 
 
 def _compared(group: Group) -> list[Record]:
-    """Return the runs with the settings that most runs share; all runs if none has finished."""
+    """Return the runs with the settings that most models share; return all runs if none has these settings."""
     return [r for r in group.records if r.variant == group.variant] or group.records
 
 
 def protocol_section(group: Group) -> PageSection:
-    """List protocol, data, machine, commit, versions and seeds, warnings first, and every run."""
+    """Make the section with notes on protocol, data, machine, commit, versions and seeds, and with a table of all runs.
+
+    Warnings come first.
+    """
     columns = [Column("run"), Column("status"), Column("PSNR dB", 2), Column("training s", 1), Column("CPU s", 1)]
     columns += [Column("load", 1), Column("ms a frame", 2), Column("MB", 2), Column("iterations"), Column("machine")]
     columns += [Column("commit"), Column("command")]
@@ -55,7 +58,7 @@ def protocol_section(group: Group) -> PageSection:
 
 
 def failures(group: Group) -> DataTable | None:
-    """List the runs that did not finish and why."""
+    """Return a table of the runs that did not finish and why; None if all runs finished."""
     lost = [r for r in group.records if r.status != "ok"]
     columns = [Column("run"), Column("status"), Column("reason")]
     rows: list[list[Value]] = [[messages.run_name(r), r.status, messages.shorten(r.reason, 2000)] for r in lost]

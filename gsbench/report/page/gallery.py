@@ -1,4 +1,4 @@
-"""Cut the image strips beside the records into images small enough to be part of the page."""
+"""Cut the example images of runs from their files, and make them small enough to embed in the HTML report."""
 
 import base64
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from gsbench.report.page.messages import shorten
 
 FILE_NAME = "pictures.png"
 BUDGET = 900_000  # bytes of all images as text, which leaves the page below 2 MB
-IMAGES_BUDGET = 300_000  # of `images`, beside those
+IMAGES_BUDGET = 300_000  # bytes of the images of `images`, in addition to BUDGET
 IMAGE_SIDE = 960  # pixels
 STEPS = ((400, 92, 3), (400, 85, 3), (320, 80, 3), (256, 75, 3), (256, 75, 1), (160, 70, 1), (96, 60, 1), (48, 50, 1))
 
 
 @dataclass(frozen=True)
 class GalleryView:
-    """The images of one view of a scene: the ground truth, and render and error by model, as data addresses."""
+    """The images of one view as data URLs: the ground truth, and the render and the error image of each model."""
 
     scene: str
     name: str
@@ -36,10 +36,10 @@ StripRow = tuple[Pixels, Pixels, Pixels]  # render, truth, error
 
 
 def gallery(records: list[Record], folder: Path) -> list[GalleryView]:
-    """Return the views that have images, of the first seed of each model, in less than BUDGET bytes.
+    """Return the example views of the first seed of each model, with images of at most BUDGET bytes in total.
 
-    If images do not fit, they are compressed more, then made smaller, then reduced to one view for each scene, and
-    at last left out.
+    If the images do not fit, they are compressed more. If this is not enough, they are made smaller, then reduced to
+    one view for each scene, and finally left out.
     """
     strips = _strips(records, folder)
     for side, quality, views in STEPS:
@@ -52,7 +52,10 @@ def gallery(records: list[Record], folder: Path) -> list[GalleryView]:
 
 
 def _strips(records: list[Record], folder: Path) -> dict[str, dict[str, tuple[Record, list[StripRow]]]]:
-    """Find, by scene and model, the record and the cut strip of the first seed that has one."""
+    """Find for each scene and model the first seed with an image file, and return its record and images.
+
+    The file has one row of render, ground truth and error image for each view.
+    """
     at = places(folder, FILE_NAME)
     found: dict[str, dict[str, tuple[Record, list[StripRow]]]] = {}
     for r in sorted(records, key=lambda r: r.seed):
@@ -64,14 +67,14 @@ def _strips(records: list[Record], folder: Path) -> dict[str, dict[str, tuple[Re
 
 
 def places(folder: Path, name: str) -> dict[Path, Path]:
-    """Find the files of a name below a folder of results, by `Record.path`."""
+    """Return all files with a certain name below a folder of results, in a dictionary by the path of their run."""
     return {Path(*path.parts[-5:-1]): path for path in sorted(folder.resolve().rglob(name))}
 
 
 def images(of: list[tuple[str, Path]]) -> list[Image]:
-    """Return as many pictures, with captions, as fit into IMAGES_BUDGET bytes; damaged files are left out.
+    """Encode images with captions, at most IMAGES_BUDGET bytes in total; files that cannot be read are left out.
 
-    Pictures that do not fit are first compressed more, then left out.
+    If the images do not fit, they are compressed more. If this is not enough, the last ones are left out.
     """
     read = [(caption, data) for caption, path in of if (data := cv2.imread(str(path), cv2.IMREAD_COLOR)) is not None]
     for quality in (90, 75, 60):
@@ -88,7 +91,10 @@ def _image(caption: str, image: Pixels, quality: int) -> Image:
 
 
 def cut_strip(path: Path) -> list[StripRow]:
-    """Cut a strip into rows of (render, truth, error) at their own resolution; return nothing if it is no strip."""
+    """Cut an image file into rows of (render, truth, error) at their own resolution.
+
+    The list is empty if the file has another layout.
+    """
     data = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if data is None:
         return []
@@ -108,14 +114,14 @@ def cut_strip(path: Path) -> list[StripRow]:
 
 
 def _row_height(body: Pixels) -> int:
-    """Return the height of a row of images: the first line of pixels that is all grey is the gap below the row."""
+    """Return the height of a row of images; a grey band separates it from the row below."""
     grey = (body == body[:, :1, :1]).all((1, 2))
     inside = [y for y in range(1, len(body) - GAP) if grey[y : y + GAP].all() and (body[y : y + GAP] == 200).all()]
     return inside[0] if inside else len(body)
 
 
 def _enlargement(parts: list[Pixels]) -> int:
-    """Return the integer factor by which images were enlarged without smoothing."""
+    """Return the integer factor by which images were enlarged without interpolation, or 1 if they were not enlarged."""
     for factor in range(8, 1, -1):
         if all(not (p.shape[0] % factor or p.shape[1] % factor) and _blocks(p, factor) for p in parts):
             return factor
@@ -130,7 +136,7 @@ def _blocks(image: Pixels, factor: int) -> bool:
 def _views(
     scene: str, models: dict[str, tuple[Record, list[StripRow]]], side: int, quality: int, most: int
 ) -> list[GalleryView]:
-    """Encode the views that every model's strip has."""
+    """Encode the views that the image files of all models contain."""
     shown = []
     shared = min(len(rows) for _, rows in models.values())
     names = _names(next(iter(models.values()))[0], shared)
@@ -147,7 +153,7 @@ def _views(
 
 
 def _names(record: Record, rows: int) -> list[str]:
-    """Name the rows of a strip: it shows evenly spaced views of those that were evaluated."""
+    """Return the names of the views in an image file, which are evenly spaced among the evaluated views."""
     views = [view.name for view in record.per_view]
     step = max(1, len(views) // max(1, rows))
     spaced = [shorten(name, 60) for name in views[::step][:rows]]
@@ -155,7 +161,7 @@ def _names(record: Record, rows: int) -> list[str]:
 
 
 def _encode(image: Pixels, side: int, quality: int) -> str:
-    """Encode an image of at most `side` pixels a side as a data address."""
+    """Encode an image as WebP in a data URL; its longer side is reduced to at most `side` pixels."""
     scale = side / max(image.shape[:2])
     if scale < 1:
         image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,4 +1,4 @@
-"""Format numbers, intervals and names for the sentences of the page."""
+"""Format numbers, intervals and names for the sentences of the HTML report."""
 
 import math
 import shlex
@@ -12,44 +12,44 @@ LONGEST = 300  # characters of a text from a record
 
 
 def shorten(text: object, longest: int = LONGEST) -> str:
-    """Put a text from a record on one line of at most `longest` characters."""
+    """Return a text on one line, with control characters escaped, cut to at most `longest` characters."""
     line = printable(str(text)[: 4 * longest])
     return line if len(line) <= longest else f"{line[: longest - 1]}…"
 
 
 def shorten_middle(text: str, longest: int, tail: int) -> str:
-    """Shorten a text to `longest` characters by leaving out its middle, so that `tail` characters of its end stay."""
+    """Shorten a text to `longest` characters: its middle is cut out and its last `tail` characters stay."""
     line = shorten(text)
     return line if len(line) <= longest else f"{line[: longest - tail - 1].rstrip()}…{line[-tail:]}"
 
 
 def listing(words: list[str], last: str = "and") -> str:
-    """Join words: "a", "a and b", "a, b and c"."""
+    """Join words into a list such as "a", "a and b" or "a, b and c"."""
     return f"{', '.join(words[:-1])} {last} {words[-1]}" if len(words) > 1 else "".join(words)
 
 
 def sentence(text: str) -> str:
-    """Begin a text with a capital letter, and leave the others as they are."""
+    """Return a text with a capital first letter; the other letters stay unchanged."""
     return text[:1].upper() + text[1:]
 
 
 def count(number: int, what: str) -> str:
-    """Count things: "1 run", "2 runs"."""
+    """Return a number with a noun in the singular or plural, such as "1 run" or "2 runs"."""
     return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
 def plain(value: float, digits: int = 2) -> str:
-    """Write a number with a true minus sign; a dash for NaN."""
+    """Format a number with a typographic minus sign; return a dash for NaN."""
     return "–" if math.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
 
 
 def probability(p: float) -> str:
-    """Write a p-value, or a bound if it is too small for three digits."""
+    """Format a p-value with three digits, or as "< 0.001" if it is smaller than that."""
     return "< 0.001" if p < 0.001 else plain(p, 3)
 
 
 def signed(value: float, digits: int = 2) -> str:
-    """Write a difference with its sign; a difference that rounds to zero has none."""
+    """Format a difference with its sign; a difference that rounds to zero has no sign."""
     text = plain(value, digits)
     if math.isnan(value) or float(text.replace("−", "-")) == 0:
         return text.removeprefix("−")
@@ -57,7 +57,7 @@ def signed(value: float, digits: int = 2) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Write a time in the unit that suits it: 8.3 s, 12 min, 2.5 h; "never" if it is infinite."""
+    """Format a time in seconds, minutes or hours, such as "8.3 s" or "2.5 h"; return "never" if it is infinite."""
     if math.isnan(seconds):
         return "–"
     if math.isinf(seconds):
@@ -68,23 +68,23 @@ def duration(seconds: float) -> str:
 
 
 def budget(seconds: float) -> str:
-    """Write a budget: 10 s, 1 min, 10 min."""
+    """Format a time budget in seconds or minutes, such as "10 s" or "1 min"."""
     return f"{seconds:g} s" if seconds < 60 else f"{seconds / 60:g} min"
 
 
 def interval(of: Estimate, digits: int = 2, *, sign: bool = False) -> str:
-    """Write the 95 % interval and what it is over; without an interval, NO_SPREAD."""
+    """Format a 95 % interval and say for what it holds, such as other seeds; return NO_SPREAD if there is none."""
     write = signed if sign else plain
     return f"95 % {write(of.low, digits)} to {write(of.high, digits)} over {of.over}" if of.over else NO_SPREAD
 
 
 def over(of: Estimate) -> str:
-    """Say whether an interval holds for other scenes, or only for other seeds and views."""
+    """Say whether an interval holds for similar scenes, or only for other seeds and views of the same scenes."""
     return {"scenes": "scenes like these", "": "–"}.get(of.over, f"{of.over}, on {count(of.scenes, 'scene')}")
 
 
 def scope(of: Estimate) -> str:
-    """Say in a sentence over how many scenes differences are, and what their intervals generalise to."""
+    """Return a sentence with the number of compared scenes, which also says whether intervals hold for other scenes."""
     scenes = {1: "One scene", 2: "Two scenes"}.get(of.scenes, count(of.scenes, "scene"))
     if not of.over:
         return f"{scenes}, one seed: no interval is known."
@@ -94,12 +94,15 @@ def scope(of: Estimate) -> str:
 
 
 def run_name(record: Record) -> str:
-    """Name a run as its folder does."""
+    """Return the name of a run: the path of its folder."""
     return record.path.as_posix()
 
 
 def command(records: list[Record]) -> str:
-    """Return the command that repeats the runs, or the first of them if they differ in more than the seed."""
+    """Return the command that repeats the given runs.
+
+    If the runs differ in more than the seed, the command repeats only the first one.
+    """
     if not all(r.overrides for r in records):
         return ""
     rest = {tuple(o for o in r.overrides if not o.startswith("seed=")) for r in records}

@@ -1,4 +1,8 @@
-"""Write the section on effects on demand: why a model depends on time, and which effects the Gaussians keep."""
+"""Write the section of the HTML report on effects on demand: which effects the Gaussians keep, and why.
+
+The effects are time, view direction and AGR (the neural refinement of Gaussians). A Gaussian keeps only the effects
+that it needs.
+"""
 
 import math
 from collections import Counter
@@ -15,13 +19,13 @@ from gsbench.report.page.content import Canvas, Column, DataTable, Image, PageFi
 from gsbench.report.page.palette import EFFECT_SET_LIKE, MODELS
 from gsbench.report.page.svg import LINE, model_colour, stage_colour
 
-PICTURE, OLD_PICTURE = "effect_sets.png", "classes.png"  # runs of before have the old name
-MOST_SAID = 12  # scenes and models that have a sentence
+PICTURE, OLD_PICTURE = "effect_sets.png", "classes.png"  # older runs have the old name
+MOST_SAID = 12  # scenes and models that are described in a sentence
 MOST_BARS = 24
 MOST_NOTES = 12
 LONGEST_REASON = 200
-LONGEST_LABEL = 32  # of a bar, which has a number beside it
-LABEL_END = 15  # characters of its end, which tell lengths and capacities apart
+LONGEST_LABEL = 32  # characters of the label of a bar, which has a number beside it
+LABEL_END = 15  # characters at its end, which differ between training lengths and sizes
 IN_TRAINING = (
     "What the gate in training changed is not in these dB and ms, as the training goes on after it: the frontier has "
     "runs with and without gates, where both were run."
@@ -30,7 +34,11 @@ NAMES = EFFECT_SETS | {REMOVED: "removed"}
 
 
 def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection | None:
-    """Describe the decisions, and draw how many Gaussians keep which effects and harmonics; None without decisions."""
+    """Make the section on which effects the Gaussians keep; None if no run chose effects.
+
+    The effects are time, view direction and neural refinement. The figures show how many Gaussians keep which effects,
+    and the degrees of their spherical harmonics.
+    """
     found = decided(group)
     if not found:
         return None
@@ -55,13 +63,13 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection
 
 
 def _sentence(one: Decided) -> str:
-    """Describe the decisions on a scene for a model."""
+    """Describe which effects (time, view direction, neural refinement) a model and its Gaussians keep on a scene."""
     parts = [_screen_words(one.runs), *_gate_words(one)]
     return f"On {one.scene}, {one.name}: {' '.join(part for part in parts if part)}"
 
 
 def _screen_words(runs: list[Record]) -> str:
-    """Say whether the model depends on time, the reason in the first run, and the decisions of other seeds."""
+    """Say whether the model depends on time, why the first run decided so, and whether other seeds agree."""
     screens = _screens(runs)
     if not screens:
         return ""
@@ -84,7 +92,10 @@ def _screens(runs: list[Record]) -> list[TimeScreen]:
 
 
 def _gate_words(one: Decided) -> list[str]:
-    """Say which effects the Gaussians keep, and what their removal after the training changed."""
+    """Say which effects (time, view direction, neural refinement) Gaussians keep, and what removing the others changed.
+
+    The text gives the change of PSNR and of the milliseconds per frame.
+    """
     if not one.gated:
         return ["No gate has changed a Gaussian."]
     kept = [f"{one.rows[name]:,.0f} {said}" for name, said in EFFECT_SETS.items() if one.rows[name] >= 0.5]
@@ -104,13 +115,16 @@ def _gate_words(one: Decided) -> list[str]:
 
 
 def _change(of: Estimate, unit: str, digits: int) -> str:
-    """Format a change with its interval, if it has one."""
+    """Format the change of a value, with its interval if there is one."""
     interval = f" ({messages.interval(of, digits, sign=True)})" if of.over else ""
     return f"{messages.signed(of.mean, digits)} {unit}{interval}"
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
-    """List what could not be decided, equal notes of seeds once, and what the numbers do not contain."""
+    """List the notes on the choice of effects: what could not be decided, and what the numbers leave out.
+
+    Equal notes of several seeds are merged.
+    """
     named: dict[str, list[int]] = {}
     for one in found:
         for run in one.runs:
@@ -133,7 +147,10 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
 
 
 def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
-    """Draw for each scene and model how many Gaussians keep which effects, and which degrees their harmonics have."""
+    """Draw two stacked bars for each scene and model: Gaussians by the effects that they keep, and by SH degree.
+
+    The effects are time, view direction and neural refinement.
+    """
     label = lambda one: messages.shorten_middle(f"{one.scene}, {one.name}", LONGEST_LABEL, LABEL_END)  # noqa: E731
     effect_sets = [
         charts.Bar(label(one), _shares([one.rows[name] for name in NAMES]), f"{one.left:,.0f} of {one.before:,.0f}")
@@ -153,7 +170,7 @@ def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
 
 
 def _stage(degree: int) -> int:
-    """Return the colour of a degree: more harmonics stand out more from the page, in both themes."""
+    """Return the colour number of an SH degree; higher degrees have a stronger contrast with the background."""
     return DEGREES - 1 - degree
 
 
@@ -169,14 +186,17 @@ def _mean_degree(one: Decided) -> str:
 
 
 def _swatches() -> list[Swatch]:
-    """Name the colours of both drawings."""
+    """Return the legend of the colours for sets of effects, such as "static", and for SH degrees."""
     effect_sets = [Swatch(said, f"model-{MODELS.index(EFFECT_SET_LIKE[name])}") for name, said in EFFECT_SETS.items()]
     degrees = [Swatch(f"degree {i}", f"stage-{_stage(i)}") for i in range(DEGREES)]
     return [*effect_sets, Swatch(NAMES[REMOVED], "line"), *degrees]
 
 
 def _images(found: list[Decided], folder: Path) -> list[Image]:
-    """Show pictures of Gaussians in the colours of their effects, for the first seed of each scene and model."""
+    """Return images in which each Gaussian has the colour of the effects that it keeps, such as time.
+
+    There is one image for each scene and model, from the first seed that has one.
+    """
     places = gallery.places(folder, OLD_PICTURE) | gallery.places(folder, PICTURE)
     paths = [next((p for r in one.runs if (p := places.get(r.path))), None) for one in found]
     captions = [f"{one.scene}, {one.name}" for one in found]

@@ -1,15 +1,15 @@
-"""Give every model a colour and a marker, the same in all figures, for the light and the dark theme.
+"""Give every model one colour and one marker, the same in all figures, for the light and the dark theme.
 
-The first hues are those of Okabe and Ito, which readers with the common colour deficiencies can distinguish. They are
-darkened for a white page and lightened for a black one, to a contrast of at least 4.5:1. Markers distinguish the models
-without colour.
+The first hues come from the palette of Okabe and Ito, which readers with common colour deficiencies can distinguish.
+Each hue is darkened for a white page and lightened for a black page, so that its contrast is at least 4.5:1. The
+markers distinguish the models without colour.
 """
 
 from dataclasses import dataclass
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "3dgs_agr", "4dgs_agr", "6dgs_agr", "auto",
           "7dgs_nodir", "7dgs_nodir_agr")  # fmt: skip
-EFFECT_SET_LIKE = {  # a Gaussian has the colour of the model whose effects it still has
+EFFECT_SET_LIKE = {  # a Gaussian has the colour of the model with the same effects
     "refined": "7dgs",
     "conditioned": "7dgs_noagr",
     "time": "6dgs",
@@ -21,21 +21,24 @@ LIGHT = ("#5c6066", "#0069a8", "#00734f", "#b34700", "#9c3d82", "#7d6608", "#1f6
 DARK = ("#b9bec6", "#5cbcf2", "#3ccb9f", "#ff9454", "#eb9fd0", "#e3cc4a", "#6fd0da", "#a9adff", "#ff9c9c", "#a8d672",
         "#ff8fbf", "#d9b38c")  # fmt: skip
 MARKERS = ("^", "s", "h", "o", "D", "v", "P", "X", "<", ">", "p", "d")
-# Shades for the stages of a step, two other hues for what is done once a run, a grey for what has no name.
+# Stages of a training step are shades of one hue, stages that occur once a run have two other hues, the rest is grey.
 STAGES_LIGHT = ("#22476b", "#3b6b96", "#6390b8", "#8fb2d1", "#b7cfe3", "#d7e4ef", "#b9770e", "#efc06a", "#9a9da3")
 STAGES_DARK = ("#c9e0f5", "#a3c6e6", "#7ba8cf", "#588ab3", "#3f6e95", "#2c5373", "#f0b35a", "#96651f", "#7d828b")
 
 
 @dataclass(frozen=True)
 class Style:
-    """The style of a model: the number of its colour, and its marker as matplotlib's letter."""
+    """The style of a model in figures: the number of its colour and its matplotlib marker."""
 
     colour: int
     marker: str
 
 
 def styles(models: list[str]) -> dict[str, Style]:
-    """Return the style of each model; a known model always has the same, other models take the rest in turn."""
+    """Return the style (colour and marker) of each model.
+
+    A model in MODELS always has the same style. Other models get the remaining styles in alphabetical order.
+    """
     others = sorted(set(models) - set(MODELS))
     spare = range(len(MODELS), len(LIGHT))
     free = [*spare, *(i for i, m in enumerate(MODELS) if m not in models)]

@@ -1,6 +1,7 @@
 """Draw matplotlib figures as inline SVG with real text, whose colours are variables of the page's style sheet.
 
-Figures are drawn with placeholder colours, which are then replaced, so one drawing serves both themes.
+Figures are drawn in placeholder colours, which are then replaced by CSS variables. Therefore one drawing serves both
+the light and the dark theme.
 """
 
 import io
@@ -16,12 +17,12 @@ from matplotlib.figure import Figure
 from matplotlib.markers import MarkerStyle
 from matplotlib.ticker import NullLocator
 
-WIDTH = 360  # units of a panel, about pixels: a phone shows it unscaled
+WIDTH = 360  # width of a figure in pixels, which fits on the screen of a phone
 FONT = 11.5
 INK, MUTED, LINE, PAPER = "#010101", "#010102", "#010103", "#010104"
 VARIABLES = {INK: "ink", MUTED: "muted", LINE: "line", PAPER: "paper"}
-LANE = 17  # units of a row below the axes
-HIT = 9  # radius of what answers to a pointer
+LANE = 17  # height in pixels of a row below the axes
+HIT = 9  # radius in pixels of the area that reacts to the pointer
 RC: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "gsbench",  # the same numbers give the same file
@@ -46,28 +47,28 @@ RC: dict[Any, Any] = {
 
 
 def model_colour(index: int) -> str:
-    """Return the placeholder of a model's colour, which the page's style sheet replaces."""
+    """Return a placeholder for the colour of a model; a variable of the style sheet later replaces it."""
     return f"#0200{index:02x}"
 
 
 def stage_colour(index: int) -> str:
-    """Return the placeholder of the colour of a training stage, which the page's style sheet replaces."""
+    """Return a placeholder for the colour of a training stage; a variable of the style sheet later replaces it."""
     return f"#0300{index:02x}"
 
 
 @dataclass
 class Panel:
-    """A drawing of one pair of axes; `hits` are points that name a run when pointed at."""
+    """A figure with one pair of axes; `hits` are the points that show the name of a run under the pointer."""
 
     height: int
-    left: int = 38  # units left of the axes
+    left: int = 38  # pixels left of the axes
     top: int = 24
-    lanes: int = 0  # rows below the axes, for `lane`
+    lanes: int = 0  # number of rows below the axes, for events
     width: int = WIDTH
     hits: list[tuple[float, float, int]] = field(default_factory=list)  # data coordinates, number of the run
     figure: Figure = field(init=False)
     axes: Axes = field(init=False)
-    below: Axes = field(init=False)  # the lanes, on the same x axis
+    below: Axes = field(init=False)  # the axes of these rows, with the same x axis
 
     def __post_init__(self) -> None:
         with mpl.rc_context(RC):
@@ -82,28 +83,30 @@ class Panel:
             FigureCanvasSVG(self.figure)
 
     def _axes(self, bottom: float, height: float, **options: Any) -> Axes:
-        """Add axes at a distance from the bottom, both in units."""
+        """Add axes to the figure, with their distance from its bottom and their height in pixels."""
         across = self.left / self.width, (self.width - self.left - 12) / self.width
         box = across[0], bottom / self.height, across[1], height / self.height
         return self.figure.add_axes(box, facecolor="none", **options)
 
     def labels(self, x: str, y: str = "") -> None:
-        """Name the axes: x below at the right, y above at the left, so that nothing is turned."""
+        """Write both axis labels horizontally: x below the axes at the right, y above the axes at the left."""
         style: dict[str, Any] = {"color": MUTED, "fontsize": FONT}
         self.figure.text(1 - 12 / self.width, 2 / self.height, x, ha="right", va="bottom", **style)
         self.figure.text(0, 1 - 2 / self.height, y, ha="left", va="top", **style)
 
     def above(self, row: float, left: str, right: str) -> None:
-        """Write texts at both ends of a row, on the page's own colour, so that no line runs through them."""
+        """Write a text at each end of a row, on the background colour so that no line runs through the texts."""
         box = {"facecolor": PAPER, "edgecolor": "none", "pad": 1.0}
         for x, side, text, colour in ((0, "left", left, INK), (1, "right", right, MUTED)):
             place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "va": "top", "ha": side}
             self.axes.annotate(text, (x, row), color=colour, fontsize=FONT, bbox=box, **place)
 
     def svg(self, name: str, alt: str) -> str:
-        """Return the drawing as an SVG element.
+        """Return the figure as an SVG element.
 
-        `name` is part of its ids, so that drawings of a page do not share ids.
+        Args:
+            name: a prefix for the element's ids, so that figures on one page do not share ids.
+            alt: a description of the figure for readers who cannot see it.
         """
         circles = "".join(self._hit(*hit) for hit in self.hits)
         raw = io.StringIO()
@@ -125,18 +128,18 @@ class Panel:
 
 
 def _font(found: re.Match[str]) -> str:
-    """Keep size and weight; the family is the page's."""
+    """Reduce a CSS font description to size and weight, so that the text has the font family of the page."""
     return f"font-size: {found[2]}px" + ("; font-weight: 600" if found[1] else "")
 
 
 def _variable(colour: str) -> str:
-    """Name the variable of the style sheet for a placeholder colour."""
+    """Return the name of the CSS variable that replaces a placeholder colour."""
     kind = {"02": "model-", "03": "stage-"}.get(colour[1:3])
     return f"{kind}{int(colour[5:], 16)}" if kind else VARIABLES.get(colour, "ink")
 
 
 def marker(letter: str, colour: int) -> str:
-    """Return a model's marker as a small element for legends."""
+    """Return the marker of a model as a small SVG element for legends."""
     style = MarkerStyle(letter)
     path = style.get_path().transformed(style.get_transform())
     outlines: Any = path.to_polygons(closed_only=False)

@@ -1,4 +1,4 @@
-"""Write the sections on time to quality: the seconds each model needs for the targets, and its training curves."""
+"""Write the sections of the HTML report on training time: the seconds to reach PSNR targets, and PSNR over time."""
 
 import math
 from statistics import fmean
@@ -10,7 +10,7 @@ from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, P
 
 
 def quality_section(group: Group, canvas: Canvas) -> PageSection:
-    """Say how long each model trains to reach given values of PSNR, and draw the performance profile."""
+    """Make the section on how long each model trains to reach PSNR targets, with their performance profile."""
     targets = f.targets(group)
     if not targets:
         text = "No target: no finished run has PSNR on val and training seconds, or all reach the same."
@@ -40,7 +40,10 @@ def quality_section(group: Group, canvas: Canvas) -> PageSection:
 
 
 def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
-    """Say which model reaches most targets, which is quickest most often, and what only one reaches."""
+    """Say which models reach most PSNR targets, and which are most often the fastest.
+
+    The text also says how many targets only one model reaches.
+    """
     reached = {m: sum(math.isfinite(t.seconds.get(m, math.inf)) for t in targets) for m in models}
     fastest = {m: sum(t.seconds.get(m, math.inf) == min(t.seconds.values()) for t in targets) for m in models}
     most = [m for m in models if reached[m] == max(reached.values())]
@@ -57,7 +60,10 @@ def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
 
 
 def anytime_section(group: Group, canvas: Canvas) -> PageSection:
-    """Draw PSNR on val over the training, for each scene, of runs with the settings that most runs share."""
+    """Make the section that draws PSNR on the validation views during training, one figure for each scene.
+
+    It shows the runs with the settings that most runs share.
+    """
     drawings: list[PageFigure] = []
     rows: list[list[Value]] = []
     tails: dict[str, list[float]] = {}
@@ -94,7 +100,10 @@ def anytime_section(group: Group, canvas: Canvas) -> PageSection:
 def _mean_curve(
     group: Group, configuration: Configuration, scene: str
 ) -> tuple[list[int], list[float], list[float]] | None:
-    """Return iterations, mean seconds and mean PSNR over the seeds, at the iterations that all of them measured."""
+    """Return iterations, mean seconds and mean PSNR over seeds, at the iterations that all seeds measured.
+
+    The result is None if there is no such iteration.
+    """
     seeds = [
         {p.iteration: p for p in r.curve if p.psnr_val is not None}
         for r in configuration.runs.get(scene, [])
@@ -108,7 +117,7 @@ def _mean_curve(
 
 
 def _when(step: int, steps: list[int], seconds: list[float]) -> float:
-    """Return the seconds at a step, from the measured points about it."""
+    """Return the training seconds at a step, interpolated between the measured points around it."""
     steps, seconds = [0, *steps], [0.0, *seconds]
     after = next((i for i, s in enumerate(steps) if s >= step), len(steps) - 1)
     span = steps[after] - steps[after - 1] if after else 0
@@ -117,7 +126,7 @@ def _when(step: int, steps: list[int], seconds: list[float]) -> float:
 
 
 def _anytime_words(tails: dict[str, list[float]]) -> list[str]:
-    """Say which models end with a lower PSNR on val than they had earlier."""
+    """Say which models end with a lower PSNR on the validation views than they had earlier in training."""
     lost = {m: fmean(losses) for m, losses in tails.items() if fmean(losses) >= 0.05}
     if not lost:
         return ["Every model ends within 0.05 dB of the best it had on val: none overfits visibly by its last step."]

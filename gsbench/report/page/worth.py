@@ -1,4 +1,8 @@
-"""Write the sections on the worth of effects: their prices, the seconds by stage, and the differences of models."""
+"""Write the sections of the HTML report on effects, training time by stage, and differences between models.
+
+The effects are time, view direction and AGR (the neural refinement of Gaussians). Their section shows what each effect
+gains in PSNR and what it costs.
+"""
 
 import math
 from dataclasses import replace
@@ -14,7 +18,7 @@ from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, P
 UNITS = (("psnr", "dB", 2), ("seconds", "training s", 1), ("ms", "ms a frame", 2), ("mb", "MB", 2))
 STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer", "screen", "gate")  # each has a colour
 REST = "other"
-MOST_PAIRS = 28  # that are drawn: those of eight models
+MOST_PAIRS = 28  # pairs that are drawn, as many as eight models have
 PARAMETRISATION = (
     "4dgs is another parametrisation of a Gaussian than 7dgs without direction, so direction given time is priced "
     "across the two."
@@ -24,7 +28,10 @@ NESTED = "Nested: 7dgs_nodir, which is 7dgs less direction and nothing else, in 
 
 
 def effects_section(group: Group, family: Family, canvas: Canvas) -> PageSection:
-    """Show what time, direction, AGR and their interactions gain and cost, as far as the models were run."""
+    """Make the section on what time, view direction and AGR (neural refinement) gain in PSNR and cost.
+
+    The section includes interactions of these effects. It leaves out effects for which a model was not run.
+    """
     cube = compare.cube(group, family)
     notes = []
     if cube.missing:
@@ -81,7 +88,10 @@ def _cells(price: Price, unit: str) -> tuple[Value, ...]:
 
 
 def _scope(cube: Cube, family: Family) -> list[str]:
-    """Say what the intervals of prices are over, and for how many comparisons the p-values are adjusted."""
+    """Say whether the intervals of the effects' gains hold for other scenes or only for other seeds.
+
+    The text also says for how many comparisons the p-values are adjusted.
+    """
     fewest = min((price.costs["psnr"] for price in cube.prices), key=lambda of: of.scenes)
     if not family.size():
         return [messages.scope(fewest)]
@@ -94,7 +104,10 @@ def _scope(cube: Cube, family: Family) -> list[str]:
 
 
 def _effect_words(cube: Cube) -> list[str]:
-    """Say which effect is worth most, what it costs, which effects are not significant, and how they interact."""
+    """Say which effect (time, view direction, neural refinement) raises PSNR most, and what it costs.
+
+    The text also says which effects are not significant and how effects interact.
+    """
     single = [p for p in cube.prices if compare.is_single(p.name)]
     best = max(single, key=lambda p: p.costs["psnr"].mean)
     gain, seconds = best.costs["psnr"], best.costs["seconds"]
@@ -123,7 +136,7 @@ def _effect_words(cube: Cube) -> list[str]:
 
 
 def stages_section(group: Group, canvas: Canvas) -> PageSection:
-    """Draw the seconds of training by stage."""
+    """Make the section that draws the training seconds of each model by stage, such as loss or backward pass."""
     parts = {c.model: found for c in group.main_configurations if (found := _stage_seconds(group, c.model))}
     if not parts:
         return PageSection("stages", "Where the seconds go", ["No finished run tells its seconds by stage."])
@@ -154,12 +167,12 @@ def stages_section(group: Group, canvas: Canvas) -> PageSection:
 
 
 def _colour(stage: str) -> int:
-    """Return the number of a stage's colour, which does not depend on the other stages."""
+    """Return the colour number of a training stage, which is the same in every figure."""
     return (*STAGES, REST).index(stage)
 
 
 def _slowest_words(parts: dict[str, dict[str, float]], names: list[str]) -> str:
-    """Say how much longer the slowest model takes than the quickest, and the share of one stage in that."""
+    """Say how much longer the slowest model trains than the fastest, and which stage causes most of the difference."""
     slow, quick = (pick(parts, key=lambda m: sum(parts[m].values())) for pick in (max, min))
     took, least = sum(parts[slow].values()), sum(parts[quick].values())
     if took == least:
@@ -172,7 +185,7 @@ def _slowest_words(parts: dict[str, dict[str, float]], names: list[str]) -> str:
 
 
 def _stage_seconds(group: Group, model: str) -> dict[str, float]:
-    """Return the mean seconds of each of STAGES over scenes and seeds, and the seconds of all other work."""
+    """Return the mean seconds of a model in each stage of training, over scenes and seeds, and in all other work."""
     (configuration,) = (c for c in group.main_configurations if c.model == model)
     scenes = [s for s in group.covered or configuration.runs if s in configuration.runs]
     runs = [[r for r in configuration.runs[s] if r.cost and not math.isnan(group.value(r, "seconds"))] for s in scenes]
@@ -187,7 +200,7 @@ def _stage_seconds(group: Group, model: str) -> dict[str, float]:
 
 
 def pairs_section(group: Group, family: Family, canvas: Canvas) -> PageSection:
-    """Draw the difference of every two models with its interval."""
+    """Make the section that draws the PSNR difference of every two models with its interval."""
     found = compare.pairs(group, family)
     if not found:
         text = "Fewer than two models have finished the same scene, so there is no pair to compare."
