@@ -1,4 +1,4 @@
-"""Measure a fitted model: the quality of its images, the time of a frame, what the training cost."""
+"""Measure a trained model: image quality, frame time, and the cost of its training."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -24,7 +24,7 @@ Pairs = list[tuple[npt.ArrayLike, npt.ArrayLike]]  # render and ground truth, [H
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured of a trained model, for its record, and some of its images for pictures.png."""
+    """The measurements of a trained model for its record, and images to be written beside the record."""
 
     metrics: dict[str, float | None]
     missing: dict[str, str]  # why a metric has no value
@@ -35,12 +35,14 @@ class Measured:
 
 
 def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measured:
-    """Measure a fitted model on the evaluated views.
+    """Measure a trained model on the evaluated views.
 
     Args:
         trainer: the finished training.
-        config: the config of the run.
-        with_effect_sets: whether to draw Gaussians in the colours of the effects that they keep, too.
+        config: the settings of the run.
+        with_effect_sets: whether to also draw an image with a colour for each set of effects (time, direction, AGR)
+            that
+            Gaussians keep.
     """
     views = trainer.views
     shown: Pairs = []
@@ -79,7 +81,7 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
 
 
 def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[str, Tensor, Tensor]]:
-    """Yield (name, render, ground truth) of every evaluated view; a few evenly spaced pairs go to `shown` too."""
+    """Yield (name, render, ground truth) of each evaluated view, and append a few evenly spaced pairs to `shown`."""
     views = trainer.views
     chosen = range(0, len(views), max(1, len(views) // max(1, pictures)))[:pictures]
     for i, view in enumerate(views):  # one at a time: fifty views of 2048 x 1088 take 3 GB
@@ -90,9 +92,10 @@ def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[s
 
 
 def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dict[str, str]]:
-    """Choose the function whose FPS is measured, and the record's protocol entry on how it makes frames on a GPU.
+    """Return the function that renders a frame for the FPS measurement, and a note for the record.
 
-    Frames are `replayed` from a CUDA graph if CUDA can record the model. Otherwise each frame is `launched` anew.
+    On a GPU frames are "replayed" from a CUDA graph if the model can be captured, otherwise "launched" kernel by
+    kernel.
     """
     if trainer.model.backend.name != "cuda":
         return trainer.render, {}
@@ -106,7 +109,11 @@ def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dic
 
 
 def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[str, float | None], dict[str, str]]:
-    """Add PSNR at the iterations that were best on val or on test to the metrics of the last iteration."""
+    """Return the metrics of the last iteration, with the PSNR at the best iteration added.
+
+    The best iteration is the one with the highest PSNR on the validation split. If the settings ask for `best_on_test`,
+    PSNR at the best iteration on the evaluated split is added too.
+    """
     metrics, missing = dict(quality.metrics), dict(quality.missing)
     metrics["psnr_best_on_val"] = trainer.best.eval_at_best_val
     if config.scene.eval_split == "val":

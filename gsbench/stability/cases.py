@@ -1,4 +1,4 @@
-"""Define hard cases: each has a name, a bound on its errors, and a severity that hypothesis can search."""
+"""Define the test cases of the stability audit: numerically hard inputs, each with a bound on its errors."""
 
 import math
 import zlib
@@ -13,7 +13,7 @@ AREAS = ("slicing", "colour", "projection", "blending", "training", "drift")
 
 @dataclass(frozen=True)
 class Bound:
-    """The largest errors that the defaults may have in a case. They are relative unless the case says otherwise."""
+    """The largest errors, usually relative, that a default setting may have in a test case."""
 
     forward: float = 1e-4
     gradient: float = 1e-3
@@ -21,7 +21,10 @@ class Bound:
 
 @dataclass(frozen=True)
 class Case:
-    """A hard case, made by `build(generator, severity, **more)`: ordinary at severity 0 and hardest at 1."""
+    """A test case of the stability audit: a function that builds numerically hard inputs, and a bound on the errors.
+
+    The inputs are ordinary at severity 0 and hardest at severity 1, so that tests can search the values between.
+    """
 
     name: str
     area: str
@@ -31,18 +34,18 @@ class Case:
 
     @property
     def stresses(self) -> str:
-        """Return what the case stresses, and where it was met in practice: the builder's docstring."""
+        """Return the builder's docstring, which says why the inputs of this case are numerically hard."""
         return " ".join((self.build.__doc__ or "").split())
 
     def __call__(self, severity: float = 1.0, seed: int = 0, **more: Any) -> Any:
-        """Build the case; the same arguments give the same numbers."""
+        """Build the inputs of this test case at a severity between 0 and 1; the same seed gives the same inputs."""
         mixed = zlib.crc32(f"{self.name}/{seed}".encode())
         return self.build(torch.Generator().manual_seed(mixed), severity, **more)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """The result of a case for one model, scheme and backend."""
+    """The errors and the time of one test case with one model, slicing scheme and backend."""
 
     area: str
     case: str
@@ -58,23 +61,27 @@ class Cell:
 
     @property
     def is_default(self) -> bool:
-        """Tell whether the result is that of a default setting; other slicing schemes are only for comparison."""
+        """Return whether the result comes from a default setting; other schemes are measured for comparison only."""
         return self.scheme in ("square_root", "-")
 
     @property
     def holds(self) -> bool:
-        """Tell whether both errors are within their bounds, and no number is NaN, infinite or otherwise wrong."""
+        """Return whether both errors are within their bounds, all values finite and all covariances definite."""
         gradient = math.isnan(self.bound.gradient) or self.gradient <= self.bound.gradient
         return self.bad == 0 and self.forward <= self.bound.forward and gradient
 
 
 def device_of(backend: str) -> str:
-    """Return the kind of device on which a backend computes."""
+    """Return the torch device type on which a backend computes: "cuda" or "cpu"."""
     return "cuda" if backend == "cuda" else "cpu"
 
 
 def backends_with(scheme: str, model: str, backends: list[str]) -> list[str]:
-    """List the backends with code for a scheme: square_root all, cholesky for 6D and 7D the CPU too, schur torch."""
+    """Return the backends that implement a slicing scheme, which computes the conditional 3D Gaussian.
+
+    All backends implement `square_root`. `cholesky` runs in torch, and for 6D and 7D also in the CPU kernels. `schur`
+    runs in torch only.
+    """
     if scheme == "square_root":
         return backends
     if scheme == "cholesky" and model != "4dgs":
@@ -86,7 +93,7 @@ CASES: dict[str, Case] = {}
 
 
 def case(area: str, *subjects: str, forward: float = 1e-4, gradient: float = 1e-3) -> Callable[..., Any]:
-    """Decorate a builder so that CASES lists its case under its name.
+    """Return a decorator that adds a function to CASES, the test cases of the stability audit.
 
     Args:
         area: the part of gsbench that the case tests, one of AREAS.
@@ -104,5 +111,5 @@ def case(area: str, *subjects: str, forward: float = 1e-4, gradient: float = 1e-
 
 
 def of_area(area: str) -> list[Case]:
-    """List the cases of one area, in the order of their definition."""
+    """Return the test cases of one area, such as "slicing" or "blending", in the order of their definition."""
     return [found for found in CASES.values() if found.area == area]

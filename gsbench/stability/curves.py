@@ -1,4 +1,4 @@
-"""Measure errors by condition number and by time, and the cost of the square-root scheme beside the others."""
+"""Measure errors of slicing schemes against condition number and precision, and the time of each scheme."""
 
 import itertools
 import time
@@ -34,7 +34,7 @@ PERCENTILE = 0.999  # of the errors of a population, to which the bounds apply
 
 @dataclass(frozen=True)
 class ConditionCurve:
-    """Errors of one scheme by the condition number of the factor, in float32."""
+    """The float32 errors of one slicing scheme as a function of the condition number of the covariance's factor."""
 
     scheme: str
     condition: list[float]  # middle of each bin
@@ -45,7 +45,10 @@ class ConditionCurve:
 
 @dataclass(frozen=True)
 class SliceTime:
-    """Milliseconds of slicing TIMED 7D Gaussians; for kernels the medians over REPEATS."""
+    """The milliseconds that one slicing scheme takes for TIMED 7D Gaussians, forward and backward.
+
+    For kernels this is the median of REPEATS calls, for torch one call.
+    """
 
     order: str
     scheme: str
@@ -56,7 +59,7 @@ class SliceTime:
 
 @dataclass(frozen=True)
 class AccuracyPoint:
-    """The accuracy and the time of one way to slice or render."""
+    """The error and the time of one scheme or backend that slices or renders Gaussians, as a point of a plot."""
 
     thing: str  # "slicing" or "picture"
     way: str
@@ -65,7 +68,10 @@ class AccuracyPoint:
 
 
 def accuracy_for_time(backends: list[str]) -> Iterator[AccuracyPoint]:
-    """Slice SLICED hard Gaussians and render a crowd, in every scheme, precision and instruction set."""
+    """Yield error and time of slicing and rendering, for each slicing scheme, precision and CPU instruction set.
+
+    The inputs are SLICED 7D Gaussians with ill-conditioned factors, and an image of DRAWN 3D Gaussians.
+    """
     hard = population.draw(torch.Generator().manual_seed(4), SLICED, "paper")
     known = population.truth(hard, "paper")
     for scheme in SCHEMES:
@@ -126,12 +132,15 @@ def _drawn(
 
 
 def percentile(errors: population.Floats) -> float:
-    """Return the 99.9th percentile; an error that is not finite counts as infinite."""
+    """Return the 99.9th percentile of errors; NaN counts as infinite."""
     return float(np.quantile(np.nan_to_num(errors, nan=np.inf), PERCENTILE, method="higher"))
 
 
 def by_condition() -> Iterator[ConditionCurve]:
-    """Measure errors by condition number in torch, in the paper's factor order, in which no scheme is trivial."""
+    """Yield, for each slicing scheme, the float32 errors in torch as a function of the factor's condition number.
+
+    The factors have the rows in the paper's order (position first), in which every scheme has to compute something.
+    """
     order = "paper"
     generator = torch.Generator().manual_seed(2)
     decades = DECADES * torch.rand(SPREAD, 1, generator=generator, dtype=torch.float64)
@@ -153,7 +162,7 @@ def by_condition() -> Iterator[ConditionCurve]:
 
 
 def safety(backends: list[str]) -> Iterator[SliceTime]:
-    """Time every scheme on every backend that has it."""
+    """Yield the time of each slicing scheme on each backend that implements it, forward and backward."""
     for order in FACTOR_ORDERS:
         hard = population.draw(torch.Generator().manual_seed(3), TIMED, order, 1.0)
         for scheme in SCHEMES:
