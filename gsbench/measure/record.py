@@ -162,7 +162,7 @@ class Provenance:
 
     @property
     def machine(self) -> str:
-        """Return the machine and the number of threads as text; times are comparable between runs with the same text."""
+        """Return the machine and the number of threads as text; times are comparable if these texts are equal."""
         return named(self.device, self.threads, self.hardware)
 
 
