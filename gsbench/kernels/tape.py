@@ -33,7 +33,7 @@ def add_to(sums: dict[int, Tensor], key: int, gradient: Tensor) -> None:
 
 
 class Differentiable(Protocol):
-    """The interface of an operation that a tape can record and run backwards (`gsbench.kernels.operation.Operation`)."""
+    """The interface of an operation that a tape can record and run backwards, such as a kernel `Operation`."""
 
     name: str
     adds: set[int]  # inputs to whose gradient the backward kernel adds
@@ -68,7 +68,7 @@ class _Note(NamedTuple):
 
 
 class Tape:
-    """Records the operations that run inside `with Tape() as tape: ...`, so that `tape.backward` can run them backwards."""
+    """Records the operations that run inside `with Tape() as tape: ...`; `tape.backward` computes their gradients."""
 
     def __init__(self) -> None:
         """Create a tape without operations."""

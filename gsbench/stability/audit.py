@@ -64,7 +64,9 @@ def run(million: int = MILLION, *, long: bool = False, short: bool = False) -> A
 
     Args:
         million: the number of random Gaussians with ill-conditioned factors to slice, by default a million.
-        long: train for 2,000 steps instead of 150, and slice this number of Gaussians with both factor orders.
+        long: train for 2,000 steps instead of 150, and slice this many Gaussians in both factor orders (by default,
+            only in
+            the default order).
         short: test only default settings, with fewer Gaussians and training steps, one seed and no timings.
     """
     began = time.perf_counter()

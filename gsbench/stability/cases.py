@@ -34,7 +34,7 @@ class Case:
 
     @property
     def stresses(self) -> str:
-        """Return the builder's docstring, which says why the inputs of this case are numerically hard."""
+        """Return the docstring of the function that builds the inputs, which says why they are numerically hard."""
         return " ".join((self.build.__doc__ or "").split())
 
     def __call__(self, severity: float = 1.0, seed: int = 0, **more: Any) -> Any:

@@ -94,8 +94,8 @@ def judge(found: Case, backends: list[str]) -> Iterator[Cell]:
 def truth(shown: ColorInputs, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     """Compute exact colours [COUNT, 3] and gradients [COUNT, 5] in mpmath.
 
-    The five derivatives are those by the mean (3), by mu_t, and along the direction `along` in the space of
-    coefficients.
+    The five derivatives are with respect to the mean (3), to mu_t, and to a step along the direction `along` in the
+    space of coefficients.
     """
     layout = {"means": 3, "times": 1, "sh": len(along)}
     time = float(torch.tensor(shown.time))
@@ -114,7 +114,10 @@ def truth(shown: ColorInputs, weight: Tensor, along: Tensor) -> tuple[Tensor, Te
 
 
 def differentiate(shown: ColorInputs, backend: str, weight: Tensor, copies: int) -> tuple[Tensor, Tensor]:
-    """Compute colours [N, 3] and their gradients [N, 4 + coefficients] by mean, mu_t and coefficients in float32."""
+    """Compute colours [N, 3] in float32, and their gradients [N, 4 + coefficients].
+
+    The gradients are with respect to the mean (3), to the mean time mu_t (1) and to the colour coefficients.
+    """
     model, device = build(shown.model, backend=BACKENDS[backend]), device_of(backend)
     rows = torch.arange(COUNT).repeat(copies)
     inputs = [value[rows].requires_grad_() for value in (shown.means, shown.times, shown.sh)]

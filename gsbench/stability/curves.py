@@ -45,9 +45,9 @@ class ConditionCurve:
 
 @dataclass(frozen=True)
 class SliceTime:
-    """The milliseconds that one slicing scheme takes for TIMED 7D Gaussians, forward and backward.
+    """The milliseconds that one slicing scheme takes for 7D Gaussians (`TIMED` of them), forward and backward.
 
-    For kernels this is the median of REPEATS calls, for torch one call.
+    For kernels this is the median of several calls (`REPEATS`), for torch one call.
     """
 
     order: str
@@ -70,7 +70,8 @@ class AccuracyPoint:
 def accuracy_for_time(backends: list[str]) -> Iterator[AccuracyPoint]:
     """Yield error and time of slicing and rendering, for each slicing scheme, precision and CPU instruction set.
 
-    The inputs are SLICED 7D Gaussians with ill-conditioned factors, and an image of DRAWN 3D Gaussians.
+    The inputs are 7D Gaussians with ill-conditioned factors (`SLICED` of them) for slicing, and 3D Gaussians (`DRAWN`
+    of them) for rendering.
     """
     hard = population.draw(torch.Generator().manual_seed(4), SLICED, "paper")
     known = population.truth(hard, "paper")
@@ -139,7 +140,8 @@ def percentile(errors: population.Floats) -> float:
 def by_condition() -> Iterator[ConditionCurve]:
     """Yield, for each slicing scheme, the float32 errors in torch as a function of the factor's condition number.
 
-    The factors have the rows in the paper's order (position first), in which every scheme has to compute something.
+    The rows of the factors are in the paper's order, with position first. In the default order the conditional Gaussian
+    is a block of the factor, so that the default scheme would have nothing to compute.
     """
     order = "paper"
     generator = torch.Generator().manual_seed(2)

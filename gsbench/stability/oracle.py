@@ -23,9 +23,9 @@ Function = Callable[[Vector], Vector]
 
 
 def gradient(function: Function, at: Sequence[float], weights: Sequence[float], first: int | None = None) -> Vector:
-    """Compute the gradient of `weights . function(x)` at `at` by central differences.
+    """Compute the gradient of the dot product `weights . function(x)` at the point x = `at` by central differences.
 
-    If `first` is given, return only the derivatives by the first `first` entries of x.
+    If `first` is given, return only the derivatives with respect to the first `first` entries of x.
     """
     with mp.workdps(DIGITS):
         x = [mpf(v) for v in at]
@@ -88,8 +88,8 @@ def slice_triangular(x: Vector, layout: dict[str, int], order: str, half: float,
 def slice_rotated(x: Vector, layout: dict[str, int], log_lambda: dict[str, float], time: float) -> Vector:
     """Compute the conditional 3D Gaussian of a 4DGS Gaussian in mpmath: mean (3), covariance (9, by rows) and opacity.
 
-    The covariance is (R s)(R s)^T, in which two quaternions l and r give the 4D rotation R = M_left(l) M_right(r) (4DGS
-    eq. 5 to 9).
+    The 4D covariance is (R s)(R s)^T with the diagonal matrix s of the four sizes. Two quaternions l and r give the
+    rotation R = M_left(l) M_right(r) (4DGS eq. 5 to 9).
     """
     raw = _unpack(x, layout)
     a, b, c, d = _normalised(raw["left_quats"])

@@ -80,7 +80,7 @@ def upright(observed: Observed) -> None:
 
 
 def entries(observed: Observed, variable: str) -> list[int]:
-    """Return the indices of one variable's rows in the list of entries below the diagonal."""
+    """Return the indices of the entries in one variable's rows, among all entries below the diagonal."""
     rows = [i for i, name in enumerate(variables(observed.model)) if name == variable]
     return [i * (i - 1) // 2 + j for i in rows for j in range(i)]
 
