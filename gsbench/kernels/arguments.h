@@ -1,10 +1,12 @@
-// What the kernels take, on the CPU and on a GPU alike: addresses of arrays, row-major and contiguous, and numbers.
+// The arguments of the kernels, on the CPU and on a GPU: numbers and addresses of contiguous row-major arrays.
 //
-// A structure holds the inputs of an operation, its outputs, the gradients given of its outputs, or those wanted of its
-// inputs. gsbench/kernels/operation.py fills the fields by their names: beside each structure GSB_FIELDS says which of
-// the four it is, and lists them. GSB_KERNELS lists the kernels that both the CPU and a GPU have.
+// Each structure holds the inputs of an operation, its outputs, the given gradients of its outputs, or the gradients of
+// its inputs that the kernel computes. GSB_FIELDS after a structure says which of the four it is (INPUTS, OUTPUTS,
+// GIVEN, GRADS) and lists its fields, which gsbench/kernels/operation.py fills by name. GSB_KERNELS lists the kernels
+// that exist for both the CPU and a GPU.
 //
-// N Gaussians come before C cameras. Scalars that a GPU computes are addresses too, so that nothing waits to read them.
+// Arrays are over N Gaussians or over C cameras times N Gaussians. Scalars that a GPU computes are passed as addresses,
+// so that the CPU does not wait to read them.
 #pragma once
 
 #include <cstdint>
@@ -20,7 +22,8 @@ namespace gsb {
 
 // ---- gsbench/kernels/slices.py
 
-// Gaussians with a triangular factor over p and d, t or both, observed from a place and at a time (6DGS, 7DGS).
+// Gaussians of 6DGS and 7DGS: triangular factors over position p and direction d, time t or both, and the camera centre
+// and time at which they are sliced.
 struct TriangularArgs {
     int64_t N, conditioned;  // rows from `conditioned` on are static: no query changes them
     bool conditioned_first;
@@ -44,7 +47,8 @@ struct TriangularGrads {
 GSB_FIELDS(TriangularGrads, GRADS, means, directions, times, log_diagonal, shape, motion, coupling, opacities,
            log_lambda_d, log_lambda_t)
 
-// Gaussians over (x, y, z, t) with the factor M_left M_right diag(exp scales), observed at a time (4DGS).
+// Gaussians of 4DGS over (x, y, z, t) with the factor M_left M_right diag(exp scales), and the time at which they are
+// sliced.
 struct RotatedArgs {
     int64_t N, conditioned;  // rows from `conditioned` on are static
     const float *means, *times, *scales, *left_quats, *right_quats;  // [N, 3] [N, 1] [N, 4] [N, 4] [N, 4]
@@ -61,7 +65,7 @@ struct RotatedGrads {
 };
 GSB_FIELDS(RotatedGrads, GRADS, means, times, scales, left_quats, right_quats, opacities, log_lambda_t)
 
-// The 3D Gaussians that an observation leaves.
+// The conditional 3D Gaussians (slice) for one camera and time.
 struct Observation {
     float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
 };
@@ -72,7 +76,7 @@ struct ObservationGrads {
 };
 GSB_FIELDS(ObservationGrads, GIVEN, means, factors, opacities)
 
-// 3D Gaussians with the factor R diag(exp scales), which are their own slice (3DGS).
+// Gaussians of 3DGS with the factor R diag(exp scales), which do not change with the camera or the time.
 struct StaticArgs {
     int64_t N;
     const float *scales, *quats, *opacities;  // [N, 3] [N, 4] [N] logits
@@ -97,7 +101,8 @@ GSB_FIELDS(StaticGrads, GRADS, scales, quats, opacities)
 
 // ---- gsbench/kernels/colors.py
 
-// Colours by spherical harmonics in the direction from `center`, times `waves` frequencies of time.
+// Inputs of colours: SH in the direction from `center` to the mean, times a Fourier series in time with `waves`
+// frequencies.
 struct ColorArgs {
     int64_t N;
     int degree, bases, waves;        // bases: harmonics stored for each frequency
@@ -110,7 +115,8 @@ struct ColorArgs {
 };
 GSB_FIELDS(ColorArgs, INPUTS, N, degree, bases, waves, sh0, shN, means, opacities, times, center, time, orders, threads)
 
-// A channel that is clamped is -0 instead of 0, so that backward knows it without another look at the coefficients.
+// A colour channel that is clamped to zero is stored as -0, so that the backward pass recognises it without reading the
+// coefficients again.
 constexpr float CLAMPED = -0.0f;
 
 struct Colors {
@@ -136,8 +142,9 @@ GSB_FIELDS(ColorGrads, GRADS, sh0, shN, means, times)
 
 // ---- gsbench/kernels/refine.py
 
-// Perceptrons features x HIDDEN x width, one for each of `networks`, on every Gaussian (AGR). They read the values of the
-// first `networks - 1` arrays, each of which one of them moves; the last moves all the others.
+// The `networks` MLPs of AGR, each with `features` inputs and HIDDEN hidden units, applied to every Gaussian. The first
+// `networks - 1` arrays of values are their inputs. MLP number i changes array i; the last MLP changes all further
+// arrays.
 struct RefineArgs {
     int64_t N, refined;  // rows from `refined` on stay where they are
     int features, networks, arrays, outputs;  // features: numbers that are read; outputs: the sum of widths
@@ -237,7 +244,7 @@ struct BlendGrads {
 };
 GSB_FIELDS(BlendGrads, GRADS, means2d, roots, colors, background, scratch)
 
-// Bit k of `flags` is set where the k-th array has a value that is not finite, or out of range.
+// Bit k of `flags` is set if the k-th array has a value that is not finite or out of range.
 struct ValueArgs {
     int64_t N, C, all_colors;  // all_colors: how many numbers
     int D;
@@ -270,7 +277,7 @@ GSB_FIELDS(SimilarityLoss, OUTPUTS, loss, gradient, scratch)
 
 // ---- gsbench/kernels/adam.py
 
-// Adam on the rows [N, width] of a parameter that are `drawn`.
+// Adam updates the rows of a parameter [N, width] that `drawn` selects.
 struct AdamArgs {
     int64_t N, width;
     const bool* drawn;       // [N]

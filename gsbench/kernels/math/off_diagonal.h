@@ -1,4 +1,5 @@
-// What the parameters of a triangular factor below its diagonal are; gsbench.models.factors has the forms in this order.
+// How parameters map to entries below the diagonal of a triangular factor; gsbench.models.factors lists the same forms
+// in the same order.
 #pragma once
 
 namespace gsb {
