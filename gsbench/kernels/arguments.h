@@ -14,7 +14,7 @@
 #include "math/off_diagonal.h"
 #include "math/sizes.h"
 
-#ifndef GSB_FIELDS  // bindings.h reads them; to everything else they are nothing
+#ifndef GSB_FIELDS  // only bindings.h gives it a meaning
 #define GSB_FIELDS(Structure, role, ...)
 #endif
 
@@ -25,12 +25,12 @@ namespace gsb {
 // Gaussians of 6DGS and 7DGS: triangular factors over position p and direction d, time t or both, and the camera centre
 // and time at which they are sliced.
 struct TriangularArgs {
-    int64_t N, conditioned;  // rows from `conditioned` on are static: no query changes them
+    int64_t N, conditioned;  // Gaussians from `conditioned` on are static (no camera or time changes them)
     bool conditioned_first;
     OffDiagonal form;
-    bool subtracts;  // by the scheme that forms S, for comparison; on the CPU only
+    bool subtracts;  // use the method that forms covariances, for comparison (CPU only)
     float half;
-    const float *means, *directions, *times;  // [N, 3] [N, 3] [N, 1]; one of the last two may be null: not observed
+    const float *means, *directions, *times;  // [N, 3] [N, 3] [N, 1]; one of the last two may be null
     const float *log_diagonal, *shape, *motion, *coupling;    // [N, k + 3] [N, 3] [N, 3 k] [N, k (k - 1) / 2]
     const float *opacities, *center;                          // [N] logits, [3]
     const float *time, *log_lambda_d, *log_lambda_t;          // [] [] []
@@ -50,7 +50,7 @@ GSB_FIELDS(TriangularGrads, GRADS, means, directions, times, log_diagonal, shape
 // Gaussians of 4DGS over (x, y, z, t) with the factor M_left M_right diag(exp scales), and the time at which they are
 // sliced.
 struct RotatedArgs {
-    int64_t N, conditioned;  // rows from `conditioned` on are static
+    int64_t N, conditioned;  // Gaussians from `conditioned` on are static
     const float *means, *times, *scales, *left_quats, *right_quats;  // [N, 3] [N, 1] [N, 4] [N, 4] [N, 4]
     const float *opacities, *clock, *time, *log_lambda_t;            // [N] logits, [] [] []
     int threads;
@@ -105,12 +105,12 @@ GSB_FIELDS(StaticGrads, GRADS, scales, quats, opacities)
 // frequencies.
 struct ColorArgs {
     int64_t N;
-    int degree, bases, waves;        // bases: harmonics stored for each frequency
+    int degree, bases, waves;        // bases: the number of harmonics stored for each frequency
     const float *sh0, *shN;          // [N, 1, 3] [N, waves * bases - 1, 3]
-    const float *means, *opacities;  // [N, 3] [N]: one below 1/255 is not drawn, and has no colour
-    const float* times;              // [N, 1], null: colours do not change
+    const float *means, *opacities;  // [N, 3] [N]; colours are not computed for opacities below 1/255
+    const float* times;              // [N, 1]; null if colours do not change with time
     const float *center, *time;      // [3] []
-    const int32_t* orders;           // [N] what a row has at most, degree + 4 (waves - 1); null: all of them have all
+    const int32_t* orders;           // [N] each Gaussian's degree + 4 (waves - 1); null: all have the maximum
     int threads;
 };
 GSB_FIELDS(ColorArgs, INPUTS, N, degree, bases, waves, sh0, shN, means, opacities, times, center, time, orders, threads)
@@ -146,13 +146,13 @@ GSB_FIELDS(ColorGrads, GRADS, sh0, shN, means, times)
 // `networks - 1` arrays of values are their inputs. MLP number i changes array i; the last MLP changes all further
 // arrays.
 struct RefineArgs {
-    int64_t N, refined;  // rows from `refined` on stay where they are
-    int features, networks, arrays, outputs;  // features: numbers that are read; outputs: the sum of widths
+    int64_t N, refined;  // Gaussians from `refined` on are not changed
+    int features, networks, arrays, outputs;  // features: inputs of the MLPs; outputs: the sum of widths
     int widths[MAX_NETWORKS], value_widths[MAX_VALUES];
     const float* values[MAX_VALUES];     // [arrays] of [N, value_widths]
     const float *weight_in, *bias_in;    // [networks * 64, features] [networks * 64]
     const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
-    // [refined, 2] [], or both null: outside its visible interval a row stays where it is, see is_awake.
+    // [refined, 2] [], or both null: outside of its interval of time a Gaussian is not changed (is_awake).
     const float *intervals, *time;
     int threads;
 };
@@ -170,7 +170,7 @@ struct RefinedGrads {
 GSB_FIELDS(RefinedGrads, GIVEN, values)
 
 struct RefineGrads {
-    float* values[MAX_VALUES];                           // of the features: [networks - 1] of [N, value_widths]
+    float* values[MAX_VALUES];                           // of the MLPs' inputs: [networks - 1] of [N, value_widths]
     float *weight_in, *bias_in, *weight_out, *bias_out;  // zero on entry
     float* scratch;                                      // [networks, refined, features], on a GPU
 };
@@ -194,7 +194,7 @@ struct Splats {
     float* means2d;     // [C, N, 2]
     float* roots;       // [C, N, 4]: p, q, r of math/projection.h and the opacity
     float* depths;      // [C, N]
-    float* half_sizes;  // [C, N, 2], 0: not drawn
+    float* half_sizes;  // [C, N, 2]; 0: culled
 };
 GSB_FIELDS(Splats, OUTPUTS, means2d, roots, depths, half_sizes)
 
@@ -223,7 +223,7 @@ GSB_FIELDS(BlendArgs, INPUTS, N, C, D, color_per_camera, means2d, roots, half_si
 
 struct Picture {
     float *image, *alpha;         // [C, H, W, D] [C, H, W, 1]
-    float *transmittance, *stop;  // [C, tiles * 256] what is left, and where in its list a pixel ends: each backend's way
+    float *transmittance, *stop;  // [C, tiles * 256]; `stop`: list position at which a pixel ended
 };
 GSB_FIELDS(Picture, OUTPUTS, image, alpha, transmittance, stop)
 
@@ -246,7 +246,7 @@ GSB_FIELDS(BlendGrads, GRADS, means2d, roots, colors, background, scratch)
 
 // Bit k of `flags` is set if the k-th array has a value that is not finite or out of range.
 struct ValueArgs {
-    int64_t N, C, all_colors;  // all_colors: how many numbers
+    int64_t N, C, all_colors;  // all_colors: the size of `colors`
     int D;
     const float *means, *factors, *opacities, *colors, *viewmats, *Ks, *background;
     int threads;
@@ -269,7 +269,7 @@ struct SimilarityArgs {
 GSB_FIELDS(SimilarityArgs, INPUTS, height, width, image, target, ssim_weight, threads)
 
 struct SimilarityLoss {
-    float* loss;      // [parts], to be added up: `similarity_parts` says how many
+    float* loss;      // [parts] partial sums of the loss, as many as `similarity_parts` returns
     float* gradient;  // [H, W, 3]; null: not wanted
     float* scratch;   // [3, 3, H, W], on a GPU, for the gradient
 };

@@ -20,11 +20,11 @@ from gsbench.stability.training_cases import LONG_STEPS
 
 BACKENDS = ("cpu", "cuda", "reference")
 MILLION = 1_000_000
-NOT_DEFAULT = 100_000  # hard slices for the factor order that is not the default, in the short audit
-SUBTRACTING = 50_000  # Gaussians for the schemes that subtract, which fail often
+NOT_DEFAULT = 100_000  # Gaussians that are sliced in the factor order that is not the default
+SUBTRACTING = 50_000  # Gaussians that are sliced by the schemes that subtract covariances
 DEFAULT_ORDER = "conditioned_first"
 SEED = 0
-# Of the short audit: hard slices, steps of trainings, and the case that is left out.
+# The short audit: random Gaussians per factor order, training steps, and the test case that is left out.
 FEW, SHORT_STEPS, SLOWEST = 4_000, 60, "faint_crowd"
 T = TypeVar("T")
 Step = Callable[[], None]
@@ -36,7 +36,7 @@ class Audit:
 
     backends: list[str]
     cells: list[Cell] = field(default_factory=list)
-    verified: dict[str, float] = field(default_factory=dict)  # float64 against mpmath, by factor order
+    verified: dict[str, float] = field(default_factory=dict)  # errors of float64 against mpmath, by factor order
     conditions: list[curves.ConditionCurve] = field(default_factory=list)
     accuracy: list[curves.AccuracyPoint] = field(default_factory=list)
     safety: list[curves.SliceTime] = field(default_factory=list)
@@ -85,7 +85,7 @@ def _short_steps(audit: Audit) -> list[tuple[str, Step]]:
     fastest = audit.backends[0]
     judged: list[tuple[Case, Callable[[Case], Iterable[Cell]]]] = []
     for case in of_area("slicing"):
-        some = only(case, *(model for model in case.subjects if model != "6dgs"))  # it is 7DGS without time
+        some = only(case, *(model for model in case.subjects if model != "6dgs"))  # 6DGS is 7DGS without time
         judged.append((some, partial(slices.judge, backends=audit.backends, schemes=["square_root"])))
     for area, judge in (("colour", colors.judge), ("projection", pictures.judge), ("blending", pictures.judge)):
         judged += [(case, partial(judge, backends=audit.backends)) for case in of_area(area) if case.name != SLOWEST]

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-PRODUCTS = 1 << 21  # (Gaussian, pixel) products at a time, which bounds memory
+PRODUCTS = 1 << 21  # (Gaussian, pixel) pairs in one chunk, to limit memory
 Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors")
 
@@ -26,8 +26,8 @@ class Picture:
 
     image: Tensor  # [C, H, W, D]
     alpha: Tensor  # [C, H, W, 1]
-    touched: Tensor  # [C, N, H, W] bool: the Gaussian's alpha is at least 1/255 here
-    slack: Tensor  # [C, H, W] relative distance of a decision to its threshold; if small, float32 may differ
+    touched: Tensor  # [C, N, H, W] bool: whether the Gaussian's alpha is at least 1/255 at this pixel
+    slack: Tensor  # [C, H, W] relative distance to the nearest threshold; if it is small, float32 may differ
 
 
 class _Splats(NamedTuple):

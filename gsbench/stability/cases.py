@@ -29,7 +29,7 @@ class Case:
     name: str
     area: str
     build: Callable[..., Any]
-    subjects: tuple[str, ...]  # the models that are tested with it; empty: it needs none
+    subjects: tuple[str, ...]  # the models that are tested with it; empty if the case has no model
     bound: Bound
 
     @property
@@ -49,13 +49,13 @@ class Cell:
 
     area: str
     case: str
-    subject: str  # the model; "-" where there is none
+    subject: str  # the model; "-" if the case has none
     scheme: str
     backend: str
-    forward: float  # error of the result; NaN where it is not finite
-    gradient: float  # error of its gradient; NaN where it is not finite or not judged
-    bad: float  # share of Gaussians (pixels, steps) whose result or gradient is not finite, or is indefinite
-    ms: float  # forward and backward
+    forward: float  # error of the result; NaN if it is not finite
+    gradient: float  # error of its gradient; NaN if it is not finite or not tested
+    bad: float  # share of Gaussians (pixels, steps) whose result is not finite or is an indefinite covariance
+    ms: float  # milliseconds of forward and backward
     bound: Bound
     note: str = ""
 

@@ -14,9 +14,9 @@ from gsbench.stability import oracle
 from gsbench.stability.cases import Case, Cell, case, device_of
 from gsbench.stability.slices import fastest, worst
 
-COUNT = 3  # Gaussians in a case
+COUNT = 3  # Gaussians in a test case
 WAVES = {"3dgs": 1, "4dgs": 3}
-COPIES = 1024  # of a case's Gaussians, for its timing
+COPIES = 1024  # copies of the Gaussians in a test case, for timing
 
 
 @dataclass

@@ -20,16 +20,16 @@ from gsbench.stability import picture_cases, pictures, population, slices
 from gsbench.stability.cases import backends_with, device_of
 from gsbench.stability.picture_cases import Arguments
 
-SPREAD = 40_000  # Gaussians of the curve by condition number
-DECADES = 8.0  # factors' diagonals go down to 10^-DECADES, those of each Gaussian to a random part of that
+SPREAD = 40_000  # Gaussians in the measurement of errors against condition number
+DECADES = 8.0  # diagonal entries go down to 10^-u, with u random in [0, DECADES] for each Gaussian
 BINS = np.arange(0, 13)  # powers of ten of the condition number
 LEAST = 50  # a bin with fewer Gaussians is not shown
-TIMED = 100_000  # Gaussians of the comparison of costs
-REPEATS = 9  # one for the slow schemes in torch
-SLICED = 20_000  # Gaussians, and ..
-DRAWN = 1_500  # .. Gaussians in an image of PICTURE pixels a side, for the accuracy-for-time curve
+TIMED = 100_000  # Gaussians in the comparison of times
+REPEATS = 9  # torch, which is slow, is timed once
+SLICED = 20_000  # 7D Gaussians that are sliced ..
+DRAWN = 1_500  # .. and 3D Gaussians that are rendered, for the plots of error against time
 PICTURE = 96
-PERCENTILE = 0.999  # of the errors of a population, to which the bounds apply
+PERCENTILE = 0.999  # the quantile of errors over random Gaussians that must be below the bound
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class ConditionCurve:
     condition: list[float]  # middle of each bin
     median: list[float]
     percentile99: list[float]
-    bad: list[float]  # share not finite or indefinite
+    bad: list[float]  # share of covariances that are not finite or indefinite
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class AccuracyPoint:
 
     thing: str  # "slicing" or "picture"
     way: str
-    error: float  # 99.9th percentile of a covariance; largest of a decided pixel
+    error: float  # slicing: 99.9th percentile over covariances; picture: largest error of a pixel
     ms: float  # forward and backward
 
 

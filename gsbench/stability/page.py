@@ -17,7 +17,7 @@ from gsbench.stability.cases import AREAS, CASES, Cell
 
 COLUMNS = ("area", "case", "subject", "scheme", "backend", "forward", "gradient", "bad", "ms", "holds", "note")
 MARK = "**over** "
-RUNS = ("training", "drift")  # areas whose cells are whole trainings
+RUNS = ("training", "drift")  # areas in which each test case is a training
 
 
 def write(audit: Audit, folder: Path) -> None:

@@ -11,9 +11,9 @@ from gsbench.stability.cases import case
 Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`, float32
 WIDTH, HEIGHT = 16, 12
 FOCAL = 24.0
-DEPTH = 4.0  # the default; a power of two, so that a camera without rotation gives it exactly
+DEPTH = 4.0  # the default depth of means; a power of two, so that it is exact in float32
 CROWD = 100_000
-NO_GRADIENT = math.nan  # the bound of a gradient that is not judged
+NO_GRADIENT = math.nan  # means that the gradient is not tested
 
 
 def single(mean: Tensor, factor: Tensor, opacity: float = 0.9) -> Arguments:

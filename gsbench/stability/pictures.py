@@ -14,7 +14,7 @@ from gsbench.stability import brute, oracle
 from gsbench.stability.cases import Case, Cell, device_of
 from gsbench.stability.slices import fastest, worst
 
-UNDECIDED = 1e-3  # a pixel relatively nearer to a threshold may fall to either side of it in float32
+UNDECIDED = 1e-3  # relative distance to a threshold below which float32 may decide either way
 Arguments = dict[str, Any]
 # image and alpha [1, H, W, .], decided [1, H, W], gradients
 ImageTruth = tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]
@@ -24,7 +24,7 @@ def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
     """Yield, for each backend, the largest errors of image and gradients over all images of one test case."""
     pictures = case()
     truths = [(alone if case.area == "projection" else together)(arguments) for arguments in pictures]
-    if case.bound.gradient != case.bound.gradient:  # every pixel is at a threshold, and these are judged
+    if case.bound.gradient != case.bound.gradient:  # NaN: pixels are at a threshold on purpose, so all of them count
         truths = [(image, alpha, torch.ones_like(decided), {}) for image, alpha, decided, _ in truths]
     for backend in backends:
         found = [compare(a, known, backend) for a, known in zip(pictures, truths, strict=True)]
@@ -114,7 +114,7 @@ def compare(arguments: Arguments, known: ImageTruth, backend: str) -> tuple[floa
     weight, weight_alpha = (w * decided[..., None] for w in weights(arguments))
     try:
         got, covered, gradients = differentiate(arguments, backend, weight, weight_alpha)
-    except InputError:  # a refusal is not a wrong image, but every case here must be rendered
+    except InputError:  # each test case must be rendered, so a refusal is an error
         return float("nan"), float("nan"), 1.0
     finite = got.isfinite().all() & covered.isfinite().all() & all(g.isfinite().all() for g in gradients.values())
     brightest = max(1.0, float(arguments["colors"].abs().max())) if arguments["colors"].numel() else 1.0

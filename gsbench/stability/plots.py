@@ -13,7 +13,7 @@ from gsbench.measure.atomic import write_atomically
 from gsbench.stability.audit import Audit
 
 COLORS = {"square_root": "tab:blue", "schur": "tab:red", "cholesky": "tab:orange"}
-LEAST, MOST = 1e-16, 1e3  # the range of errors; one beyond it is plotted at the edge
+LEAST, MOST = 1e-16, 1e3  # the range of plotted errors; values outside are plotted at the edge
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from gsbench.stability import oracle
 from gsbench.stability.cases import device_of
 
 Floats = NDArray[np.float64]
-CHUNK = 50_000  # Gaussians at a time, which bounds memory
+CHUNK = 50_000  # Gaussians in one chunk, to limit memory
 BELOW = np.tril_indices(7, -1)
 NEVER = -110.0  # log lambda; its exp is zero in float32, so that no Gaussian is culled at any query
 
@@ -62,7 +62,7 @@ class Errors:
 
     cov: Floats
     gradient: Floats
-    bad: NDArray[np.bool_]  # not finite, or not semi-definite where the scheme forms a covariance
+    bad: NDArray[np.bool_]  # not finite, or an indefinite covariance
 
 
 def draw(generator: torch.Generator, N: int, order: str, decades: Tensor | float = 5.0) -> Hard:

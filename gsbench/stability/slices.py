@@ -25,7 +25,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "7dgs": {"lambda_d": 0.35, "lambda_t": 0.35},
 }
 SLOW_MS = 500.0
-COPIES = 1024  # of a case's Gaussians, for its timing
+COPIES = 1024  # copies of the Gaussians in a test case, for timing
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class SliceTruth:
     """The exact conditional mean, covariance and opacity of Gaussians in a test case, and the gradient of a loss."""
 
     outputs: Tensor  # [COUNT, 13] float64
-    weights: Tensor  # [COUNT, 13]: the loss is their product with the outputs, summed
-    scale: Tensor  # [COUNT] what errors of the mean are relative to
+    weights: Tensor  # [COUNT, 13]: the loss is the sum of weights x outputs
+    scale: Tensor  # [COUNT]: errors of the mean are divided by this
     gradient: Tensor  # [COUNT, parameters], in the order of `Observed.raw`
 
 
@@ -64,7 +64,7 @@ def truth(observed: Observed) -> SliceTruth:
         scale = mean.norm() + (values[:3] - mean).norm() + values[[3, 7, 11]].sum().sqrt()
         weights[i, :3] /= scale
         weights[i, 3:12] /= values[3:12].norm()
-        if values[12] < ALPHA_MIN:  # it is culled, so its place and shape do not matter
+        if values[12] < ALPHA_MIN:  # it is culled, so its mean and covariance do not matter
             weights[i, :12] = 0
         outputs.append(values)
         scales.append(scale)

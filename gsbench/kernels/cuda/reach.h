@@ -6,8 +6,8 @@
 
 namespace gsb::cuda {
 
-constexpr float POWER_MARGIN = 0.01f;  // on log2(255 opacity), so that rounding cuts off no pixel; far above that of the
-                                       // instructions that divide and take logarithms fast
+constexpr float POWER_MARGIN = 0.01f;  // added to log2(255 opacity), so that rounding cuts off no pixel; far above the
+                                       // errors of the fast division and logarithm
 
 struct Reach {
     float x, y, p, q, r, foot_x, foot_y, most_power;

@@ -5,9 +5,9 @@
 namespace gsb {
 
 enum class OffDiagonal : int {
-    relative,    // shape in units of its row's diagonal, motion and coupling as they are
-    raw,         // all as they are
-    row_scaled,  // all (2 sigmoid(x) - 1) times their row's diagonal
+    relative,    // `shape` in units of its row's diagonal entry, `motion` and `coupling` unchanged
+    raw,         // all unchanged
+    row_scaled,  // all (2 sigmoid(x) - 1) times the diagonal entry of their row
 };
 
 }  // namespace gsb

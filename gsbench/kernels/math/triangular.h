@@ -22,10 +22,10 @@ void observing(bool direction, bool time, Run run) {
 // The values that are equal for all Gaussians of a model, and the camera centre and time.
 struct TriangularModel {
     bool conditioned_first;  // rows of the factor are (d, t, p); else (p, t, d), as in the paper
-    OffDiagonal form;        // what the parameters below the diagonal are
-    float half;              // of f_dir's exponent: 1/2 (7DGS eq. 12) or 1 (6DGS)
+    OffDiagonal form;        // how parameters map to entries below the diagonal
+    float half;              // the constant in the exponent of f_dir: 1/2 (7DGS eq. 12) or 1 (6DGS)
     float lambda_d, lambda_t;
-    float center[3], time;  // where from and when it is observed
+    float center[3], time;  // the camera centre and the time of the view
 };
 
 // The conditional 3D Gaussian, which the rasterizer gets.
@@ -38,7 +38,7 @@ template <class T, Query Q>
 struct TriangularParameters {
     static constexpr bool DIRECTION = Q != Query::time, TIME = Q != Query::direction;
     static constexpr int TIME_ROW = DIRECTION ? 3 : 0, K = TIME_ROW + TIME, N = K + 3;
-    static constexpr bool COUPLED = K > 1;  // else there is no entry within q, and `coupling` is not used
+    static constexpr bool COUPLED = K > 1;  // otherwise `coupling` has no entries and is not used
     T mean[3], direction[3], time, log_diagonal[N];
     T shape[3], motion[3 * K], coupling[COUPLED ? K * (K - 1) / 2 : 1];  // row by row: `entry` says which is which
     T opacity;                                                           // a logit
