@@ -46,7 +46,7 @@ def download(source: Source, folder: Path) -> Path:
                          f"{by_hand(source, path)}") from None  # fmt: skip
     except InputError:
         raise
-    # ValueError: a length or an address, perhaps of a redirection, that is none; not all of them are requests' own
+    # ValueError: an invalid length or URL, perhaps of a redirection, which requests does not always wrap
     except (requests.exceptions.RequestException, ValueError) as error:
         raise InputError(f"{source.name}: {url} broke off or is no answer ({type(error).__name__}): try again, or "
                          f"{by_hand(source, path)}") from None  # fmt: skip

@@ -19,10 +19,10 @@ class Source:
 
     name: str
     what: str
-    file: str  # its name on a mirror, and on this machine while it is fetched
-    folder: Path  # where it goes; an archive is unpacked into it
+    file: str  # the file name on a mirror, and on this machine during the download
+    folder: Path  # the folder of the file; an archive is unpacked into it
     url: str | None  # None: only a browser can download it
-    sha256: str | None = None  # its known first digits; None: its authors publish none
+    sha256: str | None = None  # its first digits; None if the authors publish none
     published: str = ""  # where, in words
 
     @property

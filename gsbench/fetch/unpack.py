@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from gsbench.errors import InputError, one_line
 
 MOST_FILES = 1_000_000
-# What zipfile raises on a damaged or an encrypted one; RecursionError, of folders 1000 deep, is a RuntimeError.
+# Exceptions of zipfile for damaged or encrypted archives; RecursionError (folders 1000 deep) is a RuntimeError.
 DAMAGED = (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, zlib.error, lzma.LZMAError, struct.error,
            ValueError, IndexError)  # fmt: skip
 

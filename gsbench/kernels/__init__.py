@@ -1,4 +1,4 @@
-"""Compiled CPU and CUDA kernels for slices, images and losses, as differentiable operations on torch tensors.
+"""Provide compiled kernels for slicing, rasterization and losses as differentiable operations on torch tensors.
 
 The compiled extension `_native` is optional. Without it this package can be imported, but its operations raise
 InputError, and the backend "reference" computes the same in torch.

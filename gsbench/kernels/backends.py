@@ -17,7 +17,7 @@ class Backend:
     """A backend, which decides by device and type whether a tensor is processed by compiled kernels or by torch."""
 
     name: str
-    devices: tuple[str, ...]  # the kinds of device on which it uses kernels
+    devices: tuple[str, ...]  # the device types on which this backend uses kernels
 
     def serves(self, tensor: Tensor) -> bool:
         """Return whether kernels process this tensor; otherwise torch does."""

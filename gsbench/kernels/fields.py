@@ -9,14 +9,14 @@ Shape = tuple[int | str, ...]
 
 
 class Gradient(Enum):
-    """How a backward kernel returns the gradient of an input: it overwrites memory, adds to it, or has none."""
+    """How a backward kernel returns the gradient of an input: by overwriting memory, by adding to it, or not at all."""
 
-    WRITTEN = auto()  # writes every entry
-    ADDED = auto()  # adds to every entry, so that the views of a batch share one memory
-    SUMMED = auto()  # adds a part of a sum over Gaussians from each block of a GPU, to memory that starts at zero
-    ON_REQUEST = auto()  # as SUMMED, and only where the caller wants it, since it costs something
-    NONE = auto()  # leaves it out, in silence
-    REFUSED = auto()  # there is none; asking for it is an error
+    WRITTEN = auto()  # overwrites every entry
+    ADDED = auto()  # adds to every entry, so that all views of a batch share one gradient
+    SUMMED = auto()  # a sum over all Gaussians: each GPU block adds its part, to memory that is zero at first
+    ON_REQUEST = auto()  # as SUMMED, but computed only if the caller needs it
+    NONE = auto()  # no gradient is computed; inputs may require one
+    REFUSED = auto()  # there is no gradient; an input that requires one is an error
 
 
 @dataclass(frozen=True)

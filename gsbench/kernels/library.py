@@ -11,10 +11,10 @@ from gsbench import kernels
 from gsbench.errors import InputError
 from gsbench.kernels import cuda
 
-# In front of a field's name, by what its structure holds: see kernels/arguments.h.
+# The prefix of a kernel argument's name, by the role of its C++ structure (kernels/arguments.h).
 _PREFIX = {"INPUTS": "", "OUTPUTS": "out.", "GIVEN": "given.", "GRADS": "grad."}
 
-Slots = dict[str, Any]  # by prefix and name: a number, an address as an int, or a tuple of either
+Slots = dict[str, Any]  # kernel arguments by name: a number, an address as an int, or a tuple of these
 
 
 class Library:
@@ -77,7 +77,7 @@ class CudaLibrary(Library):
         return int(self.extension.similarity_parts(height, width))
 
 
-_LIBRARIES: dict[str, Library] = {}  # by kind of device, as they were asked for
+_LIBRARIES: dict[str, Library] = {}  # by device type, filled on first use
 
 
 def library_of(device: str) -> Library:

@@ -58,7 +58,7 @@ _similarity = _Similarity()
 
 def l1_ssim(
     image: Tensor,  # [H, W, 3] or [1, H, W, 3]
-    target: Tensor,  # the same
+    target: Tensor,  # as image
     ssim_weight: float,
 ) -> Tensor:  # []
     """Return the loss of 3DGS (eq. 7), (1 - w) L1 + w (1 - SSIM), differentiable with respect to `image`.

@@ -18,16 +18,16 @@ from gsbench.kernels.fields import Gradient, Input, Output, sizes_of
 from gsbench.kernels.library import Slots, allocate, library_of
 from gsbench.kernels.tensors import check_tensor
 
-Tensors = list[Tensor]  # an input that is left out is an empty tensor of one dimension
+Tensors = list[Tensor]  # an input that is left out is an empty 1D tensor
 Sizes = dict[str, int]
 
 _SCHEMA = {int: "int", float: "float", bool: "bool"}
 _STARTS_AT_ZERO = (Gradient.ADDED, Gradient.SUMMED, Gradient.ON_REQUEST)
-_KINDS: dict[type, tuple[type, ...]] = {int: (int,), float: (float, int), bool: (bool,)}  # what is accepted for each
+_KINDS: dict[type, tuple[type, ...]] = {int: (int,), float: (float, int), bool: (bool,)}  # accepted Python types
 
 
-EVERY_ROW = 2**62  # for a number of rows: as many as there are
-MOST_KNOWN = 64  # calls whose shapes an operation remembers; density control makes new ones all the time
+EVERY_ROW = 2**62  # stands for all rows
+MOST_KNOWN = 64  # the most calls whose shapes are cached; densification makes new shapes all the time
 
 
 class Operation:
@@ -64,11 +64,11 @@ class Operation:
         self._carries = [x.gradient for x in outputs.values()]
         self._optional = {i for i, x in enumerate(given) if x.left_out_with}
         self._shapes = [sizes_of(x.shape) for x in given]
-        self._lists = {i: x.shape for i, x in enumerate(given) if x.is_list}  # the names of their lengths
+        self._lists = {i: x.shape for i, x in enumerate(given) if x.is_list}  # size names of inputs with is_list
         self._derive = derive
         self._scratch = sizes_of(scratch) if scratch is not None else None
         self._memory = memory
-        # The names of the kernels' fields; None where there is no gradient.
+        # The argument names of the kernels; None if an input has no gradient.
         self._out = [(f"out.{key}", sizes_of(x.shape)) for key, x in outputs.items()]
         self._given = [f"given.{key}" for key in outputs]
         self._needed = {f"given.{key}" for key, x in outputs.items() if x.gradient} - _MAY_BE_NULL
@@ -79,7 +79,7 @@ class Operation:
             (Tensor, NoneType) if i in self._optional else (Tensor,) for i in range(len(inputs))
         ]
         self._kinds += [_KINDS[kind] for kind in self.numbers.values()]
-        self._known: dict[tuple[Any, ...], Slots] = {}  # by numbers, shapes and types: what `match` found
+        self._known: dict[tuple[Any, ...], Slots] = {}  # results of `match` by numbers, shapes and types
         self.backward_kernel = f"{name}_backward"  # of the same arguments as any other that is put here
         self._traced = _register(self)
 
@@ -119,7 +119,7 @@ class Operation:
         """Return for each output whether it has a gradient."""
         return self._carries
 
-    # ---- the pair
+    # ---- forward and backward
 
     def forward(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
         """Run the forward kernel and return the outputs, without recording the call for the backward pass."""
@@ -172,7 +172,7 @@ class Operation:
         """
         like = tensors[0]
         library = library_of(like.device.type)
-        kept: list[Tensor | None] = []  # alive until the kernel has run
+        kept: list[Tensor | None] = []  # tensors that must not be freed before the kernel has run
         for name, g, x in zip(self._given, given, outputs, strict=True):
             if g is None and name in self._needed:
                 g = torch.zeros_like(x)
@@ -215,7 +215,7 @@ class Operation:
         """
         call = (*numbers, *[(x.dim() if i in self._lists else x.shape, x.dtype, x.device, x.layout)
                             for i, x in enumerate(tensors)])  # fmt: skip
-        slots = self._known.get(call)  # a training asks the same a thousand times, models in turns the same few
+        slots = self._known.get(call)  # training calls an operation with few different shapes
         if slots is None:
             slots = self._match(tensors, numbers)
             for length in self._lists.values():
@@ -231,7 +231,7 @@ class Operation:
         for group in {x.left_out_with for x in self.inputs.values()} - {None}:
             together = {key: own for (key, x), own in zip(self.inputs.items(), there, strict=True)
                         if x.left_out_with == group}  # fmt: skip
-            if len(set(together.values())) > 1:  # a kernel takes the address of each for that of a number
+            if len(set(together.values())) > 1:  # kernels expect all addresses of a group
                 raise InputError(f"{self.name}: expected all of {', '.join(together)}, or none of them")
         for (key, declared), x, own in zip(self.inputs.items(), tensors, there, strict=True):
             if own:
@@ -279,7 +279,7 @@ class Operation:
         return [x.new_empty(x.shape) for x in tensors]
 
 
-# Gradients that are seldom given, and whose kernels know that a null is zero.
+# Output gradients that may be null, which these kernels treat as zero.
 _MAY_BE_NULL = frozenset({"given.depths", "given.alpha"})
 _NOTHING = torch.Size([0])
 
@@ -295,9 +295,9 @@ def addresses(tensors: Sequence[Tensor]) -> tuple[int, ...]:
 
 
 def first_rows(name: str, count: int, x: Tensor) -> int:
-    """Return how many rows of a tensor, counted from the first, an operation changes.
+    """Return the number of rows, counted from the first, that an operation changes.
 
-    `count` may be EVERY_ROW, which means all rows.
+    `count` may be EVERY_ROW, which means all rows of the tensor.
 
     Raises:
         InputError: the tensor has fewer than `count` rows.
@@ -314,7 +314,7 @@ def in_rows(tensors: Tensors) -> Tensors:
 
 
 def _apart(results: Tensors, inputs: Sequence[Tensor | None]) -> Tensors:
-    """Return `results` with copies where one shares memory with an input or another result.
+    """Return `results`, copying each one that shares memory with an input or another result.
 
     torch requires that the outputs of a custom operation share no memory.
     """

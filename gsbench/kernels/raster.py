@@ -15,8 +15,8 @@ from gsbench.kernels.operation import Operation, address, in_rows
 from gsbench.process.memory import require
 
 TILE_PIXELS = TILE * TILE
-MAX_PAIRS = (1 << 31) - 1  # splats, and pairs of a tile and a splat, are numbered by int32
-GEOMETRY = 6  # of a splat: x, y, p, q, r, opacity
+MAX_PAIRS = (1 << 31) - 1  # splats and tile intersections (pairs of tile and splat) are numbered by int32
+GEOMETRY = 6  # numbers per splat: x, y, p, q, r, opacity
 LOWER = "use a smaller image, fewer cameras at once or fewer Gaussians"  # where memory does not suffice
 
 
@@ -183,7 +183,7 @@ def bin_within(splats: Splats, viewport: Viewport, flags: Tensor, room: int) -> 
     library = library_of(splats.depths.device.type)
     order, ends = _sort_on_gpu(library, splats, viewport, flags)
     lists = _room(splats, room)
-    lists[0].fill_(-1)  # no tile: what is not filled sorts behind all others
+    lists[0].fill_(-1)  # no tile, so that unused entries are sorted last
     return _list_on_gpu(library, splats, viewport, (order, ends), lists), ends[-2:]
 
 

@@ -46,8 +46,8 @@ class _Inputs(NamedTuple):
     def layers(self) -> dict[str, Tensor]:
         """Return the weights of the MLPs in the form that the kernels take.
 
-        The encoded time gamma(t) is merged into the biases of the first layers, and the units into the weights, because
-        both are equal for all Gaussians.
+        The encoded time gamma(t) is merged into the biases of the first layers, and the scales `units` into the
+        weights, because both are equal for all Gaussians.
         """
         read = self.weight_in.shape[1] - self.gamma.shape[0]
         weight_in = self.weight_in.detach()
@@ -70,7 +70,7 @@ class _Refine(Operation):
     """The AGR operation, whose tensors are the fields of `_Inputs` in order.
 
     Values that are equal for all Gaussians are merged into the weights of the MLPs first: the encoded time gamma(t)
-    into the biases of the first layers, and the units into the weights.
+    into the biases of the first layers, and the scales `units` of inputs and outputs into the weights.
     """
 
     def __init__(self) -> None:
@@ -195,7 +195,7 @@ def refine(
         bias_in: the biases of the first layers.
         weight_out: the second layers, one row for each output.
         bias_out: the biases of the second layers.
-        units: the unit of each number that the MLPs read or change.
+        units: a scale for each number: MLPs read the number divided by its scale, and their output is multiplied by it.
         gamma: the encoded time, equal for all Gaussians.
         rows: how many Gaussians, counted from the first, are changed (default: all); the others are copied.
         intervals: the first and last time at which each of these Gaussians is changed; None for always.
@@ -207,7 +207,7 @@ def refine(
     """
     if (intervals is None) != (time is None):
         raise InputError("refine: expected intervals and time together, got one of them")
-    nothing = gamma.new_empty(0) if isinstance(gamma, Tensor) else gamma  # what is no tensor is refused with the others
+    nothing = gamma.new_empty(0) if isinstance(gamma, Tensor) else gamma  # another type is refused with the others
     when = (nothing, nothing) if intervals is None else (intervals, time)
     return _refine(*values, weight_in, bias_in, weight_out, bias_out, units, gamma, *when,
                    EVERY_ROW if rows is None else rows)  # fmt: skip

@@ -36,7 +36,7 @@ class Differentiable(Protocol):
     """The interface of an operation that a tape can record and run backwards, such as a kernel `Operation`."""
 
     name: str
-    adds: set[int]  # inputs to whose gradient the backward kernel adds
+    adds: set[int]  # the indices of inputs whose gradients the backward kernel adds to given memory
 
     def run(self, tensors: list[Tensor], numbers: Sequence[Any]) -> tuple[list[Tensor], dict[str, Any]]:
         """Run the forward kernel; return the outputs, and the kernel arguments that the backward pass needs."""
@@ -83,7 +83,7 @@ class Tape:
         _in_charge.tape = self._outer
 
     def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
-        """Run an operation; record it if an input that requires a gradient has one."""
+        """Run an operation, and record it if an input requires a gradient which the operation computes."""
         outputs, slots = operation.run(tensors, numbers)
         if not torch.is_grad_enabled():
             return outputs
@@ -92,15 +92,15 @@ class Tape:
         if any(wanted):
             for x, through in zip(outputs, operation.carries_gradient(outputs), strict=True):
                 if through:
-                    x.requires_grad_()  # so that what torch makes of it has a graph that begins here
+                    x.requires_grad_()  # so that autograd records what torch computes from this output
             self._notes.append(_Note(operation, tensors, wanted, slots, outputs))
         return outputs
 
     def backward(self, loss: Tensor, seed: Tensor, sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
         """Compute the gradients of `loss` with respect to `sources`, and add them to `sums` by the id of each source.
 
-        `seed` is the gradient of the loss itself, by which all gradients are multiplied. What is added does not depend
-        on the contents of `sums`, to the bit. A tape may run backwards several times, with different seeds.
+        `seed` is the gradient of the loss itself, by which all gradients are multiplied. The added gradients are
+        bitwise the same whether `sums` is empty or not. A tape may run backwards several times, with different seeds.
         """
         at = _Gradients(self._notes, sources, sums)
         at.give(loss, seed)
@@ -129,7 +129,7 @@ class _Gradients:
         gradients = torch.autograd.grad(x, ends, gradient, allow_unused=True, retain_graph=True)
         for end, found in zip(ends, gradients, strict=True):
             if found is not None:
-                self._add(end, found.clone())  # torch may give two tensors one memory
+                self._add(end, found.clone())  # torch may return two gradients that share memory
 
     def _add(self, x: Tensor, gradient: Tensor) -> None:
         before = self.found.get(id(x))
@@ -140,7 +140,7 @@ class _Gradients:
         given = [self.found.get(id(x)) for x in note.outputs]
         if all(g is None for g in given):
             return
-        # An input that only this operation reads has its whole gradient here: it may be added to that of other views.
+        # If only this operation reads an input, this is its whole gradient, which may be added to that of other views.
         whole, there = {}, {}
         for i in note.operation.adds:
             key = id(note.tensors[i])

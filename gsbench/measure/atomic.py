@@ -7,7 +7,7 @@ import secrets
 import socket
 from pathlib import Path
 
-WITHOUT_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # errors of a file system without them
+WITHOUT_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # errors if hard links are not supported
 HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
 
 
@@ -28,7 +28,7 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
         temporary.replace(path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        # The error of a full disk names no file, and the temporary name tells a user nothing.
+        # The error of a full disk has no file name, and a user does not know the temporary file.
         if isinstance(error, OSError) and error.errno:
             error.filename = str(path)
             del error.filename2  # None would be printed
@@ -37,7 +37,7 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
         return
     folder = os.open(path.parent, os.O_RDONLY)
     try:
-        os.fsync(folder)  # the new name itself must survive a power cut
+        os.fsync(folder)  # the folder entry must survive a power cut too
     finally:
         os.close(folder)
 
@@ -54,7 +54,7 @@ def create_atomically(path: Path, data: bytes) -> bool:
         try:
             os.link(temporary, path)
         except FileExistsError:
-            return temporary.stat().st_nlink == 2  # NFS may have made the link, and lost the answer
+            return temporary.stat().st_nlink == 2  # NFS may have made the link although its reply was lost
         except OSError as error:
             if error.errno not in WITHOUT_LINKS:
                 raise

@@ -11,8 +11,8 @@ class Point(NamedTuple):
     """One evaluation during training: iteration, seconds and PSNR."""
 
     iteration: int
-    seconds: float  # of training so far, evaluation excluded
-    psnr_val: float | None  # dB on the validation split; None where it was not finite
+    seconds: float  # seconds of training so far, without evaluation
+    psnr_val: float | None  # dB on the validation split; None if it was not finite
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Curve:
 
     @property
     def best(self) -> Point | None:
-        """Return the evaluation with the highest PSNR (the earliest of equals), or None if no PSNR is finite."""
+        """Return the evaluation with the highest PSNR (the first one if several are equal), or None if no PSNR is finite."""
         finite = [(p.psnr_val, p) for p in self.points if p.psnr_val is not None]
         return max(finite, key=lambda pair: pair[0])[1] if finite else None
 

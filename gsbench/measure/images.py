@@ -9,8 +9,8 @@ import numpy.typing as npt
 from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 
-ERROR_SCALE = 0.2  # the error shown brightest; fixed, so that strips can be compared
-LEAST_WIDTH = 240  # pixels of a column; a smaller image is enlarged by an integer factor, without smoothing
+ERROR_SCALE = 0.2  # the error that has the brightest colour, equal for all images, so that they can be compared
+LEAST_WIDTH = 240  # pixels per column; a smaller image is enlarged by an integer factor, without smoothing
 HEADER = 44  # pixels
 GAP = 4  # pixels; grey, because the background is often white
 GREY = 200

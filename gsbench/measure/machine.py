@@ -24,13 +24,13 @@ _KEYS = {
 class Hardware:
     """The processor and the memory of a machine; values that the system does not report are None."""
 
-    processor: str  # by name
-    cores: int | None  # of the system, whether this run may use them or not
-    memory_gib: int | None  # rounded up, so that memory which the system reserves at boot does not change it
+    processor: str  # its name
+    cores: int | None  # all cores of the system, even if this run may not use all of them
+    memory_gib: int | None  # rounded up, because the system reserves some memory at boot
     family: str | None = None
     model: str | None = None
     stepping: str | None = None
-    instruction_set: str | None = None  # that the CPU's kernels ran with, such as "v3"; None: they are not built
+    instruction_set: str | None = None  # the one that the CPU kernels used, such as "v3"; None if they are not built
 
     def __str__(self) -> str:
         kind = [f"{name} {value}" for name in _KEYS if (value := getattr(self, name)) is not None]

@@ -55,11 +55,11 @@ class Backbone:
     """A pretrained network of LPIPS: its layers, the indices of the compared layers, and the SHA-256 of its weights."""
 
     trunk: Callable[[], nn.Sequential]
-    taps: tuple[int, ...]  # the ReLUs whose outputs are compared
+    taps: tuple[int, ...]  # the indices of the ReLU layers whose outputs are compared
     least_side: int  # pixels; the pooling layers reduce a smaller image to nothing
-    file: str  # torchvision's name of the weights, which ends in the first 8 hex digits of their SHA-256
-    linear_sha256: str  # of lpips' own weights v0.1
-    other_sha256: tuple[str, ...] = ()  # further files with the same weights
+    file: str  # torchvision's file name, which ends in the first 8 digits of the weights' SHA-256
+    linear_sha256: str  # the SHA-256 of the linear layers of lpips v0.1
+    other_sha256: tuple[str, ...] = ()  # the SHA-256 of other files with the same weights
 
     @property
     def trunk_sha256(self) -> tuple[str, ...]:

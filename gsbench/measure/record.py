@@ -23,7 +23,7 @@ from gsbench.measure.speed import RenderTimes
 from gsbench.reading import MAX_JSON, parse_json, read_file
 
 VERSION = 1
-MAX_POINTS = 10_000  # of a curve: more than a figure shows, and as many as a page draws in a moment
+MAX_POINTS = 10_000  # the most points of a training curve, which a page can still draw quickly
 FILE_NAME = "record.json"
 PUBLISHED = "published"  # the folder of records that ship with the code; it is read only where it is named
 STATUSES = ("ok", "failed", "diverged")
@@ -65,15 +65,15 @@ class ViewScore:
 class Cost:
     """The cost of a run: training seconds, memory, frame times and the size of the model."""
 
-    train_s: float  # seconds of the whole training loop less evaluation
-    stage_s: dict[str, float]  # the same by stage
+    train_s: float  # seconds of the training loop without evaluation
+    stage_s: dict[str, float]  # the same seconds by stage of training
     render_ms: RenderTimes
     fps: float  # 1000 / render_ms.p50: gsbench.measure.speed.time_renders
     num_gaussians: int
-    bytes: int  # of the model's parameters
+    bytes: int  # size of the model's parameters
     peak_memory: int  # bytes: gsbench.measure.speed.peak_memory
-    train_cpu_s: float | None = None  # CPU-seconds of all threads in those of `train_s`; None in older records
-    load: float | None = None  # of the machine, this run included, mean over `train_s`: gsbench.measure.speed.load
+    train_cpu_s: float | None = None  # CPU-seconds of all threads during `train_s`; None in older records
+    load: float | None = None  # mean load average of the machine during `train_s`, including this run
 
 
 @dataclass(frozen=True)
@@ -82,10 +82,10 @@ class TimeScreen:
 
     decision: str  # on, off or undecided
     reason: str
-    p: float | None  # share of permutations with as much energy in slow waves of time; None: not tested
-    z: float | None  # the energy's distance from that of permutations, in their standard deviations
-    free: float | None  # share of the waves' variance that the camera leaves free; None: it stood still, or not tested
-    seconds: float  # that the test took
+    p: float | None  # p-value: share of permutations of time with at least this energy; None: not tested
+    z: float | None  # z-score of the energy in low frequencies of time, among those of permutations
+    free: float | None  # share of the variance that the camera path does not explain; None: fixed camera, or not tested
+    seconds: float  # duration of the test
 
 
 RENAMED_KEYS = {"levels": "orders"}  # of a gate in older records and checkpoints ..
@@ -96,24 +96,24 @@ RENAMED_EFFECT_SETS = {"sliced": "conditioned", "still": "static"}  # .. and nam
 class Gate:
     """The result of removing time, direction or AGR from the Gaussians that do not need them: savings and lost PSNR."""
 
-    share: float  # of the squared error, the budget of the prediction
+    share: float  # share of the squared error that the removal is predicted to add at most
     predicted_db: float
-    measured_db: float  # PSNR lost on the views that it was checked on
-    rows: dict[str, int]  # Gaussians by effect set: gsbench.models.effect_sets.NAMES, and removed
-    orders: dict[str, int]  # Gaussians by the harmonics of their colours
+    measured_db: float  # PSNR lost on the views on which the removal was checked
+    rows: dict[str, int]  # number of Gaussians by effect set (gsbench.models.effect_sets.NAMES), and of removed ones
+    orders: dict[str, int]  # number of Gaussians by the order of their colours
     bytes_before: int
     bytes: int
-    step: int | None = None  # of the training, before which it acted; None: at the end
+    step: int | None = None  # the training step before which the removal was done; None: after training
     checked_on: str = "val"  # or "held-out training views"
     seconds: float = 0.0
-    eval_loss_db: float | None = None  # PSNR lost on the evaluated split, where that was measured
-    frame_ms_before: float | None = None  # medians of frames, rendered in turns with those after
+    eval_loss_db: float | None = None  # PSNR lost on the evaluated split, if measured
+    frame_ms_before: float | None = None  # median frame times before and after, measured alternately
     frame_ms: float | None = None
-    asleep: float | None = None  # share of AGR's work left out: Gaussians that no training view shows at its time
+    asleep: float | None = None  # share of AGR's work that is skipped for Gaussians that no training view shows
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return the JSON of a `Gate` in which old keys of earlier versions of gsbench are replaced."""
+        """Return the JSON of a `Gate` in which old keys of earlier versions of gsbench are replaced by the present ones."""
         plain = {RENAMED_KEYS.get(key, key): value for key, value in plain.items()}
         if isinstance(rows := plain.get("rows"), dict):
             plain["rows"] = {RENAMED_EFFECT_SETS.get(name, name): count for name, count in rows.items()}
@@ -124,9 +124,9 @@ class Gate:
 class Direction:
     """The change in PSNR and frame time if all Gaussians of a trained model ignore the view direction."""
 
-    kept: float  # share of the Gaussians whose slices change with the direction of view
-    loss_db: float  # PSNR lost on the evaluated split if direction were frozen in all of them
-    frame_ms: float  # medians of frames, rendered in turns
+    kept: float  # share of the Gaussians that depend on the view direction
+    loss_db: float  # PSNR lost on the evaluated split if they all ignored the view direction
+    frame_ms: float  # median frame times with and without direction, measured alternately
     frame_ms_without: float
 
 
@@ -136,27 +136,27 @@ class OnDemand:
 
     screen: TimeScreen | None = None
     gates: list[Gate] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)  # what could not be decided, and why
-    direction: Direction | None = None  # None: the model does not observe it
+    notes: list[str] = field(default_factory=list)  # decisions that were not possible, and why
+    direction: Direction | None = None  # None: the model has no view direction
 
 
 @dataclass(frozen=True)
 class Provenance:
     """The conditions under which a run was measured: commit, versions, machine, settings and date."""
 
-    git_commit: str | None  # "-dirty" at the end where tracked files were changed; None outside a git checkout
-    versions: dict[str, str]  # python and the packages that the numbers depend on
-    device: str  # the processor or GPU by name
-    threads: int  # of torch and of the kernels
-    config: dict[str, Any]  # the whole resolved config, plain JSON
+    git_commit: str | None  # with "-dirty" if tracked code was changed; None outside of a git checkout
+    versions: dict[str, str]  # of Python and the packages that results depend on
+    device: str  # the name of the processor or GPU
+    threads: int  # threads of torch and of the kernels
+    config: dict[str, Any]  # all settings of the run with references resolved, plain JSON
     config_hash: str
     data_hash: str  # Scene.fingerprint
     time: str  # UTC, ISO 8601
-    hardware: Hardware | None = None  # None in older records, which tell machines apart by `device` alone
+    hardware: Hardware | None = None  # None in older records, which have only `device`
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return the JSON of a `Provenance` in which old config keys of earlier versions of gsbench are replaced."""
+        """Return the JSON of a `Provenance` in which config keys of earlier versions have their present names."""
         config = plain.get("config")
         return plain | {"config": with_present_keys(config)} if isinstance(config, dict) else plain
 
@@ -174,7 +174,7 @@ class Record:
     """
 
     status: str  # "ok", "failed" or "diverged"
-    reason: str | None  # why it is not ok
+    reason: str | None  # why the status is not "ok"
     experiment: str
     model: str
     scene: str
@@ -191,7 +191,7 @@ class Record:
     version: int = VERSION
     variant: str = ""  # settings of its training that differ from the experiment's, such as "iterations=10"
     overrides: list[str] = field(default_factory=list)  # `python -m gsbench` with these arguments repeats the run
-    on_demand: OnDemand | None = None  # None: every Gaussian paid for every effect of the model
+    on_demand: OnDemand | None = None  # None: no effect was removed from the model or its Gaussians
 
     @property
     def path(self) -> Path:
@@ -235,10 +235,10 @@ def _validated(plain: Any, path: Path) -> Record:
         InputError: the JSON is not a valid record; the message names `path` and the field.
     """
     version = plain.get("version") if isinstance(plain, dict) else VERSION
-    if type(version) is not int or version != VERSION:  # first: another version has other keys
+    if type(version) is not int or version != VERSION:  # checked first, because another version has other keys
         raise InputError(f"{path}: version: expected {VERSION}, got {ascii(version)[:80]}; run again with this gsbench")
     curve = plain.get("curve") if isinstance(plain, dict) else None
-    if isinstance(curve, list) and len(curve) > MAX_POINTS:  # before each point is parsed
+    if isinstance(curve, list) and len(curve) > MAX_POINTS:  # checked before the points are parsed
         raise InputError(f"{path}: curve: expected at most {MAX_POINTS:,} points, got {len(curve):,}; run again with "
                          f"fewer train.curve_points")  # fmt: skip
     record = parse(Record, plain, str(path))
@@ -250,7 +250,7 @@ def find(root: Path) -> list[Path]:
     """Return the sorted paths of all record.json files under `root`, without subfolders called "published"."""
     found = []
     for folder, folders, names in os.walk(root):
-        if FILE_NAME in names or FILE_NAME in folders:  # a broken link counts, as what it should show is missing
+        if FILE_NAME in names or FILE_NAME in folders:  # a broken link counts too, so that it is reported
             found.append(Path(folder, FILE_NAME))
         folders[:] = [name for name in folders if name != PUBLISHED]
     return sorted(found)

@@ -43,7 +43,10 @@ def present_override(override: str) -> str:
 
 
 def with_present_keys(plain: dict[str, Any], group: str = "") -> dict[str, Any]:
-    """Return a nested config with the present names of all keys; `group` is the dotted key of the config itself."""
+    """Return a nested config with the present names of all keys.
+
+    `group` is the dotted key at which `plain` belongs in the whole config, such as "train"; "" for a whole config.
+    """
     found: dict[str, Any] = {}
     for name, value in plain.items():
         inner = with_present_keys(value, f"{group}.{name}".lstrip(".")) if isinstance(value, dict) else value

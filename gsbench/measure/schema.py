@@ -9,7 +9,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 from gsbench.errors import InputError, did_you_mean
 
 T = TypeVar("T")
-LARGEST = 1e100  # the square of a number stays finite, and a chart can have it on an axis
+LARGEST = 1e100  # squares stay finite, and charts can show the number
 
 
 def parse(kind: type[T], value: object, file: str) -> T:
@@ -79,7 +79,7 @@ def _parse_any(value: Any, file: str, field: str) -> Any:
     for container in (dict[str, Any], list[Any]):
         if type(value) is get_origin(container):
             return _parse(container, value, file, field)
-    if type(value) is float and math.isfinite(value):  # of a config, which may be anything
+    if type(value) is float and math.isfinite(value):  # a setting may be any finite number
         return value
     return _parse_scalar(type(value), value, file, field)
 
@@ -88,7 +88,7 @@ def _parse_scalar(kind: Any, value: Any, file: str, field: str) -> Any:
     """Parse a bool, int, float or str; only an int in place of a float is converted."""
     if kind is str and type(value) is str:
         return _text(value, file, field)
-    if kind is int and type(value) is int and abs(value) < 2**63:  # tables cannot hold larger integers
+    if kind is int and type(value) is int and abs(value) < 2**63:  # tables cannot store larger integers
         return value
     if kind is float and type(value) in (int, float):
         try:

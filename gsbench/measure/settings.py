@@ -23,12 +23,12 @@ PLACES = (
     "results", "resume", "launch", "data.root", "data.published", "data.scenes", "init.ply", "scene.released_as",
     "train.checkpoint_minutes", "protocol.lpips_alex", "protocol.lpips_vgg",
 )  # fmt: skip
-# Keys that older configs lack, with the value that they all had.
+# Keys that are missing in older configs, with the value that all older runs had.
 ALWAYS = {
     "train.densify.kind": "gradient",
     **{f"train.penalties.{name}.{key}": 0 for name in ("opacity", "size") for key in ("weight", "start")},
 }
-_MOST_NAMED = 5  # differences that are named
+_MOST_NAMED = 5  # the most differences that a message contains
 
 
 def training_part(plain: Plain) -> Plain:

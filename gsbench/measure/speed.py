@@ -123,7 +123,7 @@ class StageClock:
     def __init__(self, device: str = "cpu") -> None:
         self._seconds: dict[str, float] = {}
         self._clock = _clock_of(device)
-        self._ended: deque[tuple[str, Any, Any]] = deque()  # name, start and end, not yet in the sums
+        self._ended: deque[tuple[str, Any, Any]] = deque()  # name, start and end of stages that are not yet in the sums
         self._current: str | None = None
 
     @contextmanager
@@ -187,7 +187,7 @@ class Laps:
         """Start the first stage."""
         self._clock = _clock_of(device)
         self._last = self._clock.mark()
-        self._ended: list[tuple[str, Any, Any]] = []  # name, start and end
+        self._ended: list[tuple[str, Any, Any]] = []  # name, start and end of each stage
 
     def end(self, name: str) -> None:
         """End the current stage and give it a name; the seconds of stages with equal names are added."""
@@ -319,7 +319,7 @@ def reset_peak_memory(device: str = "cpu") -> None:
         torch.cuda.reset_peak_memory_stats(device)
     elif (clear := Path("/proc/self/clear_refs")).exists():
         with suppress(AttributeError):  # a libc that is not glibc
-            ctypes.CDLL(None).malloc_trim(0)  # memory kept by the kernels is not of the next run
+            ctypes.CDLL(None).malloc_trim(0)  # freed memory that malloc keeps does not belong to the next run
         clear.write_text("5")  # proc(5): resets VmHWM, which ru_maxrss reports
 
 

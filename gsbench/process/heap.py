@@ -4,8 +4,8 @@ import ctypes
 import os
 import sys
 
-KEPT = 1 << 30  # bytes of a block, and of the free end of the heap
-# Options of glibc's malloc (mallopt(3)) by the environment variable that overrides each.
+KEPT = 1 << 30  # bytes: the largest block that malloc keeps, and the most free memory at the end of the heap
+# Options of glibc's malloc (mallopt(3)), by the environment variable that overrides the option.
 OPTIONS = {
     "MALLOC_TRIM_THRESHOLD_": (-1, KEPT),  # M_TRIM_THRESHOLD
     "MALLOC_MMAP_THRESHOLD_": (-3, KEPT),  # M_MMAP_THRESHOLD

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gsbench.errors import TooLargeError
 
-# Messages of the library loader, torch, C++, the system's threads and OpenCV where memory runs out.
+# Messages of the library loader, torch, C++, system threads and OpenCV if memory runs out.
 WITHOUT_MEMORY = re.compile(r"memory|bad_alloc|bad alloc|failed to map segment|can't start new thread", re.IGNORECASE)
 SMALL = 1 << 26  # bytes; smaller requests are not checked
 # Bytes of address space (`ulimit -v`) that Python, torch and OpenBLAS need to start. With less, torch or the C library
@@ -76,5 +76,5 @@ def _control_group() -> int | None:
         lines = (folder / "memory.stat").read_text().splitlines()
     except (OSError, ValueError):  # no control group, or no limit ("max")
         return None
-    # `current` counts files that were read and can be dropped again at any time.
+    # memory.current includes cached files, which the system can drop at any time.
     return left + next((int(line.split()[1]) for line in lines if line.startswith("inactive_file ")), 0)

@@ -16,8 +16,8 @@ def sleep_when_idle() -> None:
     """Make idle OpenMP threads sleep, before or after torch is imported, unless the environment sets a policy.
 
     If libgomp is already loaded, its idle threads spin for 300,000 rounds, but only for 100 rounds while there are more
-    OpenMP threads than processors (libgomp manual, GOMP_SPINCOUNT). So this function then starts that many threads,
-    which do nothing. It does not affect a copy of libgomp that a library ships under another name.
+    OpenMP threads than processors (libgomp manual, GOMP_SPINCOUNT). In this case the function starts more threads than
+    processors, which do nothing. It does not affect a copy of libgomp that a library ships under another name.
     """
     if "OMP_WAIT_POLICY" in os.environ or "GOMP_SPINCOUNT" in os.environ:
         return
@@ -34,8 +34,8 @@ def sleep_when_idle() -> None:
 
 
 def _crowd(runtime: ctypes.CDLL, made: threading.Event) -> None:
-    """Start more OpenMP threads than there are processors, and keep this thread alive, because they end with it."""
-    nothing = ctypes.CDLL(None).sched_yield  # each of them runs it once; it takes no argument
+    """Start more OpenMP threads than there are processors; this thread never ends, because they would end with it."""
+    nothing = ctypes.CDLL(None).sched_yield  # each thread calls this once; it has no arguments
     runtime.GOMP_parallel(nothing, None, runtime.omp_get_num_procs() + 1, 0)
     made.set()
     threading.Event().wait()

@@ -40,7 +40,7 @@ def _pool(workers: int, threads: int) -> ThreadPoolExecutor:
     before = torch.get_num_threads()
 
     def settle() -> None:
-        torch.get_num_threads()  # in a thread that has not asked yet, asking puts the process's number in place
+        torch.get_num_threads()  # the first call in a thread sets its number to that of the process, so call it first
         torch.set_num_threads(threads)
 
     pool = ThreadPoolExecutor(workers, "gsbench-worker", settle)

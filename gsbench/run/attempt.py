@@ -30,7 +30,7 @@ class Attempt:
         self.resolved = Resolved(before_scene(this.config))
         self.model: GaussianModel | None = None
         self.scene: Scene | None = None
-        self.start: TrainedGaussians | None = None  # trained Gaussians to start from; None: points
+        self.start: TrainedGaussians | None = None  # trained Gaussians to start from; None to start from points
         self._images: dict[str, Pixels] = {}
 
     def prepare(self) -> tuple[GaussianModel, Scene]:
@@ -53,7 +53,7 @@ class Attempt:
         return self.model, scene
 
     def fit(self, model: GaussianModel, scene: Scene) -> Trainer:
-        """Train to the last step; with model=auto, first test whether the scene changes with time to choose a model.
+        """Train to the last step; for model=auto, first choose a model with or without time by a test of the scene.
 
         Raises as `gsbench.run.fitting.fit`.
         """

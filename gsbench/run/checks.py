@@ -31,9 +31,9 @@ from gsbench.train.penalties import check_penalties
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 PACKAGE = "pkg://"  # in front of the module whose files data.root names
 SPLITS = ("test", "val")
-LEAST_GAUSSIANS = 4  # to start from: initial scales come from three neighbours
+LEAST_GAUSSIANS = 4  # the fewest Gaussians to start from: initial scales come from three neighbours
 ENDLESS = 10**9  # more than any machine can do
-RANGES = {  # of numbers that the schema types but does not bound, both ends included
+RANGES = {  # the ranges of settings, both ends included
     "train.iterations": (1, ENDLESS),
     "train.recipe_iterations": (1, ENDLESS),
     "train.batch_size": (1, 10_000),
@@ -203,7 +203,7 @@ def scene_folder(config: Config) -> Path:
     """
     data, scene = config.data, config.scene
     names = [scene.name, *([scene.released_as] if scene.released_as else [])]
-    folders = [data_root(data.root) / name for name in names]  # a name has no slash: gsbench.measure.record.run_path
+    folders = [data_root(data.root) / name for name in names]  # names have no slash (checked by run_path)
     for folder in folders:
         if folder.is_dir():
             return folder
@@ -232,7 +232,7 @@ def data_root(root: str) -> Path:
 
 
 def check_gates(model: GaussianModel, config: Config) -> None:
-    """Raise InputError if `effects.gate` asks to remove time, direction or AGR from Gaussians, and the model cannot."""
+    """Raise InputError if `effects.gate` asks to remove time, direction or AGR, but the model does not support this."""
     if config.effects.gate != "off":
         as_gated(model)
 

@@ -19,7 +19,7 @@ from gsbench.run import progress
 from gsbench.run.progress import Progress
 
 LOCK = ".claim"
-PATIENCE = 5.0  # seconds to wait for the lock; a process that holds it longer is suspended, and the link decides
+PATIENCE = 5.0  # seconds to wait for the lock; a process that holds it longer is suspended, so go on without
 ATTEMPTS = 100
 NOTHING, DAMAGED = "nothing", "damaged"  # results of reading a claim that is no progress file
 
@@ -40,7 +40,7 @@ def take(folder: Path, mine: Progress) -> Progress | None:
             if isinstance(other, Progress) and not _may_be_taken(other, mine):
                 return other
             if other is not NOTHING:
-                path.unlink(missing_ok=True)  # a dead process left it, or it is damaged and says nothing
+                path.unlink(missing_ok=True)  # its process has ended, or the file is damaged
             if create_atomically(path, progress.encode(mine)):
                 return None
     raise InputError(f"{path}: expected to claim the run, other processes claim it again and again: try later")
@@ -54,7 +54,7 @@ def release(folder: Path, mine: Progress) -> None:
             other = _read(path)
             if isinstance(other, Progress) and _is_one(other, mine):
                 path.unlink(missing_ok=True)
-    except OSError:  # the folder is gone or cannot be written any more; the claim goes with its process
+    except OSError:  # the folder cannot be written any more; the claim expires with this process
         return
 
 

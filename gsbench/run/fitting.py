@@ -91,7 +91,7 @@ def fit(trainer: Trainer, this: Run, resolved: Resolved, plain: dict[str, Any]) 
 
 def _check_fitted(trainer: Trainer) -> None:
     """Raise DivergedError if a parameter is not finite, and InputError if no Gaussian is left."""
-    for name, parameter in trainer.model.named_parameters():  # no image shows a colour of -inf: it is black
+    for name, parameter in trainer.model.named_parameters():  # images would not show a colour of -inf, which is black
         if not parameter.isfinite().all():
             raise DivergedError(f"step {trainer.step}: '{name}' has values that are not finite")
     if not len(trainer.model):

@@ -25,7 +25,7 @@ from gsbench.scenes.ply import MAX_FILE
 
 OWN_NAMES = ("exp", "model", "scene")  # the groups that have a place in a run's path
 DEFAULTS = {"train": "default", "raster": "default", "protocol": "gsbench"}  # groups of conf/config.yaml
-LONGEST_VARIANT = 80  # characters: several such folders must fit into a path of 255
+LONGEST_VARIANT = 80  # characters; longer names could exceed the limits of a path
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class Run:
     """The training and measurement of one model on one scene with one seed: settings, names and folder."""
 
     config: Config
-    plain: Plain  # the config as recorded
-    folder: Path  # where the record, the checkpoint and the images go
-    label: str  # the model's name, with _agr or _noagr where it is not as published
+    plain: Plain  # the settings as they are recorded, plain values
+    folder: Path  # the folder of the record, the checkpoint and the images
+    label: str  # the model's name, with _agr or _noagr if it differs from the published method
     variant: str = ""  # settings of its training that differ from the experiment's, such as "iterations=10"
-    overrides: list[str] = field(default_factory=list)  # arguments of `python -m gsbench` that repeat it
+    overrides: list[str] = field(default_factory=list)  # arguments of `python -m gsbench` that repeat the run
 
     @property
     def name(self) -> str:

@@ -53,7 +53,7 @@ class LoadedRun:
     model: GaussianModel
     config: Config
     scene: SceneDescription
-    step: int  # finished steps; below config.train.iterations where the run was interrupted
+    step: int  # finished steps; fewer than config.train.iterations if the run was interrupted
     folder: Path
 
 
@@ -93,7 +93,7 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     scene = parse(SceneDescription, found.scene, str(path))
     _check_scene(scene, path)
     model = build(config)
-    points = torch.eye(4, 3)  # the fewest allowed; `load_state` replaces them
+    points = torch.eye(4, 3)  # placeholders, which `load_state` replaces
     model.initialise(Points(points, points), scene.extent, generator(config.seed))
     model.to(device)
     try:
@@ -101,7 +101,7 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
         step = checkpoint.whole_number("step", found.state["step"], config.train.iterations)
     except (InputError, MemoryError):
         raise
-    except Exception as error:  # a part may be of any type
+    except Exception as error:  # parts of an untrusted file may have any type
         raise InputError(f"{path}: expected a training's state, it lacks {one_line(error)!s:.200}") from None
     schedule = Schedule(config.train, config.model.sh_degree, config.agr)
     model.set_active(schedule.active(max(0, step - 1)))
@@ -171,7 +171,7 @@ def typed_config(plain: dict[str, Any], path: Path) -> Config:
     try:
         typed = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.create(_without_interpolations(plain)))
         config: Config = OmegaConf.to_object(typed)  # type: ignore[assignment]
-    except Exception as error:  # OmegaConf raises many kinds, some of them its own
+    except Exception as error:  # OmegaConf raises many types of exceptions
         raise InputError(f"{path}: expected the config of a run: {one_line(error)[:200]}") from None
     names = [config.scene.name] + ([config.scene.released_as] if config.scene.released_as else [])
     try:

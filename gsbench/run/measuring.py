@@ -30,8 +30,8 @@ class Measured:
     missing: dict[str, str]  # why a metric has no value
     per_view: list[ViewScore]
     cost: Cost
-    frames: dict[str, str]  # how frames are made on a GPU, for the record's protocol
-    images: dict[str, Pixels]  # by file name
+    frames: dict[str, str]  # whether frames on a GPU are replayed from a CUDA graph, for the record
+    images: dict[str, Pixels]  # images by file name
 
 
 def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measured:
@@ -84,7 +84,7 @@ def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[s
     """Yield (name, render, ground truth) of each evaluated view, and append a few evenly spaced pairs to `shown`."""
     views = trainer.views
     chosen = range(0, len(views), max(1, len(views) // max(1, pictures)))[:pictures]
-    for i, view in enumerate(views):  # one at a time: fifty views of 2048 x 1088 take 3 GB
+    for i, view in enumerate(views):  # one view at a time, because fifty views of 2048 x 1088 take 3 GB
         render, truth = trainer.render(view), view.image
         if i in chosen:
             shown.append((render.cpu().numpy(), truth.cpu().numpy()))
@@ -102,7 +102,7 @@ def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dic
     graphed = GraphedFrames(trainer.model, trainer.renderer.background, trainer.renderer.antialias)
     try:
         graphed(first.camera, first.time)
-    except RuntimeError as error:  # an operation that waits for the device, in a model or a scheme written in torch
+    except RuntimeError as error:  # the model waits for the GPU, which a CUDA graph does not allow
         print(f"FPS is that of launched frames: CUDA cannot record this model: {one_line(error)}", file=sys.stderr)
         return trainer.render, {"frames": "launched"}
     return lambda view: graphed(view.camera, view.time), {"frames": "replayed"}
@@ -112,7 +112,7 @@ def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[
     """Return the metrics of the last iteration, with the PSNR at the best iteration added.
 
     The best iteration is the one with the highest PSNR on the validation split. If the settings ask for `best_on_test`,
-    PSNR at the best iteration on the evaluated split is added too.
+    the highest PSNR on the evaluated split during training is added too.
     """
     metrics, missing = dict(quality.metrics), dict(quality.missing)
     metrics["psnr_best_on_val"] = trainer.best.eval_at_best_val

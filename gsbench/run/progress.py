@@ -23,7 +23,7 @@ SILENT = 600.0  # seconds without a report after which a run on an unreachable h
 class Progress:
     """The progress of a run (step, seconds, PSNR), and the process that runs it."""
 
-    overrides: list[str]  # of the run, as in its record
+    overrides: list[str]  # the run's overrides, as in its record
     host: str = field(default_factory=socket.gethostname)
     pid: int = field(default_factory=os.getpid)
     born: int | None = field(default_factory=lambda: born(os.getpid()))
@@ -31,9 +31,9 @@ class Progress:
     started: float = field(default_factory=time.time)  # Unix seconds
     updated: float = field(default_factory=time.time)  # Unix seconds
     step: int = 0
-    steps: int = 0  # 0 while the run is claimed and does not train yet
-    seconds: float = 0.0  # of training so far
-    psnr_val: float | None = None  # dB, the last one measured
+    steps: int = 0  # 0 while the run is claimed but does not train yet
+    seconds: float = 0.0  # seconds of training so far
+    psnr_val: float | None = None  # the latest one, dB
 
 
 def write(folder: Path, progress: Progress) -> None:
@@ -47,7 +47,7 @@ def encode(progress: Progress) -> bytes:
 
 
 class Reporter:
-    """Writes the progress of a run during its training, at most every EVERY seconds."""
+    """Writes progress.json during the training of a run, at most once per interval (`EVERY` seconds)."""
 
     def __init__(self, folder: Path, overrides: list[str], steps: int) -> None:
         """Report that the run in `folder` has started, with `steps` steps to do."""
@@ -57,7 +57,7 @@ class Reporter:
         self._written = time.monotonic()
 
     def is_due(self) -> bool:
-        """Return whether the last report is at least EVERY seconds old.
+        """Return whether the interval since the last report (`EVERY` seconds) is over.
 
         The caller asks first, because computing a report may wait for the GPU.
         """
@@ -72,7 +72,7 @@ class Reporter:
         self._written = time.monotonic()
         try:
             write(self.folder, self.progress)
-        except OSError:  # a full disk ends the run at its checkpoint or its record, not here
+        except OSError:  # a full disk must not end the run here, but at its checkpoint or record
             return
 
     def end(self) -> None:

@@ -21,7 +21,7 @@ CANDIDATES = ("moving", "static")  # in conf/model/auto.yaml
 
 
 def is_auto(config: Config) -> bool:
-    """Return whether the settings have model=auto, so that the model is still to be chosen."""
+    """Return whether the settings have model=auto, so that a test of the scene must still choose the model."""
     return config.model.name == AUTO
 
 
@@ -47,8 +47,8 @@ class Resolved:
     """The settings of a training after model=auto was replaced by a model, and the test that chose it."""
 
     config: Config
-    screen: TimeScreen | None = None  # what chose the model of model=auto
-    effort: Effort = field(default_factory=Effort)  # of the screen
+    screen: TimeScreen | None = None  # the test that chose the model, for model=auto
+    effort: Effort = field(default_factory=Effort)  # CPU time of this test
 
 
 def before_scene(config: Config) -> Config:

@@ -92,14 +92,14 @@ def _done(attempt: Attempt) -> Record:
         return kept
     try:
         write(record, this.folder)
-    except OSError as error:  # the other runs of the sweep go on; this one's checkpoint is what it was
+    except OSError as error:  # the sweep continues with its other runs; the checkpoint of this run is unchanged
         raise UnrecordedError(f"{summary(record)}; its record cannot be written: {error.strerror}") from None
     for line in messages.lines(record.on_demand) if record.on_demand else []:
         print(f"{this.name}: {line}")
     print(f"{this.name}: {summary(record)}; {this.folder / records.FILE_NAME}")
     try:
         attempt.draw()
-    except Exception as error:  # the record is there; pictures are worth less than the next run
+    except Exception as error:  # the record is written, so an error in the pictures must not end the sweep
         print(f"{this.name}: no pictures: {one_line(error)}", file=sys.stderr)
     return record
 
@@ -112,13 +112,13 @@ def _ended_badly(attempt: Attempt, error: Exception) -> Record:
     """
     is_diverged = isinstance(error, DivergedError)
     if is_out_of_memory(error):
-        error.__traceback__ = None  # its frames hold what filled the memory, and a record takes some
+        error.__traceback__ = None  # the frames of the traceback keep the large objects alive
         gc.collect()
     reason = one_line(error) if is_diverged else reason_of(error, attempt.this.folder)
     if is_diverged and attempt.model is not None:
         try:
             reason = f"{reason}; {explain(attempt.model)}"
-        except Exception as unexplained:  # what it resembles is worth less than that it diverged
+        except Exception as unexplained:  # an error in the explanation must not hide that the run diverged
             reason = f"{reason}; it cannot be explained: {one_line(unexplained)}"
     return attempt.describe("diverged" if is_diverged else "failed", reason)
 

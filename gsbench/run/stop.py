@@ -10,12 +10,12 @@ from typing import Any
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
 
 
-class Stopped(BaseException):  # like KeyboardInterrupt: not an error, and no handler of errors takes it
+class Stopped(BaseException):  # like KeyboardInterrupt, so that `except Exception` does not catch it
     """A signal asked the process to end, and the run has saved its state."""
 
     def __init__(self, number: int, message: str) -> None:
         super().__init__(message)
-        self.code = 128 + number  # the exit status by which a shell knows the signal
+        self.code = 128 + number  # the exit status of a process that a signal ended
 
 
 def stop_at_once(number: int, _: FrameType | None) -> None:
@@ -31,7 +31,7 @@ class Request:
         self._before: dict[int, Any] = {}
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
-        if self.signal is not None:  # at the second signal the earlier handler acts, which mostly ends the process
+        if self.signal is not None:  # a second signal goes to the earlier handler, which usually ends the process
             self.hand_on(number, frame)
         self.signal = number
 
@@ -59,7 +59,7 @@ def requested() -> Iterator[Request]:
     for number in SIGNALS:
         before = signal.getsignal(number)
         if before == signal.SIG_IGN or (number == signal.SIGUSR2 and before == signal.SIG_DFL):
-            continue  # a shell's background process ignores SIGINT; SIGUSR2 is a request only where submitit listens
+            continue  # background processes ignore SIGINT; SIGUSR2 matters only if submitit has a handler
         request._before[number] = signal.signal(number, request._ask)
     try:
         yield request
