@@ -44,7 +44,7 @@ class Curve:
 
     @property
     def best(self) -> Point | None:
-        """Return the evaluation with the highest PSNR (the first one if several are equal), or None if no PSNR is finite."""
+        """Return the evaluation with the highest PSNR (the first of several equal ones), or None if none is finite."""
         finite = [(p.psnr_val, p) for p in self.points if p.psnr_val is not None]
         return max(finite, key=lambda pair: pair[0])[1] if finite else None
 

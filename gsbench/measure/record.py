@@ -113,7 +113,7 @@ class Gate:
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return the JSON of a `Gate` in which old keys of earlier versions of gsbench are replaced by the present ones."""
+        """Return the JSON of a `Gate` in which keys of earlier versions of gsbench have their present names."""
         plain = {RENAMED_KEYS.get(key, key): value for key, value in plain.items()}
         if isinstance(rows := plain.get("rows"), dict):
             plain["rows"] = {RENAMED_EFFECT_SETS.get(name, name): count for name, count in rows.items()}

@@ -45,7 +45,10 @@ class Case:
 
 @dataclass(frozen=True)
 class Cell:
-    """The errors and the time of one test case with one model, slicing scheme and backend."""
+    """The errors and the time of one test case with one model, backend and slicing scheme.
+
+    The slicing scheme is the algorithm that computes the conditional 3D Gaussian at a time and view direction.
+    """
 
     area: str
     case: str
@@ -61,7 +64,10 @@ class Cell:
 
     @property
     def is_default(self) -> bool:
-        """Return whether the result comes from a default setting; other schemes are measured for comparison only."""
+        """Return whether the result comes from a default setting.
+
+        The other algorithms for conditional Gaussians (`schur`, `cholesky`) are measured for comparison only.
+        """
         return self.scheme in ("square_root", "-")
 
     @property

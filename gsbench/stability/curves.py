@@ -1,4 +1,7 @@
-"""Measure errors of slicing schemes against condition number and precision, and the time of each scheme."""
+"""Measure the errors of slicing schemes against condition number and precision, and the time of each scheme.
+
+A slicing scheme is an algorithm that computes the conditional 3D Gaussian at a time and view direction.
+"""
 
 import itertools
 import time
@@ -34,7 +37,10 @@ PERCENTILE = 0.999  # the quantile of errors over random Gaussians that must be 
 
 @dataclass(frozen=True)
 class ConditionCurve:
-    """The float32 errors of one slicing scheme as a function of the condition number of the covariance's factor."""
+    """The float32 errors of one slicing scheme as a function of the condition number of the covariance's factor.
+
+    A slicing scheme is an algorithm that computes the conditional 3D Gaussian.
+    """
 
     scheme: str
     condition: list[float]  # middle of each bin
@@ -68,7 +74,7 @@ class AccuracyPoint:
 
 
 def accuracy_for_time(backends: list[str]) -> Iterator[AccuracyPoint]:
-    """Yield error and time of slicing and rendering, for each slicing scheme, precision and CPU instruction set.
+    """Yield error and time of slicing (each algorithm and precision) and of rendering (each CPU instruction set).
 
     The inputs are 7D Gaussians with ill-conditioned factors (`SLICED` of them) for slicing, and 3D Gaussians (`DRAWN`
     of them) for rendering.
@@ -138,10 +144,10 @@ def percentile(errors: population.Floats) -> float:
 
 
 def by_condition() -> Iterator[ConditionCurve]:
-    """Yield, for each slicing scheme, the float32 errors in torch as a function of the factor's condition number.
+    """Yield, for each algorithm of slicing, its float32 errors in torch against the condition number of the factor.
 
     The rows of the factors are in the paper's order, with position first. In the default order the conditional Gaussian
-    is a block of the factor, so that the default scheme would have nothing to compute.
+    is a block of the factor, so that the default algorithm would have nothing to compute.
     """
     order = "paper"
     generator = torch.Generator().manual_seed(2)
@@ -164,7 +170,7 @@ def by_condition() -> Iterator[ConditionCurve]:
 
 
 def safety(backends: list[str]) -> Iterator[SliceTime]:
-    """Yield the time of each slicing scheme on each backend that implements it, forward and backward."""
+    """Yield the time of each algorithm for conditional Gaussians on each backend that has it, forward and backward."""
     for order in FACTOR_ORDERS:
         hard = population.draw(torch.Generator().manual_seed(3), TIMED, order, 1.0)
         for scheme in SCHEMES:

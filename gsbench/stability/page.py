@@ -107,7 +107,7 @@ def _number(x: float) -> str:
 
 
 def costs(audit: Audit) -> list[str]:
-    """Return the Markdown table of the times of slicing schemes.
+    """Return the Markdown table of the times of the algorithms for conditional Gaussians.
 
     It compares the default `square_root` with `schur` and `cholesky`, which subtract covariances.
     """
@@ -135,7 +135,7 @@ def stresses() -> list[str]:
 
 
 def csv_of(cells: list[Cell]) -> str:
-    """Return all results of the stability audit as CSV, one line per test case, model, slicing scheme and backend."""
+    """Return all results of the stability audit as CSV, one line per test case, model, algorithm and backend."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)

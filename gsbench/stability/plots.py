@@ -66,7 +66,10 @@ def save(path: Path, draw: Callable[[Axes], None], size: tuple[float, float] = (
 
 
 def by_condition(axes: Axes, audit: Audit) -> None:
-    """Plot errors of slicing schemes (left axis) and the share of invalid covariances (right) over condition number."""
+    """Plot errors (left axis) and the share of invalid covariances (right axis) over the condition number.
+
+    There is a curve for each algorithm that computes conditional covariances.
+    """
     shares = axes.twinx()
     for curve in audit.conditions:
         color = COLORS[curve.scheme]
@@ -81,7 +84,7 @@ def by_condition(axes: Axes, audit: Audit) -> None:
 
 
 def by_time(axes: Axes, audit: Audit, thing: str) -> None:
-    """Plot the error over the time of each slicing scheme or rasterizer backend, as labelled points."""
+    """Plot errors over milliseconds as labelled points, one for each slicing algorithm or rasterizer backend."""
     points = [point for point in audit.accuracy if point.thing == thing]
     points.sort(key=lambda point: point.ms)
     for i, (point, height) in enumerate(zip(points, shown([point.error for point in points]), strict=True)):

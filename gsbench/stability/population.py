@@ -89,7 +89,7 @@ def factor(hard: Hard) -> Floats:
 
 
 def conditioned(order: str) -> list[int]:
-    """Return the rows of direction and then of time in the triangular factor, for a given factor order."""
+    """Return the rows of direction and then of time in the triangular factor, for a given row order of this factor."""
     return [4, 5, 6, 3] if order == "paper" else [0, 1, 2, 3]
 
 
@@ -229,7 +229,7 @@ def judge(hard: Hard, known: PopulationTruth, order: str, scheme: str, backend: 
 
 
 def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
-    """Make a 7DGS model in which no Gaussian fades with time or direction: its factors f_temp and f_dir are 1."""
+    """Make a 7DGS model in which opacity does not depend on time and direction (the factors f_temp and f_dir are 1)."""
     model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme, off_diagonal="raw",
                   backend=BACKENDS[backend])  # fmt: skip
     assert isinstance(model, TriangularModel)

@@ -39,7 +39,7 @@ class SliceTruth:
 
 
 def judge(case: Case, backends: list[str], schemes: Sequence[str] = SCHEMES) -> Iterator[Cell]:
-    """Yield the errors of conditional 3D Gaussians in one test case, for each model, slicing scheme and backend."""
+    """Yield the errors of conditional 3D Gaussians in one test case, for each model, algorithm and backend."""
     for model in case.subjects:
         observed = case(model=model)
         known = truth(observed)
@@ -75,7 +75,8 @@ def truth(observed: Observed) -> SliceTruth:
 def exact(observed: Observed) -> oracle.Function:
     """Return the mpmath function from the raw parameters of a Gaussian to its conditional 3D Gaussian.
 
-    Time and lambdas are rounded to float32, because the models get them in float32.
+    The time and the learned coefficients lambda_t and lambda_d are rounded to float32, because the models get them in
+    float32.
     """
     layout = {name: value[0].numel() for name, value in observed.raw.items()}
     log_lambda = {name: _single(value) for name, value in observed.log_lambda.items()}

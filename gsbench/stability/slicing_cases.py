@@ -198,7 +198,10 @@ def far_from_the_query(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def insensitive(g: Generator, severity: float, model: str) -> Observed:
-    """Let lambda go to 0: the opacity no longer depends on time and direction, and only the mean does."""
+    """Let lambda go to 0: opacity no longer depends on time and direction, and only the mean does.
+
+    Lambda is the coefficient in the exponent by which opacity decreases with the distance in time or direction.
+    """
     observed = ordinary(g, model)
     observed.log_lambda = dict.fromkeys(observed.log_lambda, -110.0 * severity)  # exp(-110) is 0 in float32
     return observed
@@ -206,7 +209,10 @@ def insensitive(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def oversensitive(g: Generator, severity: float, model: str) -> Observed:
-    """Set lambda to 10^4, as when training increases lambda without bound: opacity is 0 except near mu_t and mu_d."""
+    """Set lambda to 10^4, as when training increases lambda without bound: opacity is 0 except near mu_t and mu_d.
+
+    Lambda is the coefficient in the exponent by which opacity decreases with the distance in time or direction.
+    """
     observed = ordinary(g, model)
     observed.log_lambda = dict.fromkeys(observed.log_lambda, 4 * LN_10 * severity)
     near = 10 ** (-2 * severity)

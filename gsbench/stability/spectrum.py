@@ -20,9 +20,10 @@ PERCENTILES = (50, 90, 99, 99.9, 100)
 
 
 def measure(path: Path) -> dict[str, Floats]:
-    """Return the condition numbers of each Gaussian's factors in a checkpoint, before AGR changes the Gaussians.
+    """Return the condition numbers of each Gaussian's covariance factors in a checkpoint.
 
-    There are two factors: that of the full covariance (4D, 6D or 7D), and that of the conditional 3D covariance.
+    There are two factors: that of the full covariance (4D, 6D or 7D), and that of the conditional 3D covariance. Both
+    are computed from the trained parameters, without AGR (the neural refinement).
 
     Raises:
         InputError: the file is not a checkpoint, or its model is 3DGS, which has no conditional Gaussians.
@@ -33,10 +34,10 @@ def measure(path: Path) -> dict[str, Floats]:
 
 
 def failures(path: Path) -> dict[str, tuple[float, float]]:
-    """Measure the float32 errors of the schemes `schur` and `cholesky` on the Gaussians of a checkpoint.
+    """Measure the float32 errors of the methods `schur` and `cholesky` on the Gaussians of a checkpoint.
 
-    Both schemes subtract covariances. Return, for each of them, the share of indefinite conditional covariances and the
-    99th percentile of relative errors.
+    Both methods compute conditional covariances by a subtraction. Return, for each of them, the share of indefinite
+    conditional covariances and the 99th percentile of relative errors.
     """
     joint, _ = joint_factors(_splats(path), path)
     exact = reduce(joint).T_pp
@@ -57,8 +58,8 @@ def _splats(path: Path) -> dict[str, Tensor]:
 def joint_factors(splats: dict[str, Tensor], path: Path) -> tuple[Tensor, int]:
     """Return the covariance factors [N, 3+k, 3+k] of a trained 4DGS, 6DGS or 7DGS, and k.
 
-    The first three rows are position, and the k others time and direction. The model must have the default factor
-    order.
+    The first three rows are position, and the k others time and direction. The model must store its factors in the
+    default row order.
     """
     if "log_diagonal" in splats:
         k = splats["log_diagonal"].shape[1] - 3

@@ -126,7 +126,10 @@ def reset_into_refinement(g: Generator, severity: float, model: str) -> Training
 
 @case("training", "6dgs", "7dgs", forward=0.0, gradient=math.nan)
 def lambda_switched_on(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """Start to train lambda halfway with 1000 times the usual learning rate, so that lambda goes to 0 or infinity."""
+    """Start to train lambda halfway at 1000 times the usual rate, so that lambda goes to 0 or infinity.
+
+    Lambda is the coefficient in the exponent by which opacity decreases with the distance in time or direction.
+    """
     config = compose(model, STEPS, "train.lambda_from=15000")
     config.model.lr["lambda"].start = 1e-3 * 1000**severity
     return Training(model, config, moving_square())
@@ -144,9 +147,9 @@ def poisoned_photograph(g: Generator, severity: float, model: str) -> Training: 
 def single_against_double(
     g: Generator, severity: float, model: str, run_seed: int = 0, steps: int = DRIFT_STEPS,  # noqa: ARG001
 ) -> Training:  # fmt: skip
-    """Train 150 steps of suzanne at 40 x 40 pixels in float32 and in float64, and compare PSNR in dB.
+    """Train 150 steps of the embedded scene suzanne at 40 x 40 pixels in float32 and in float64, and compare PSNR.
 
-    Rounding may decide which Gaussians are split.
+    Rounding may decide which Gaussians are split. The error is the difference in dB.
     """
     config = compose(model, steps, "scene=suzanne", "scene.downscale=4", f"seed={run_seed}", "train.batch_size=1",
                      f"train.densify.every={steps // 3}")  # fmt: skip

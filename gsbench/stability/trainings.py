@@ -96,7 +96,7 @@ def psnr(trainer: Trainer) -> float:
 
 
 def share_not_finite(model: GaussianModel) -> float:
-    """Return the share of parameter values (of Gaussians, networks and lambdas) that are NaN or infinite."""
+    """Return the share of the model's parameter values (including network weights) that are NaN or infinite."""
     values = torch.cat([p.detach().flatten() for p in model.parameters()])
     return float((~values.isfinite()).double().mean()) if values.numel() else 0.0
 
