@@ -1,1 +1,1 @@
-"""Download data sets and weights that others publish, and put them where gsbench finds them."""
+"""Download published data sets and network weights to the folders in which gsbench looks for them."""

@@ -1,4 +1,4 @@
-"""Download data sets and weights (``python -m gsbench.fetch dnerf|pbr|lpips-alex|lpips-vgg|--list``)."""
+"""Download data sets and LPIPS weights (`python -m gsbench.fetch dnerf|pbr|lpips-alex|lpips-vgg|--list`)."""
 
 import argparse
 import sys
@@ -9,7 +9,10 @@ from gsbench.fetch.sources import Source, find, sources
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Fetch the named sources in turn; return 0, or 2 with a line on stderr for each that failed."""
+    """Download the named data sets or weights one after the other.
+
+    Return the exit code: 0, or 2 if a download failed. Each failure is printed as one line on stderr.
+    """
     made = argparse.ArgumentParser(prog="python -m gsbench.fetch", description=__doc__)
     made.add_argument("names", nargs="*", metavar="NAME", help="dnerf, pbr, lpips-alex or lpips-vgg")
     made.add_argument("--list", action="store_true", help="print what can be fetched, and what is there")
@@ -35,7 +38,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def folder_of(path: Path) -> Path:
-    """Return the folder that a user named; raises InputError if no folder can have that name."""
+    """Return the folder that the user named, with `~` expanded.
+
+    Raises:
+        InputError: the text is not a valid folder name.
+    """
     try:
         if "\0" not in str(path):
             return path.expanduser()
@@ -45,12 +52,12 @@ def folder_of(path: Path) -> Path:
 
 
 def line_of(source: Source) -> str:
-    """Describe a source in a line of the list."""
+    """Return the line of `--list` for one download: name, content and folder."""
     return f"{source.name:<11} {source.what}; {'is in' if source.target.exists() else 'goes to'} {source.target}"
 
 
 def plan_of(source: Source) -> str:
-    """Describe what would be downloaded, from where, to where, and how it is checked."""
+    """Return what `--dry-run` prints for one download: the URL, the folder and the expected SHA-256."""
     if source.target.exists():
         return f"{source.name}: {source.target} is there: nothing would be fetched"
     checked = f"its SHA-256 must begin with {source.sha256}" if source.sha256 else "no SHA-256 of it is published"
@@ -58,10 +65,10 @@ def plan_of(source: Source) -> str:
 
 
 def fetch(source: Source) -> str:
-    """Download a source and return a line on where it is.
+    """Download one data set or weight file, and return a line that says where it is.
 
     Raises:
-        InputError: the download fails, or the file is not the expected one.
+        InputError: the download fails, or the file does not have the expected SHA-256.
     """
     from gsbench.fetch.download import check, download, sha256_of
     from gsbench.fetch.unpack import scenes_in, unpack
@@ -85,7 +92,7 @@ def fetch(source: Source) -> str:
 
 
 def scenes(found: dict[Path, list[str]]) -> str:
-    """Describe which data.root to use for which scenes."""
+    """Return a text that says which `data.root` setting belongs to which downloaded scenes."""
     if not found:
         return "no scene with a transforms_train.json is in it"
     return printable("; ".join(f"data.root={root} has {', '.join(names)}" for root, names in found.items()))

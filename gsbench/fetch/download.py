@@ -1,4 +1,4 @@
-"""Download a file by pooch and check it; a failed download leaves no file and raises an error of one line."""
+"""Download a file with pooch and check its SHA-256; a failed download leaves no file."""
 
 import hashlib
 import logging
@@ -16,14 +16,15 @@ TIMEOUT = 30  # seconds without a byte
 
 
 def download(source: Source, folder: Path) -> Path:
-    """Download the file of a source into a folder and return its path; a file that is there already is checked.
+    """Download the file of a source into `folder` and return its path; an existing file is only checked.
 
-    Proxies are those of the environment (HTTPS_PROXY, NO_PROXY). A download that breaks off leaves nothing and starts
-    anew the next time.
+    Proxies are those of the environment (HTTPS_PROXY, NO_PROXY). An interrupted download leaves no file and starts from
+    the beginning next time.
 
     Raises:
-        InputError: the server cannot be reached, has no such file, breaks off, sends other bytes than expected, or
-            sends no valid answer.
+        InputError: the server cannot be reached, does not have the file, closes the connection, or sends other bytes
+            than
+            expected.
     """
     url, path = source.address(), folder / source.file
     if path.is_file():
@@ -45,7 +46,7 @@ def download(source: Source, folder: Path) -> Path:
                          f"{by_hand(source, path)}") from None  # fmt: skip
     except InputError:
         raise
-    # ValueError: a length or an address, perhaps of a redirection, that is none; not all of them are requests' own
+    # ValueError: an invalid length or URL, perhaps of a redirection, which requests does not always wrap
     except (requests.exceptions.RequestException, ValueError) as error:
         raise InputError(f"{source.name}: {url} broke off or is no answer ({type(error).__name__}): try again, or "
                          f"{by_hand(source, path)}") from None  # fmt: skip
@@ -53,12 +54,12 @@ def download(source: Source, folder: Path) -> Path:
 
 
 def by_hand(source: Source, path: Path) -> str:
-    """Describe how to download the file by hand."""
+    """Return a text that says how to download the file by hand."""
     return f"take it from {source.url or source.published} by hand to {path} and repeat this"
 
 
 def check(path: Path, source: Source, advice: str) -> None:
-    """Raise InputError if the source has a SHA-256 and that of the file begins otherwise."""
+    """Raise InputError if the SHA-256 of a file does not begin with the expected digits."""
     found = sha256_of(path)
     if source.sha256 and not found.startswith(source.sha256):
         raise InputError(f"{source.name}: expected {source.file} with SHA-256 {source.sha256}.., got {found[:8]}..: "
@@ -66,6 +67,6 @@ def check(path: Path, source: Source, advice: str) -> None:
 
 
 def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file in hex."""
+    """Return the SHA-256 of a file as hexadecimal text."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

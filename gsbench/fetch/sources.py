@@ -1,4 +1,4 @@
-"""List the sources that can be downloaded: their address, their SHA-256 and their folder."""
+"""List the data sets and weights that can be downloaded, with URL, SHA-256 and folder."""
 
 import os
 from dataclasses import dataclass
@@ -15,31 +15,31 @@ MIRROR = "GSBENCH_MIRROR"  # an address; every file is then fetched from it, by 
 
 @dataclass(frozen=True)
 class Source:
-    """A data set or a file of weights that others publish."""
+    """A published data set or weight file: its URL, its SHA-256 and the folder into which it is downloaded."""
 
     name: str
     what: str
-    file: str  # its name on a mirror, and on this machine while it is fetched
-    folder: Path  # where it goes; an archive is unpacked into it
+    file: str  # the file name on a mirror, and on this machine during the download
+    folder: Path  # the folder of the file; an archive is unpacked into it
     url: str | None  # None: only a browser can download it
-    sha256: str | None = None  # its known first digits; None: its authors publish none
+    sha256: str | None = None  # its first digits; None if the authors publish none
     published: str = ""  # where, in words
 
     @property
     def is_archive(self) -> bool:
-        """Tell whether it is unpacked."""
+        """Return whether the file is a zip archive, which is unpacked after the download."""
         return self.file.endswith(".zip")
 
     @property
     def target(self) -> Path:
-        """Return the file that exists after the download, or the folder of an archive."""
+        """Return the path that exists after the download: the file, or the folder of an unpacked archive."""
         return self.folder if self.is_archive else self.folder / self.file
 
     def address(self) -> str:
-        """Return the URL of the download, on the mirror if one is set.
+        """Return the URL of the download; if the environment sets a mirror, a URL on this mirror.
 
         Raises:
-            InputError: there is none, or the mirror's is not one.
+            InputError: only a browser can download the file, or the mirror's URL is invalid.
         """
         mirror = os.environ.get(MIRROR)
         if mirror:
@@ -54,7 +54,7 @@ class Source:
 
 
 def sources(data: Path) -> dict[str, Source]:
-    """Return all sources by name; data sets go into folders of `data`."""
+    """Return all data sets and weights that can be downloaded, by name; data sets go to subfolders of `data`."""
     known = [
         Source(
             name="dnerf",
@@ -79,14 +79,18 @@ def sources(data: Path) -> dict[str, Source]:
 
 
 def find(name: str, known: dict[str, Source]) -> Source:
-    """Return the source of that name; raises InputError if there is none."""
+    """Return the source with this name.
+
+    Raises:
+        InputError: there is no such source.
+    """
     if name not in known:
         raise InputError(f"'{name}' is not known. {did_you_mean(name, known)}")
     return known[name]
 
 
 def _is_address(text: str) -> bool:
-    """Tell whether a text is an http or https address with a host and perhaps a port."""
+    """Return whether a text is a valid http or https URL."""
     try:
         parts = urlsplit(text)
         (parts.hostname or "").encode("idna")  # raises ValueError, as `port` does
@@ -96,12 +100,12 @@ def _is_address(text: str) -> bool:
 
 
 def _published(experiment: str) -> str:
-    """Return where an experiment's config says that its data are published."""
+    """Return where the data of an experiment are published, as its config says."""
     return str(OmegaConf.load(CONF / "exp" / f"{experiment}.yaml").data.published)
 
 
 def _trunk(backbone: str) -> Source:
-    """Return the source of an LPIPS trunk, which gsbench.measure reads from torch's own folder."""
+    """Return the source of the AlexNet or VGG16 weights for LPIPS, which go to torch's own folder."""
     import torch  # it takes two seconds to load
 
     from gsbench.measure.perceptual import BACKBONES

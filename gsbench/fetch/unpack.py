@@ -1,4 +1,4 @@
-"""Unpack a downloaded zip into one folder, and refuse members that would lie elsewhere."""
+"""Unpack a downloaded zip archive, and refuse members that would be written outside of its folder."""
 
 import lzma
 import secrets
@@ -12,16 +12,17 @@ from pathlib import Path, PurePosixPath
 from gsbench.errors import InputError, one_line
 
 MOST_FILES = 1_000_000
-# What zipfile raises on a damaged or an encrypted one; RecursionError, of folders 1000 deep, is a RuntimeError.
+# Exceptions of zipfile for damaged or encrypted archives; RecursionError (folders 1000 deep) is a RuntimeError.
 DAMAGED = (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, zlib.error, lzma.LZMAError, struct.error,
            ValueError, IndexError)  # fmt: skip
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpack a zip into a new folder, which appears only when it is complete.
+    """Unpack a zip archive into a new folder, which appears only after everything is unpacked.
 
     Raises:
-        InputError: it is no zip, it is damaged, a name in it leads out of the folder, or the disk is too small for it.
+        InputError: the file is not a zip archive or is damaged, a member leads out of the folder, or the disk is too
+            small.
     """
     part = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.part")
     try:
@@ -44,7 +45,7 @@ def unpack(archive: Path, folder: Path) -> None:
 
 
 def check(member: zipfile.ZipInfo, archive: Path) -> None:
-    """Raise InputError if a member of a zip has no name, would lie outside the folder, or is a link or a device."""
+    """Raise InputError if a zip member has no name, leads out of the folder, or is a link or a device."""
     name = member.filename
     path = PurePosixPath(name.replace("\\", "/"))
     if path.is_absolute() or ".." in path.parts or ":" in name or not name.isprintable():
@@ -57,7 +58,7 @@ def check(member: zipfile.ZipInfo, archive: Path) -> None:
 
 
 def scenes_in(folder: Path) -> dict[Path, list[str]]:
-    """Return the folders below `folder` that hold scenes, each with the names of its scenes."""
+    """Return the folders below `folder` that contain scenes, with the names of these scenes."""
     found: dict[Path, list[str]] = {}
     for marker in sorted(folder.rglob("transforms_train.json")):
         found.setdefault(marker.parent.parent, []).append(marker.parent.name)

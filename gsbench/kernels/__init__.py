@@ -1,7 +1,7 @@
-"""Compute slices, images and losses by compiled kernels, and offer them as operations on tensors.
+"""Provide compiled kernels for slicing, rasterization and losses as differentiable operations on torch tensors.
 
-The extension `_native` is optional. If it was not built, this package can still be imported, `available()` is False and
-every operation raises `InputError`. The reference backend then does the same work in torch.
+The compiled extension `_native` is optional. Without it this package can be imported, but its operations raise
+InputError, and the backend "reference" computes the same in torch.
 """
 
 import importlib
@@ -17,15 +17,15 @@ if importlib.util.find_spec("gsbench.kernels._native") is not None:  # an extens
 
 
 def available() -> bool:
-    """Tell whether the compiled kernels are part of this installation."""
+    """Return whether the compiled CPU kernels are installed."""
     return _native is not None
 
 
 def native() -> ModuleType:
-    """Return the compiled extension.
+    """Return the compiled extension with the CPU kernels.
 
     Raises:
-        InputError: it was not built.
+        InputError: the extension is not built.
     """
     if _native is None:
         raise InputError("the native kernels are not built in this installation: reinstall with a C++20 compiler, "
@@ -34,17 +34,17 @@ def native() -> ModuleType:
 
 
 def instruction_set() -> str | None:
-    """Return the instruction set that the CPU's kernels run with, such as `v3`; None if they are not built."""
+    """Return the instruction set of the CPU kernels, such as `v3` (an x86-64 level), or None if they are not built."""
     return None if _native is None else str(_native.active())
 
 
 def use_instruction_set(name: str) -> None:
-    """Run the kernels built for one instruction set (`v2`, `v3`, `v4`: x86-64 levels); the best one is the default.
+    """Select the instruction set of the CPU kernels: `v2`, `v3` or `v4` (x86-64 levels).
 
-    The environment variable GSBENCH_ISA does the same from outside.
+    The default is the best one that the processor supports. The environment variable GSBENCH_ISA has the same effect.
 
     Raises:
-        InputError: it is not built, or this machine does not run it.
+        InputError: the kernels are not built for it, or the processor does not support it.
     """
     known = native().instruction_sets()
     if name not in known:

@@ -1,4 +1,4 @@
-"""Update parameters by Adam in place: some rows of one parameter, or all rows of several parameters in one call."""
+"""Update parameters by Adam in place: some rows of one parameter, or several whole parameters in one call."""
 
 from collections.abc import Sequence
 
@@ -24,21 +24,21 @@ def adam(
     eps: float,
     step: Tensor,  # []
 ) -> None:
-    """Update the rows `drawn` once, as step number `step` from 1 (Kingma & Ba 2015, algorithm 1).
+    """Do one Adam update (Kingma & Ba 2015, algorithm 1) of those rows (Gaussians) of a parameter that `drawn` selects.
 
     Args:
-        parameter: the tensor that is updated.
-        gradient: the gradient of the loss by the parameter.
-        mean: the running mean of the gradient.
-        square: the running mean of the squared gradient.
-        drawn: the rows that are updated.
+        parameter: the tensor to update.
+        gradient: the gradient of the loss with respect to the parameter.
+        mean: the running mean of the gradient, updated too.
+        square: the running mean of the squared gradient, updated too.
+        drawn: the rows to update.
         rate: the learning rate.
-        betas: the share of each running mean that is kept.
-        eps: added to the root of the mean square.
-        step: the number of this update.
+        betas: the decay rates of the two running means.
+        eps: added to the square root of the mean square.
+        step: the number of this update, from 1.
 
     Raises:
-        InputError: tensors are not contiguous float32 on one device, or their shapes do not fit.
+        InputError: tensors are not contiguous float32 on one device, or their shapes do not match.
     """
     named = {"parameter": parameter, "gradient": gradient, "mean": mean, "square": square}
     for name, x in named.items():
@@ -83,23 +83,23 @@ def adam_all(
     betas: list[float],
     eps: float,
 ) -> None:
-    """Update parameters on the CPU, each at a rate of its own, as `torch.optim.Adam` does.
+    """Update several parameters on the CPU by Adam, each with its own learning rate, as `torch.optim.Adam` does.
 
-    One call updates all parameters, because a small model has a dozen of them, and a call of torch costs as much as
-    their update.
+    All parameters are updated in one call: a small model has about twelve, and the overhead of a torch call costs as
+    much as the update of one.
 
     Args:
-        parameters: the tensors to update, of any shapes.
-        gradients: the gradients of the loss by the parameters.
-        means: the running means of the gradients.
-        squares: the running means of the squared gradients.
+        parameters: the tensors to update, of any shape.
+        gradients: the gradients of the loss with respect to the parameters.
+        means: the running means of the gradients, updated too.
+        squares: the running means of the squared gradients, updated too.
         steps: the number of this update for each parameter, from 1.
         rates: the learning rates.
-        betas: the share of each running mean that is kept.
-        eps: added to the root of the mean square.
+        betas: the decay rates of the two running means.
+        eps: added to the square root of the mean square.
 
     Raises:
-        InputError: tensors are not float32 on the CPU and row by row in memory, or their shapes do not fit.
+        InputError: tensors are not contiguous float32 on the CPU, or their shapes do not match.
     """
     gradients = in_rows(list(gradients))
     for name, listed in {"parameter": parameters, "gradient": gradients, "mean": means, "square": squares}.items():

@@ -1,10 +1,12 @@
-// What the kernels take, on the CPU and on a GPU alike: addresses of arrays, row-major and contiguous, and numbers.
+// The arguments of the kernels, on the CPU and on a GPU: numbers and addresses of contiguous row-major arrays.
 //
-// A structure holds the inputs of an operation, its outputs, the gradients given of its outputs, or those wanted of its
-// inputs. gsbench/kernels/operation.py fills the fields by their names: beside each structure GSB_FIELDS says which of
-// the four it is, and lists them. GSB_KERNELS lists the kernels that both the CPU and a GPU have.
+// Each structure holds the inputs of an operation, its outputs, the given gradients of its outputs, or the gradients of
+// its inputs that the kernel computes. GSB_FIELDS after a structure says which of the four it is (INPUTS, OUTPUTS,
+// GIVEN, GRADS) and lists its fields, which gsbench/kernels/operation.py fills by name. GSB_KERNELS lists the kernels
+// that exist for both the CPU and a GPU.
 //
-// N Gaussians come before C cameras. Scalars that a GPU computes are addresses too, so that nothing waits to read them.
+// Arrays are over N Gaussians or over C cameras times N Gaussians. Scalars that a GPU computes are passed as addresses,
+// so that the CPU does not wait to read them.
 #pragma once
 
 #include <cstdint>
@@ -12,7 +14,7 @@
 #include "math/off_diagonal.h"
 #include "math/sizes.h"
 
-#ifndef GSB_FIELDS  // bindings.h reads them; to everything else they are nothing
+#ifndef GSB_FIELDS  // only bindings.h gives it a meaning
 #define GSB_FIELDS(Structure, role, ...)
 #endif
 
@@ -20,14 +22,15 @@ namespace gsb {
 
 // ---- gsbench/kernels/slices.py
 
-// Gaussians with a triangular factor over p and d, t or both, observed from a place and at a time (6DGS, 7DGS).
+// Gaussians of 6DGS and 7DGS: triangular factors over position p and direction d, time t or both, and the camera centre
+// and time at which they are sliced.
 struct TriangularArgs {
-    int64_t N, conditioned;  // rows from `conditioned` on are static: no query changes them
+    int64_t N, conditioned;  // Gaussians from `conditioned` on are static (no camera or time changes them)
     bool conditioned_first;
     OffDiagonal form;
-    bool subtracts;  // by the scheme that forms S, for comparison; on the CPU only
+    bool subtracts;  // use the method that forms covariances, for comparison (CPU only)
     float half;
-    const float *means, *directions, *times;  // [N, 3] [N, 3] [N, 1]; one of the last two may be null: not observed
+    const float *means, *directions, *times;  // [N, 3] [N, 3] [N, 1]; one of the last two may be null
     const float *log_diagonal, *shape, *motion, *coupling;    // [N, k + 3] [N, 3] [N, 3 k] [N, k (k - 1) / 2]
     const float *opacities, *center;                          // [N] logits, [3]
     const float *time, *log_lambda_d, *log_lambda_t;          // [] [] []
@@ -44,9 +47,10 @@ struct TriangularGrads {
 GSB_FIELDS(TriangularGrads, GRADS, means, directions, times, log_diagonal, shape, motion, coupling, opacities,
            log_lambda_d, log_lambda_t)
 
-// Gaussians over (x, y, z, t) with the factor M_left M_right diag(exp scales), observed at a time (4DGS).
+// Gaussians of 4DGS over (x, y, z, t) with the factor M_left M_right diag(exp scales), and the time at which they are
+// sliced.
 struct RotatedArgs {
-    int64_t N, conditioned;  // rows from `conditioned` on are static
+    int64_t N, conditioned;  // Gaussians from `conditioned` on are static
     const float *means, *times, *scales, *left_quats, *right_quats;  // [N, 3] [N, 1] [N, 4] [N, 4] [N, 4]
     const float *opacities, *clock, *time, *log_lambda_t;            // [N] logits, [] [] []
     int threads;
@@ -61,7 +65,7 @@ struct RotatedGrads {
 };
 GSB_FIELDS(RotatedGrads, GRADS, means, times, scales, left_quats, right_quats, opacities, log_lambda_t)
 
-// The 3D Gaussians that an observation leaves.
+// The conditional 3D Gaussians (slice) for one camera and time.
 struct Observation {
     float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
 };
@@ -72,7 +76,7 @@ struct ObservationGrads {
 };
 GSB_FIELDS(ObservationGrads, GIVEN, means, factors, opacities)
 
-// 3D Gaussians with the factor R diag(exp scales), which are their own slice (3DGS).
+// Gaussians of 3DGS with the factor R diag(exp scales), which do not change with the camera or the time.
 struct StaticArgs {
     int64_t N;
     const float *scales, *quats, *opacities;  // [N, 3] [N, 4] [N] logits
@@ -97,20 +101,22 @@ GSB_FIELDS(StaticGrads, GRADS, scales, quats, opacities)
 
 // ---- gsbench/kernels/colors.py
 
-// Colours by spherical harmonics in the direction from `center`, times `waves` frequencies of time.
+// Inputs of colours: SH in the direction from `center` to the mean, times a Fourier series in time with `waves`
+// frequencies.
 struct ColorArgs {
     int64_t N;
-    int degree, bases, waves;        // bases: harmonics stored for each frequency
+    int degree, bases, waves;        // bases: the number of harmonics stored for each frequency
     const float *sh0, *shN;          // [N, 1, 3] [N, waves * bases - 1, 3]
-    const float *means, *opacities;  // [N, 3] [N]: one below 1/255 is not drawn, and has no colour
-    const float* times;              // [N, 1], null: colours do not change
+    const float *means, *opacities;  // [N, 3] [N]; colours are not computed for opacities below 1/255
+    const float* times;              // [N, 1]; null if colours do not change with time
     const float *center, *time;      // [3] []
-    const int32_t* orders;           // [N] what a row has at most, degree + 4 (waves - 1); null: all of them have all
+    const int32_t* orders;           // [N] each Gaussian's degree + 4 (waves - 1); null: all have the maximum
     int threads;
 };
 GSB_FIELDS(ColorArgs, INPUTS, N, degree, bases, waves, sh0, shN, means, opacities, times, center, time, orders, threads)
 
-// A channel that is clamped is -0 instead of 0, so that backward knows it without another look at the coefficients.
+// A colour channel that is clamped to zero is stored as -0, so that the backward pass recognises it without reading the
+// coefficients again.
 constexpr float CLAMPED = -0.0f;
 
 struct Colors {
@@ -136,16 +142,17 @@ GSB_FIELDS(ColorGrads, GRADS, sh0, shN, means, times)
 
 // ---- gsbench/kernels/refine.py
 
-// Perceptrons features x HIDDEN x width, one for each of `networks`, on every Gaussian (AGR). They read the values of the
-// first `networks - 1` arrays, each of which one of them moves; the last moves all the others.
+// The `networks` MLPs of AGR, each with `features` inputs and HIDDEN hidden units, applied to every Gaussian. The first
+// `networks - 1` arrays of values are their inputs. MLP number i changes array i; the last MLP changes all further
+// arrays.
 struct RefineArgs {
-    int64_t N, refined;  // rows from `refined` on stay where they are
-    int features, networks, arrays, outputs;  // features: numbers that are read; outputs: the sum of widths
+    int64_t N, refined;  // Gaussians from `refined` on are not changed
+    int features, networks, arrays, outputs;  // features: inputs of the MLPs; outputs: the sum of widths
     int widths[MAX_NETWORKS], value_widths[MAX_VALUES];
     const float* values[MAX_VALUES];     // [arrays] of [N, value_widths]
     const float *weight_in, *bias_in;    // [networks * 64, features] [networks * 64]
     const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
-    // [refined, 2] [], or both null: outside its visible interval a row stays where it is, see is_awake.
+    // [refined, 2] [], or both null: outside of its interval of time a Gaussian is not changed (is_awake).
     const float *intervals, *time;
     int threads;
 };
@@ -163,7 +170,7 @@ struct RefinedGrads {
 GSB_FIELDS(RefinedGrads, GIVEN, values)
 
 struct RefineGrads {
-    float* values[MAX_VALUES];                           // of the features: [networks - 1] of [N, value_widths]
+    float* values[MAX_VALUES];                           // of the MLPs' inputs: [networks - 1] of [N, value_widths]
     float *weight_in, *bias_in, *weight_out, *bias_out;  // zero on entry
     float* scratch;                                      // [networks, refined, features], on a GPU
 };
@@ -187,7 +194,7 @@ struct Splats {
     float* means2d;     // [C, N, 2]
     float* roots;       // [C, N, 4]: p, q, r of math/projection.h and the opacity
     float* depths;      // [C, N]
-    float* half_sizes;  // [C, N, 2], 0: not drawn
+    float* half_sizes;  // [C, N, 2]; 0: culled
 };
 GSB_FIELDS(Splats, OUTPUTS, means2d, roots, depths, half_sizes)
 
@@ -216,7 +223,7 @@ GSB_FIELDS(BlendArgs, INPUTS, N, C, D, color_per_camera, means2d, roots, half_si
 
 struct Picture {
     float *image, *alpha;         // [C, H, W, D] [C, H, W, 1]
-    float *transmittance, *stop;  // [C, tiles * 256] what is left, and where in its list a pixel ends: each backend's way
+    float *transmittance, *stop;  // [C, tiles * 256]; `stop`: list position at which a pixel ended
 };
 GSB_FIELDS(Picture, OUTPUTS, image, alpha, transmittance, stop)
 
@@ -237,9 +244,9 @@ struct BlendGrads {
 };
 GSB_FIELDS(BlendGrads, GRADS, means2d, roots, colors, background, scratch)
 
-// Bit k of `flags` is set where the k-th array has a value that is not finite, or out of range.
+// Bit k of `flags` is set if the k-th array has a value that is not finite or out of range.
 struct ValueArgs {
-    int64_t N, C, all_colors;  // all_colors: how many numbers
+    int64_t N, C, all_colors;  // all_colors: the size of `colors`
     int D;
     const float *means, *factors, *opacities, *colors, *viewmats, *Ks, *background;
     int threads;
@@ -262,7 +269,7 @@ struct SimilarityArgs {
 GSB_FIELDS(SimilarityArgs, INPUTS, height, width, image, target, ssim_weight, threads)
 
 struct SimilarityLoss {
-    float* loss;      // [parts], to be added up: `similarity_parts` says how many
+    float* loss;      // [parts] partial sums of the loss, as many as `similarity_parts` returns
     float* gradient;  // [H, W, 3]; null: not wanted
     float* scratch;   // [3, 3, H, W], on a GPU, for the gradient
 };
@@ -270,7 +277,7 @@ GSB_FIELDS(SimilarityLoss, OUTPUTS, loss, gradient, scratch)
 
 // ---- gsbench/kernels/adam.py
 
-// Adam on the rows [N, width] of a parameter that are `drawn`.
+// Adam updates the rows of a parameter [N, width] that `drawn` selects.
 struct AdamArgs {
     int64_t N, width;
     const bool* drawn;       // [N]

@@ -1,4 +1,4 @@
-"""Choose the backend that computes: torch alone, the kernels on the CPU, or the kernels on a GPU."""
+"""Choose the backend: torch alone ("reference"), the CPU kernels ("cpu") or the CUDA kernels ("cuda")."""
 
 import functools
 import warnings
@@ -14,21 +14,21 @@ from gsbench.kernels import cuda
 
 @dataclass(frozen=True)
 class Backend:
-    """Decides whether kernels or torch compute; models, rasterizer, loss and optimizer ask by `serves`."""
+    """A backend, which decides by device and type whether a tensor is processed by compiled kernels or by torch."""
 
     name: str
-    devices: tuple[str, ...]  # the kinds of device on which it uses kernels
+    devices: tuple[str, ...]  # the device types on which this backend uses kernels
 
     def serves(self, tensor: Tensor) -> bool:
-        """Tell whether kernels compute with a tensor of this device and type; otherwise torch computes."""
+        """Return whether kernels process this tensor; otherwise torch does."""
         device = tensor.device.type
         return tensor.dtype == torch.float32 and device in self.devices and _built(device)
 
     def workers(self, tensor: Tensor) -> int:
-        """Return how many Python threads should share independent pieces of work on tensors of this device.
+        """Return how many Python threads should share independent work on tensors of this device.
 
-        Only the CPU's kernels gain by threads: torch holds Python's lock between its operations, and a GPU does one
-        thing after the other anyway.
+        Only the CPU kernels run faster with several Python threads: torch holds the GIL between its operations, and a
+        GPU runs one kernel after the other.
         """
         return torch.get_num_threads() if tensor.device.type == "cpu" and self.serves(tensor) else 1
 
@@ -41,10 +41,10 @@ BACKENDS = {backend.name: backend for backend in (AUTO, REFERENCE, CPU, CUDA)}
 
 
 def resolve(name: str, device: str = "cpu") -> Backend:
-    """Find a backend by its name for a kind of device; `auto` becomes the fastest one that is installed for it.
+    """Return the backend with this name for a device type; "auto" becomes the fastest installed one.
 
     Raises:
-        InputError: the backend does not exist, is not installed, or does not work on that device.
+        InputError: the backend does not exist, is not installed, or does not work on the device.
     """
     if name not in BACKENDS:
         raise InputError(f"raster backend '{name}' is not known. {did_you_mean(name, BACKENDS)}")
@@ -68,7 +68,7 @@ def _built(device: str) -> bool:
 
 
 def _warn(device: str) -> None:
-    """Warn if `auto` falls back to a slower backend."""
+    """Warn if the backend "auto" falls back to a slower backend."""
     if cuda.built() and not cuda.available():
         _warn_once("no CUDA device was found: the CUDA kernels of this installation are idle, the CPU renders")
     if device == "cpu" and not kernels.available():
@@ -81,5 +81,5 @@ def _warn(device: str) -> None:
 
 @functools.cache
 def _warn_once(why: str) -> None:
-    """Warn, but only once in a process."""
+    """Print a warning, but only once per process."""
     warnings.warn(f"raster backend 'auto': {why}", stacklevel=4)

@@ -1,7 +1,8 @@
-// The door between Python and the kernels: a call passes a number for each field of the structures that a kernel takes,
-// an address of an array as an int. gsbench/kernels/operation.py has checked the arrays; here only kinds and counts are.
+// The bindings between Python and the kernels: a call passes one number for each field of a kernel's argument
+// structures, with addresses of arrays as integers. gsbench/kernels/operation.py has checked the arrays before; only
+// the number and the types of the values are checked here.
 //
-// Tensors cross as addresses because a DLPack capsule costs microseconds for each, as much as a small kernel takes.
+// Tensors are passed as addresses because a DLPack capsule costs microseconds per tensor, as much as a small kernel.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -13,13 +14,13 @@
 
 namespace gsb {
 
-// Of a structure S: its role, the names of its fields, and references to them.
+// The role (INPUTS, OUTPUTS, ..), the field names and references to the fields of a structure S.
 template <class S>
 struct Fields;
 
 }  // namespace gsb
 
-// "INPUTS" fields go by their own names in Python, others with what they are in front.
+// In Python, fields of INPUTS have their own names; other fields have a prefix that names their role (library.py).
 #define GSB_FIELDS(Structure, role, ...)                                                     \
     template <>                                                                              \
     struct Fields<Structure> {                                                               \
@@ -49,7 +50,7 @@ inline void check(bool good) {
     if (!good) throw nb::python_error();
 }
 
-// One number of Python to one field.
+// Converts one Python number to one field.
 template <class T>
 void read(PyObject* from, T& to) {
     if constexpr (std::is_pointer_v<T>) {
@@ -62,7 +63,7 @@ void read(PyObject* from, T& to) {
     check(!PyErr_Occurred());
 }
 
-// A tuple to a field of several, the rest of which stays zero.
+// Converts a Python tuple to a field that is an array; its remaining entries stay zero.
 template <class T, size_t n>
 void read(PyObject* from, T (&to)[n]) {
     if (!PyTuple_Check(from) || PyTuple_GET_SIZE(from) > static_cast<Py_ssize_t>(n)) {
@@ -71,13 +72,13 @@ void read(PyObject* from, T (&to)[n]) {
     for (Py_ssize_t i = 0; i < PyTuple_GET_SIZE(from); ++i) read(PyTuple_GET_ITEM(from, i), to[i]);
 }
 
-// Fills a structure from `values`, beginning at `at`, which is moved on.
+// Fills a structure from `values`, starting at the index `at`, and advances `at`.
 template <class S>
 void fill(S& s, PyObject* values, Py_ssize_t& at) {
     std::apply([&](auto&... field) { (read(PyTuple_GET_ITEM(values, at++), field), ...); }, Fields<S>::all(s));
 }
 
-// The same for an address that belongs to no structure.
+// Fills an address that is not a field of a structure.
 template <class T>
 void fill(T*& address, PyObject* values, Py_ssize_t& at) {
     read(PyTuple_GET_ITEM(values, at++), address);
@@ -86,7 +87,7 @@ void fill(T*& address, PyObject* values, Py_ssize_t& at) {
 template <class S>
 constexpr size_t count = std::tuple_size_v<decltype(Fields<S>::all(std::declval<S&>()))>;
 
-// ("INPUTS", "N, means, ..") of each structure.
+// Returns the role and the field names of each structure, such as ("INPUTS", "N, means, ..").
 template <class... S>
 nb::tuple signature() {
     const auto one = [](std::string_view kind, std::string_view names) {
@@ -95,8 +96,9 @@ nb::tuple signature() {
     return nb::make_tuple(one(Fields<S>::kind, Fields<S>::names)...);
 }
 
-// Defines m.name(*values), and m.SIGNATURES[name]. `run` is called with the structures, without the GIL, and with an
-// address of each type in `Last`, which come after all other values: on a GPU, the stream.
+// Defines the Python function m.name(*values) and m.SIGNATURES[name]. `run` is called without the GIL, with the
+// structures and with an address of each type in `Last`. These addresses are the last values of the call: on a GPU, the
+// stream.
 template <class... S, class Run, class... Last>
 void define(nb::module_& m, const char* name, Run run, Last*...) {
     nb::dict signatures = nb::cast<nb::dict>(m.attr("SIGNATURES"));

@@ -1,6 +1,6 @@
-"""Colour Gaussians by spherical harmonics and waves of time.
+"""Compute the view-dependent colours of Gaussians from SH, and time-dependent colours from a Fourier series.
 
-Gaussians that cannot be seen (opacity below 1/255 after f_temp and f_dir) are left out; no image changes by that.
+Gaussians with an opacity below 1/255 at the rendered time and direction are skipped, because they change no pixel.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ from gsbench.kernels.operation import Operation
 
 
 def _bases(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
-    """Return the number of harmonics that are stored for each frequency."""
+    """Return the number of SH coefficients that are stored for each frequency in time."""
     shN, degree, waves = given["shN"], numbers["degree"], numbers["waves"]
     stored = shN.shape[1] + 1 if shN.dim() == 3 else 0
     if stored % waves or stored // waves < (degree + 1) ** 2:
@@ -57,26 +57,28 @@ def show_colors(
     waves: int = 1,
     orders: Tensor | None = None,  # [N] int32
 ) -> Tensor:  # [N, 3]
-    """Return colours max(0, sum beta_nlm cos(2 pi n (t - mu_t)) Y_lm(d) + 0.5), d from `center` to the mean.
+    """Return the colours [N, 3] of Gaussians, from spherical harmonics and, for 4DGS, a Fourier series in time.
 
-    Colours are those of `gsbench.models.appearance.sh_colors` (waves = 1) and `sh_time_colors`, and zero for Gaussians
-    whose opacity is below 1/255.
+    A colour is max(0, 0.5 + sum of beta_nlm cos(2 pi n (t - mu_t)) Y_lm(d)), with the direction d from `center` to the
+    mean. It equals `gsbench.models.appearance.sh_colors` (one frequency) or `sh_time_colors`, and is zero if the
+    opacity is below 1/255.
 
     Args:
         sh0: the constant coefficient.
         shN: the other coefficients: K harmonics for each frequency, of which (degree + 1)^2 are used.
         means: the means of the Gaussians, world units.
-        opacities: the opacities after slicing, in [0, 1]; colours give them no gradient.
+        opacities: the opacities after slicing, in [0, 1]; they get no gradient.
         center: the camera's centre, world units.
-        degree: the degree of the harmonics, 0 to 3.
+        degree: the SH degree, 0 to 3.
         times: the mean times mu_t, if colours change with time.
         time: the time at which to compute colours; 1 is the length of the sequence.
-        waves: the number of frequencies in time, including the constant.
-        orders: each colour's own degree and waves, packed as degree + 4 (waves - 1); coefficients above it are not
-            read, and their gradient is zero. None: all colours have `degree` and `waves`.
+        waves: the number of frequencies in time, including frequency 0.
+        orders: the degree and number of frequencies of each Gaussian, packed as degree + 4 (waves - 1). Its
+            coefficients
+            above them are not read, and their gradient is zero. None: all Gaussians have `degree` and `waves`.
 
     Raises:
-        InputError: tensors are not float32 on one device, or their shapes do not fit.
+        InputError: tensors are not float32 on one device, or their shapes do not match.
     """
     if degree not in range(4) or waves not in range(1, MAX_WAVES + 1):
         raise InputError(f"show_colors: expected degree 0 to 3 and 1 to {MAX_WAVES} frequencies, got "

@@ -1,4 +1,4 @@
-"""Describe one tensor that an operation takes or returns: its shape, its type and its gradient."""
+"""Describe a tensor that a kernel reads or returns: its shape, type and gradient."""
 
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -9,27 +9,27 @@ Shape = tuple[int | str, ...]
 
 
 class Gradient(Enum):
-    """What the backward kernel does with the gradient of an input."""
+    """How a backward kernel returns the gradient of an input: by overwriting memory, by adding to it, or not at all."""
 
-    WRITTEN = auto()  # writes every entry
-    ADDED = auto()  # adds to every entry, so that the views of a batch share one memory
-    SUMMED = auto()  # adds a part of a sum over Gaussians from each block of a GPU, to memory that starts at zero
-    ON_REQUEST = auto()  # as SUMMED, and only where the caller wants it, since it costs something
-    NONE = auto()  # leaves it out, in silence
-    REFUSED = auto()  # there is none; asking for it is an error
+    WRITTEN = auto()  # overwrites every entry
+    ADDED = auto()  # adds to every entry, so that all views of a batch share one gradient
+    SUMMED = auto()  # a sum over all Gaussians: each GPU block adds its part, to memory that is zero at first
+    ON_REQUEST = auto()  # as SUMMED, but computed only if the caller needs it
+    NONE = auto()  # no gradient is computed; inputs may require one
+    REFUSED = auto()  # there is no gradient; an input that requires one is an error
 
 
 @dataclass(frozen=True)
 class Input:
-    """A tensor that an operation takes.
+    """A tensor that an operation (a pair of forward and backward kernels) reads.
 
     Args:
-        shape: sizes such as "N 3" or "C height width D". A size is a number, or a name that means one size wherever it
-            stands in the operation. A first size that may be left out has a question mark.
-        gradient: what the backward kernel does with the input's gradient.
-        dtype: the type, float32 or, for indices, int32.
-        left_out_with: makes the input optional; inputs with the same name are left out together.
-        is_list: the tensor is [n]; n differs from call to call and is no other size.
+        shape: dimensions such as "N 3" or "C height width D". A dimension is a number or a name; equal names in one
+            operation mean equal sizes. A first dimension that may be missing starts with a question mark.
+        gradient: how the backward kernel returns the gradient.
+        dtype: the type, float32, or int32 for indices.
+        left_out_with: makes the input optional; inputs with the same value here are left out together.
+        is_list: the tensor has one dimension, whose size changes from call to call and is used for no other tensor.
     """
 
     shape: str
@@ -41,12 +41,12 @@ class Input:
 
 @dataclass(frozen=True)
 class Output:
-    """A tensor that an operation returns: its shape, as in `Input`, and whether a gradient goes through it."""
+    """A tensor that an operation returns: its shape as in `Input`, and whether it has a gradient."""
 
     shape: str
     gradient: bool = True
 
 
 def sizes_of(shape: str) -> Shape:
-    """Split a shape into its sizes; numbers become ints."""
+    """Split a shape such as "N 3" into its dimensions; numbers become integers."""
     return tuple(int(size) if size.isdigit() else size for size in shape.split())

@@ -1,4 +1,4 @@
-"""Read the constants of the kernels' headers, so that kernels, torch and Python use the same ones."""
+"""Read constants from the C++ headers of the kernels, so that C++ and Python use the same values."""
 
 import re
 from importlib import resources
@@ -7,7 +7,7 @@ _LINE = re.compile(r"^constexpr (int|float) (\w+) = ([\d.e-]+)f?(?: / ([\d.]+)f)
 
 
 def _constants(header: str, kind: str) -> dict[str, float]:
-    """Return the constants of one type in a header of this package, by name."""
+    """Return the constants of type `kind` ("int" or "float") in a C++ header of this package, by name."""
     text = resources.files("gsbench.kernels").joinpath(header).read_text()
     return {name: float(value) / float(divisor or 1)
             for type_, name, value, divisor in _LINE.findall(text) if type_ == kind}  # fmt: skip

@@ -1,4 +1,4 @@
-"""Call the compiled kernels of one kind of device, and fill the fields of their argument structures by name."""
+"""Call compiled kernels on the CPU or on a GPU, with arguments given by name."""
 
 import functools
 from types import ModuleType
@@ -11,25 +11,25 @@ from gsbench import kernels
 from gsbench.errors import InputError
 from gsbench.kernels import cuda
 
-# In front of a field's name, by what its structure holds: see kernels/arguments.h.
+# The prefix of a kernel argument's name, by the role of its C++ structure (kernels/arguments.h).
 _PREFIX = {"INPUTS": "", "OUTPUTS": "out.", "GIVEN": "given.", "GRADS": "grad."}
 
-Slots = dict[str, Any]  # by prefix and name: a number, an address as an int, or a tuple of either
+Slots = dict[str, Any]  # kernel arguments by name: a number, an address as an int, or a tuple of these
 
 
 class Library:
-    """The kernels for tensors on the CPU."""
+    """The compiled kernels for tensors on the CPU."""
 
     def __init__(self, extension: ModuleType) -> None:
-        """Take the extension that has the kernels."""
+        """Store the compiled extension and read the argument names of its kernels."""
         self.extension = extension
         self._fields = {name: _fields(signature) for name, signature in extension.SIGNATURES.items()}
 
     def call(self, name: str, slots: Slots, like: Tensor) -> None:
-        """Run a kernel on the device of `like`; `slots` has a value for each of its fields.
+        """Run a kernel on the device of `like`; `slots` holds the value of each kernel argument by name.
 
         Raises:
-            InputError: the kernel does not support such sizes or options.
+            InputError: the kernel does not support these sizes or options.
         """
         slots["threads"] = torch.get_num_threads()
         self._run(name, *[slots[field] for field in self._fields[name]])
@@ -41,24 +41,24 @@ class Library:
             raise InputError(str(error)) from None
 
     def takes(self, name: str, field: str) -> bool:
-        """Tell whether a kernel has a field."""
+        """Return whether a kernel has an argument with this name."""
         return field in self._fields[name]
 
     @property
     def needs_scratch(self) -> bool:
-        """Tell whether kernels need scratch memory from torch; kernels of the CPU allocate their own."""
+        """Return whether kernels need scratch memory from torch; the CPU kernels allocate their own."""
         return False
 
     def similarity_parts(self, height: int, width: int) -> int:
-        """Return into how many parts `l1_ssim` divides its loss."""
+        """Return the number of partial sums that the kernel of `l1_ssim` writes: 1 on the CPU."""
         return 1
 
 
 class CudaLibrary(Library):
-    """The kernels for tensors on a GPU, enqueued on torch's current stream."""
+    """The compiled kernels for tensors on a GPU; they are enqueued on torch's current stream."""
 
     def call(self, name: str, slots: Slots, like: Tensor) -> None:
-        """Enqueue a kernel on the device of `like`."""
+        """Enqueue a kernel on the device of `like`; `slots` holds the value of each kernel argument by name."""
         slots["threads"] = 1
         values = [slots[field] for field in self._fields[name]]
         if not like.is_cuda:  # tests run these kernels on the CPU
@@ -69,22 +69,22 @@ class CudaLibrary(Library):
 
     @property
     def needs_scratch(self) -> bool:
-        """Return True: on a GPU torch's caching allocator gives scratch memory too."""
+        """Return True: on a GPU, torch's caching allocator also provides the kernels' scratch memory."""
         return True
 
     def similarity_parts(self, height: int, width: int) -> int:
-        """Return one part for each block of threads."""
+        """Return the number of partial sums that the kernel of `l1_ssim` writes: one per thread block."""
         return int(self.extension.similarity_parts(height, width))
 
 
-_LIBRARIES: dict[str, Library] = {}  # by kind of device, as they were asked for
+_LIBRARIES: dict[str, Library] = {}  # by device type, filled on first use
 
 
 def library_of(device: str) -> Library:
-    """Return the kernels for tensors on a kind of device, `cpu` or `cuda`.
+    """Return the compiled kernels for a device type, "cpu" or "cuda".
 
     Raises:
-        InputError: the kernels were not built, or there are none for such a device.
+        InputError: the kernels are not built, or there are none for the device type.
     """
     if device not in _LIBRARIES:
         if device not in ("cpu", "cuda"):
@@ -94,10 +94,11 @@ def library_of(device: str) -> Library:
 
 
 def allocate(what: str, like: Tensor, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Tensor:
-    """Allocate an uninitialised tensor on the device of `like`; `what` names it in a message.
+    """Allocate an uninitialised tensor on the device of `like`.
 
     Raises:
-        torch.OutOfMemoryError: one line that has `what`, the size, and what to lower.
+        torch.OutOfMemoryError: the memory is not sufficient; the message says what needs it (`what`) and what to
+            reduce.
     """
     try:
         return like.new_empty(shape, dtype=dtype)

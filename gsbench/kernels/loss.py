@@ -1,4 +1,4 @@
-"""Compute the training loss (1 - w) L1 + w (1 - SSIM) of two images, together with its gradient."""
+"""Compute the training loss of 3DGS, (1 - w) L1 + w (1 - SSIM) with weight w, together with its gradient."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +14,10 @@ from gsbench.kernels.tensors import check_number, check_tensor
 
 
 class _Similarity(Operation):
-    """The loss as an autograd function. Forward also computes the gradient, so backward only multiplies by a number."""
+    """The loss as a differentiable operation; the forward pass also computes the gradient with respect to the image.
+
+    So the backward pass only multiplies this gradient by that of the loss.
+    """
 
     def __init__(self) -> None:
         super().__init__(
@@ -55,15 +58,17 @@ _similarity = _Similarity()
 
 def l1_ssim(
     image: Tensor,  # [H, W, 3] or [1, H, W, 3]
-    target: Tensor,  # the same
+    target: Tensor,  # as image
     ssim_weight: float,
 ) -> Tensor:  # []
-    """Return the loss of 3DGS (eq. 7), differentiable by `image`: 11 x 11 Gaussian window, sigma 1.5, zero padded.
+    """Return the loss of 3DGS (eq. 7), (1 - w) L1 + w (1 - SSIM), differentiable with respect to `image`.
 
-    The value is that of `gsbench.train.losses.photometric`.
+    The weight w is `ssim_weight`. SSIM has an 11 x 11 Gaussian window of sigma 1.5 and zero padding. The value is that
+    of `gsbench.train.losses.photometric`.
 
     Raises:
-        InputError: the arguments are not two float32 images of one size on one device, or `target` requires a gradient.
+        InputError: the arguments are not float32 images of the same size on one device, or `target` requires a
+            gradient.
     """
     check_tensor(image, "l1_ssim: image", (torch.float32,))
     check_tensor(target, "l1_ssim: target", (torch.float32,))

@@ -1,8 +1,8 @@
-// The mathematics of one Gaussian and of one pixel, each function with its derivative beside it, for every backend.
+// The mathematics of one Gaussian and of one pixel: each function with its derivative, for all backends.
 //
-// Written once, for a type T that is `float` (CUDA, one Gaussian or pixel a thread) or a SIMD vector (CPU, sixteen).
-// Derivatives are vector-Jacobian products: given the gradient of the loss by a function's outputs, they return or add
-// that by its inputs. Names of gradients start with g_.
+// The code is templated on a number type T: `float` on CUDA, with one Gaussian or pixel per thread, or a SIMD vector of
+// sixteen floats on the CPU. Derivatives (`vjp`) are vector-Jacobian products: from the gradients of a function's
+// outputs, they return or add the gradients of its inputs. Names of gradients start with g_.
 #pragma once
 
 #include "math/awake.h"

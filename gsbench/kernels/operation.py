@@ -1,7 +1,8 @@
-"""Declare an operation of the kernels once. Its checks, calls, gradient and fake for torch.compile follow from this.
+"""Declare a differentiable operation by its kernels; checks, calls and the gradient follow from the declaration.
 
-An operation is a pair of functions on tensors, `forward` and `backward`. If a tape (gsbench.kernels.tape) is active, it
-records each call. Otherwise torch's autograd does, which knows the operation as `torch.ops.gsbench.NAME`.
+An operation is a pair of compiled kernels, forward and backward. If a tape (`gsbench.kernels.tape`) is active, it
+records each call for the backward pass. Otherwise torch's autograd does, for which the operation is registered as
+`torch.ops.gsbench.NAME`.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,20 +18,20 @@ from gsbench.kernels.fields import Gradient, Input, Output, sizes_of
 from gsbench.kernels.library import Slots, allocate, library_of
 from gsbench.kernels.tensors import check_tensor
 
-Tensors = list[Tensor]  # an input that is left out is an empty tensor of one dimension
+Tensors = list[Tensor]  # an input that is left out is an empty 1D tensor
 Sizes = dict[str, int]
 
 _SCHEMA = {int: "int", float: "float", bool: "bool"}
 _STARTS_AT_ZERO = (Gradient.ADDED, Gradient.SUMMED, Gradient.ON_REQUEST)
-_KINDS: dict[type, tuple[type, ...]] = {int: (int,), float: (float, int), bool: (bool,)}  # what is accepted for each
+_KINDS: dict[type, tuple[type, ...]] = {int: (int,), float: (float, int), bool: (bool,)}  # accepted Python types
 
 
-EVERY_ROW = 2**62  # for a number of rows: as many as there are
-MOST_KNOWN = 64  # calls whose shapes an operation remembers; density control makes new ones all the time
+EVERY_ROW = 2**62  # stands for all rows
+MOST_KNOWN = 64  # the most calls whose shapes are cached; densification makes new shapes all the time
 
 
 class Operation:
-    """An operation; its kernel has the same name, and the kernel of its gradient is NAME_backward."""
+    """A differentiable operation with a forward kernel NAME and a backward kernel NAME_backward."""
 
     def __init__(
         self,
@@ -46,13 +47,13 @@ class Operation:
         """Declare the operation.
 
         Args:
-            name: the name of the operation and of its kernel.
-            inputs: the tensors it takes, by the names of the kernel's fields.
-            outputs: the tensors it returns.
-            numbers: the type of each argument that is no tensor; an int may be a size too.
-            derive: returns sizes that no input has, from the given tensors and numbers.
-            scratch: the shape of memory that backward needs on a GPU, zero on entry.
-            memory: the name of the outputs in a message about too little memory.
+            name: the name of the operation and of its forward kernel.
+            inputs: the input tensors, by the argument names of the kernel.
+            outputs: the output tensors, by the argument names of the kernel.
+            numbers: the type of each argument that is not a tensor; an int may also be a dimension of a tensor.
+            derive: computes dimensions that are not dimensions of an input, from the given tensors and numbers.
+            scratch: the shape of memory, initialised to zero, that the backward kernel needs on a GPU.
+            memory: what the outputs are called in a message about too little memory.
         """
         self.name = name
         self.inputs, self.outputs = inputs, outputs
@@ -63,11 +64,11 @@ class Operation:
         self._carries = [x.gradient for x in outputs.values()]
         self._optional = {i for i, x in enumerate(given) if x.left_out_with}
         self._shapes = [sizes_of(x.shape) for x in given]
-        self._lists = {i: x.shape for i, x in enumerate(given) if x.is_list}  # the names of their lengths
+        self._lists = {i: x.shape for i, x in enumerate(given) if x.is_list}  # size names of inputs with is_list
         self._derive = derive
         self._scratch = sizes_of(scratch) if scratch is not None else None
         self._memory = memory
-        # The names of the kernels' fields; None where there is no gradient.
+        # The argument names of the kernels; None if an input has no gradient.
         self._out = [(f"out.{key}", sizes_of(x.shape)) for key, x in outputs.items()]
         self._given = [f"given.{key}" for key in outputs]
         self._needed = {f"given.{key}" for key, x in outputs.items() if x.gradient} - _MAY_BE_NULL
@@ -78,16 +79,17 @@ class Operation:
             (Tensor, NoneType) if i in self._optional else (Tensor,) for i in range(len(inputs))
         ]
         self._kinds += [_KINDS[kind] for kind in self.numbers.values()]
-        self._known: dict[tuple[Any, ...], Slots] = {}  # by numbers, shapes and types: what `match` found
+        self._known: dict[tuple[Any, ...], Slots] = {}  # results of `match` by numbers, shapes and types
         self.backward_kernel = f"{name}_backward"  # of the same arguments as any other that is put here
         self._traced = _register(self)
 
     def __call__(self, *arguments: Any) -> Tensors:
-        """Return the outputs for tensors (None: left out) and then numbers, in the order of the declaration.
+        """Call the operation with tensors (None for an optional one), then numbers, in the order of the declaration.
 
         Raises:
-            InputError: shapes do not fit, tensors are not float32 or not on one device, or an input requires a gradient
-                that the operation does not have.
+            InputError: shapes do not match, tensors are not float32 on one device, or an input requires a gradient that
+                the
+                operation does not compute.
         """
         tensors, numbers = self.split(arguments)
         for (key, declared), x in zip(self.inputs.items(), tensors, strict=False):
@@ -110,21 +112,21 @@ class Operation:
         return [like.new_empty(0) if x is None else x for x in arguments[:count]], tuple(arguments[count:])
 
     def differentiable(self, tensors: Tensors) -> list[bool]:
-        """Tell for each input whether it has a gradient."""
+        """Return for each input whether the operation computes its gradient."""
         return self._differentiable
 
     def carries_gradient(self, outputs: Tensors) -> list[bool]:
-        """Tell for each output whether a gradient goes through it."""
+        """Return for each output whether it has a gradient."""
         return self._carries
 
-    # ---- the pair
+    # ---- forward and backward
 
     def forward(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
-        """Return the outputs without recording the call."""
+        """Run the forward kernel and return the outputs, without recording the call for the backward pass."""
         return self.run(tensors, numbers)[0]
 
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
-        """Return the outputs, and slots for backward: sizes, numbers, and the inputs' memory in `rows`."""
+        """Run the forward kernel; return the outputs, and the kernel arguments that the backward pass needs."""
         slots, like, outputs = self._slots_of(tensors, numbers), tensors[0], []
         for key, shape in self._out:
             outputs.append(allocate(self._memory, like, tuple([slots[x] if isinstance(x, str) else x for x in shape])))
@@ -133,13 +135,16 @@ class Operation:
         return outputs, slots
 
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
-        """Return the slots that `run` returned, from the tensors that autograd has kept."""
+        """Return the kernel arguments of an earlier `run` again, computed from the tensors that autograd saved."""
         slots = self._slots_of(tensors, numbers)
         slots.update({key: x.data_ptr() for (key, _), x in zip(self._out, outputs, strict=True)})
         return slots
 
     def _slots_of(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        """Return sizes, numbers and the addresses of the inputs, whose memory `rows` keeps alive."""
+        """Return the kernel arguments of a call by name: sizes, numbers and addresses of the inputs.
+
+        The entry `rows` holds the tensors, so that their memory is not freed.
+        """
         slots = self.match(tensors, numbers).copy()
         rows = slots["rows"] = in_rows(tensors)
         for key, x in zip(self.inputs, rows, strict=True):
@@ -155,19 +160,19 @@ class Operation:
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
-        """Return the gradients of the inputs, given those of the outputs (None: zero).
+        """Run the backward kernel and return the gradients of the inputs.
 
         Args:
-            tensors: the arguments of `run`.
-            slots: as `run` returned them.
-            outputs: as `run` returned them.
-            given: the gradient of each output.
-            wanted: whether each input needs its gradient; it matters only for gradients ON_REQUEST.
-            sums: the memory to which an ADDED gradient is added, by the number of its input.
+            tensors: the inputs of `run`.
+            slots: the kernel arguments that `run` returned.
+            outputs: the outputs that `run` returned.
+            given: the gradient of each output; None for zero.
+            wanted: whether the caller needs the gradient of each input; used only for gradients of kind ON_REQUEST.
+            sums: tensors to which gradients of kind ADDED are added, by the index of the input.
         """
         like = tensors[0]
         library = library_of(like.device.type)
-        kept: list[Tensor | None] = []  # alive until the kernel has run
+        kept: list[Tensor | None] = []  # tensors that must not be freed before the kernel has run
         for name, g, x in zip(self._given, given, outputs, strict=True):
             if g is None and name in self._needed:
                 g = torch.zeros_like(x)
@@ -203,10 +208,14 @@ class Operation:
     # ---- what follows from the declaration
 
     def match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        """Return the sizes and numbers of a call; raise InputError unless all arguments are as declared."""
+        """Return the sizes and numbers of a call.
+
+        Raises:
+            InputError: an argument does not match the declaration.
+        """
         call = (*numbers, *[(x.dim() if i in self._lists else x.shape, x.dtype, x.device, x.layout)
                             for i, x in enumerate(tensors)])  # fmt: skip
-        slots = self._known.get(call)  # a training asks the same a thousand times, models in turns the same few
+        slots = self._known.get(call)  # training calls an operation with few different shapes
         if slots is None:
             slots = self._match(tensors, numbers)
             for length in self._lists.values():
@@ -222,7 +231,7 @@ class Operation:
         for group in {x.left_out_with for x in self.inputs.values()} - {None}:
             together = {key: own for (key, x), own in zip(self.inputs.items(), there, strict=True)
                         if x.left_out_with == group}  # fmt: skip
-            if len(set(together.values())) > 1:  # a kernel takes the address of each for that of a number
+            if len(set(together.values())) > 1:  # kernels expect all addresses of a group
                 raise InputError(f"{self.name}: expected all of {', '.join(together)}, or none of them")
         for (key, declared), x, own in zip(self.inputs.items(), tensors, there, strict=True):
             if own:
@@ -249,47 +258,49 @@ class Operation:
         return slots
 
     def _wrong_kind(self, arguments: Sequence[Any]) -> InputError:
-        """Name the argument that is not a tensor or a number although it should be."""
+        """Return an InputError that names the argument with the wrong type."""
         named = zip([*self.inputs, *self.numbers], arguments, self._kinds, strict=True)
         key, x, kinds = next((key, x, kinds) for key, x, kinds in named if not isinstance(x, kinds))
         expected = "a tensor" if Tensor in kinds else kinds[0].__name__
         return InputError(f"{self.name}: expected {key} as {expected}, got {type(x).__name__}")
 
     def _is_left_out(self, i: int, x: Tensor) -> bool:
-        """Tell whether input number `i` is left out."""
+        """Return whether input number `i` is optional and left out."""
         return i in self._optional and x.shape == _NOTHING
 
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
-        """Return empty outputs of the right shapes, for torch.compile."""
+        """Return uninitialised outputs of the right shapes, for torch.compile."""
         slots = self._match(tensors, numbers)
         shapes = [[slots[x] if isinstance(x, str) else x for x in shape] for _, shape in self._out]
         return [tensors[0].new_empty(shape) for shape in shapes]
 
     def fake_backward(self, tensors: Tensors) -> Tensors:
-        """Return empty gradients of the right shapes, for torch.compile."""
+        """Return uninitialised gradients of the right shapes, for torch.compile."""
         return [x.new_empty(x.shape) for x in tensors]
 
 
-# Gradients that are seldom given, and whose kernels know that a null is zero.
+# Output gradients that may be null, which these kernels treat as zero.
 _MAY_BE_NULL = frozenset({"given.depths", "given.alpha"})
 _NOTHING = torch.Size([0])
 
 
 def address(x: Tensor | None) -> int:
-    """Return the address of a tensor's first number; 0 for None. The tensor must outlive the call that uses it."""
+    """Return the memory address of a tensor's first element, or 0 for None; the caller must keep the tensor alive."""
     return 0 if x is None else x.data_ptr()
 
 
 def addresses(tensors: Sequence[Tensor]) -> tuple[int, ...]:
-    """Return the address of each tensor's first number; the tensors must live as long as for `address`."""
+    """Return the memory address of each tensor's first element; the caller must keep the tensors alive."""
     return tuple([x.data_ptr() for x in tensors])
 
 
 def first_rows(name: str, count: int, x: Tensor) -> int:
-    """Return the number of first rows that an operation changes; `count` may be EVERY_ROW, which means all.
+    """Return the number of rows, counted from the first, that an operation changes.
+
+    `count` may be EVERY_ROW, which means all rows of the tensor.
 
     Raises:
-        InputError: the tensor has fewer rows.
+        InputError: the tensor has fewer than `count` rows.
     """
     N = x.shape[0] if x.dim() else 0
     if count != EVERY_ROW and not 0 <= count <= N:
@@ -298,12 +309,15 @@ def first_rows(name: str, count: int, x: Tensor) -> int:
 
 
 def in_rows(tensors: Tensors) -> Tensors:
-    """Return the same values row by row in memory, also those of a view that torch negates when it reads it."""
+    """Return the tensors as contiguous ones, with torch's lazy negation applied."""
     return [x if x.is_contiguous() and not x.is_neg() else x.resolve_neg().contiguous() for x in tensors]
 
 
 def _apart(results: Tensors, inputs: Sequence[Tensor | None]) -> Tensors:
-    """Return results that share no memory with an input or each other, as torch requires of custom operations."""
+    """Return `results`, copying each one that shares memory with an input or another result.
+
+    torch requires that the outputs of a custom operation share no memory.
+    """
     taken, apart = {x.untyped_storage().data_ptr() for x in inputs if x is not None}, []
     for x in results:
         apart.append(x.clone() if x.untyped_storage().data_ptr() in taken else x)
@@ -312,7 +326,7 @@ def _apart(results: Tensors, inputs: Sequence[Tensor | None]) -> Tensors:
 
 
 def _register(operation: Operation) -> Callable[..., Any]:
-    """Register the operation as torch.ops.gsbench.NAME, for autograd and torch.compile, and return it."""
+    """Register the operation as `torch.ops.gsbench.NAME` for autograd and torch.compile, and return it."""
     name, numbers = operation.name, operation.numbers
     declared = "".join(f", {_SCHEMA[kind]} {key}" for key, kind in numbers.items())
     schema, count = f"(Tensor[] tensors{declared}) -> Tensor[]", len(numbers)

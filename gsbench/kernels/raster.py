@@ -1,4 +1,4 @@
-"""Rasterize by kernels: project Gaussians to splats, list the splats of each tile, blend them into images."""
+"""Rasterize 3D Gaussians by kernels: project them, list the intersections of each tile, and blend them into images."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,13 +15,13 @@ from gsbench.kernels.operation import Operation, address, in_rows
 from gsbench.process.memory import require
 
 TILE_PIXELS = TILE * TILE
-MAX_PAIRS = (1 << 31) - 1  # splats, and pairs of a tile and a splat, are numbered by int32
-GEOMETRY = 6  # of a splat: x, y, p, q, r, opacity
+MAX_PAIRS = (1 << 31) - 1  # splats and tile intersections (pairs of tile and splat) are numbered by int32
+GEOMETRY = 6  # numbers per splat: x, y, p, q, r, opacity
 LOWER = "use a smaller image, fewer cameras at once or fewer Gaussians"  # where memory does not suffice
 
 
 class Viewport(NamedTuple):
-    """The settings of `rasterize` that are not tensors: image size, planes and filters."""
+    """The arguments of `rasterize` that are not tensors: image size, near and far plane, blur and antialiasing."""
 
     width: int
     height: int
@@ -32,7 +32,7 @@ class Viewport(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """The projected Gaussians of C cameras."""
+    """Gaussians projected to the image planes of C cameras."""
 
     means2d: Tensor  # [C, N, 2] pixels
     roots: Tensor  # [C, N, 4]: p, q, r of the inverse 2D covariance's triangular root (math/projection.h); the opacity
@@ -41,14 +41,14 @@ class Splats(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """The splats of each tile, front to back."""
+    """The projected Gaussians that touch each image tile, sorted front to back."""
 
     offsets: Tensor  # [C * tiles + 1] int32: tile t's list is ids[offsets[t] : offsets[t + 1]]
     ids: Tensor  # [pairs] int32
 
 
 def count_tiles(width: int, height: int) -> int:
-    """Count the tiles of one image."""
+    """Return the number of tiles in an image."""
     return -(-width // TILE) * -(-height // TILE)
 
 
@@ -75,7 +75,11 @@ _project = Operation(
 def project(
     means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, viewport: Viewport
 ) -> Splats:
-    """Project Gaussians (EWA splatting, eq. 29), differentiable except by Ks; see `gsbench.raster.rasterize`."""
+    """Project 3D Gaussians to the image planes of all cameras (EWA splatting, eq. 29).
+
+    The result is differentiable with respect to all arguments except Ks. The arguments are those of
+    `gsbench.raster.rasterize`.
+    """
     return Splats(*_project(means, factors, opacities, viewmats, Ks, *viewport))
 
 
@@ -114,9 +118,9 @@ _blend = Operation(
 
 
 def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewport: Viewport) -> tuple[Tensor, Tensor]:
-    """Blend each tile's splats front to back (3DGS eq. 3): image [C, H, W, D], alpha [C, H, W, 1].
+    """Blend the Gaussians of each tile front to back (3DGS eq. 3); return image [C, H, W, D] and alpha [C, H, W, 1].
 
-    Colours are [N, D] for all cameras or [C, N, D]; the background is [D].
+    Colours are [N, D] if all cameras see the same ones, otherwise [C, N, D]. The background is [D].
     """
     means2d, roots, _, half_sizes = splats
     image, alpha, *_ = _blend(means2d, roots, half_sizes, colors, background, *bins, viewport.width, viewport.height)
@@ -125,9 +129,9 @@ def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewpo
 
 @contextmanager
 def backward_by_splat() -> Iterator[None]:
-    """Let the block differentiate blending on a GPU by the kernel with a lane for each splat, not for each pixel.
+    """Inside this context, compute gradients of blending on a GPU with one thread per Gaussian, not per pixel.
 
-    The gradients are the same. docs/gpu.md says why the default is a lane for each pixel.
+    The gradients are the same. docs/gpu.md says why one thread per pixel is the default.
     """
     before, _blend.backward_kernel = _blend.backward_kernel, "blend_backward_by_splat"
     try:
@@ -137,9 +141,9 @@ def backward_by_splat() -> Iterator[None]:
 
 
 def flag_values(*values: Tensor) -> Tensor:
-    """Return [1] int64 on the device of `values`, not zero if a value is not finite or out of range.
+    """Return a tensor [1] int64 that is not zero if any value is not finite or out of range.
 
-    `values` are means, factors, opacities, colours, viewmats, Ks and background, as in `rasterize`.
+    The values are means, factors, opacities, colours, viewmats, Ks and background, as in `rasterize`.
     """
     means, _, _, colors, viewmats, *_ = values
     flags, rows = torch.zeros(1, dtype=torch.int64, device=means.device), in_rows(list(values))
@@ -152,14 +156,13 @@ def flag_values(*values: Tensor) -> Tensor:
 
 @torch.no_grad()
 def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, int]:
-    """Sort splats by depth (equal depths by index), and list those of each tile.
+    """List the projected Gaussians that touch each tile, sorted by depth, and by index if depths are equal.
 
-    Return `flags` [1] int64 as an int too.
-
-    On a GPU this waits once for the device, to read the number of intersections and `flags`.
+    Also return `flags` [1] int64 as an int. On a GPU the CPU waits once for the number of tile intersections and for
+    `flags`.
 
     Raises:
-        InputError: there are more intersections of splats and tiles than int32 can count or memory can hold.
+        InputError: there are more tile intersections than int32 can count or than fit into memory.
     """
     library = library_of(splats.depths.device.type)
     if not library.needs_scratch:
@@ -172,14 +175,15 @@ def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, 
 
 @torch.no_grad()
 def bin_within(splats: Splats, viewport: Viewport, flags: Tensor, room: int) -> tuple[Bins, Tensor]:
-    """Do `bin_tiles` on a GPU without waiting, with room for a number of intersections; others are left out.
+    """List the projected Gaussians that touch each tile, as `bin_tiles`, on a GPU and without waiting for it.
 
-    Returns the number of intersections, if there are Gaussians, and `flags`: [2] int64.
+    Memory is allocated for `room` tile intersections, and further ones are left out. Also return a tensor [2] int64
+    with the number of intersections and `flags`; without Gaussians it has only `flags`.
     """
     library = library_of(splats.depths.device.type)
     order, ends = _sort_on_gpu(library, splats, viewport, flags)
     lists = _room(splats, room)
-    lists[0].fill_(-1)  # no tile: what is not filled sorts behind all others
+    lists[0].fill_(-1)  # no tile, so that unused entries are sorted last
     return _list_on_gpu(library, splats, viewport, (order, ends), lists), ends[-2:]
 
 
@@ -213,7 +217,11 @@ PAIRS = "lists of each tile's Gaussians"
 
 
 def _sort_on_gpu(library: Library, splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Tensor, Tensor]:
-    """Return splats by depth, [C * N] int32, and the running sum of their tiles, then `flags`, [C * N + 1] int64."""
+    """Sort projected Gaussians by depth on a GPU.
+
+    Return their order [C * N] int32, and a tensor [C * N + 1] int64: the cumulative number of tile intersections in
+    this order, followed by `flags`.
+    """
     like, count = splats.depths, splats.depths.numel()
     keys, indices, sorted_keys, order = allocate("depths to sort", like, (4, count), torch.int32).unbind()
     ends = allocate("numbers of tiles", like, (count + 1,), torch.int64)
@@ -227,7 +235,10 @@ def _sort_on_gpu(library: Library, splats: Splats, viewport: Viewport, flags: Te
 
 
 def _room(splats: Splats, pairs: int) -> tuple[Tensor, ...]:
-    """Allocate tiles, splats, sorted tiles, sorted splats, each [pairs] int32; the last lives until backward."""
+    """Allocate four int32 tensors [pairs] for the tile and the Gaussian of each intersection, unsorted and sorted.
+
+    The last one, the sorted Gaussians, is kept for the backward pass.
+    """
     rows = allocate(PAIRS, splats.depths, (3, pairs), torch.int32)
     return *rows.unbind(), allocate(PAIRS, splats.depths, (pairs,), torch.int32)
 
@@ -235,7 +246,7 @@ def _room(splats: Splats, pairs: int) -> tuple[Tensor, ...]:
 def _list_on_gpu(
     library: Library, splats: Splats, viewport: Viewport, by_depth: tuple[Tensor, Tensor], lists: tuple[Tensor, ...]
 ) -> Bins:
-    """List and sort the intersections for which `lists` have room."""
+    """List the tile intersections on a GPU and sort them by tile, as many as fit into `lists`."""
     like, ids = splats.depths, lists[-1]
     tiles = len(like) * count_tiles(viewport.width, viewport.height)
     offsets = allocate("lists of tiles", like, (tiles + 1,), torch.int32)
@@ -250,5 +261,5 @@ def _list_on_gpu(
 
 
 def _scratch(library: Library, items: int, like: Tensor) -> Tensor:
-    """Allocate the memory that sorting and summing a number of items need."""
+    """Allocate the scratch memory that the GPU needs to sort and to sum `items` numbers."""
     return allocate("scratch space to sort", like, (library.extension.scratch_bytes(items),), torch.uint8)

@@ -1,4 +1,7 @@
-"""Move Gaussians by AGR's perceptrons; hidden layers stay in cache, and backward computes them again."""
+"""Apply AGR, the neural refinement of 7DGS: small MLPs that change the parameters of Gaussians with time.
+
+The kernels keep hidden layers in cache only, and the backward pass computes them again.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -15,7 +18,7 @@ from gsbench.kernels.tensors import check_tensor
 
 
 class _Inputs(NamedTuple):
-    """The inputs of the operation, by name; the operation itself takes one list of tensors."""
+    """The inputs of the AGR operation by name; the operation itself takes them as one list of tensors."""
 
     values: Tensors
     weight_in: Tensor
@@ -29,19 +32,23 @@ class _Inputs(NamedTuple):
 
     @classmethod
     def of(cls, tensors: Tensors) -> "_Inputs":
-        """Name the tensors of the list; intervals and time are empty if they are left out."""
+        """Return the inputs by name from the list of tensors; `intervals` and `time` are None if both are empty."""
         *values, weight_in, bias_in, weight_out, bias_out, units, gamma, intervals, time = tensors
         left_out = intervals.shape == time.shape == (0,)
         return cls(values, weight_in, bias_in, weight_out, bias_out, units, gamma,
                    None if left_out else intervals, None if left_out else time)  # fmt: skip
 
     def named(self) -> list[tuple[str, Tensor]]:
-        """List every given tensor in order, with its name for messages."""
+        """Return all given tensors in order, each with its name for error messages."""
         each = [(name, x if isinstance(x, list) else [x]) for name, x in self._asdict().items() if x is not None]
         return [(name, x) for name, listed in each for x in listed]
 
     def layers(self) -> dict[str, Tensor]:
-        """Return the weights as the kernels take them: gamma(t) is in the biases, and the units are in the weights."""
+        """Return the weights of the MLPs in the form that the kernels take.
+
+        The encoded time gamma(t) is merged into the biases of the first layers, and the scales `units` into the
+        weights, because both are equal for all Gaussians.
+        """
         read = self.weight_in.shape[1] - self.gamma.shape[0]
         weight_in = self.weight_in.detach()
         weights = {
@@ -53,17 +60,17 @@ class _Inputs(NamedTuple):
         return dict(zip(weights, in_rows(list(weights.values())), strict=True))
 
     def of_layers(self, g: dict[str, Tensor]) -> Tensors:
-        """Return the gradients of the layers' own weights, from those of `layers`."""
+        """Return the gradients of the original weights, given the gradients of the weights that `layers` returns."""
         read = g["weight_in"].shape[1]
         g_in = torch.cat([g["weight_in"] / self.units[:read], torch.outer(g["bias_in"], self.gamma)], 1)
         return [g_in, g["bias_in"], g["weight_out"] * self.units[:, None], g["bias_out"] * self.units]
 
 
 class _Refine(Operation):
-    """The operation on a list of tensors, the fields of `_Inputs` in their order.
+    """The AGR operation, whose tensors are the fields of `_Inputs` in order.
 
-    What is equal for all Gaussians is computed here, on the weights. gamma(t) becomes part of the first layers' biases,
-    and the units become part of their columns and of the last layers' rows.
+    Values that are equal for all Gaussians are merged into the weights of the MLPs first: the encoded time gamma(t)
+    into the biases of the first layers, and the scales `units` of inputs and outputs into the weights.
     """
 
     def __init__(self) -> None:
@@ -115,7 +122,7 @@ class _Refine(Operation):
         return [*moved, *dense[features:], *own, None, None, None, None]
 
     def _slots(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        """Return what the kernels take, and what must live as long: the arrays, the layers and the intervals."""
+        """Return the kernel arguments by name, and the tensors that must not be freed before the kernels have run."""
         slots = self.match(tensors, numbers).copy()
         given = _Inputs.of(tensors)
         values, weights = in_rows(given.values), given.layers()
@@ -176,28 +183,31 @@ def refine(
     intervals: Tensor | None = None,  # [rows, 2] clips
     time: Tensor | None = None,  # []
 ) -> Tensors:  # of [N, c], as `values`
-    """Move values by P perceptrons (F + G) x 64 x c with ReLU: x + phi(features, gamma) (7DGS eq. 14 and 15).
+    """Change raw parameters of Gaussians by P small MLPs with ReLU, as AGR of 7DGS does (eq. 14 and 15).
 
-    Perceptron i moves values i. The last one moves all values that are left, in their order.
+    Each MLP has F + G inputs (F features of the Gaussian, G numbers that encode the time) and 64 hidden units. Its
+    output is added to the parameters. MLP number i changes `values[i]`; the last MLP changes all remaining tensors of
+    `values`.
 
     Args:
-        values: raw parameters, those that are read first.
-        weight_in: the first layers of all perceptrons, 64 rows each.
+        values: raw parameters; the first P - 1 tensors are also the features.
+        weight_in: the first layers of all MLPs, 64 rows each.
         bias_in: the biases of the first layers.
-        weight_out: the second layers, a row for each number that is moved.
+        weight_out: the second layers, one row for each output.
         bias_out: the biases of the second layers.
-        units: the unit of each number that the perceptrons read or change.
+        units: a scale for each number: MLPs read the number divided by its scale, and their output is multiplied by it.
         gamma: the encoded time, equal for all Gaussians.
-        rows: how many of the first rows are moved, by default all; the others are copied.
-        intervals: the first and the last time at which each of these rows is moved; always, by default.
-        time: the time of the view, needed with intervals.
+        rows: how many Gaussians, counted from the first, are changed (default: all); the others are copied.
+        intervals: the first and last time at which each of these Gaussians is changed; None for always.
+        time: the time of the view, required with `intervals`.
 
     Raises:
-        InputError: tensors are not float32 on one device, their shapes do not fit, or there are fewer than `rows` rows.
+        InputError: tensors are not float32 on one device, their shapes do not match, or there are fewer than `rows`
+            rows.
     """
     if (intervals is None) != (time is None):
         raise InputError("refine: expected intervals and time together, got one of them")
-    nothing = gamma.new_empty(0) if isinstance(gamma, Tensor) else gamma  # what is no tensor is refused with the others
+    nothing = gamma.new_empty(0) if isinstance(gamma, Tensor) else gamma  # another type is refused with the others
     when = (nothing, nothing) if intervals is None else (intervals, time)
     return _refine(*values, weight_in, bias_in, weight_out, bias_out, units, gamma, *when,
                    EVERY_ROW if rows is None else rows)  # fmt: skip

@@ -1,4 +1,7 @@
-"""Compute 3D Gaussians at a camera and a time (a slice) from 7D, 6D or 4D ones, or from 3D ones that do not change."""
+"""Compute the conditional 3D Gaussians (slice) of 7D, 6D or 4D Gaussians for one camera and time.
+
+3D Gaussians are converted to the same form.
+"""
 
 from typing import Any
 
@@ -34,12 +37,12 @@ _triangular = Operation(
 
 
 def _conditioned(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
-    """Return how many rows change with the camera and time."""
+    """Return how many Gaussians, counted from the first, change with the camera and the time."""
     return {"conditioned": first_rows("conditioned", numbers["conditioned"], given["means"])}
 
 
 def _entries(given: dict[str, Tensor]) -> dict[str, int]:
-    """Return how many numbers of each kind a factor over p and k conditioned variables has."""
+    """Return the numbers of entries of each kind in a triangular factor over position, time and direction."""
     k = 3 * ("directions" in given) + ("times" in given)
     if k == 0:
         raise InputError("slice_triangular: expected directions, times or both, got neither")
@@ -66,36 +69,38 @@ def slice_triangular(
     subtracts: bool = False,
     conditioned: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Slice Gaussians over p and d, t or both at a query: means [N, 3], factors [N, 3, 3], opacities [N].
+    """Compute the conditional 3D Gaussians of 6DGS or 7DGS Gaussians for a camera centre and a time.
 
-    The scheme is `square_root` of `gsbench.models.slicing`, for the parameters of `gsbench.models.triangular`.
-    Opacities include f_temp and f_dir (7DGS eq. 9 to 12). With `subtracts` the scheme is `cholesky`, on the CPU only.
+    Return means [N, 3], factors [N, 3, 3] of the covariances, and opacities [N], which include f_temp and f_dir (7DGS
+    eq. 9 to 12). The method is `square_root` of `gsbench.models.slicing`. Variables are position p, direction d and
+    time t; 6DGS has no t, and a model may have no d.
 
-    Rows from `conditioned` on are static: no query changes their mean, their factor is L_pp alone, and their opacity
-    has no f_temp and no f_dir. The gradient of all other parameters is zero.
+    Only the first `conditioned` Gaussians depend on the camera and the time. The others are static: their mean does not
+    change, their factor is its block for p, and their opacity has no f_temp and f_dir. Their other parameters get zero
+    gradients.
 
     Args:
         means: the mean positions mu_p, world units.
         directions: the mean directions mu_d.
         times: the mean times mu_t; 1 is the length of the sequence.
-        log_diagonal: the logarithms of the factor's diagonal.
-        shape: the entries of the factor within p (below its diagonal).
+        log_diagonal: the logarithms of the triangular factor's diagonal.
+        shape: the entries of the factor between components of p, below its diagonal.
         motion: the entries of the factor between p and d or t, world units.
-        coupling: the entries of the factor within d and t.
+        coupling: the entries of the factor between components of d and t.
         opacities: the opacities before the sigmoid (logits).
         center: the camera's centre, world units.
         time: the time at which to slice; 1 is the length of the sequence.
-        log_lambda_d: ln lambda_d, the coefficient of f_dir.
-        log_lambda_t: ln lambda_t, the coefficient of f_temp.
-        conditioned_first: whether the factor's rows are ordered (d, t, p), else (p, t, d).
-        form: the form of entries below the diagonal, an index of `gsbench.models.factors.OFF_DIAGONALS`.
-        directional_half: whether f_dir has the 1/2 of 7DGS eq. 12.
-        subtracts: whether the scheme is `cholesky`, which forms S.
-        conditioned: how many rows change with the query, by default all.
+        log_lambda_d: ln lambda_d, the coefficient in the exponent of f_dir.
+        log_lambda_t: ln lambda_t, the coefficient in the exponent of f_temp.
+        conditioned_first: whether the factor's rows are ordered (d, t, p); otherwise (p, t, d).
+        form: how entries below the diagonal are parametrised, an index of `gsbench.models.factors.OFF_DIAGONALS`.
+        directional_half: whether the exponent of f_dir has the factor 1/2 of 7DGS eq. 12.
+        subtracts: whether to use the method `cholesky`, which subtracts covariances (CPU only, for comparison).
+        conditioned: how many Gaussians depend on camera and time; None for all.
 
     Raises:
-        InputError: tensors are not float32 on one device, their shapes do not fit, nothing is observed, a gradient by
-            `center` or `time` is asked for, or more rows are conditioned than there are.
+        InputError: tensors are not float32 on one device, their shapes do not match, both `directions` and `times` are
+            missing, `center` or `time` requires a gradient, or `conditioned` exceeds N.
     """
     timed = times is not None
     seen = _triangular(means, directions, times, log_diagonal, shape, motion, coupling, opacities, center,
@@ -138,14 +143,15 @@ def slice_rotated(
     *,
     conditioned: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Slice 4D Gaussians F = M_left M_right diag(exp scales) at `time`: means [N, 3], factors [N, 3, 3], opacities [N].
+    """Compute the conditional 3D Gaussians of 4DGS Gaussians at `time`: means [N, 3], factors [N, 3, 3], opacities [N].
 
-    The scheme is `square_root` of `gsbench.models.slicing`, for the parameters of `gsbench.models.gaussians4d`.
-    Opacities include f_temp, and are zero if it is not above 0.05 (4DGS).
+    The 4D covariance is F F^T with F = M_left M_right diag(exp scales), in which two quaternions give the rotation
+    matrices. The method is `square_root` of `gsbench.models.slicing`. Opacities include f_temp, and are zero if f_temp
+    is at most 0.05 (4DGS).
 
-    Rows from `conditioned` on are static: their factor is R diag(exp scales) over (x, y, z) as in 3DGS, with the
-    rotation of `gsbench.models.factors.turn_of_space`, and their opacity has no f_temp. The gradient of all other
-    parameters is zero.
+    Only the first `conditioned` Gaussians change with time. The others are static: their factor is R diag(exp scales)
+    over (x, y, z) as in 3DGS, with the rotation R of `gsbench.models.factors.turn_of_space`, and their opacity has no
+    f_temp. Their other parameters get zero gradients.
 
     Args:
         means: the mean positions, world units.
@@ -154,13 +160,13 @@ def slice_rotated(
         left_quats: the left quaternions, of any length but zero.
         right_quats: the right quaternions, of any length but zero.
         opacities: the opacities before the sigmoid (logits).
-        clock: the number of world units that the length of the sequence counts as.
+        clock: how many world units along the fourth axis equal the length of the sequence.
         time: the time at which to slice; 1 is the length of the sequence.
-        log_lambda_t: ln lambda_t, the coefficient of f_temp.
-        conditioned: how many rows change with the time, by default all.
+        log_lambda_t: ln lambda_t, the coefficient in the exponent of f_temp.
+        conditioned: how many Gaussians change with time; None for all.
 
     Raises:
-        InputError: tensors are not float32 on one device, their shapes do not fit, or `conditioned` exceeds the rows.
+        InputError: tensors are not float32 on one device, their shapes do not match, or `conditioned` exceeds N.
     """
     seen = _rotated(means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
                     EVERY_ROW if conditioned is None else conditioned)  # fmt: skip
@@ -184,10 +190,10 @@ def slice_static(
     quats: Tensor,  # [N, 4] wxyz
     opacities: Tensor,  # [N] logits
 ) -> tuple[Tensor, Tensor]:
-    """Return factors F = R diag(exp scales) [N, 3, 3] (3DGS eq. 6) and opacities [N] of 3D Gaussians, their own slices.
+    """Return the factors F = R diag(exp scales) [N, 3, 3] (3DGS eq. 6) and the opacities [N] of 3D Gaussians.
 
     Raises:
-        InputError: tensors are not float32 on one device, or their shapes do not fit.
+        InputError: tensors are not float32 on one device, or their shapes do not match.
     """
     seen = _static(scales, quats, opacities)
     return seen[0], seen[1]

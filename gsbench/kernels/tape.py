@@ -1,8 +1,8 @@
-"""Differentiate a chain of operations without autograd: record operations as they run, then run them backwards.
+"""Differentiate the operations of a rendered view without autograd: record them, then run them backwards.
 
-A training step is a few dozen calls of kernels on small tensors. Autograd's graph and torch's dispatch would cost more
-than the kernels. Autograd differentiates everything else: if a tensor of its graph enters an operation, the tape gives
-it the gradient. So the same code trains a model that is written in torch.
+A training step is a few dozen kernel calls on small tensors, for which autograd's overhead would exceed the time of the
+kernels. Autograd still differentiates other code: if a tensor with a `grad_fn` enters an operation, the tape passes the
+gradient on to autograd. So models written in torch also train.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _in_charge = threading.local()  # each thread has its own
 
 
 def current() -> Tape | None:
-    """Return the tape that records in this thread, if there is one."""
+    """Return the tape that records operations in this thread, or None."""
     return getattr(_in_charge, "tape", None)
 
 
 def add_to(sums: dict[int, Tensor], key: int, gradient: Tensor) -> None:
-    """Add a gradient to the sum of a key, in place; the first one becomes the sum."""
+    """Add a gradient in place to `sums[key]`; if there is none yet, the gradient becomes this entry."""
     if key in sums:
         sums[key] += gradient
     else:
@@ -33,19 +33,19 @@ def add_to(sums: dict[int, Tensor], key: int, gradient: Tensor) -> None:
 
 
 class Differentiable(Protocol):
-    """What a tape needs of an operation: to run it forward and backward (`gsbench.kernels.operation.Operation`)."""
+    """The interface of an operation that a tape can record and run backwards, such as a kernel `Operation`."""
 
     name: str
-    adds: set[int]  # inputs to whose gradient the backward kernel adds
+    adds: set[int]  # the indices of inputs whose gradients the backward kernel adds to given memory
 
     def run(self, tensors: list[Tensor], numbers: Sequence[Any]) -> tuple[list[Tensor], dict[str, Any]]:
-        """Return the outputs, and the slots that backward needs."""
+        """Run the forward kernel; return the outputs, and the kernel arguments that the backward pass needs."""
 
     def differentiable(self, tensors: list[Tensor]) -> list[bool]:
-        """Tell for each input whether it has a gradient."""
+        """Return for each input whether the operation computes its gradient."""
 
     def carries_gradient(self, outputs: list[Tensor]) -> list[bool]:
-        """Tell for each output whether a gradient goes through it."""
+        """Return for each output whether it has a gradient."""
 
     def backward(
         self,
@@ -56,7 +56,7 @@ class Differentiable(Protocol):
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
-        """Return the gradients of the inputs, given those of the outputs."""
+        """Return the gradients of the inputs, given the gradients of the outputs."""
 
 
 class _Note(NamedTuple):
@@ -68,10 +68,10 @@ class _Note(NamedTuple):
 
 
 class Tape:
-    """Records the operations that run in ``with Tape() as tape: ...``, for ``tape.backward(loss, ...)``."""
+    """Records the operations that run inside `with Tape() as tape: ...`; `tape.backward` computes their gradients."""
 
     def __init__(self) -> None:
-        """Start without operations."""
+        """Create a tape without operations."""
         self._notes: list[_Note] = []
 
     def __enter__(self) -> Self:
@@ -83,7 +83,7 @@ class Tape:
         _in_charge.tape = self._outer
 
     def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
-        """Run an operation, and record it if a gradient goes through it."""
+        """Run an operation, and record it if an input requires a gradient which the operation computes."""
         outputs, slots = operation.run(tensors, numbers)
         if not torch.is_grad_enabled():
             return outputs
@@ -92,15 +92,15 @@ class Tape:
         if any(wanted):
             for x, through in zip(outputs, operation.carries_gradient(outputs), strict=True):
                 if through:
-                    x.requires_grad_()  # so that what torch makes of it has a graph that begins here
+                    x.requires_grad_()  # so that autograd records what torch computes from this output
             self._notes.append(_Note(operation, tensors, wanted, slots, outputs))
         return outputs
 
     def backward(self, loss: Tensor, seed: Tensor, sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
-        """Add the gradients of `seed` times `loss` by `sources` to `sums`, whose keys are the ids of the sources.
+        """Compute the gradients of `loss` with respect to `sources`, and add them to `sums` by the id of each source.
 
-        What is added has the same bits whether `sums` already holds a gradient or not. The tape may run backwards
-        again, for another seed.
+        `seed` is the gradient of the loss itself, by which all gradients are multiplied. The added gradients are
+        bitwise the same whether `sums` is empty or not. A tape may run backwards several times, with different seeds.
         """
         at = _Gradients(self._notes, sources, sums)
         at.give(loss, seed)
@@ -110,7 +110,7 @@ class Tape:
 
 
 class _Gradients:
-    """The gradients that one backward pass has computed so far, by tensor."""
+    """The gradients of tensors that one backward pass of a tape has computed so far."""
 
     def __init__(self, notes: list[_Note], sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
         self.notes = notes
@@ -120,7 +120,7 @@ class _Gradients:
         self.uses = Counter([id(x) for note in notes for x in note.tensors])
 
     def give(self, x: Tensor, gradient: Tensor) -> None:
-        """Accumulate the gradient dL/dx of a tensor x; if x has a `grad_fn`, backpropagate through autograd."""
+        """Add a gradient to that of the tensor `x`; if `x` has a `grad_fn`, backpropagate it through autograd."""
         self._add(x, gradient)
         if x.grad_fn is None:
             return
@@ -129,18 +129,18 @@ class _Gradients:
         gradients = torch.autograd.grad(x, ends, gradient, allow_unused=True, retain_graph=True)
         for end, found in zip(ends, gradients, strict=True):
             if found is not None:
-                self._add(end, found.clone())  # torch may give two tensors one memory
+                self._add(end, found.clone())  # torch may return two gradients that share memory
 
     def _add(self, x: Tensor, gradient: Tensor) -> None:
         before = self.found.get(id(x))
         self.found[id(x)] = gradient if before is None else before + gradient
 
     def through(self, note: _Note) -> None:
-        """Run one operation backwards, if its outputs have a gradient."""
+        """Run one recorded operation backwards, if one of its outputs has a gradient."""
         given = [self.found.get(id(x)) for x in note.outputs]
         if all(g is None for g in given):
             return
-        # An input that only this operation reads has its whole gradient here: it may be added to that of other views.
+        # If only this operation reads an input, this is its whole gradient, which may be added to that of other views.
         whole, there = {}, {}
         for i in note.operation.adds:
             key = id(note.tensors[i])
@@ -158,7 +158,7 @@ class _Gradients:
                 self.give(x, gradient)
 
     def finish(self) -> None:
-        """Add the gradient of each source to the sums."""
+        """Add the gradients of all sources to the sums of the caller."""
         for key in self.sources:
             gradient = self.found.get(key)
             if gradient is not None:

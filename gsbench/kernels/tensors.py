@@ -1,4 +1,4 @@
-"""Check the tensors and numbers that are given to a public function."""
+"""Check tensors and numbers that are passed to public functions."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ LARGEST = 1e300
 
 
 def check_tensor(x: object, name: str, dtypes: tuple[torch.dtype, ...] = FLOATS) -> None:
-    """Raise InputError unless `x` is a dense tensor of one of `dtypes`; `name` stands in the message."""
+    """Raise InputError unless `x` is a dense tensor with one of the given dtypes; the message contains `name`."""
     if not isinstance(x, Tensor):
         raise InputError(f"{name}: expected a tensor, got {type(x).__name__}")
     if x.layout != torch.strided or x.is_quantized:
@@ -24,11 +24,11 @@ def check_tensor(x: object, name: str, dtypes: tuple[torch.dtype, ...] = FLOATS)
 
 
 def check_number(x: object, name: str, low: float = -LARGEST, high: float = LARGEST) -> None:
-    """Raise InputError unless `x` is a number, neither NaN nor infinite, of at least `low` and at most `high`."""
+    """Raise InputError unless `x` is a finite number from `low` to `high`; the message contains `name`."""
     if isinstance(x, bool) or not isinstance(x, int | float) or not low <= x <= high:
         raise InputError(f"{name}: expected a number in [{low:g}, {high:g}], got {x!r:.80}")
 
 
 def _brief(kind: object) -> str:
-    """Name a dtype or layout without its module."""
+    """Return the name of a dtype or layout without the prefix "torch."."""
     return str(kind).removeprefix("torch.")

@@ -1,1 +1,1 @@
-"""Measure a run: the quality of its images, its speed, its curve, and the record that keeps them."""
+"""Measure quality, speed and memory of a run, and keep the results in its record."""

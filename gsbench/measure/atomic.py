@@ -7,15 +7,15 @@ import secrets
 import socket
 from pathlib import Path
 
-WITHOUT_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # errors of a file system without them
+WITHOUT_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # errors if hard links are not supported
 HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
 
 
 def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
     """Write `data` to a temporary file in the folder of `path`, then rename the file to `path`.
 
-    A missing folder is made. A reader of `path` sees the old file or the new one, never a part. A `lasting` file is
-    flushed to the disk before it is renamed, so it survives a power cut.
+    If the folder does not exist, it is created. Readers of `path` see either the old file or the new file. If
+    `lasting`, the file is flushed to the disk before it is renamed, so that it survives a power cut.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)
@@ -28,7 +28,7 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
         temporary.replace(path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        # The error of a full disk names no file, and the temporary name tells a user nothing.
+        # The error of a full disk has no file name, and a user does not know the temporary file.
         if isinstance(error, OSError) and error.errno:
             error.filename = str(path)
             del error.filename2  # None would be printed
@@ -37,16 +37,16 @@ def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
         return
     folder = os.open(path.parent, os.O_RDONLY)
     try:
-        os.fsync(folder)  # the new name itself must survive a power cut
+        os.fsync(folder)  # the folder entry must survive a power cut too
     finally:
         os.close(folder)
 
 
 def create_atomically(path: Path, data: bytes) -> bool:
-    """Create the file `path` with all of `data`, in an existing folder; return False if the file exists already.
+    """Create the file `path` with the content `data`; return False if the file already exists.
 
-    If several processes create one file, also across hosts, only one succeeds: a hard link to an existing name
-    fails.
+    The folder must exist. If several processes (on one or more hosts) create the same file, only one of them succeeds,
+    because a hard link to an existing name fails.
     """
     temporary = _beside(path)
     try:
@@ -54,7 +54,7 @@ def create_atomically(path: Path, data: bytes) -> bool:
         try:
             os.link(temporary, path)
         except FileExistsError:
-            return temporary.stat().st_nlink == 2  # NFS may have made the link, and lost the answer
+            return temporary.stat().st_nlink == 2  # NFS may have made the link although its reply was lost
         except OSError as error:
             if error.errno not in WITHOUT_LINKS:
                 raise
@@ -65,7 +65,7 @@ def create_atomically(path: Path, data: bytes) -> bool:
 
 
 def _create_here(path: Path, data: bytes) -> bool:
-    """Create a file on a file system without hard links, such as FAT; a reader may see a part of it."""
+    """Create a file on a file system without hard links, such as FAT; a reader may see a half-written file."""
     try:
         with path.open("xb") as file:
             file.write(data)
@@ -79,7 +79,7 @@ def _beside(path: Path) -> Path:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that killed processes of this machine left in `folder`."""
+    """Remove the temporary files that killed processes on this host left in `folder`."""
     for path in folder.glob(".*.tmp"):
         found = re.fullmatch(rf"\..+\.{HOST}\.(\d+)\.[0-9a-f]{{8}}\.tmp", path.name)
         if found and not Path(f"/proc/{found[1]}").exists():

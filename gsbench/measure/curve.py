@@ -1,4 +1,4 @@
-"""Keep the training curve of a run: PSNR on the val split over iterations and seconds."""
+"""Store the training curve of a run: PSNR on the validation split over iterations and seconds."""
 
 import math
 from dataclasses import dataclass, field
@@ -8,24 +8,28 @@ from gsbench.errors import InputError
 
 
 class Point(NamedTuple):
-    """One evaluation during training."""
+    """One evaluation during training: iteration, seconds and PSNR."""
 
     iteration: int
-    seconds: float  # of training so far, evaluation excluded
-    psnr_val: float | None  # dB on the validation split; None where it was not finite
+    seconds: float  # seconds of training so far, without evaluation
+    psnr_val: float | None  # dB on the validation split; None if it was not finite
 
 
 @dataclass
 class Curve:
-    """The points of a run's training curve in order.
+    """The training curve of a run: its evaluations in order.
 
-    The checkpoint holds them, so a resumed run continues the curve.
+    The checkpoint stores the curve, so that a resumed run continues it.
     """
 
     points: list[Point] = field(default_factory=list)
 
     def add(self, iteration: int, seconds: float, psnr_val: float) -> None:
-        """Append a point; raises InputError if iteration or seconds go backwards (after a faulty resume)."""
+        """Append an evaluation to the curve.
+
+        Raises:
+            InputError: iteration or seconds are smaller than those of the last evaluation, as after a faulty resume.
+        """
         if self.points and (iteration <= self.points[-1].iteration or seconds < self.points[-1].seconds):
             raise InputError(
                 f"curve: expected a point after {self.points[-1].iteration} iterations, {self.points[-1].seconds} s; "
@@ -35,18 +39,18 @@ class Curve:
 
     @property
     def last(self) -> Point | None:
-        """Return the latest point; None before the first."""
+        """Return the latest evaluation, or None if there is none."""
         return self.points[-1] if self.points else None
 
     @property
     def best(self) -> Point | None:
-        """Return the earliest of the points with the highest PSNR; None if no PSNR is finite."""
+        """Return the evaluation with the highest PSNR (the first of several equal ones), or None if none is finite."""
         finite = [(p.psnr_val, p) for p in self.points if p.psnr_val is not None]
         return max(finite, key=lambda pair: pair[0])[1] if finite else None
 
     @property
     def progress(self) -> str:
-        """Return the latest point as text, with its change: "12 s of training, val 24.40 dB (+0.31)"."""
+        """Return the latest evaluation and its change as text, such as "12 s of training, val 24.40 dB (+0.31)"."""
         if not self.points:
             return "val not measured yet"
         before, now = (self.points[-2] if len(self.points) > 1 else None), self.points[-1]
@@ -57,15 +61,19 @@ class Curve:
         return f"{told}{now.psnr_val:.2f} dB{change}"
 
     def seconds_to(self, psnr: float) -> float | None:
-        """Return the training seconds at the first point that reached `psnr` dB, not interpolated; None if none did."""
+        """Return the training seconds at the first evaluation with at least `psnr` dB, or None if there is none."""
         return next((p.seconds for p in self.points if p.psnr_val is not None and p.psnr_val >= psnr), None)
 
     def state_dict(self) -> list[tuple[int, float, float | None]]:
-        """Return the points as plain tuples, which a checkpoint can hold (weights_only=True)."""
+        """Return the evaluations as plain tuples, which a checkpoint can store and load with `weights_only=True`."""
         return [(p.iteration, p.seconds, p.psnr_val) for p in self.points]
 
     def load_state_dict(self, state: list[tuple[int, float, float | None]]) -> None:
-        """Continue from the points of a checkpoint; raises InputError if they do not make a curve."""
+        """Replace the evaluations by those of a checkpoint.
+
+        Raises:
+            InputError: iterations or seconds are not increasing.
+        """
         self.points = []
         for iteration, seconds, psnr in state:
             self.add(iteration, float(seconds), math.nan if psnr is None else float(psnr))

@@ -1,4 +1,4 @@
-"""Turn rendered colours into 8-bit images, error maps and strips (render | ground truth | error); write them as PNG."""
+"""Make 8-bit images, error maps and comparison images (render | ground truth | error), and write PNG files."""
 
 from pathlib import Path
 
@@ -9,8 +9,8 @@ import numpy.typing as npt
 from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 
-ERROR_SCALE = 0.2  # the error shown brightest; fixed, so that strips can be compared
-LEAST_WIDTH = 240  # pixels of a column; a smaller image is enlarged by an integer factor, without smoothing
+ERROR_SCALE = 0.2  # the error that has the brightest colour, equal for all images, so that they can be compared
+LEAST_WIDTH = 240  # pixels per column; a smaller image is enlarged by an integer factor, without smoothing
 HEADER = 44  # pixels
 GAP = 4  # pixels; grey, because the background is often white
 GREY = 200
@@ -19,13 +19,14 @@ Pixels = npt.NDArray[np.uint8]
 
 
 def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
-    """Put (render, truth) pairs, each [H, W, 3] in [0, 1] of one size, into a strip: uint8 [H', W', 3] RGB.
+    """Make a comparison image of renders and ground truths, uint8 [H', W', 3] RGB.
 
-    The third column is the absolute error (the mean over RGB), from black for no error to bright yellow for 0.2 or
-    more. The header names the columns and shows this scale.
+    Each (render, truth) pair, two images [H, W, 3] in [0, 1], is one row. The third column shows the absolute error
+    (mean over RGB), from black for no error to bright yellow for 0.2 or more. A header names the columns and shows this
+    scale.
 
     Raises:
-        InputError: there is no pair, or sizes differ.
+        InputError: there is no pair, or the images differ in size.
     """
     if not rows:
         raise InputError("strip: expected at least one pair (render, truth), got none")
@@ -46,7 +47,10 @@ def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
 
 
 def error_image(render: npt.NDArray[np.float32], truth: npt.NDArray[np.float32]) -> Pixels:  # [H, W, 3], each
-    """Map the absolute error (mean over RGB) to colours: black for 0, bright yellow from 0.2 on, magenta for NaN."""
+    """Return an image of the absolute error (mean over RGB).
+
+    Black is no error, bright yellow an error of 0.2 or more, and magenta marks NaN.
+    """
     error = np.abs(np.clip(render, 0, 1) - np.clip(truth, 0, 1)).mean(-1)
     shown = inferno(np.nan_to_num(error) / ERROR_SCALE)
     shown[np.isnan(error)] = (255, 0, 255)
@@ -54,20 +58,24 @@ def error_image(render: npt.NDArray[np.float32], truth: npt.NDArray[np.float32])
 
 
 def to_bytes(image: npt.NDArray[np.float32]) -> Pixels:  # [H, W, 3]
-    """Convert colours from [0, 1], clamped, to 8 bits; NaN, which a diverged model renders, becomes magenta."""
+    """Convert an image from [0, 1] (clamped) to 8 bits; NaN pixels, as of a diverged model, become magenta."""
     shown = (np.clip(np.nan_to_num(image), 0, 1) * 255).round().astype(np.uint8)
     shown[np.isnan(image).any(-1)] = (255, 0, 255)
     return shown
 
 
 def inferno(values: npt.NDArray[np.floating]) -> Pixels:  # [H, W]
-    """Map values from [0, 1], clamped, to OpenCV's inferno colours, [H, W, 3] RGB."""
+    """Convert values in [0, 1] (clamped) to the colours [H, W, 3] of OpenCV's colour map "inferno", RGB."""
     levels = (np.clip(values, 0, 1) * 255).round().astype(np.uint8)
     return np.asarray(cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB
-    """Write `image` to `path` as PNG, atomically; raises InputError if OpenCV cannot encode it."""
+    """Write `image` to `path` as PNG, atomically.
+
+    Raises:
+        InputError: OpenCV cannot encode the image.
+    """
     done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not done:
         raise InputError(f"{path}: expected an image that PNG can hold, got {image.shape} of {image.dtype}")
@@ -75,14 +83,14 @@ def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB
 
 
 def _beside(images: list[Pixels], factor: int) -> Pixels:
-    """Put enlarged images side by side, with gaps between them."""
+    """Enlarge three images by an integer factor, and put them side by side with gaps between them."""
     large = [image.repeat(factor, 0).repeat(factor, 1) for image in images]
     gap = np.full((large[0].shape[0], GAP, 3), GREY, np.uint8)
     return np.concatenate([large[0], gap, large[1], gap, large[2]], 1)
 
 
 def _header(width: int) -> Pixels:
-    """Write the titles of the columns, each `width` pixels wide, and the scale of the error."""
+    """Return the header of a comparison image: the titles of three columns of `width` pixels, and the error scale."""
     header = np.full((HEADER, 3 * width + 2 * GAP, 3), 255, np.uint8)
     titles = ("render", "ground truth", "absolute error, mean of RGB")
     for column, title in enumerate(titles):

@@ -1,7 +1,7 @@
-"""Describe the machine of a run by what its seconds depend on: processor, cores and memory.
+"""Describe the hardware on which a run was timed: processor, cores and memory.
 
-The name "AMD EPYC" of a rented machine stands for several generations of processors; family, model and stepping
-distinguish them. The module needs no torch.
+A name such as "AMD EPYC" may stand for several generations of processors, so family, model and stepping are recorded
+too. The module does not import torch.
 """
 
 import math
@@ -22,15 +22,15 @@ _KEYS = {
 
 @dataclass(frozen=True)
 class Hardware:
-    """The processor and the memory of a machine; a fact that the system does not report is None."""
+    """The processor and the memory of a machine; values that the system does not report are None."""
 
-    processor: str  # by name
-    cores: int | None  # of the system, whether this run may use them or not
-    memory_gib: int | None  # rounded up, so that memory which the system reserves at boot does not change it
+    processor: str  # its name
+    cores: int | None  # all cores of the system, even if this run may not use all of them
+    memory_gib: int | None  # rounded up, because the system reserves some memory at boot
     family: str | None = None
     model: str | None = None
     stepping: str | None = None
-    instruction_set: str | None = None  # that the CPU's kernels ran with, such as "v3"; None: they are not built
+    instruction_set: str | None = None  # the one that the CPU kernels used, such as "v3"; None if they are not built
 
     def __str__(self) -> str:
         kind = [f"{name} {value}" for name in _KEYS if (value := getattr(self, name)) is not None]
@@ -42,22 +42,22 @@ class Hardware:
 
 
 def named(device: str, threads: int, hardware: Hardware | None) -> str:
-    """Name a machine so that the seconds of two runs are comparable where their names are equal.
+    """Return a description of a machine; times of two runs are comparable only if their descriptions are equal.
 
     Args:
-        device: the processor or GPU by name.
+        device: the name of the processor or GPU.
         threads: the number of threads of torch and of the kernels.
-        hardware: the processor and memory; None for older records, which lack them.
+        hardware: the processor and memory; None if the record was written before gsbench recorded them.
     """
     where = "" if hardware is None or device == hardware.processor else f"{device} in "
     return f"{where}{hardware or device}, {threads} thread{'' if threads == 1 else 's'}"
 
 
 def hardware(instruction_set: str | None = None) -> Hardware:
-    """Describe this machine.
+    """Return the processor and memory of this machine.
 
     Args:
-        instruction_set: the instruction set that the CPU's kernels run with (`gsbench.kernels.instruction_set`).
+        instruction_set: the instruction set that the CPU kernels use (`gsbench.kernels.instruction_set`).
     """
     facts = _facts(CPUINFO)
     kind = {name: next((facts[key] for key in keys if key in facts), None) for name, keys in _KEYS.items()}
@@ -72,7 +72,10 @@ def processor_name() -> str:
 
 
 def _facts(path: Path) -> dict[str, str]:
-    """Read the first value of each key of a file with lines `key : value`; nothing if there is no such file."""
+    """Read a file with lines `key : value`, such as /proc/cpuinfo, and return the first value of each key.
+
+    Return an empty dict if the file cannot be read.
+    """
     try:
         lines = path.read_text().splitlines()
     except OSError:

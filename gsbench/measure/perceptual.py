@@ -1,9 +1,9 @@
-"""Compute LPIPS 0.1, the distance between the features of two images in a trained network (Zhang et al. 2018).
+"""Compute LPIPS 0.1, the distance between the features of two images in a pretrained network (Zhang et al. 2018).
 
-The network without LPIPS' own linear layers is called trunk. Results are bit-equal to those of the lpips package on the
-same trunk. The package is not imported, because it imports torchvision, whose wheel fails on CPU builds of torch, and
-does not check weights. Its linear weights are read from its wheel; the weights of the trunk come from a file that is
-checked by its SHA-256.
+LPIPS weights the features of a backbone (AlexNet or VGG16) by linear layers. With the same backbone weights, results
+are bit-equal to those of the lpips package. That package is not imported, because it needs torchvision and does not
+verify weights; only its linear layers are read from its files. The backbone's weights come from a file whose SHA-256 is
+checked.
 """
 
 import hashlib
@@ -23,11 +23,11 @@ from gsbench.errors import InputError, did_you_mean
 
 
 class BackboneMissing(Exception):  # noqa: N818  # not an error: the column stays empty, and this is its reason
-    """The weights of an LPIPS network are not on this machine; the message explains the empty column of a table."""
+    """The weights of an LPIPS network are not on this machine; the message says which file is missing."""
 
 
 def _alexnet() -> nn.Sequential:
-    """Build the features of torchvision's AlexNet, up to the last ReLU."""
+    """Return the convolutional layers of torchvision's AlexNet, up to the last ReLU."""
     relu, pool = nn.ReLU(), nn.MaxPool2d(3, 2)
     return nn.Sequential(
         *(nn.Conv2d(3, 64, 11, 4, 2), relu, pool),
@@ -39,7 +39,7 @@ def _alexnet() -> nn.Sequential:
 
 
 def _vgg16() -> nn.Sequential:
-    """Build the features of torchvision's VGG16, up to the last ReLU."""
+    """Return the convolutional layers of torchvision's VGG16, up to the last ReLU."""
     layers: list[nn.Module] = []
     last = 3
     for channels, count in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
@@ -52,18 +52,18 @@ def _vgg16() -> nn.Sequential:
 
 @dataclass(frozen=True)
 class Backbone:
-    """A pretrained network of LPIPS: its layers, the outputs that are compared, and the SHA-256 of its weights."""
+    """A pretrained network of LPIPS: its layers, the indices of the compared layers, and the SHA-256 of its weights."""
 
     trunk: Callable[[], nn.Sequential]
-    taps: tuple[int, ...]  # the ReLUs whose outputs are compared
+    taps: tuple[int, ...]  # the indices of the ReLU layers whose outputs are compared
     least_side: int  # pixels; the pooling layers reduce a smaller image to nothing
-    file: str  # torchvision's name of the weights, which ends in the first 8 hex digits of their SHA-256
-    linear_sha256: str  # of lpips' own weights v0.1
-    other_sha256: tuple[str, ...] = ()  # further files with the same weights
+    file: str  # torchvision's file name, which ends in the first 8 digits of the weights' SHA-256
+    linear_sha256: str  # the SHA-256 of the linear layers of lpips v0.1
+    other_sha256: tuple[str, ...] = ()  # the SHA-256 of other files with the same weights
 
     @property
     def trunk_sha256(self) -> tuple[str, ...]:
-        """Return the first digits of the SHA-256 of the files that are accepted as weights of an LPIPS network."""
+        """Return the SHA-256 (or their first digits) of the weight files that are accepted for this backbone."""
         return (Path(self.file).stem.rsplit("-", 1)[1], *self.other_sha256)
 
 
@@ -88,7 +88,13 @@ BACKBONES = {
 
 
 class Perceptual(nn.Module):
-    """LPIPS on one backbone, given the trunk's weights (``0.weight``, ...) and the five linear ones ([1, C, 1, 1])."""
+    """LPIPS with one backbone, as a torch module.
+
+    Args:
+        backbone: the layers of AlexNet or VGG16.
+        trunk: the weights of these layers, with names such as `0.weight`.
+        linear: the weights of LPIPS' five linear layers, [1, C, 1, 1].
+    """
 
     shift: Tensor
     scale: Tensor
@@ -104,7 +110,7 @@ class Perceptual(nn.Module):
         self.requires_grad_(False)
 
     def features(self, images: Tensor) -> list[Tensor]:  # [B, 3, H, W] in [-1, 1]
-        """Compute the compared features, each of unit length at every pixel."""
+        """Return the features of the compared layers, normalised to unit length at each pixel."""
         tapped = []
         x = (images - self.shift) / self.scale
         for i, layer in enumerate(self.trunk):
@@ -114,7 +120,7 @@ class Perceptual(nn.Module):
         return tapped
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:  # [B, 3, H, W] in [-1, 1], each
-        """Compute the distances [B] (Zhang et al. 2018, eq. 1)."""
+        """Return the LPIPS distances [B] of B image pairs (Zhang et al. 2018, eq. 1)."""
         distance = torch.zeros(len(a), 1, 1, 1, device=a.device)
         for fa, fb, weight in zip(self.features(a), self.features(b), self.linear, strict=True):
             distance = distance + F.conv2d((fa - fb) ** 2, weight).mean((2, 3), keepdim=True)
@@ -123,13 +129,14 @@ class Perceptual(nn.Module):
 
 @cache
 def load(backbone: str = "alex", weights: Path | None = None, device: str = "cpu") -> Perceptual:
-    """Load the network, once per process and device.
+    """Load an LPIPS network; a second call with the same arguments returns the same network.
 
-    The trunk's weights come from the file `weights`, else from torchvision's file in ``$TORCH_HOME/hub/checkpoints``.
+    The backbone's weights come from the file `weights`, or else from torchvision's file in
+    `$TORCH_HOME/hub/checkpoints`.
 
     Raises:
-        BackboneMissing: neither file is on this machine.
-        InputError: the file `weights` is missing, or the file holds other weights.
+        BackboneMissing: `weights` is None and torchvision's file does not exist, or the lpips package is not installed.
+        InputError: the backbone is unknown, the file `weights` does not exist, or a file has the wrong SHA-256.
     """
     if backbone not in BACKBONES:
         raise InputError(f"lpips: unknown backbone '{backbone}'. {did_you_mean(backbone, BACKBONES)}")
@@ -155,17 +162,21 @@ def load(backbone: str = "alex", weights: Path | None = None, device: str = "cpu
 
 
 def is_here(backbone: str, weights: Path | None = None) -> bool:
-    """Tell whether the weights of a backbone are on this machine; arguments as in `load`, which also checks them."""
+    """Return whether the weights of a backbone are on this machine, without checking their SHA-256."""
     return importlib.util.find_spec("lpips") is not None and (weights or _trunk(backbone)).is_file()
 
 
 def _trunk(backbone: str) -> Path:
-    """Return where torchvision keeps the weights of a trunk."""
+    """Return the path at which torchvision stores the weights of a backbone."""
     return Path(torch.hub.get_dir()) / "checkpoints" / BACKBONES[backbone].file
 
 
 def _read_weights(path: Path, accepted: tuple[str, ...]) -> dict[str, Tensor]:
-    """Read the tensors of a .pth or .npz file; raises InputError unless its SHA-256 begins with one of `accepted`."""
+    """Read the tensors of a .pth or .npz file.
+
+    Raises:
+        InputError: the SHA-256 of the file does not begin with one of `accepted`.
+    """
     data = path.read_bytes()
     sha256 = hashlib.sha256(data).hexdigest()
     if not sha256.startswith(accepted):

@@ -1,4 +1,4 @@
-"""Describe the provenance of a run: its commit, versions, machine, config and time."""
+"""Collect the provenance of a run: its commit, package versions, machine, settings and time."""
 
 import hashlib
 import json
@@ -24,14 +24,14 @@ def provenance(
     device: str | None = None,
     instruction_set: str | None = None,
 ) -> Provenance:
-    """Describe the provenance of a run that ends now; the packages whose versions it records are not imported.
+    """Return the provenance of a run that ends now, without importing the packages whose versions are recorded.
 
     Args:
-        config: the whole resolved config, plain JSON.
+        config: all settings of the run with references resolved, as plain JSON.
         data_hash: the fingerprint of the scene.
-        threads: the number of threads of torch, which is also that of the kernels.
-        device: the name of the GPU; None stands for the processor, which is then named.
-        instruction_set: the instruction set that the CPU's kernels run with; None if they are not built.
+        threads: the number of threads of torch and of the kernels.
+        device: the name of the GPU; None if the run used the CPU.
+        instruction_set: the instruction set that the CPU kernels use; None if they are not built.
     """
     here = hardware(instruction_set)
     return Provenance(
@@ -48,13 +48,13 @@ def provenance(
 
 
 def config_hash(config: dict[str, Any]) -> str:
-    """Compute the SHA-256 of a resolved config in plain JSON; the order of its keys does not matter."""
+    """Return the SHA-256 of a config in plain JSON; the order of its keys does not matter."""
     canonical = json.dumps(config, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of python, of gsbench and of the installed packages that the numbers depend on."""
+    """Return the versions of Python, gsbench and the installed packages that results depend on."""
     found = {"python": platform.python_version(), "gsbench": __version__}
     for package in PACKAGES:
         try:
@@ -68,10 +68,10 @@ NO_CODE = ("results", "docs", "*.md")
 
 
 def git_commit() -> str | None:
-    """Return the commit of the checkout that this file belongs to, with "-dirty" if tracked code differs from it.
+    """Return the git commit of gsbench's checkout, with the suffix "-dirty" if tracked code was changed.
 
-    Changed results and texts do not count, as they change no number. The commit is None if git does not track this
-    file, as in a wheel that is installed inside another repository.
+    Changed results and documents do not count, because they change no measurement. Return None if git does not track
+    this file, for instance if gsbench was installed from a wheel.
     """
     here = Path(__file__)
     if _git(here.parent, "ls-files", "--error-unmatch", here.name) is None:
@@ -82,7 +82,7 @@ def git_commit() -> str | None:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """Run git and return its output; None if git is not installed, fails, hangs or lacks memory."""
+    """Run git and return its output, or None if git is not installed, fails, hangs or lacks memory."""
     try:
         done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True, timeout=10)
     except (OSError, subprocess.SubprocessError, MemoryError):

@@ -1,7 +1,7 @@
-"""Measure the quality of images by one protocol: PSNR, SSIM and LPIPS, and their means over the views of a split.
+"""Measure image quality: PSNR, SSIM, LPIPS, and their means over the views of a split.
 
-Images are [H, W, 3] tensors of floats and are clamped to [0, 1]. A NaN pixel makes the result NaN. Where published
-code uses several definitions of a metric, the function states which definition it uses.
+Images are float tensors [H, W, 3] and are clamped to [0, 1]. If a pixel is NaN, the result is NaN. If published code
+uses several definitions of a metric, the function states which definition it uses.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -28,7 +28,7 @@ SSIM_LEAST_SIDE = 11  # pixels: the width of a Gaussian window of sigma 1.5, cut
 
 
 def evenly(items: Sequence[T], count: int) -> list[T]:
-    """Choose at most `count` items at even spacing, beginning with the first: a fixed subset of a split's views."""
+    """Return at most `count` items at even spacing, beginning with the first, such as a fixed subset of test views."""
     count = min(count, len(items))
     return [items[i * len(items) // count] for i in range(count)]
 
@@ -38,7 +38,7 @@ def psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
 
         PSNR = 10 log10(1 / MSE),   MSE = mean over H x W x 3 of (a - b)^2
 
-    The channels are joined in one mean; `psnr_channel_mean` has the mean of the channels' PSNR instead.
+    MSE is one mean over all channels; `psnr_channel_mean` instead averages the PSNR of each channel.
 
     Args:
         a: an image [H, W, 3] of floats, clamped to [0, 1].
@@ -48,7 +48,7 @@ def psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
         PSNR in dB; infinite for equal images.
 
     Raises:
-        InputError: they are not two images of one size.
+        InputError: `a` and `b` are not images of the same size.
 
     Example:
         >>> import torch
@@ -63,17 +63,21 @@ def psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
 
 
 def psnr_channel_mean(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
-    """Compute the mean of the channels' PSNR in dB, as some codes report it; by Jensen it is at least `psnr`."""
+    """Compute the mean over RGB of the PSNR of each channel in dB, as some published code does.
+
+    This is at least `psnr`, by Jensen's inequality.
+    """
     return fmean(_decibels(error) for error in _squared_error(a, b).mean((0, 1)))
 
 
 def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
-    """Compute the structural similarity of two images (Wang et al. 2004), by scikit-image in float64:
+    """Compute the structural similarity of two images (Wang et al. 2004) with scikit-image in float64:
 
         SSIM = mean of (2 m_a m_b + C1) (2 s_ab + C2) / ((m_a^2 + m_b^2 + C1) (s_a^2 + s_b^2 + C2))
 
-    over pixels and channels, with means m, variances s^2 and the covariance s_ab in a Gaussian window of sigma 1.5 (11
-    pixels), C1 = 0.01^2 and C2 = 0.03^2. `data_range` is 1; scikit-image would assume 2 for floats.
+    The mean is over pixels and channels. The means m, variances s^2 and the covariance s_ab are those in a Gaussian
+    window of sigma 1.5 (11 pixels), with C1 = 0.01^2 and C2 = 0.03^2. `data_range` is 1, not scikit-image's default for
+    floats, 2.
 
     Args:
         a: an image [H, W, 3] of floats, clamped to [0, 1], of at least 11 pixels a side.
@@ -83,7 +87,7 @@ def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
         SSIM in [-1, 1]; 1 for equal images.
 
     Raises:
-        InputError: the arguments are not two images of one size, or the images are too small.
+        InputError: `a` and `b` are not images of the same size, or they are too small.
 
     Example:
         >>> import torch
@@ -109,24 +113,24 @@ def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
 
 @torch.no_grad()
 def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = None) -> float:  # [H, W, 3], each
-    """Compute LPIPS 0.1, the distance between the features of two images in a trained network (Zhang et al. 2018).
+    """Compute LPIPS 0.1, the distance between the features of two images in a pretrained network (Zhang et al. 2018).
 
-    No package ships the weights of the network's trunk; `python -m gsbench.fetch lpips-alex` downloads them.
+    The weights of AlexNet or VGG16 are not part of any package; `python -m gsbench.fetch lpips-alex` downloads them.
 
     Args:
-        a: an image [H, W, 3] of floats, clamped to [0, 1] and scaled to [-1, 1], of at least 31 pixels a side for
-            `alex` and 16 for `vgg`.
-        b: another image of the same size, on the same device; this device computes the distance.
+        a: an image [H, W, 3] of floats, clamped to [0, 1], of at least 31 pixels a side for `alex` and 16 for `vgg`.
+        b: another image of the same size, on the same device, which also runs the network.
         backbone: `alex` or `vgg`.
-        weights: a file with the weights of the trunk; None: torchvision's, in $TORCH_HOME/hub/checkpoints.
+        weights: a file with the weights of the network; None for torchvision's file in $TORCH_HOME/hub/checkpoints.
 
     Raises:
-        gsbench.measure.perceptual.BackboneMissing: no file is named, and torchvision's is not on this machine.
-        InputError: the arguments are not two images of one size, the images are too small, the backbone is unknown, or
-            the file `weights` is missing or holds other weights.
+        gsbench.measure.perceptual.BackboneMissing: `weights` is None, and torchvision's file does not exist.
+        InputError: `a` and `b` are not images of the same size, they are too small, the backbone is unknown, or the
+            file
+            `weights` does not exist or has the wrong SHA-256.
 
     Example:
-        On a machine without the weights; with them it is 0.0.
+        This is the output without the weights; with the weights the result is 0.0.
 
         >>> import torch
         >>> from gsbench import lpips
@@ -142,7 +146,7 @@ def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = N
 
 
 def quantise(image: Tensor) -> Tensor:  # [..., 3]
-    """Round an image to the values that an 8-bit PNG can hold, in [0, 1]."""
+    """Round an image to the values in [0, 1] that an 8-bit PNG can store."""
     check_tensor(image, "quantise: the image")
     require(3 * image.element_size() * image.numel(), f"quantise: images {list(image.shape)}", "use smaller ones")
     return (image.clamp(0, 1) * 255).round() / 255
@@ -150,7 +154,7 @@ def quantise(image: Tensor) -> Tensor:  # [..., 3]
 
 @dataclass(frozen=True)
 class Quality:
-    """The metrics of a split: the mean over its views and the value of each view, by the names in the record."""
+    """The image metrics of a split: the means over its views, and the values of each view."""
 
     metrics: dict[str, float | None]  # means over the views
     missing: dict[str, str]  # why a metric is None
@@ -164,17 +168,20 @@ def evaluate(
     quantised: bool = False,
     weights: dict[str, Path] | None = None,
 ) -> Quality:
-    """Compute every metric of every image, and their means.
+    """Compute all metrics of all views of a split, and their means.
 
-    A metric is None, with the reason, where its backbone is missing or an image is too small for it.
+    If the weights of an LPIPS network are missing, or an image is too small for a metric, this metric is None, and the
+    reason is returned too.
 
     Args:
-        images: pairs of a render and the ground truth, for the views of a split.
-        background: the colour that the truth was composited over; an image of only this colour scores
-            `psnr_background_only`.
+        images: name, render and ground truth of each view.
+        background: the background colour of the ground truth; the metric `psnr_background_only` is the PSNR of an image
+            that has only this colour.
         quantised: whether renders are rounded to 8 bits first.
-        weights: the files with the weights of LPIPS' networks, by backbone; see `gsbench.measure.perceptual.load`, and
-            the InputError that it raises.
+        weights: the files with the weights of LPIPS' networks, by backbone (`gsbench.measure.perceptual.load`).
+
+    Raises:
+        InputError: there is no image, sizes differ, or a weights file is missing or has the wrong SHA-256.
     """
     measures: dict[str, Callable[[Tensor, Tensor], float]] = {
         "psnr": psnr,
@@ -217,14 +224,18 @@ def evaluate(
 
 
 def _images(a: Tensor, b: Tensor, least_side: int, what: str) -> tuple[Tensor, Tensor]:
-    """Clamp both images to [0, 1] in float64; raises InputError unless they are two images of one size."""
+    """Convert two images to float64 and clamp them to [0, 1].
+
+    Raises:
+        InputError: the arguments are not images of the same size.
+    """
     _check_images(a, b, least_side, what)
     require(64 * a.numel(), f"{what}: two images {list(a.shape)}", "use smaller ones")
     return a.detach().double().clamp(0, 1), b.detach().double().clamp(0, 1)
 
 
 def _check_images(a: Tensor, b: Tensor, least_side: int, what: str) -> None:
-    """Raise InputError unless they are two images of one size, with sides of at least `least_side` pixels."""
+    """Raise InputError unless `a` and `b` are images of the same size, with at least `least_side` pixels a side."""
     for image in (a, b):
         check_tensor(image, f"{what}: an image")
         if image.ndim != 3 or image.shape[2] != 3:
@@ -244,5 +255,5 @@ def _squared_error(a: Tensor, b: Tensor) -> Tensor:  # [H, W, 3]
 
 
 def _decibels(mean_squared_error: Tensor) -> float:
-    """Convert a mean squared error to PSNR in dB, for a peak of 1."""
+    """Convert a mean squared error of images in [0, 1] to PSNR in dB."""
     return float(-10 * mean_squared_error.log10())

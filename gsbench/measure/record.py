@@ -1,7 +1,7 @@
-"""Declare the schema of record.json, the record of one run, write it atomically and validate it when it is read.
+"""Define record.json, the record of one run, and write, read and validate it.
 
-A record holds the run (model, scene, seed, effects), the protocol, the results (metrics, cost, curve) and the
-provenance of the numbers. A missing number is null, and `missing` gives the reason. The module needs no torch.
+A record holds the run (model, scene, seed), the protocol, the results (metrics, cost, training curve) and the
+provenance. If a number is missing, it is null, and `missing` gives the reason. The module does not import torch.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from gsbench.measure.speed import RenderTimes
 from gsbench.reading import MAX_JSON, parse_json, read_file
 
 VERSION = 1
-MAX_POINTS = 10_000  # of a curve: more than a figure shows, and as many as a page draws in a moment
+MAX_POINTS = 10_000  # the most points of a training curve, which a page can still draw quickly
 FILE_NAME = "record.json"
 PUBLISHED = "published"  # the folder of records that ship with the code; it is read only where it is named
 STATUSES = ("ok", "failed", "diverged")
@@ -42,7 +42,7 @@ METRICS = (
 
 @dataclass(frozen=True)
 class Effects:
-    """Which effects the model has: time, direction and AGR."""
+    """Whether the Gaussians of a model depend on time, on the view direction and on AGR (the neural refinement)."""
 
     time: bool
     direction: bool
@@ -51,7 +51,7 @@ class Effects:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """The metrics of one rendered view; a metric is None if it is missing or not finite."""
+    """The image metrics of one rendered view; a metric is None if it is missing or not finite."""
 
     name: str
     psnr: float | None = None
@@ -63,29 +63,29 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Cost:
-    """What the run cost: seconds, memory, frame times and the size of the model."""
+    """The cost of a run: training seconds, memory, frame times and the size of the model."""
 
-    train_s: float  # seconds of the whole training loop less evaluation
-    stage_s: dict[str, float]  # the same by stage
+    train_s: float  # seconds of the training loop without evaluation
+    stage_s: dict[str, float]  # the same seconds by stage of training
     render_ms: RenderTimes
     fps: float  # 1000 / render_ms.p50: gsbench.measure.speed.time_renders
     num_gaussians: int
-    bytes: int  # of the model's parameters
+    bytes: int  # size of the model's parameters
     peak_memory: int  # bytes: gsbench.measure.speed.peak_memory
-    train_cpu_s: float | None = None  # CPU-seconds of all threads in those of `train_s`; None in older records
-    load: float | None = None  # of the machine, this run included, mean over `train_s`: gsbench.measure.speed.load
+    train_cpu_s: float | None = None  # CPU-seconds of all threads during `train_s`; None in older records
+    load: float | None = None  # mean load average of the machine during `train_s`, including this run
 
 
 @dataclass(frozen=True)
 class TimeScreen:
-    """The result of the test for time dependence of a scene before the training: gsbench.effects.choose.screen."""
+    """The result of the statistical test, before training, whether a scene changes with time."""
 
     decision: str  # on, off or undecided
     reason: str
-    p: float | None  # share of permutations with as much energy in slow waves of time; None: not tested
-    z: float | None  # the energy's distance from that of permutations, in their standard deviations
-    free: float | None  # share of the waves' variance that the camera leaves free; None: it stood still, or not tested
-    seconds: float  # that the test took
+    p: float | None  # p-value: share of permutations of time with at least this energy; None: not tested
+    z: float | None  # z-score of the energy in low frequencies of time, among those of permutations
+    free: float | None  # share of the variance that the camera path does not explain; None: fixed camera, or not tested
+    seconds: float  # duration of the test
 
 
 RENAMED_KEYS = {"levels": "orders"}  # of a gate in older records and checkpoints ..
@@ -94,26 +94,26 @@ RENAMED_EFFECT_SETS = {"sliced": "conditioned", "still": "static"}  # .. and nam
 
 @dataclass(frozen=True)
 class Gate:
-    """One removal of effects from Gaussians (a gate of gsbench.effects): when it was done, its result and its loss."""
+    """The result of removing time, direction or AGR from the Gaussians that do not need them: savings and lost PSNR."""
 
-    share: float  # of the squared error, the budget of the prediction
+    share: float  # share of the squared error that the removal is predicted to add at most
     predicted_db: float
-    measured_db: float  # PSNR lost on the views that it was checked on
-    rows: dict[str, int]  # Gaussians by effect set: gsbench.models.effect_sets.NAMES, and removed
-    orders: dict[str, int]  # Gaussians by the harmonics of their colours
+    measured_db: float  # PSNR lost on the views on which the removal was checked
+    rows: dict[str, int]  # number of Gaussians by effect set (gsbench.models.effect_sets.NAMES), and of removed ones
+    orders: dict[str, int]  # number of Gaussians by the order of their colours
     bytes_before: int
     bytes: int
-    step: int | None = None  # of the training, before which it acted; None: at the end
+    step: int | None = None  # the training step before which the removal was done; None: after training
     checked_on: str = "val"  # or "held-out training views"
     seconds: float = 0.0
-    eval_loss_db: float | None = None  # PSNR lost on the evaluated split, where that was measured
-    frame_ms_before: float | None = None  # medians of frames, rendered in turns with those after
+    eval_loss_db: float | None = None  # PSNR lost on the evaluated split, if measured
+    frame_ms_before: float | None = None  # median frame times before and after, measured alternately
     frame_ms: float | None = None
-    asleep: float | None = None  # share of AGR's work left out: Gaussians that no training view shows at its time
+    asleep: float | None = None  # share of AGR's work that is skipped for Gaussians that no training view shows
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return the JSON of a gate with the present names of its keys, also if an older gsbench wrote it."""
+        """Return the JSON of a `Gate` in which keys of earlier versions of gsbench have their present names."""
         plain = {RENAMED_KEYS.get(key, key): value for key, value in plain.items()}
         if isinstance(rows := plain.get("rows"), dict):
             plain["rows"] = {RENAMED_EFFECT_SETS.get(name, name): count for name, count in rows.items()}
@@ -122,56 +122,59 @@ class Gate:
 
 @dataclass(frozen=True)
 class Direction:
-    """What freezing the direction of view in all Gaussians of a trained model changes in dB and ms."""
+    """The change in PSNR and frame time if all Gaussians of a trained model ignore the view direction."""
 
-    kept: float  # share of the Gaussians whose slices change with the direction of view
-    loss_db: float  # PSNR lost on the evaluated split if direction were frozen in all of them
-    frame_ms: float  # medians of frames, rendered in turns
+    kept: float  # share of the Gaussians that depend on the view direction
+    loss_db: float  # PSNR lost on the evaluated split if they all ignored the view direction
+    frame_ms: float  # median frame times with and without direction, measured alternately
     frame_ms_without: float
 
 
 @dataclass(frozen=True)
 class OnDemand:
-    """Which effects (time, direction, AGR) were chosen for the scene and for its Gaussians, and why."""
+    """The decisions of a run to remove time, direction or AGR from its model or from single Gaussians, with reasons."""
 
     screen: TimeScreen | None = None
     gates: list[Gate] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)  # what could not be decided, and why
-    direction: Direction | None = None  # None: the model does not observe it
+    notes: list[str] = field(default_factory=list)  # decisions that were not possible, and why
+    direction: Direction | None = None  # None: the model has no view direction
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where the numbers come from: commit, versions, machine, config and time (made by gsbench.measure.provenance)."""
+    """The conditions under which a run was measured: commit, versions, machine, settings and date."""
 
-    git_commit: str | None  # "-dirty" at the end where tracked files were changed; None outside a git checkout
-    versions: dict[str, str]  # python and the packages that the numbers depend on
-    device: str  # the processor or GPU by name
-    threads: int  # of torch and of the kernels
-    config: dict[str, Any]  # the whole resolved config, plain JSON
+    git_commit: str | None  # with "-dirty" if tracked code was changed; None outside of a git checkout
+    versions: dict[str, str]  # of Python and the packages that results depend on
+    device: str  # the name of the processor or GPU
+    threads: int  # threads of torch and of the kernels
+    config: dict[str, Any]  # all settings of the run with references resolved, plain JSON
     config_hash: str
     data_hash: str  # Scene.fingerprint
     time: str  # UTC, ISO 8601
-    hardware: Hardware | None = None  # None in older records, which tell machines apart by `device` alone
+    hardware: Hardware | None = None  # None in older records, which have only `device`
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return provenance as JSON whose config has the names of now, where an older gsbench wrote it."""
+        """Return the JSON of a `Provenance` in which config keys of earlier versions have their present names."""
         config = plain.get("config")
         return plain | {"config": with_present_keys(config)} if isinstance(config, dict) else plain
 
     @property
     def machine(self) -> str:
-        """Return the machine and the threads as text; seconds of two runs are comparable only if this text is equal."""
+        """Return the machine and the number of threads as text; times are comparable if these texts are equal."""
         return named(self.device, self.threads, self.hardware)
 
 
 @dataclass(frozen=True)
 class Record:
-    """One run. The keys of `metrics` are among METRICS; `missing` gives the reason for every null."""
+    """The record of one run: what was run, its status, results, cost and provenance.
+
+    The keys of `metrics` are among METRICS; `missing` gives the reason for each metric that is None.
+    """
 
     status: str  # "ok", "failed" or "diverged"
-    reason: str | None  # why it is not ok
+    reason: str | None  # why the status is not "ok"
     experiment: str
     model: str
     scene: str
@@ -188,21 +191,25 @@ class Record:
     version: int = VERSION
     variant: str = ""  # settings of its training that differ from the experiment's, such as "iterations=10"
     overrides: list[str] = field(default_factory=list)  # `python -m gsbench` with these arguments repeats the run
-    on_demand: OnDemand | None = None  # None: every Gaussian paid for every effect of the model
+    on_demand: OnDemand | None = None  # None: no effect was removed from the model or its Gaussians
 
     @property
     def path(self) -> Path:
-        """Return the folder of the run, from that of all results; raises InputError as `run_path`."""
+        """Return the folder of the run relative to the folder of all results.
+
+        Raises:
+            InputError: a name is not a valid folder name, see `run_path`.
+        """
         return run_path(Path(), self.experiment, self.scene, self.model, self.seed, variant=self.variant)
 
 
 def write(record: Record, path: Path) -> None:
     """Write `record` to `path` atomically as strict JSON.
 
-    A metric that is not finite becomes null with its reason.
+    Metrics that are not finite become null, and `missing` gets the reason.
 
     Raises:
-        InputError: the record is not valid, so `read` would refuse it; the message names the field.
+        InputError: the record is not valid; the message names the field.
     """
     try:
         plain = json.loads(json.dumps(dataclasses.asdict(_without_non_finite(record))))
@@ -213,17 +220,25 @@ def write(record: Record, path: Path) -> None:
 
 
 def read(path: Path) -> Record:
-    """Read and validate the record at `path`; raises InputError that names the file and the field."""
+    """Read and validate the record at `path`.
+
+    Raises:
+        InputError: the record is not valid; the message names the file and the field.
+    """
     return _validated(parse_json(read_file(path, str(path), MAX_JSON), str(path)), path)
 
 
 def _validated(plain: Any, path: Path) -> Record:
-    """Convert plain JSON to a record; raises InputError that names `path` and the field."""
+    """Convert plain JSON to a record.
+
+    Raises:
+        InputError: the JSON is not a valid record; the message names `path` and the field.
+    """
     version = plain.get("version") if isinstance(plain, dict) else VERSION
-    if type(version) is not int or version != VERSION:  # first: another version has other keys
+    if type(version) is not int or version != VERSION:  # checked first, because another version has other keys
         raise InputError(f"{path}: version: expected {VERSION}, got {ascii(version)[:80]}; run again with this gsbench")
     curve = plain.get("curve") if isinstance(plain, dict) else None
-    if isinstance(curve, list) and len(curve) > MAX_POINTS:  # before each point is parsed
+    if isinstance(curve, list) and len(curve) > MAX_POINTS:  # checked before the points are parsed
         raise InputError(f"{path}: curve: expected at most {MAX_POINTS:,} points, got {len(curve):,}; run again with "
                          f"fewer train.curve_points")  # fmt: skip
     record = parse(Record, plain, str(path))
@@ -232,28 +247,28 @@ def _validated(plain: Any, path: Path) -> Record:
 
 
 def find(root: Path) -> list[Path]:
-    """List the paths of all records under `root`, sorted, except those in a folder PUBLISHED below it."""
+    """Return the sorted paths of all record.json files under `root`, without subfolders called "published"."""
     found = []
     for folder, folders, names in os.walk(root):
-        if FILE_NAME in names or FILE_NAME in folders:  # a broken link counts, as what it should show is missing
+        if FILE_NAME in names or FILE_NAME in folders:  # a broken link counts too, so that it is reported
             found.append(Path(folder, FILE_NAME))
         folders[:] = [name for name in folders if name != PUBLISHED]
     return sorted(found)
 
 
 def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, variant: str = "") -> Path:
-    """Return the folder of a run, ``root/<experiment>/<scene>/<model>[,<variant>]/seed<k>``.
+    """Return the folder of a run: `root/<experiment>/<scene>/<model>[,<variant>]/seed<k>`.
 
     Args:
         root: the folder of all results.
         experiment: the name of the experiment.
         scene: the name of the scene.
-        model: the label of the run: the model's name, with _agr or _noagr if it differs from the published method.
+        model: the model's name, with the suffix _agr or _noagr if its use of AGR differs from the published method.
         seed: the seed of the run, at least 0 and below 2^63.
-        variant: the settings that differ from the experiment's; "" for none.
+        variant: the settings that differ from the experiment's, such as "iterations=10"; "" for none.
 
     Raises:
-        InputError: a name could leave its folder, or the seed is out of its range.
+        InputError: a name has characters that a folder name may not have, or the seed is out of range.
     """
     _check_names(experiment, scene, model, variant, "")
     _check_seed(seed, "")
@@ -261,12 +276,12 @@ def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, 
 
 
 def model_folder(model: str, variant: str) -> str:
-    """Name the folder of all seeds of a model with the settings of a variant, which may be ""."""
+    """Return the folder name of a model and its variant (the settings that differ from the experiment's, or "")."""
     return f"{model},{variant}" if variant else model
 
 
 def _check_names(experiment: str, scene: str, model: str, variant: str, where: str) -> None:
-    """Raise InputError for a name that, as a folder's name, could lead out of its parent."""
+    """Raise InputError if a name is not a valid folder name, for instance because it leads out of its parent."""
     for what, name in (("experiment", experiment), ("scene", scene), ("model", model)):
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}", name):
             raise InputError(f"{where}{what}: expected a name of letters, digits and _ . + -, got {name!r:.80}")
@@ -280,7 +295,11 @@ def _check_seed(seed: int, where: str) -> None:
 
 
 def check(record: Record, file: str) -> None:
-    """Check the rules that types do not express; raises InputError that names `file` and the field."""
+    """Check the rules of a record that types cannot express.
+
+    Raises:
+        InputError: the record breaks a rule; the message names `file` and the field.
+    """
     if record.status not in STATUSES:
         raise InputError(f"{file}: status: got {record.status!r:.80}. {did_you_mean(record.status, STATUSES)}")
     _check_names(record.experiment, record.scene, record.model, record.variant, f"{file}: ")
@@ -306,7 +325,7 @@ def check(record: Record, file: str) -> None:
 
 
 def _without_non_finite(record: Record) -> Record:
-    """Set the metrics, view scores and curve points that are not finite to None, with the reason."""
+    """Replace metrics, view scores and curve points that are not finite by None, and add the reasons to `missing`."""
     metrics, missing = record.metrics, dict(record.missing)
     if metrics is not None:
         bad = {name: value for name, value in metrics.items() if value is not None and not math.isfinite(value)}

@@ -1,6 +1,6 @@
-"""Know the keys of the config that were renamed: older command lines, records and checkpoints hold their old names.
+"""Translate config keys that were renamed, so that command lines, records and checkpoints with old keys still work.
 
-Nothing else knows an old name of a key. The module needs no torch.
+No other module knows an old key. The module does not import torch.
 """
 
 import re
@@ -21,17 +21,20 @@ _REFERENCE = re.compile(r"(?<=\$\{)[\w.]+(?=\})")
 
 
 def present_key(key: str) -> str:
-    """Return the name that a dotted key has now."""
+    """Return the present name of a dotted config key, such as `train.lambda_from` for `train.modulation_from`."""
     return _renamed(key, RENAMED)
 
 
 def old_key(key: str) -> str:
-    """Return the first name of a dotted key: hashes are taken of it, so that a new name changes no older run's."""
+    """Return the oldest name of a dotted config key.
+
+    Hashes of configs use the oldest names, so that renaming a key does not change the hashes of earlier runs.
+    """
     return _renamed(key, _OLD)
 
 
 def present_override(override: str) -> str:
-    """Return an override of a command line with the names that its key and its `${keys}` have now."""
+    """Return a command-line override with the present names of its key and of the keys in `${...}`."""
     match = _OVERRIDE.fullmatch(override)
     if match is None:
         return override
@@ -40,7 +43,10 @@ def present_override(override: str) -> str:
 
 
 def with_present_keys(plain: dict[str, Any], group: str = "") -> dict[str, Any]:
-    """Return a nested config, or one group of it, with the names that its keys have now."""
+    """Return a nested config with the present names of all keys.
+
+    `group` is the dotted key at which `plain` belongs in the whole config, such as "train"; "" for a whole config.
+    """
     found: dict[str, Any] = {}
     for name, value in plain.items():
         inner = with_present_keys(value, f"{group}.{name}".lstrip(".")) if isinstance(value, dict) else value

@@ -1,4 +1,4 @@
-"""Parse plain JSON into typed dataclasses, strictly: no unknown key, no conversion, no NaN."""
+"""Parse plain JSON into typed dataclasses; unknown keys, other types and NaN are errors."""
 
 import dataclasses
 import math
@@ -9,24 +9,24 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 from gsbench.errors import InputError, did_you_mean
 
 T = TypeVar("T")
-LARGEST = 1e100  # the square of a number stays finite, and a chart can have it on an axis
+LARGEST = 1e100  # squares stay finite, and charts can show the number
 
 
 def parse(kind: type[T], value: object, file: str) -> T:
-    """Parse `value`, as json.loads gives it, into an instance of the dataclass `kind`.
+    """Parse `value`, the result of json.loads, into an instance of the dataclass `kind`.
 
-    Fields may be dataclasses, named tuples, list[X], dict[str, X], X | None, bool, int, float (which accepts an int),
-    str, and Any (any plain JSON). A dataclass may rename what older files hold: `with_present_names`.
+    Fields may be dataclasses, named tuples, list[X], dict[str, X], X | None, bool, int, float (integers are accepted),
+    str, and Any (plain JSON). A dataclass may have a method `with_present_names`, which renames keys of older files.
 
     Raises:
-        InputError: ``<file>: <field>: expected ..., got ...``.
+        InputError: `value` does not match; the message is `<file>: <field>: expected ..., got ...`.
     """
     parsed: T = _parse(kind, value, file, "")
     return parsed
 
 
 def _parse(kind: Any, value: Any, file: str, field: str) -> Any:
-    """Parse `value` as a `kind`; `field` is its place in the file, such as ``cost.render_ms.p50`` or ``curve[3]``."""
+    """Parse `value` as the type `kind`; `field` is its path in the file, such as `cost.render_ms.p50` or `curve[3]`."""
     if dataclasses.is_dataclass(kind):
         return _parse_fields(kind, value, file, field)
     if hasattr(kind, "_fields"):  # a named tuple, written as a list
@@ -51,12 +51,12 @@ def _parse(kind: Any, value: Any, file: str, field: str) -> Any:
 
 @cache
 def _kinds(kind: Any) -> dict[str, Any]:
-    """Return the types of the fields, in their order."""
+    """Return the field types of a dataclass or named tuple, in order."""
     return get_type_hints(kind)
 
 
 def _parse_fields(kind: Any, value: Any, file: str, field: str) -> Any:
-    """Parse an object as the dataclass `kind`: it must have every field without a default, and no other key."""
+    """Parse an object as the dataclass `kind`: fields without a default are required, and other keys are errors."""
     if type(value) is not dict:
         raise _fault(file, field, "an object", value)
     if hasattr(kind, "with_present_names"):
@@ -73,22 +73,22 @@ def _parse_fields(kind: Any, value: Any, file: str, field: str) -> Any:
 
 
 def _parse_any(value: Any, file: str, field: str) -> Any:
-    """Parse plain JSON of any shape; its numbers must be finite."""
+    """Parse plain JSON of any type; numbers must be finite."""
     if value is None or type(value) is bool:
         return value
     for container in (dict[str, Any], list[Any]):
         if type(value) is get_origin(container):
             return _parse(container, value, file, field)
-    if type(value) is float and math.isfinite(value):  # of a config, which may be anything
+    if type(value) is float and math.isfinite(value):  # a setting may be any finite number
         return value
     return _parse_scalar(type(value), value, file, field)
 
 
 def _parse_scalar(kind: Any, value: Any, file: str, field: str) -> Any:
-    """Parse a bool, int, float or str without conversion, except that an int is accepted as a float."""
+    """Parse a bool, int, float or str; only an int in place of a float is converted."""
     if kind is str and type(value) is str:
         return _text(value, file, field)
-    if kind is int and type(value) is int and abs(value) < 2**63:  # tables cannot hold larger integers
+    if kind is int and type(value) is int and abs(value) < 2**63:  # tables cannot store larger integers
         return value
     if kind is float and type(value) in (int, float):
         try:
@@ -109,7 +109,7 @@ def _parse_scalar(kind: Any, value: Any, file: str, field: str) -> Any:
 
 
 def _text(value: str, file: str, field: str) -> str:
-    """Parse a string that can be encoded: JSON's escapes can also spell lone surrogates."""
+    """Parse a string that can be encoded as UTF-8; JSON escapes may also form lone surrogates, which are errors."""
     try:
         value.encode()
     except UnicodeEncodeError:

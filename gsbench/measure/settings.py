@@ -1,6 +1,6 @@
-"""Separate the settings that a training reads from those that only its measuring reads, and compare two configs.
+"""Separate settings that change the training from settings that only change measurements, and compare two configs.
 
-The module needs no torch.
+The module does not import torch.
 """
 
 from collections.abc import Collection, Iterator
@@ -23,16 +23,16 @@ PLACES = (
     "results", "resume", "launch", "data.root", "data.published", "data.scenes", "init.ply", "scene.released_as",
     "train.checkpoint_minutes", "protocol.lpips_alex", "protocol.lpips_vgg",
 )  # fmt: skip
-# Keys that older configs lack, with the value that they all had.
+# Keys that are missing in older configs, with the value that all older runs had.
 ALWAYS = {
     "train.densify.kind": "gradient",
     **{f"train.penalties.{name}.{key}": 0 for name in ("opacity", "size") for key in ("weight", "start")},
 }
-_MOST_NAMED = 5  # differences that are named
+_MOST_NAMED = 5  # the most differences that a message contains
 
 
 def training_part(plain: Plain) -> Plain:
-    """Return the part of a resolved config that a training reads."""
+    """Return the settings of a config that change the training."""
     part: Plain = {key: dict(value) if isinstance(value, dict) else value for key, value in plain.items()}
     if part.get("effects", {}).get("gate") == "off":
         del part["effects"]
@@ -48,12 +48,15 @@ def training_part(plain: Plain) -> Plain:
 
 
 def training_hash(plain: Plain) -> str:
-    """Compute the SHA-256 of the settings that a training reads; runs with equal hashes can exchange checkpoints."""
+    """Return the SHA-256 of all settings that change the training; runs with equal hashes can exchange checkpoints."""
     return config_hash({old_key(key): value for key, value in given(training_part(plain)).items()})
 
 
 def given(plain: Plain) -> Plain:
-    """Flatten a config without keys that are null or have the value of ALWAYS, so that a new key changes no old run."""
+    """Return a config as a flat dict with dotted keys, without keys that are null or have the value in ALWAYS.
+
+    So a new key with one of these values does not change the hash of earlier runs, which lack the key.
+    """
     return {key: value for key, value in flat(plain) if value is not None and ALWAYS.get(key) != value}
 
 
@@ -67,12 +70,15 @@ def flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def training_differences(theirs: Plain, mine: Plain) -> list[str]:
-    """List the settings that a training reads and in which two configs differ; the list is empty for one training."""
+    """Return descriptions of the settings that change the training and differ between two configs.
+
+    The list is empty if both configs describe the same training.
+    """
     return _differences(given(training_part(theirs)), given(training_part(mine)))
 
 
 def measuring_differences(theirs: Plain, mine: Plain) -> list[str]:
-    """List the settings that only measuring reads and in which two configs differ."""
+    """Return descriptions of the settings that only change measurements and differ between two configs."""
     read = [given(training_part(config)).keys() for config in (theirs, mine)]
     return _differences(*(
         {key: value for key, value in given(config).items() if key not in keys and not _is_of(key, PLACES)
@@ -81,7 +87,7 @@ def measuring_differences(theirs: Plain, mine: Plain) -> list[str]:
 
 
 def listed(differences: list[str]) -> str:
-    """Join differences to one line that names the first few."""
+    """Join descriptions of differences to one line, which contains only the first few and the number of others."""
     more = len(differences) - _MOST_NAMED
     return "; ".join(differences[:_MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
 
@@ -97,5 +103,5 @@ def _shown(config: Plain, key: str) -> str:
 
 
 def _is_of(key: str, settings: Collection[str]) -> bool:
-    """Tell whether a dotted key is among some settings, or in a group among them."""
+    """Return whether a dotted key is in `settings`, or belongs to a group in `settings`."""
     return any(key == one or key.startswith(f"{one}.") for one in settings)

@@ -1,6 +1,6 @@
-"""Measure speed and memory: FPS, seconds by stage of training, CPU-seconds, the load of the machine, peak bytes.
+"""Measure FPS, seconds of each training stage, CPU-seconds, the load of the machine and peak memory.
 
-torch is imported only for a GPU, so records and their tables do not need it.
+torch is imported only for a GPU, so that records can be read without torch.
 """
 
 import ctypes
@@ -23,7 +23,7 @@ LEAST_RENDERS = 30
 
 @dataclass(frozen=True)
 class RenderTimes:
-    """Milliseconds of one render at a camera and a time: 10th percentile, median, 90th percentile."""
+    """The 10th percentile, median and 90th percentile of the milliseconds of a rendered frame."""
 
     p10: float
     p50: float
@@ -31,16 +31,17 @@ class RenderTimes:
 
     @property
     def fps(self) -> float:
-        """Return frames per second: FPS = 1000 / p50, the median milliseconds of a render.
+        """Return frames per second: FPS = 1000 / p50, with the median p50 of milliseconds per frame.
 
-        A render starts with a camera and a time and ends with the image; slicing and AGR are included. It is timed
-        between two synchronisations of the device, after warm-up renders. The evaluated views take turns.
+        A frame is computed from a camera and a time, including slicing (conditioning on time and direction) and AGR,
+        the neural refinement. The device is synchronised before and after each frame, and warm-up frames do not count.
+        Frames go through the evaluated views in turn.
         """
         return 1000.0 / self.p50
 
 
 def nothing_to_wait_for() -> None:
-    """Return at once: on the CPU a call returns when its work is done."""
+    """Do nothing: this replaces the GPU synchronisation on the CPU, where calls return after their work is done."""
 
 
 def synchroniser(device: str) -> Callable[[], None]:
@@ -58,20 +59,19 @@ def time_renders(
     warmup: int = 5,
     synchronise: Callable[[], None] = nothing_to_wait_for,
 ) -> RenderTimes:
-    """Time `count` calls of `render(i)`, i = 0, 1, ..., after `warmup` untimed calls.
+    """Time `count` calls of `render(i)`, i = 0, 1, ..., after `warmup` calls that do not count.
 
-    FPS in gsbench is 1000 / the median of these milliseconds. A call renders an image on the device from the model,
-    with slicing and AGR, and caches nothing for the next call. The device is idle when a timing starts and when it
-    ends.
+    A call renders an image from the model, including slicing (conditioning on time and direction) and AGR (the neural
+    refinement), and caches nothing for the next call. The device is synchronised before and after each call.
 
     Args:
-        render: the function that renders frame i.
-        count: number of timed calls.
-        warmup: number of untimed calls before them.
+        render: renders frame i.
+        count: the number of timed calls.
+        warmup: the number of calls before them.
         synchronise: waits for the device.
 
     Raises:
-        InputError: `count` is below 30, so percentiles would mean little.
+        InputError: `count` is below 30, too few for percentiles.
     """
     if count < LEAST_RENDERS:
         raise InputError(f"time_renders: expected count >= {LEAST_RENDERS}, got {count}")
@@ -93,11 +93,11 @@ def time_in_turns(
     count: int = LEAST_RENDERS,
     synchronise: Callable[[], None] = nothing_to_wait_for,
 ) -> list[RenderTimes]:
-    """Time several functions frame by frame in turns, so that other load on the machine affects all equally.
+    """Time several render functions alternately, frame by frame, so that other load on the machine affects all of them.
 
     Args:
-        renders: the functions to time; each renders frame i, as in `time_renders`.
-        count: number of timed calls of each function.
+        renders: the functions to time; each renders frame i.
+        count: the number of timed calls of each function.
         synchronise: waits for the device.
     """
     times: list[list[float]] = [[] for _ in renders]
@@ -114,21 +114,25 @@ def time_in_turns(
 
 
 class StageClock:
-    """Sums the seconds of each stage of training: ``with stages("slice"): ...`` adds to the sum of that stage.
+    """Sums the seconds of each stage of training; `with stages("slice"): ...` adds to the stage "slice".
 
-    On a GPU both ends of a stage are events in its stream. So nothing waits for the GPU before the sums are read, and
-    work counts for the stage that launched it.
+    On a GPU, CUDA events mark the start and end of a stage, so that the CPU waits for the GPU only when the sums are
+    read. GPU work counts for the stage that launched it.
     """
 
     def __init__(self, device: str = "cpu") -> None:
         self._seconds: dict[str, float] = {}
         self._clock = _clock_of(device)
-        self._ended: deque[tuple[str, Any, Any]] = deque()  # name, start and end, not yet in the sums
+        self._ended: deque[tuple[str, Any, Any]] = deque()  # name, start and end of stages that are not yet in the sums
         self._current: str | None = None
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Time a block of work; raises InputError inside another stage, because the seconds would count twice."""
+        """Time a block of work as part of the stage `name`.
+
+        Raises:
+            InputError: the block is inside another stage, so that its seconds would count twice.
+        """
         if self._current is not None:
             raise InputError(f"stages: '{name}' was opened inside '{self._current}'; close that one first")
         self._current = name
@@ -142,7 +146,7 @@ class StageClock:
                 self._add_one()
 
     def share(self, workers: list[dict[str, float]], wall: float) -> None:
-        """Add `wall` seconds of parallel workers, split over stages in proportion to the workers' own seconds."""
+        """Add `wall` seconds of parallel workers, divided among stages in proportion to the workers' own seconds."""
         total = sum(sum(seconds.values()) for seconds in workers) or 1.0
         for seconds in workers:
             for name, own in seconds.items():
@@ -154,7 +158,7 @@ class StageClock:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Return the sums so far; reading them waits for the device."""
+        """Return the seconds of each stage; on a GPU this waits for the device."""
         while self._ended:
             self._add_one()
         return self._seconds
@@ -164,40 +168,40 @@ class StageClock:
         self._seconds[name] = self._seconds.get(name, 0.0) + self._clock.seconds(start, end)
 
     def state_dict(self) -> dict[str, float]:
-        """Return the sums so far, for the checkpoint."""
+        """Return the seconds of each stage, for a checkpoint."""
         return dict(self.seconds)
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Continue from the sums of a checkpoint."""
+        """Replace the seconds of each stage by those of a checkpoint."""
         self._ended.clear()
         self._seconds = {name: float(seconds) for name, seconds in state.items()}
 
 
 class Laps:
-    """Splits a block of work into stages; each stage begins where the previous one ended.
+    """Measures the seconds of consecutive stages in a block of work; each stage begins where the previous one ended.
 
-    The ends are marked as in `StageClock`, so nothing waits for a GPU before the seconds are read.
+    On a GPU, CUDA events mark the ends, so that the CPU waits for the GPU only when the seconds are read.
     """
 
     def __init__(self, device: str = "cpu") -> None:
-        """Begin the first stage."""
+        """Start the first stage."""
         self._clock = _clock_of(device)
         self._last = self._clock.mark()
-        self._ended: list[tuple[str, Any, Any]] = []  # name, start and end
+        self._ended: list[tuple[str, Any, Any]] = []  # name, start and end of each stage
 
     def end(self, name: str) -> None:
-        """End the current stage and name it; the seconds of equal names add up."""
+        """End the current stage and give it a name; the seconds of stages with equal names are added."""
         end = self._clock.mark()
         self._ended.append((name, self._last, end))
         self._last = end
 
     def has(self, name: str) -> bool:
-        """Tell whether a stage of that name has ended."""
+        """Return whether a stage with this name has ended."""
         return any(name == ended for ended, _, _ in self._ended)
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Return the seconds by stage, in the order in which they first ended; reading them waits for the device."""
+        """Return the seconds of each stage, in the order of their first end; on a GPU this waits for the device."""
         sums: dict[str, float] = {}
         for name, start, end in self._ended:
             sums[name] = sums.get(name, 0.0) + self._clock.seconds(start, end)
@@ -205,10 +209,10 @@ class Laps:
 
 
 class Effort:
-    """Sums the CPU-seconds of this process over blocks, ``with effort: ...``, and averages the load of the machine.
+    """Sums the CPU-seconds of this process over blocks, `with effort: ...`, and averages the load of the machine.
 
-    The load average and the CPU-seconds show whether the machine did other work: the load counts all processes that ran
-    or waited, and CPU-seconds do not grow while another process runs. An unknown value is None.
+    Both values show whether the machine did other work: the load counts the running and waiting processes of the whole
+    machine, and CPU-seconds do not grow while another process runs. An unknown value is None.
     """
 
     def __init__(self) -> None:
@@ -226,34 +230,37 @@ class Effort:
         self._load_s += load() * seconds
 
     def add(self, other: "Effort") -> None:
-        """Add the seconds of another `Effort`."""
+        """Add the measurements of another `Effort`."""
         self._seconds += other._seconds
         self._cpu_s += other._cpu_s
         self._load_s += other._load_s
 
     @property
     def cpu_s(self) -> float | None:
-        """Return the CPU-seconds of all threads of this process."""
+        """Return the CPU-seconds of all threads of this process during the timed blocks."""
         return self._cpu_s if math.isfinite(self._cpu_s) else None
 
     @property
     def load(self) -> float | None:
-        """Return the mean load of the machine over the timed seconds."""
+        """Return the mean load of the machine over the timed blocks."""
         mean = self._load_s / self._seconds if self._seconds else math.nan
         return mean if math.isfinite(mean) else None
 
     def state_dict(self) -> dict[str, float]:
-        """Return the sums so far, for the checkpoint."""
+        """Return the measurements so far, for a checkpoint."""
         return {"seconds": self._seconds, "cpu_s": self._cpu_s, "load_s": self._load_s}
 
     def load_state_dict(self, state: dict[str, float] | None) -> None:
-        """Continue from the sums of a checkpoint; if an older checkpoint has none, both values become unknown."""
+        """Replace the measurements by those of a checkpoint; if an old checkpoint has none, both values become None."""
         state = state or dict.fromkeys(("seconds", "cpu_s", "load_s"), math.nan)
         self._seconds, self._cpu_s, self._load_s = (float(state[name]) for name in ("seconds", "cpu_s", "load_s"))
 
 
 def load() -> float:
-    """Return the load average: processes that ran or waited in the last minute; NaN if the system has none."""
+    """Return the load average of the machine over the last minute, or NaN if the system does not report one.
+
+    The load average counts the processes that run or wait for a processor.
+    """
     try:
         return os.getloadavg()[0]
     except (AttributeError, OSError):  # Windows; a container without /proc
@@ -261,7 +268,7 @@ def load() -> float:
 
 
 class _Clock(Protocol):
-    """A clock that marks moments and tells the seconds between two of its marks."""
+    """A clock that marks moments and measures the seconds between two marks."""
 
     def mark(self) -> Any: ...
     def has_passed(self, mark: Any) -> bool: ...
@@ -280,7 +287,7 @@ class _HostClock:
 
 
 class _DeviceClock:
-    """Marks the moments at which a GPU has finished the work that was enqueued so far."""
+    """A clock whose marks are CUDA events: the moments at which a GPU has finished the work enqueued before."""
 
     def __init__(self, device: str) -> None:
         self.device = device
@@ -305,19 +312,19 @@ def _clock_of(device: str) -> _Clock:
 
 
 def reset_peak_memory(device: str = "cpu") -> None:
-    """Reset the peak of memory, so that a run does not report that of an earlier run in the same process (multirun)."""
+    """Reset the peak memory, so that a run does not report the peak of an earlier run in the same process."""
     if device.startswith("cuda"):
         import torch
 
         torch.cuda.reset_peak_memory_stats(device)
     elif (clear := Path("/proc/self/clear_refs")).exists():
         with suppress(AttributeError):  # a libc that is not glibc
-            ctypes.CDLL(None).malloc_trim(0)  # memory kept by the kernels is not of the next run
+            ctypes.CDLL(None).malloc_trim(0)  # freed memory that malloc keeps does not belong to the next run
         clear.write_text("5")  # proc(5): resets VmHWM, which ru_maxrss reports
 
 
 def peak_memory(device: str = "cpu") -> int:
-    """Return the peak of memory in bytes: on a GPU what torch allocated, else the process' resident memory."""
+    """Return the peak memory in bytes: on a GPU the memory allocated by torch, else the process' resident memory."""
     if device.startswith("cuda"):
         import torch
 

@@ -1,1 +1,1 @@
-"""Configure the threads, workers and memory that this process uses. Only `workers` needs torch."""
+"""Configure the threads, parallel workers and memory of this process. Only `workers` imports torch."""

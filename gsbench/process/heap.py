@@ -1,11 +1,11 @@
-"""Keep freed memory in the process: memory returned to the system must be mapped again, page by page, in each step."""
+"""Keep freed memory in the process, because getting it back from the system in each training step is slow."""
 
 import ctypes
 import os
 import sys
 
-KEPT = 1 << 30  # bytes of a block, and of the free end of the heap
-# Options of glibc's malloc (mallopt(3)) by the environment variable that overrides each.
+KEPT = 1 << 30  # bytes: the largest block that malloc keeps, and the most free memory at the end of the heap
+# Options of glibc's malloc (mallopt(3)), by the environment variable that overrides the option.
 OPTIONS = {
     "MALLOC_TRIM_THRESHOLD_": (-1, KEPT),  # M_TRIM_THRESHOLD
     "MALLOC_MMAP_THRESHOLD_": (-3, KEPT),  # M_MMAP_THRESHOLD
@@ -14,12 +14,11 @@ OPTIONS = {
 
 
 def keep_freed_memory() -> None:
-    """Keep large blocks when they are freed, on all threads. Call it before threads start: each keeps its heap.
+    """Make glibc's malloc keep large freed blocks, for all threads; call this before other threads start.
 
-    A step frees some hundred megabytes of gradients and allocates them again, which took a quarter of a step of 4DGS at
-    150,000 Gaussians. The heap ("arena") of any thread but the first returns blocks beyond 64 MB to the system whatever
-    the thresholds are. So all workers share the arena of the first thread. Without glibc nothing
-    is done.
+    A training step frees several hundred megabytes of gradients and allocates them again, which took a quarter of a
+    step of 4DGS at 150,000 Gaussians. All threads share one heap (arena), because glibc's heaps of further threads
+    return large blocks to the system. Without glibc this function does nothing.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None  # musl has none
     if mallopt is None:

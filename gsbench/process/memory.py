@@ -1,6 +1,6 @@
-"""Check that a request fits into memory before it is made, as the system kills a process that takes too much.
+"""Check that an allocation fits into memory, because Linux may kill a process that uses too much.
 
-The module needs no torch.
+The module does not import torch.
 """
 
 import errno
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gsbench.errors import TooLargeError
 
-# Messages of the library loader, torch, C++, the system's threads and OpenCV where memory runs out.
+# Messages of the library loader, torch, C++, system threads and OpenCV if memory runs out.
 WITHOUT_MEMORY = re.compile(r"memory|bad_alloc|bad alloc|failed to map segment|can't start new thread", re.IGNORECASE)
 SMALL = 1 << 26  # bytes; smaller requests are not checked
 # Bytes of address space (`ulimit -v`) that Python, torch and OpenBLAS need to start. With less, torch or the C library
@@ -19,11 +19,11 @@ LEAST_ADDRESS_SPACE = 1280 << 20
 
 
 def require(size: int, what: str, instead: str) -> None:
-    """Raise TooLargeError if `size` bytes are more than this process can still get.
+    """Raise TooLargeError if `size` bytes are more than the memory that is available to this process.
 
     Args:
         size: bytes.
-        what: the objects that need them, in the plural.
+        what: the objects that need the memory, in the plural.
         instead: the advice in the message.
     """
     if size < SMALL:
@@ -35,7 +35,7 @@ def require(size: int, what: str, instead: str) -> None:
 
 
 def too_little_address_space() -> str | None:
-    """Tell in words that the process may use too few addresses for torch to be loaded; None if it may use enough."""
+    """Return an error message if the address space (`ulimit -v`) is too small to load torch, otherwise None."""
     if sys.platform == "win32":  # it has no such limit
         return None
     import resource
@@ -48,7 +48,7 @@ def too_little_address_space() -> str | None:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Tell whether an error means that memory ran out; few libraries raise a MemoryError."""
+    """Return whether an exception means that memory ran out; most libraries do not raise MemoryError."""
     if isinstance(error, OSError):
         return error.errno == errno.ENOMEM
     told = isinstance(error, RuntimeError | ImportError | SystemError) and WITHOUT_MEMORY.search(str(error)) is not None
@@ -56,7 +56,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def available() -> int | None:
-    """Return the bytes that the system and the control group leave to this process; None if neither is known."""
+    """Return the bytes that the system and the control group leave to this process, or None if unknown."""
     limits = [x for x in (_system(), _control_group()) if x is not None]
     return min(limits, default=None)
 
@@ -76,5 +76,5 @@ def _control_group() -> int | None:
         lines = (folder / "memory.stat").read_text().splitlines()
     except (OSError, ValueError):  # no control group, or no limit ("max")
         return None
-    # `current` counts files that were read and can be dropped again at any time.
+    # memory.current includes cached files, which the system can drop at any time.
     return left + next((int(line.split()[1]) for line in lines if line.startswith("inactive_file ")), 0)

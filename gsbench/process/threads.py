@@ -1,7 +1,7 @@
-"""Let idle OpenMP threads sleep instead of spin, whichever library has loaded their runtime.
+"""Make idle OpenMP threads sleep instead of spin (busy-wait).
 
-Spinning threads of torch take cores from the kernels, and both take cores from other programs. libgomp is the runtime
-of torch's wheels and of the kernels. It reads OMP_WAIT_POLICY once, when it is loaded; no call changes it later.
+Spinning threads of torch take cores from gsbench's kernels and from other programs. Both torch's wheels and the kernels
+use the OpenMP runtime libgomp, which reads OMP_WAIT_POLICY only once, when it is loaded.
 """
 
 import ctypes
@@ -13,11 +13,11 @@ RUNTIME = "libgomp.so.1"
 
 
 def sleep_when_idle() -> None:
-    """Make idle threads sleep, before or after torch is imported, unless the environment sets a policy.
+    """Make idle OpenMP threads sleep, before or after torch is imported, unless the environment sets a policy.
 
-    A runtime that is already loaded spins for 300,000 rounds before it sleeps, but for only 100 while there are more
-    OpenMP threads than processors (manual of libgomp, GOMP_SPINCOUNT). So such a runtime gets that many threads, which
-    do nothing. A copy of the runtime that another library brings under another name is not reached.
+    If libgomp is already loaded, its idle threads spin for 300,000 rounds, but only for 100 rounds while there are more
+    OpenMP threads than processors (libgomp manual, GOMP_SPINCOUNT). In this case the function starts more threads than
+    processors, which do nothing. It does not affect a copy of libgomp that a library ships under another name.
     """
     if "OMP_WAIT_POLICY" in os.environ or "GOMP_SPINCOUNT" in os.environ:
         return
@@ -34,8 +34,8 @@ def sleep_when_idle() -> None:
 
 
 def _crowd(runtime: ctypes.CDLL, made: threading.Event) -> None:
-    """Start one OpenMP thread more than there are processors, and keep this thread alive, because they end with it."""
-    nothing = ctypes.CDLL(None).sched_yield  # each of them runs it once; it takes no argument
+    """Start more OpenMP threads than there are processors; this thread never ends, because they would end with it."""
+    nothing = ctypes.CDLL(None).sched_yield  # each thread calls this once; it has no arguments
     runtime.GOMP_parallel(nothing, None, runtime.omp_get_num_procs() + 1, 0)
     made.set()
     threading.Event().wait()

@@ -1,4 +1,4 @@
-"""Run independent tasks in parallel, each on a Python thread with its share of the kernels' threads."""
+"""Run independent tasks in parallel Python threads that share the processors."""
 
 import functools
 import time
@@ -13,14 +13,14 @@ Result = TypeVar("Result")
 
 
 def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[Result]:
-    """Yield the result of `work` for each item, in the order of the items, with `workers` items in parallel.
+    """Yield `work(item)` for each item in order, computed by `workers` parallel threads.
 
-    Kernels give the same bits for any number of threads, so the results do not depend on `workers`.
+    Results do not depend on `workers`, because gsbench's kernels give the same bits for any number of threads.
 
     Args:
-        work: must not write to data that another item reads. Gradients are enabled as for the caller.
-        items: each starts as soon as a worker is free, however slowly the results are taken.
-        workers: see `gsbench.kernels.backends.Backend.workers`.
+        work: must not write to data that another call reads. Gradients are enabled if they are enabled for the caller.
+        items: an item is started as soon as a worker is free, even if the caller has not taken earlier results.
+        workers: the number of threads; see `gsbench.kernels.backends.Backend.workers`.
     """
     workers = min(workers, len(items))
     if workers <= 1:
@@ -36,11 +36,11 @@ def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], workers:
 
 @functools.cache
 def _pool(workers: int, threads: int) -> ThreadPoolExecutor:
-    """Start workers whose kernels and torch operations run on `threads` threads each."""
+    """Return a pool of worker threads, in each of which kernels and torch use `threads` threads."""
     before = torch.get_num_threads()
 
     def settle() -> None:
-        torch.get_num_threads()  # in a thread that has not asked yet, asking puts the process's number in place
+        torch.get_num_threads()  # the first call in a thread sets its number to that of the process, so call it first
         torch.set_num_threads(threads)
 
     pool = ThreadPoolExecutor(workers, "gsbench-worker", settle)

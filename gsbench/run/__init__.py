@@ -1,1 +1,4 @@
-"""Do one run: train a model on a scene, measure it and write its record. This module imports nothing heavy."""
+"""Run one training of a model on a scene, measure the result and write its record.
+
+Importing this module imports neither torch nor other large packages.
+"""

@@ -1,4 +1,4 @@
-"""Do a run in four parts (prepare, choose the model, train, measure), and describe its result in a record."""
+"""Run one training in four steps (prepare, choose the model, train, measure), and describe it in a record."""
 
 import sys
 from dataclasses import replace
@@ -22,22 +22,22 @@ from gsbench.train.loop import Trainer
 
 
 class Attempt:
-    """One attempt at a run. Its result can be described in a record, also if an error stopped it."""
+    """One attempt at a run (a training and its measurement), which can be described in a record even after an error."""
 
     def __init__(self, this: Run) -> None:
-        """Take a run that has a name and a folder; no file is read and no setting checked yet."""
+        """Store the run; no file is read and no setting is checked yet."""
         self.this = this
         self.resolved = Resolved(before_scene(this.config))
         self.model: GaussianModel | None = None
         self.scene: Scene | None = None
-        self.start: TrainedGaussians | None = None  # trained Gaussians to start from; None: points
+        self.start: TrainedGaussians | None = None  # trained Gaussians to start from; None to start from points
         self._images: dict[str, Pixels] = {}
 
     def prepare(self) -> tuple[GaussianModel, Scene]:
-        """Check the config, build the model and load the scene, so that faults are refused before step 0.
+        """Check the settings, build the model and load the scene, so that errors are found before the first step.
 
         Raises:
-            InputError: the config, the device or the data has a fault.
+            InputError: the settings, the device or the data are invalid.
         """
         config = self.resolved.config
         check_config(config)
@@ -53,7 +53,10 @@ class Attempt:
         return self.model, scene
 
     def fit(self, model: GaussianModel, scene: Scene) -> Trainer:
-        """Choose the model if it is model=auto, and train to the end; raises as `gsbench.run.fitting.fit`."""
+        """Train to the last step; for model=auto, first choose a model with or without time by a test of the scene.
+
+        Raises as `gsbench.run.fitting.fit`.
+        """
         if is_auto(self.this.config):
             self.resolved = resolve(self.this, scene)
             self.model = model = build(self.resolved.config)
@@ -62,11 +65,11 @@ class Attempt:
         return trainer
 
     def trainer(self, model: GaussianModel, scene: Scene) -> Trainer:
-        """Initialise a model from the scene's points or from trained Gaussians, and prepare its training."""
+        """Initialise the Gaussians from the scene's points or from trained Gaussians; return the trainer at step 0."""
         return fitting.trainer_of(model, scene, self.resolved.config, self.start)
 
     def measure(self, trainer: Trainer) -> Record:
-        """Measure the images, the speed and the size of a fitted model."""
+        """Measure image quality, speed and size of the trained model, and return the record."""
         on_demand = self._on_demand(trainer)
         found = measuring.measure(trainer, self.resolved.config, on_demand is not None)
         self._images = found.images
@@ -77,16 +80,17 @@ class Attempt:
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:
-        """Return which effects were chosen; None if the config chooses none."""
+        """Return the run's decisions to remove time, direction or AGR; None if its settings do not ask for any."""
         screen, gating = self.resolved.screen, trainer.gating
         if screen is None and self.resolved.config.effects.gate == "off":
             return None
         return OnDemand(screen, gating.gates, gating.notes, gating.direction)
 
     def draw(self) -> None:
-        """Write pictures.png of the measured views, and effect_sets.png of a model whose effects were chosen.
+        """Write the measured renders as pictures.png, and the effects that Gaussians keep as effect_sets.png.
 
-        The pictures are drawn after the record is written, so a full disk costs the pictures and not the record.
+        The effects are time, direction and AGR (neural refinement). effect_sets.png is written only if the settings ask
+        to remove effects from Gaussians. If the disk is full, the run has no images, but its record is already written.
         """
         for name, image in self._images.items():
             path = self.this.folder / name
@@ -96,7 +100,7 @@ class Attempt:
                 print(f"{self.this.name}: no pictures: {path}: {error.strerror}", file=sys.stderr)
 
     def describe(self, status: str, reason: str | None) -> Record:
-        """Describe the run in a record without measurements: its config, its machine and how it ended.
+        """Return a record of the run without measurements: its settings, its machine and its status.
 
         Args:
             status: how the run ended: ok, failed or diverged.

@@ -1,4 +1,4 @@
-"""Check the config, the data set, the device and the folder of a run before the first training step."""
+"""Check the settings, the data set, the device and the folder of a run before the first training step."""
 
 import dataclasses
 import importlib.resources
@@ -31,9 +31,9 @@ from gsbench.train.penalties import check_penalties
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 PACKAGE = "pkg://"  # in front of the module whose files data.root names
 SPLITS = ("test", "val")
-LEAST_GAUSSIANS = 4  # to start from: initial scales come from three neighbours
+LEAST_GAUSSIANS = 4  # the fewest Gaussians to start from: initial scales come from three neighbours
 ENDLESS = 10**9  # more than any machine can do
-RANGES = {  # of numbers that the schema types but does not bound, both ends included
+RANGES = {  # the ranges of settings, both ends included
     "train.iterations": (1, ENDLESS),
     "train.recipe_iterations": (1, ENDLESS),
     "train.batch_size": (1, 10_000),
@@ -67,7 +67,7 @@ RANGES = {  # of numbers that the schema types but does not bound, both ends inc
 
 
 def check_config(config: Config) -> None:
-    """Raise InputError for a value of the config that no run can have on this machine."""
+    """Raise InputError if a setting is invalid, or if this machine lacks the device, backend or LPIPS weights."""
     check_values(config)
     check_device(config.device)
     resolve(config.raster.backend, torch.device(config.device).type)
@@ -76,7 +76,7 @@ def check_config(config: Config) -> None:
 
 
 def check_values(config: Config) -> None:
-    """Raise InputError for a value of the config that no run can have on any machine."""
+    """Raise InputError if a setting is invalid on every machine, for instance out of its range."""
     check_keys(config, Config, "")
     _check_choice("data.background", config.data.background, BACKGROUNDS)
     _check_choice("scene.eval_split", config.scene.eval_split, SPLITS)
@@ -97,10 +97,11 @@ def check_values(config: Config) -> None:
 
 
 def trained_start(config: Config) -> TrainedGaussians | None:
-    """Read the trained Gaussians that a training starts from; None if it starts from points.
+    """Read the trained Gaussians from which a training starts; return None if the training starts from points.
 
     Raises:
-        InputError: the file is no PLY of Gaussians, holds fewer than four, or has another SHA-256 than the config says.
+        InputError: the file is not a PLY file of Gaussians, holds fewer than four, or does not have the SHA-256 in the
+            settings.
     """
     if config.init.ply is None:
         if config.init.ply_sha256 is not None:
@@ -118,13 +119,13 @@ def trained_start(config: Config) -> TrainedGaussians | None:
 
 
 def lpips_weights(config: Config) -> dict[str, Path]:
-    """Return the files with weights of LPIPS' networks that the config names, by network."""
+    """Return the weight files of LPIPS networks in the settings, by network ("alex", "vgg")."""
     given = {"alex": config.protocol.lpips_alex, "vgg": config.protocol.lpips_vgg}
     return {backbone: Path(file).expanduser() for backbone, file in given.items() if file}
 
 
 def check_keys(value: Any, kind: Any, place: str) -> None:
-    """Raise InputError for a key that the schema lacks: Hydra's `+key=` adds it, but no code reads it."""
+    """Raise InputError if the settings have an unknown key, which Hydra's `+key=` adds without an error."""
     if isinstance(value, dict):
         for name, one in value.items():
             check_keys(one, type(one), f"{place}.{name}")
@@ -139,7 +140,7 @@ def check_keys(value: Any, kind: Any, place: str) -> None:
 
 
 def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
-    """Yield every number below a config with its dotted key."""
+    """Yield all numbers in the settings with their dotted keys."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         yield place, value
     members = value if isinstance(value, dict) else vars(value) if dataclasses.is_dataclass(value) else {}
@@ -148,14 +149,17 @@ def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
 
 
 def _check_rate(key: str, rate: LearningRate) -> None:
-    """Raise InputError for a rate that is negative, or that starts or ends a log-linear decay at zero."""
+    """Raise InputError if a learning rate is negative, or if a log-linear decay starts or ends at zero."""
     if rate.start < 0 or (rate.end is not None and (rate.end <= 0 or rate.start == 0)):
         raise InputError(f"{key}: expected start >= 0, and start > 0 with end > 0 or null, "
                          f"got start {rate.start}, end {rate.end}")  # fmt: skip
 
 
 def _check_coarse(coarse: list[list[int]]) -> None:
-    """Raise InputError unless factors are whole, fall, and end at steps that rise: [[4, 3000], [2, 15000]]."""
+    """Raise InputError unless `coarse` is a valid list of (downscaling factor, last step) pairs.
+
+    An example is [[4, 3000], [2, 15000]]: factors decrease and steps increase.
+    """
     are_pairs = all(len(pair) == 2 for pair in coarse)
     factors, steps = ([pair[at] for pair in coarse] if are_pairs else [] for at in (0, 1))
     fall = all(a > b for a, b in itertools.pairwise([*factors, 1]))
@@ -167,7 +171,7 @@ def _check_coarse(coarse: list[list[int]]) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise InputError unless files can be written in a run's folder; a missing folder is made."""
+    """Create the folder of a run if needed; raise InputError if files cannot be written there."""
     probe = folder / ".probe"
     try:
         write_atomically(probe, b"")
@@ -182,7 +186,7 @@ def _check_choice(key: str, value: str, known: Iterable[str]) -> None:
 
 
 def check_device(name: str) -> None:
-    """Raise InputError unless `name` is a device that torch can use here."""
+    """Raise InputError unless `name` is a device that torch can use on this machine."""
     kind = name.partition(":")[0]
     if kind not in ("cpu", "cuda") or name.startswith("cpu:"):
         raise InputError(f"device '{name}' is not known. {did_you_mean(kind, ['cpu', 'cuda'])}")
@@ -193,14 +197,14 @@ def check_device(name: str) -> None:
 
 
 def scene_folder(config: Config) -> Path:
-    """Find the folder of the config's scene by its name, else by its name in the published release.
+    """Return the folder of the scene, found under `data.root` by the scene's name or by its name in the published data.
 
     Raises:
-        InputError: data.root has no such folder; the message lists the names that were tried.
+        InputError: there is no such folder; the message lists the names that were tried.
     """
     data, scene = config.data, config.scene
     names = [scene.name, *([scene.released_as] if scene.released_as else [])]
-    folders = [data_root(data.root) / name for name in names]  # a name has no slash: gsbench.measure.record.run_path
+    folders = [data_root(data.root) / name for name in names]  # names have no slash (checked by run_path)
     for folder in folders:
         if folder.is_dir():
             return folder
@@ -213,10 +217,10 @@ def scene_folder(config: Config) -> Path:
 
 
 def data_root(root: str) -> Path:
-    """Return the folder that data.root names, as a path or as pkg://module for data inside a package.
+    """Return the folder of a data set, given as a path or as `pkg://module` for data inside a Python package.
 
     Raises:
-        InputError: there is no such module, or the path cannot be one.
+        InputError: the module does not exist, or the path is invalid.
     """
     if "\0" in root:
         raise InputError(f"data.root: expected a path, got {root!r:.200}")
@@ -229,13 +233,16 @@ def data_root(root: str) -> Path:
 
 
 def check_gates(model: GaussianModel, config: Config) -> None:
-    """Raise InputError if the config asks to remove effects (`effects.gate`) and the model does not support this."""
+    """Raise InputError if `effects.gate` asks to remove time, direction or AGR, but the model does not support this."""
     if config.effects.gate != "off":
         as_gated(model)
 
 
 def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
-    """Raise InputError if the scene cannot train the model: the scene has no times, or all cameras are at one place."""
+    """Raise InputError if the scene cannot train the model.
+
+    Reasons are a model with time and a scene without, cameras that are all at one place, and images that are too small.
+    """
     if ("time" in model.observes or config.agr) and not scene.has_time:
         what = "agr=true" if config.agr else config.model.name
         raise InputError(f"{what}: expected a scene with times, {scene.name} has none: use 3dgs or 6dgs, agr=false")
@@ -250,7 +257,11 @@ def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
 
 
 def evaluated_views(scene: Scene, split: str) -> list[View]:
-    """Return the views that a run is measured on; raises InputError if the split has none."""
+    """Return the views of the evaluated split ("test" or "val").
+
+    Raises:
+        InputError: the split has no views.
+    """
     views = scene.val if split == "val" else scene.test
     if not views:
         raise InputError(f"{scene.name}: expected views in the split '{split}', there are none")

@@ -1,8 +1,8 @@
-"""Claim a run for this process before anything heavy is loaded, so that only one of equal commands trains.
+"""Claim a run for this process, so that only one of several identical commands trains.
 
-The claim is the run's progress.json. It is created by a hard link, which succeeds for only one of several processes,
-also across hosts. A claim whose process is gone is taken over. During that a system lock keeps other processes out,
-where the file system has locks; the system drops the lock of a killed process. The module needs no torch.
+The claim is the file progress.json in the run's folder. It is created by a hard link, which succeeds in only one of
+several processes, on one or more hosts. If the process of a claim has ended, another process may take the claim. A file
+lock protects this step if the file system supports locks. The module does not import torch.
 """
 
 import fcntl
@@ -19,16 +19,18 @@ from gsbench.run import progress
 from gsbench.run.progress import Progress
 
 LOCK = ".claim"
-PATIENCE = 5.0  # seconds to wait for the lock; a process that holds it longer is suspended, and the link decides
+PATIENCE = 5.0  # seconds to wait for the lock; a process that holds it longer is suspended, so go on without
 ATTEMPTS = 100
 NOTHING, DAMAGED = "nothing", "damaged"  # results of reading a claim that is no progress file
 
 
 def take(folder: Path, mine: Progress) -> Progress | None:
-    """Claim the run in the existing `folder`; return None, or the progress of the live process that has the claim.
+    """Claim the run in the existing `folder`; if another live process has claimed it, return that process's progress.
+
+    Return None if the claim succeeds.
 
     Raises:
-        InputError: other processes claim and release the run again and again.
+        InputError: other processes claim and release the run repeatedly.
         OSError: the claim cannot be written.
     """
     path = folder / progress.FILE_NAME
@@ -38,28 +40,29 @@ def take(folder: Path, mine: Progress) -> Progress | None:
             if isinstance(other, Progress) and not _may_be_taken(other, mine):
                 return other
             if other is not NOTHING:
-                path.unlink(missing_ok=True)  # a dead process left it, or it is damaged and says nothing
+                path.unlink(missing_ok=True)  # its process has ended, or the file is damaged
             if create_atomically(path, progress.encode(mine)):
                 return None
     raise InputError(f"{path}: expected to claim the run, other processes claim it again and again: try later")
 
 
 def release(folder: Path, mine: Progress) -> None:
-    """Remove the claim of this process on the run in `folder`; a claim of another process stays."""
+    """Remove this process's claim on the run in `folder`; the claim of another process is kept."""
     path = folder / progress.FILE_NAME
     try:
         with _alone(folder):
             other = _read(path)
             if isinstance(other, Progress) and _is_one(other, mine):
                 path.unlink(missing_ok=True)
-    except OSError:  # the folder is gone or cannot be written any more; the claim goes with its process
+    except OSError:  # the folder cannot be written any more; the claim expires with this process
         return
 
 
 def _read(path: Path) -> Progress | str:
-    """Read a claim; return NOTHING if there is none, DAMAGED if three attempts to read it fail.
+    """Read a claim; return NOTHING if there is none, or DAMAGED if it cannot be read three times.
 
-    Without locks another process may create the claim during the first attempt, which is no damage.
+    Without file locks, another process may create the claim during the first read, so that the first failure proves
+    nothing.
     """
     for _ in range(3):
         try:
@@ -75,9 +78,10 @@ def _is_one(other: Progress, mine: Progress) -> bool:
 
 
 def _may_be_taken(other: Progress, mine: Progress) -> bool:
-    """Tell whether the process of a claim is this one, is gone, or was requeued by Slurm after its node failed.
+    """Return whether this process may take an existing claim.
 
-    A Slurm job that runs two equal commands on one node has two live processes; each respects the other's claim.
+    It may if the claim is its own, if the process of the claim has ended, or if Slurm has requeued the job after a node
+    failed. Two live processes of one Slurm job on one node respect each other's claims.
     """
     requeued = other.job is not None and other.job == mine.job and other.host != mine.host
     return _is_one(other, mine) or requeued or not progress.is_alive(other)
@@ -85,7 +89,7 @@ def _may_be_taken(other: Progress, mine: Progress) -> bool:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Lock a claim against other processes while the block reads and replaces it, where the file system has locks."""
+    """Hold a file lock while the block reads and replaces a claim; skip the lock if the file system has none."""
     path = folder / LOCK
     until = time.monotonic() + PATIENCE
     file: IO[bytes] | None = None
@@ -105,10 +109,10 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _locked(path: Path) -> IO[bytes] | None:
-    """Open and lock `path`; return None if its last holder has removed it meanwhile, as others lock another file.
+    """Open and lock `path`; return None if the file was removed in the meantime, so that the caller must try again.
 
     Raises:
-        BlockingIOError: another process holds it.
+        BlockingIOError: another process holds the lock.
     """
     file = path.open("ab")
     try:

@@ -1,4 +1,4 @@
-"""Find the record of a run that finished earlier, and decide whether it is kept, measured again or trained again."""
+"""Find the record of an earlier, finished run, and decide whether to keep it, to measure again or to train again."""
 
 import sys
 from pathlib import Path
@@ -21,10 +21,10 @@ STALE = "record.stale.json"  # that of a finished run, kept beside the record of
 
 
 def finished(this: Run, scene: Scene) -> Record | None:
-    """Read the record of this run if it ended well with the same training, measuring and data; None otherwise.
+    """Return the record of an earlier run if it is ok and has the same settings and data; otherwise None.
 
-    Where a record differs, the reason is printed. If LPIPS weights are new on this machine, the run is measured
-    again from its checkpoint; where the checkpoint is gone, the record is kept without LPIPS.
+    If a record does not match, the reason is printed. If LPIPS weights were added to this machine, the run is measured
+    again from its checkpoint; without a checkpoint, the record is kept without LPIPS.
     """
     if not this.config.resume:
         return None
@@ -48,7 +48,7 @@ def finished(this: Run, scene: Scene) -> Record | None:
 
 
 def where(this: Run, record: Record) -> str:
-    """Return when and on which machine the record of a run was measured."""
+    """Return the date and the machine of a record as text."""
     here, device = hardware(kernels.instruction_set()), this.config.device
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else here.processor
     theirs = record.provenance.machine
@@ -57,7 +57,7 @@ def where(this: Run, record: Record) -> str:
 
 
 def _outdated(this: Run, scene: Scene, record: Record) -> str:
-    """Return why the record of a finished run does not match this run; "" if it matches."""
+    """Return why the record of an earlier run does not match the settings and data of this run; "" if it matches."""
     theirs = record.provenance
     training = training_differences(theirs.config, this.plain)
     if training:
@@ -72,7 +72,7 @@ def _outdated(this: Run, scene: Scene, record: Record) -> str:
 
 
 def _lacks_lpips(this: Run, scene: Scene, record: Record) -> str:
-    """Return why new LPIPS weights make a run be measured again; "" if its record is kept."""
+    """Return why an earlier run must be measured again for LPIPS (its weights were added); "" if its record is kept."""
     camera, given = evaluated_views(scene, this.config.scene.eval_split)[0].camera, lpips_weights(this.config)
     new = [name for name, known in perceptual.BACKBONES.items()
            if (record.metrics or {}).get(f"lpips_{name}") is None and perceptual.is_here(name, given.get(name))
@@ -87,7 +87,7 @@ def _lacks_lpips(this: Run, scene: Scene, record: Record) -> str:
 
 
 def _is_trained(this: Run, scene: Scene) -> bool:
-    """Tell whether this run has a checkpoint of its finished training."""
+    """Return whether this run has a checkpoint of its finished training."""
     path: Path = this.folder / checkpoint.FILE_NAME
     try:
         state = checkpoint.load(path, training_hash(this.plain), scene.fingerprint, "cpu")

@@ -1,4 +1,4 @@
-"""Fit a model: initialise it, train it from step 0 or from a checkpoint, and stop when the process is told to."""
+"""Train a model: initialise it, train it from step 0 or from a checkpoint, and stop when a signal asks for it."""
 
 import signal
 import sys
@@ -28,13 +28,13 @@ from gsbench.train.seeding import generator
 
 
 def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: TrainedGaussians | None) -> Trainer:
-    """Initialise a model and prepare its training.
+    """Initialise the Gaussians of a model and return the trainer at step 0.
 
     Args:
-        model: the model, without Gaussians yet.
-        scene: the scene with the views, and with initial points if the data set has some.
-        config: the config of the run.
-        start: trained Gaussians to start from; None: points.
+        model: the model, still without Gaussians.
+        scene: the scene with its views, and with initial points if the data set has some.
+        config: the settings of the run.
+        start: trained Gaussians to start from; None to start from points.
     """
     random = generator(config.seed)
     if start is not None:
@@ -46,18 +46,19 @@ def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: Traine
 
 
 def fit(trainer: Trainer, this: Run, resolved: Resolved, plain: dict[str, Any]) -> None:
-    """Train to the end, starting from this training's checkpoint if the run's folder has one.
+    """Train to the last step, starting from the checkpoint in the run's folder if there is one.
 
     Args:
-        trainer: the training, at step 0.
+        trainer: the trainer at step 0.
         this: the run to train, with its folder.
-        resolved: the config of the run, and the seconds of the test for time, which count as training.
-        plain: the config as plain values, for the checkpoint.
+        resolved: the settings of the run after model=auto was replaced by a model; the seconds of this choice count as
+            training.
+        plain: the settings as plain values, for the checkpoint.
 
     Raises:
         InputError: the checkpoint is damaged, or no Gaussian is left.
         DivergedError: a loss or gradient was not finite.
-        Stopped: the process was told to end; the checkpoint is saved.
+        Stopped: a signal asked the process to end; the checkpoint is saved.
     """
     config = resolved.config
     reset_peak_memory(config.device)
@@ -89,8 +90,8 @@ def fit(trainer: Trainer, this: Run, resolved: Resolved, plain: dict[str, Any]) 
 
 
 def _check_fitted(trainer: Trainer) -> None:
-    """Raise DivergedError for a parameter that is not finite, and InputError if no Gaussian is left."""
-    for name, parameter in trainer.model.named_parameters():  # no image shows a colour of -inf: it is black
+    """Raise DivergedError if a parameter is not finite, and InputError if no Gaussian is left."""
+    for name, parameter in trainer.model.named_parameters():  # images would not show a colour of -inf, which is black
         if not parameter.isfinite().all():
             raise DivergedError(f"step {trainer.step}: '{name}' has values that are not finite")
     if not len(trainer.model):
@@ -99,7 +100,7 @@ def _check_fitted(trainer: Trainer) -> None:
 
 
 def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:
-    """Sample points to start from if the data set has none: in a cube, or in the frustum that all cameras share."""
+    """Sample initial points for a data set without points, in a cube or in the frustum that all cameras share."""
     if data.initial_half_width is not None:
         return random_points(data.initial_points, data.initial_half_width, random)
     cameras = [view.to("cpu").camera for view in scene.train]

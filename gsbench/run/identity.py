@@ -1,4 +1,4 @@
-"""Identify a run by the settings that its training reads: give the run a label, a variant and a folder."""
+"""Name a run by the settings that change its training: a label, a variant and a folder."""
 
 import hashlib
 import json
@@ -25,38 +25,39 @@ from gsbench.scenes.ply import MAX_FILE
 
 OWN_NAMES = ("exp", "model", "scene")  # the groups that have a place in a run's path
 DEFAULTS = {"train": "default", "raster": "default", "protocol": "gsbench"}  # groups of conf/config.yaml
-LONGEST_VARIANT = 80  # characters: several such folders must fit into a path of 255
+LONGEST_VARIANT = 80  # characters; longer names could exceed the limits of a path
 
 
 @dataclass(frozen=True)
 class Run:
-    """One model on one scene with one seed."""
+    """The training and measurement of one model on one scene with one seed: settings, names and folder."""
 
     config: Config
-    plain: Plain  # the config as recorded
-    folder: Path  # where the record, the checkpoint and the images go
-    label: str  # the model's name, with _agr or _noagr where it is not as published
+    plain: Plain  # the settings as they are recorded, plain values
+    folder: Path  # the folder of the record, the checkpoint and the images
+    label: str  # the model's name, with _agr or _noagr if it differs from the published method
     variant: str = ""  # settings of its training that differ from the experiment's, such as "iterations=10"
-    overrides: list[str] = field(default_factory=list)  # arguments of `python -m gsbench` that repeat it
+    overrides: list[str] = field(default_factory=list)  # arguments of `python -m gsbench` that repeat the run
 
     @property
     def name(self) -> str:
-        """Return the scene, the label, the variant and the seed, as messages show them."""
+        """Return the name of the run in messages: scene, model label, variant (changed settings) and seed."""
         variant = f" {self.variant}" if self.variant else ""
         return f"{self.config.scene.name} {self.label}{variant} seed{self.config.seed}"
 
 
 def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, overrides: Sequence[str] = ()) -> Run:
-    """Resolve the config of one run and name the run.
+    """Resolve the settings of one run, and give the run its label, variant and folder.
 
     Args:
         composed: the config of one scene, as Hydra composed it.
         choices: the choice of each config group (HydraConfig.runtime.choices); None for a run without variant.
-        overrides: the overrides of its command line (HydraConfig.overrides.task).
+        overrides: the overrides of the command line (HydraConfig.overrides.task).
 
     Raises:
-        InputError: a name cannot be that of a folder, or there is no file to start from. Hydra has already refused
-            unknown keys and wrong types.
+        InputError: a name is not a valid folder name, or the file of trained Gaussians does not exist. Hydra has
+            already
+            refused unknown keys and wrong types.
     """
     for name in (one.name for one in fields(Config)):
         if name not in composed:
@@ -84,7 +85,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
 
 
 def _rename_rates(composed: DictConfig) -> None:
-    """Give learning rates the names that their groups have now: a model's own YAML may be older than this gsbench."""
+    """Rename learning rates of a user's model YAML that was written for an older version of gsbench."""
     rates = composed.model.lr
     for name in list(rates):
         present = present_key(f"model.lr.{name}").rpartition(".")[2]
@@ -95,15 +96,19 @@ def _rename_rates(composed: DictConfig) -> None:
 
 
 def hash_of(ply: str) -> str:
-    """Compute the SHA-256 of the file that a training starts from; raises InputError if it cannot be read."""
+    """Return the SHA-256 of the PLY file from which a training starts.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
     return digest(read_file(Path(ply).expanduser(), f"init.ply={ply!a:.200}", MAX_FILE))
 
 
 def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
-    """Name the settings that a training reads beyond its experiment, model, scene and seed; "" for none.
+    """Return a name for the settings that change the training and differ from the experiment's; "" if there are none.
 
-    A group is named with its choice (`recipe=paper`). A key is named with its value where that differs from the config
-    that the choices alone compose. A long name is shortened at a whole word and ends in a hash.
+    A changed config group appears as its choice (`recipe=paper`), and a changed key as its value (`iterations=10`).
+    Model, scene and seed are not part of the name. A long name is cut after a whole word and ends in a hash.
     """
     groups = {
         group: choice
@@ -124,9 +129,9 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
 
 
 def _storable(value: Any) -> Any:
-    """Convert values that a record cannot hold, such as NaN, to text. A run with them is refused.
+    """Convert values that a record cannot hold, such as NaN, to text.
 
-    Its record shows the text.
+    A run with such values is refused, and its record shows the text.
     """
     if isinstance(value, dict):
         return {key: _storable(one) for key, one in value.items()}
@@ -136,9 +141,9 @@ def _storable(value: Any) -> Any:
 
 
 def _printed(value: Any) -> str:
-    """Format a value for the name of a folder; return a hash if it has characters that are unsafe there.
+    """Format a value for a folder name; a value with unsafe characters becomes a hash.
 
-    A SHA-256 is shortened to its first eight digits.
+    A SHA-256 is cut to its first eight digits.
     """
     text = value if isinstance(value, str) else json.dumps(value)
     if re.fullmatch("[0-9a-f]{64}", text):
@@ -148,7 +153,7 @@ def _printed(value: Any) -> str:
 
 
 def _cut(words: list[str]) -> str:
-    """Join words by commas; if the result is too long, keep the first words and a hash of all."""
+    """Join words by commas; if the result is too long, keep the first words and append a hash of all words."""
     whole = ",".join(words)
     if len(whole) <= LONGEST_VARIANT:
         return whole

@@ -1,4 +1,4 @@
-"""Load the model of a finished or interrupted run from its folder, and the scene that it was trained on."""
+"""Load the model of a finished or interrupted run from its folder, and the scene on which it was trained."""
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,7 +28,7 @@ LARGEST_EXTENT = 1e18  # world units: squares stay finite in single precision
 
 @dataclass(frozen=True)
 class SceneDescription:
-    """The facts about a scene that are needed to render a model of this scene, without images."""
+    """The properties of a scene that rendering needs: name, extent, background, whether it has time, image size."""
 
     name: str
     fingerprint: str  # Scene.fingerprint of the data that the model was trained on
@@ -40,7 +40,7 @@ class SceneDescription:
 
     @classmethod
     def of(cls, scene: Scene) -> "SceneDescription":
-        """Describe a loaded scene."""
+        """Return the description of a loaded scene."""
         camera = scene.train[0].camera
         return cls(scene.name, scene.fingerprint, scene.extent, list(scene.background), scene.has_time,
                    camera.width, camera.height)  # fmt: skip
@@ -48,30 +48,31 @@ class SceneDescription:
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A trained model, ready to render, with the config and the scene of its training."""
+    """A trained model that can be rendered, with the settings and the scene description of its training."""
 
     model: GaussianModel
     config: Config
     scene: SceneDescription
-    step: int  # finished steps; below config.train.iterations where the run was interrupted
+    step: int  # finished steps; fewer than config.train.iterations if the run was interrupted
     folder: Path
 
 
 def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> LoadedRun:
-    """Load the model, the config and a description of the scene from the folder of a run.
+    """Load the model, the settings and a description of the scene from the folder of a run.
 
-    Only the checkpoint is read. It is not trusted: nothing in it is executed, and its config and tensors are checked.
+    Only the checkpoint is read. It is not trusted: no code in it is executed, and its settings and tensors are checked.
 
     Args:
         folder: the folder of the run, such as results/mini/suzanne/7dgs/seed0.
-        device: the device to render on.
-        backend: the backend to render with, whatever the run was trained with: auto, reference, cpu or cuda.
+        device: the device on which to render.
+        backend: the backend with which to render: auto, reference, cpu or cuda. It may differ from that of the
+            training.
 
     Raises:
-        InputError: the folder has no checkpoint, or the checkpoint is damaged or not of its own config.
+        InputError: the folder has no checkpoint, or the checkpoint is damaged or does not match its settings.
 
     Example:
-        The run of `python -m gsbench +exp=mini model=3dgs scene=moving-matte train.iterations=20`.
+        First run `python -m gsbench +exp=mini model=3dgs scene=moving-matte train.iterations=20`.
 
         >>> import torch
         >>> from gsbench import Query, load_run
@@ -92,7 +93,7 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     scene = parse(SceneDescription, found.scene, str(path))
     _check_scene(scene, path)
     model = build(config)
-    points = torch.eye(4, 3)  # the fewest allowed; `load_state` replaces them
+    points = torch.eye(4, 3)  # placeholders, which `load_state` replaces
     model.initialise(Points(points, points), scene.extent, generator(config.seed))
     model.to(device)
     try:
@@ -100,7 +101,7 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
         step = checkpoint.whole_number("step", found.state["step"], config.train.iterations)
     except (InputError, MemoryError):
         raise
-    except Exception as error:  # a part may be of any type
+    except Exception as error:  # parts of an untrusted file may have any type
         raise InputError(f"{path}: expected a training's state, it lacks {one_line(error)!s:.200}") from None
     schedule = Schedule(config.train, config.model.sh_degree, config.agr)
     model.set_active(schedule.active(max(0, step - 1)))
@@ -108,14 +109,14 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
 
 
 def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
-    """Load the scene that a run was trained on.
+    """Load the scene on which a run was trained.
 
     Args:
-        run: the run whose config names the scene.
-        data_root: the folder of its data set, if it differs from the one in the config.
+        run: the run, whose settings name the scene.
+        data_root: the folder of the data set, if it is not the one in the settings.
 
     Raises:
-        InputError: the data are gone, have a fault, or differ from those of the training.
+        InputError: the data do not exist, are invalid, or differ from the data of the training.
     """
     root = data_root or own_root(run.config.data.root, run.folder)
     config = replace(run.config, data=replace(run.config.data, root=root))
@@ -130,10 +131,10 @@ def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
 
 
 def own_root(root: str, where: Path) -> str:
-    """Return the data.root that a checkpoint names, for use if the user names none.
+    """Return `root`, the data folder in a checkpoint, if it is safe to use.
 
     Raises:
-        InputError: the data are in a Python package other than gsbench's; to find its files would import the package.
+        InputError: `root` names a Python package other than gsbench's; finding its files would import untrusted code.
     """
     if root.startswith(PACKAGE) and root != EMBEDDED:
         raise InputError(f"{where}: expected data in a folder or in {EMBEDDED}, its checkpoint names {root!r:.80}, "
@@ -142,7 +143,7 @@ def own_root(root: str, where: Path) -> str:
 
 
 def _check_scene(scene: SceneDescription, path: Path) -> None:
-    """Raise InputError unless a scene description has values that can be rendered."""
+    """Raise InputError if a scene description has an invalid image size, extent or background."""
     sizes = 0 < scene.width <= MOST_PIXELS and 0 < scene.height <= MOST_PIXELS
     if not sizes or not 0 < scene.extent < LARGEST_EXTENT:
         raise InputError(f"{path}: scene: expected 1 to {MOST_PIXELS} pixels a side and a positive extent, got "
@@ -154,22 +155,23 @@ def _check_scene(scene: SceneDescription, path: Path) -> None:
 
 
 def plain_description(scene: Scene) -> dict[str, Any]:
-    """Describe a scene in plain values, as a checkpoint holds it."""
+    """Return the description of a scene as plain values, for a checkpoint."""
     return asdict(SceneDescription.of(scene))
 
 
 def typed_config(plain: dict[str, Any], path: Path) -> Config:
-    """Convert the plain config of a checkpoint to a typed one.
+    """Convert the settings in a checkpoint from plain values to a `Config`.
 
-    A checkpoint is not trusted, so the module that it names for its model is not imported here; the user imports it.
+    A checkpoint is not trusted, so the Python module that it names for its model is not imported here; the user must
+    import it.
 
     Raises:
-        InputError: it is no config, has a value that no run has, or a name that leads out of the folder of the data.
+        InputError: the settings are invalid, or a name leads out of the data folder.
     """
     try:
         typed = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.create(_without_interpolations(plain)))
         config: Config = OmegaConf.to_object(typed)  # type: ignore[assignment]
-    except Exception as error:  # OmegaConf raises many kinds, some of them its own
+    except Exception as error:  # OmegaConf raises many types of exceptions
         raise InputError(f"{path}: expected the config of a run: {one_line(error)[:200]}") from None
     names = [config.scene.name] + ([config.scene.released_as] if config.scene.released_as else [])
     try:
@@ -187,7 +189,10 @@ def typed_config(plain: dict[str, Any], path: Path) -> Config:
 
 
 def _without_interpolations(value: Any) -> Any:
-    """Return plain values, and refuse text that OmegaConf would resolve: `${oc.env:NAME}` reads the environment."""
+    """Return plain values unchanged; raise ValueError if a text contains `${`, which OmegaConf would interpolate.
+
+    For instance, `${oc.env:NAME}` would read an environment variable.
+    """
     if isinstance(value, str) and "${" in value:
         raise ValueError(f"expected resolved values, got {value!r:.80}")
     for key, one in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():

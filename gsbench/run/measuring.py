@@ -1,4 +1,4 @@
-"""Measure a fitted model: the quality of its images, the time of a frame, what the training cost."""
+"""Measure a trained model: image quality, frame time, and the cost of its training."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -24,23 +24,25 @@ Pairs = list[tuple[npt.ArrayLike, npt.ArrayLike]]  # render and ground truth, [H
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured of a trained model, for its record, and some of its images for pictures.png."""
+    """The measurements of a trained model for its record, and images to be written beside the record."""
 
     metrics: dict[str, float | None]
     missing: dict[str, str]  # why a metric has no value
     per_view: list[ViewScore]
     cost: Cost
-    frames: dict[str, str]  # how frames are made on a GPU, for the record's protocol
-    images: dict[str, Pixels]  # by file name
+    frames: dict[str, str]  # whether frames on a GPU are replayed from a CUDA graph, for the record
+    images: dict[str, Pixels]  # images by file name
 
 
 def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measured:
-    """Measure a fitted model on the evaluated views.
+    """Measure a trained model on the evaluated views.
 
     Args:
         trainer: the finished training.
-        config: the config of the run.
-        with_effect_sets: whether to draw Gaussians in the colours of the effects that they keep, too.
+        config: the settings of the run.
+        with_effect_sets: whether to also draw an image with a colour for each set of effects (time, direction, AGR)
+            that
+            Gaussians keep.
     """
     views = trainer.views
     shown: Pairs = []
@@ -79,10 +81,10 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
 
 
 def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[str, Tensor, Tensor]]:
-    """Yield (name, render, ground truth) of every evaluated view; a few evenly spaced pairs go to `shown` too."""
+    """Yield (name, render, ground truth) of each evaluated view, and append a few evenly spaced pairs to `shown`."""
     views = trainer.views
     chosen = range(0, len(views), max(1, len(views) // max(1, pictures)))[:pictures]
-    for i, view in enumerate(views):  # one at a time: fifty views of 2048 x 1088 take 3 GB
+    for i, view in enumerate(views):  # one view at a time, because fifty views of 2048 x 1088 take 3 GB
         render, truth = trainer.render(view), view.image
         if i in chosen:
             shown.append((render.cpu().numpy(), truth.cpu().numpy()))
@@ -90,23 +92,28 @@ def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[s
 
 
 def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dict[str, str]]:
-    """Choose the function whose FPS is measured, and the record's protocol entry on how it makes frames on a GPU.
+    """Return the function that renders a frame for the FPS measurement, and a note for the record.
 
-    Frames are `replayed` from a CUDA graph if CUDA can record the model. Otherwise each frame is `launched` anew.
+    On a GPU frames are "replayed" from a CUDA graph if the model can be captured, otherwise "launched" kernel by
+    kernel.
     """
     if trainer.model.backend.name != "cuda":
         return trainer.render, {}
     graphed = GraphedFrames(trainer.model, trainer.renderer.background, trainer.renderer.antialias)
     try:
         graphed(first.camera, first.time)
-    except RuntimeError as error:  # an operation that waits for the device, in a model or a scheme written in torch
+    except RuntimeError as error:  # the model waits for the GPU, which a CUDA graph does not allow
         print(f"FPS is that of launched frames: CUDA cannot record this model: {one_line(error)}", file=sys.stderr)
         return trainer.render, {"frames": "launched"}
     return lambda view: graphed(view.camera, view.time), {"frames": "replayed"}
 
 
 def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[str, float | None], dict[str, str]]:
-    """Add PSNR at the iterations that were best on val or on test to the metrics of the last iteration."""
+    """Return the metrics of the last iteration, with the PSNR at the best iteration added.
+
+    The best iteration is the one with the highest PSNR on the validation split. If the settings ask for `best_on_test`,
+    the highest PSNR on the evaluated split during training is added too.
+    """
     metrics, missing = dict(quality.metrics), dict(quality.missing)
     metrics["psnr_best_on_val"] = trainer.best.eval_at_best_val
     if config.scene.eval_split == "val":

@@ -1,4 +1,4 @@
-"""Separate the overrides that decide a run's results from those that only set its folder or how it is launched."""
+"""Separate command-line overrides that change results from those that set folders or how a run is launched."""
 
 import re
 from collections.abc import Sequence
@@ -11,10 +11,10 @@ _LAUNCH = re.compile(r"[+~]*launch\b")
 
 
 def deciding(overrides: Sequence[str]) -> list[str]:
-    """Return the overrides that decide a run's results, sorted; two commands of the same run have the same ones."""
+    """Return the sorted overrides that change results; equal runs have equal lists."""
     return sorted(present_override(one) for one in overrides if not _UNNAMED.match(one))
 
 
 def launches(override: str) -> bool:
-    """Tell whether an override says how a run is launched."""
+    """Return whether an override only sets how a run is launched, for instance on Slurm."""
     return _LAUNCH.match(override) is not None

@@ -1,4 +1,4 @@
-"""Draw the Gaussians of a finished run in the colours of the effects that they keep, seen by an evaluated camera."""
+"""Draw the Gaussians of a finished run, coloured by the effects (time, direction, AGR) that they keep."""
 
 from pathlib import Path
 
@@ -12,16 +12,18 @@ from gsbench.run.load import load_run, scene_of
 
 
 def draw_run(folder: Path, camera: int, time: float | None, data_root: str | None = None) -> Pixels:
-    """Draw `gsbench.effects.picture.draw` of a run: uint8 [H', W', 3] RGB.
+    """Draw the Gaussians of a run in colours that show which effects (time, direction, AGR) they keep.
+
+    Returns uint8 [H', W', 3] RGB.
 
     Args:
-        folder: the folder of the run, which has its checkpoint.
-        camera: the number of the evaluated view whose camera is used.
-        time: the time in [0, 1]; None: the time of this view.
-        data_root: the folder of the data set; by default the one that the run was trained on.
+        folder: the folder of the run, with its checkpoint.
+        camera: the index of the evaluated view whose camera is used.
+        time: the time in [0, 1]; None for the time of this view.
+        data_root: the folder of the data set; None for the folder in the run's settings.
 
     Raises:
-        InputError: there is no run, no data or no such view, or the time is not in [0, 1].
+        InputError: the run, the data or the view does not exist, or the time is not in [0, 1].
     """
     if time is not None and not 0 <= time <= 1:
         raise InputError(f"--time: expected 0 to 1, got {time}")

@@ -1,4 +1,4 @@
-"""Report the progress of a run to other processes by a progress.json in its folder. The module needs no torch."""
+"""Report the progress of a run to other processes in a file progress.json. The module does not import torch."""
 
 import dataclasses
 import json
@@ -21,9 +21,9 @@ SILENT = 600.0  # seconds without a report after which a run on an unreachable h
 
 @dataclass(frozen=True)
 class Progress:
-    """The progress of a run, and the process that does it."""
+    """The progress of a run (step, seconds, PSNR), and the process that runs it."""
 
-    overrides: list[str]  # of the run, as in its record
+    overrides: list[str]  # the run's overrides, as in its record
     host: str = field(default_factory=socket.gethostname)
     pid: int = field(default_factory=os.getpid)
     born: int | None = field(default_factory=lambda: born(os.getpid()))
@@ -31,37 +31,40 @@ class Progress:
     started: float = field(default_factory=time.time)  # Unix seconds
     updated: float = field(default_factory=time.time)  # Unix seconds
     step: int = 0
-    steps: int = 0  # 0 while the run is claimed and does not train yet
-    seconds: float = 0.0  # of training so far
-    psnr_val: float | None = None  # dB, the last one measured
+    steps: int = 0  # 0 while the run is claimed but does not train yet
+    seconds: float = 0.0  # seconds of training so far
+    psnr_val: float | None = None  # the latest one, dB
 
 
 def write(folder: Path, progress: Progress) -> None:
-    """Write the progress of the run in `folder`, atomically."""
+    """Write progress.json in the folder of a run, atomically."""
     write_atomically(folder / FILE_NAME, encode(progress), lasting=False)
 
 
 def encode(progress: Progress) -> bytes:
-    """Encode a progress as the JSON of its file."""
+    """Return a progress as JSON."""
     return json.dumps(dataclasses.asdict(progress), indent=1, allow_nan=False).encode()
 
 
 class Reporter:
-    """Writes the progress of a run during its training, at most once in EVERY seconds."""
+    """Writes progress.json during the training of a run, at most once per interval (`EVERY` seconds)."""
 
     def __init__(self, folder: Path, overrides: list[str], steps: int) -> None:
-        """Report at once that the run in `folder`, which has `steps` steps, has started."""
+        """Report that the run in `folder` has started, with `steps` steps to do."""
         self.folder = folder
         self.progress = Progress(overrides, steps=steps)
         write(folder, self.progress)
         self._written = time.monotonic()
 
     def is_due(self) -> bool:
-        """Tell whether the last report is EVERY seconds old; computing a report may wait for the GPU."""
+        """Return whether the interval since the last report (`EVERY` seconds) is over.
+
+        The caller asks first, because computing a report may wait for the GPU.
+        """
         return time.monotonic() - self._written >= EVERY
 
     def __call__(self, step: int, seconds: float, last: Point | None) -> None:
-        """Report finished steps, seconds of training and the last point of the curve."""
+        """Report the number of finished steps, the seconds of training and the last point of the training curve."""
         psnr = last.psnr_val if last else None
         self.progress = dataclasses.replace(
             self.progress, step=step, seconds=seconds, psnr_val=psnr, updated=time.time()
@@ -69,30 +72,34 @@ class Reporter:
         self._written = time.monotonic()
         try:
             write(self.folder, self.progress)
-        except OSError:  # a full disk ends the run at its checkpoint or its record, not here
+        except OSError:  # a full disk must not end the run here, but at its checkpoint or record
             return
 
     def end(self) -> None:
-        """Remove the progress file of this run, because its process ends the run."""
+        """Remove progress.json, because this process has stopped the run."""
         (self.folder / FILE_NAME).unlink(missing_ok=True)
 
 
 def read(path: Path) -> Progress:
-    """Read a progress.json; raises InputError if it is not one."""
+    """Read a progress.json.
+
+    Raises:
+        InputError: the file is invalid.
+    """
     return parse(Progress, parse_json(read_file(path, str(path), LARGEST), str(path)), str(path))
 
 
 def is_alive(progress: Progress) -> bool:
-    """Tell whether the process of a progress still runs; on another host, whether its last report is recent."""
+    """Return whether the process of a run is still alive; on another host, whether its last report is recent."""
     if progress.host == socket.gethostname():
         return progress.born is not None and born(progress.pid) == progress.born
     return time.time() - progress.updated < SILENT
 
 
 def born(pid: int) -> int | None:
-    """Return when a process of this machine started, in clock ticks since boot; None if there is no such process.
+    """Return the start time of a process on this machine in clock ticks since boot, or None if it does not exist.
 
-    The start distinguishes a process from a later process with the same id.
+    The start time distinguishes the process from a later one with the same id.
     """
     try:
         after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -102,6 +109,6 @@ def born(pid: int) -> int | None:
 
 
 def slurm_job() -> str | None:
-    """Return the Slurm job of this process as squeue names it (`12` or `12_3`), None outside of Slurm."""
+    """Return the id of the Slurm job of this process as in squeue (`12` or `12_3`), or None outside of Slurm."""
     array, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
     return f"{array}_{task}" if array and task else os.environ.get("SLURM_JOB_ID")

@@ -1,4 +1,4 @@
-"""Remove effects from the Gaussians of a finished run, and write the result as a separate run beside the old one."""
+"""Remove time, direction or AGR from those Gaussians of a finished run that do not need them; write a new run."""
 
 import copy
 from pathlib import Path
@@ -17,17 +17,18 @@ from gsbench.train.checkpoint import Checkpoint
 
 
 def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
-    """Remove effects as `effects.gate=end` does, but also time or direction alone.
+    """Remove time, direction or AGR from those Gaussians of a finished run that do not need them.
 
-    Return the new run's record and folder.
+    `effects.gate=end` does the same at the end of a training, except that this function may also remove time or
+    direction alone. Return the record and the folder of the new run.
 
     Args:
-        folder: the folder of the run, which is not changed.
-        budget_db: how many dB of PSNR on val this may cost.
-        data_root: the folder of the data set; by default the one that the run was trained on.
+        folder: the folder of the finished run, which is not changed.
+        budget_db: how many dB of PSNR on the validation split may be lost.
+        data_root: the folder of the data set; None for the folder in the run's settings.
 
     Raises:
-        InputError: there is no finished run, effects were already removed at its end, or the data are gone or have
+        InputError: the run is not finished, effects were already removed at its end, or its data do not exist or have
             changed.
     """
     path = folder / checkpoint.FILE_NAME

@@ -1,4 +1,4 @@
-"""Resolve the config of a training: model=auto becomes a model that depends on time, or one that does not."""
+"""Replace model=auto by a model with time or a model without, after a test whether the scene changes with time."""
 
 import sys
 from dataclasses import dataclass, field, replace
@@ -21,17 +21,17 @@ CANDIDATES = ("moving", "static")  # in conf/model/auto.yaml
 
 
 def is_auto(config: Config) -> bool:
-    """Tell whether the model is still to be chosen."""
+    """Return whether the settings have model=auto, so that a test of the scene must still choose the model."""
     return config.model.name == AUTO
 
 
 def with_candidate(config: Config, name: str) -> Config:
-    """Return the config with one of the candidates of model=auto as its model.
+    """Return settings with one candidate of model=auto ("moving" or "static") as the model.
 
-    AGR moves Gaussians with time, so the static candidate has none.
+    The static candidate has no AGR, because AGR moves Gaussians with time.
 
     Raises:
-        InputError: the config lacks the candidate, or the candidate is no model config.
+        InputError: the settings lack the candidate, or the candidate is not a model config.
     """
     chosen = config.model.candidates.get(name)
     try:
@@ -44,26 +44,26 @@ def with_candidate(config: Config, name: str) -> Config:
 
 @dataclass(frozen=True)
 class Resolved:
-    """The config of a training, after model=auto was replaced by the chosen model, and how it was chosen."""
+    """The settings of a training after model=auto was replaced by a model, and the test that chose it."""
 
     config: Config
-    screen: TimeScreen | None = None  # what chose the model of model=auto
-    effort: Effort = field(default_factory=Effort)  # of the screen
+    screen: TimeScreen | None = None  # the test that chose the model, for model=auto
+    effort: Effort = field(default_factory=Effort)  # CPU time of this test
 
 
 def before_scene(config: Config) -> Config:
-    """Return a config to check before the scene is loaded: for model=auto the candidate that depends on time."""
+    """Return settings that can be checked before the scene is loaded: model=auto becomes its candidate with time."""
     return with_candidate(config, "moving") if is_auto(config) else config
 
 
 def resolve(this: Run, scene: Scene) -> Resolved:
-    """Choose the model of model=auto by the training views of a scene, and print the reason; other configs stay.
+    """Replace model=auto by a model with or without time, after a test whether the training views change with time.
 
-    If the test whether the scene changes is undecided, the model depends on time: 7DGS on a static scene costs seconds,
-    but 6DGS on a moving scene loses the motion.
+    The reason is printed. If the test is undecided, the model has time: 7DGS on a static scene costs a few seconds, but
+    6DGS on a moving scene loses the motion. Other settings are returned unchanged.
 
     Raises:
-        InputError: as `with_candidate`.
+        InputError: the settings lack a candidate of model=auto.
     """
     if not is_auto(this.config):
         return Resolved(this.config)
@@ -78,7 +78,7 @@ def resolve(this: Run, scene: Scene) -> Resolved:
 
 
 def plain(this: Run, config: Config) -> dict[str, Any]:
-    """Return the training's config in plain values; for model=auto it holds the chosen model."""
+    """Return the settings of a training as plain values; model=auto is replaced by the chosen model."""
     if not is_auto(this.config):
         return this.plain
     model = OmegaConf.to_container(OmegaConf.structured(config.model), resolve=True)

@@ -1,4 +1,4 @@
-"""Do one run from its config to its record, which is written however the run ends."""
+"""Run one training and its measurement, and write a record even if an error ends the run."""
 
 import gc
 import sys
@@ -33,20 +33,20 @@ class UnrecordedError(InputError):
 
 
 def run(composed: DictConfig, choices: Mapping[str, str] | None = None, overrides: Sequence[str] = ()) -> Record | None:
-    """Do the run of a composed config of one scene, or keep its earlier result.
+    """Train and measure the model of a composed config on one scene, or keep the record of an earlier run.
 
     Args:
         composed: the config of one scene, as Hydra composed it.
         choices: the choice of each config group, for the run's name; see `identify`.
-        overrides: the overrides of its command line, for the record.
+        overrides: the overrides of the command line, for the record.
 
     Returns:
-        The record, which is on disk whatever its status is; None if another process does this run.
+        The record, which is also on disk, even if the run failed. None if another process does this run.
 
     Raises:
-        InputError: the run has no name that can be a folder, or its folder cannot be written.
-        UnrecordedError: the record of the run cannot be written.
-        Stopped: the process was told to end; the checkpoint is saved.
+        InputError: a name is not a valid folder name, or the run's folder cannot be written.
+        UnrecordedError: the record cannot be written.
+        Stopped: a signal asked the process to end; the checkpoint is saved.
     """
     this = identify(composed, choices, overrides)
     check_folder(this.folder)
@@ -61,7 +61,7 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
 
 
 def _is_claimed(this: Run, mine: Progress) -> bool:
-    """Claim a run for this process; if another process does this run, print that and return False.
+    """Claim a run for this process; if another process does the run, print a message and return False.
 
     Raises:
         InputError: the claim cannot be written.
@@ -77,7 +77,7 @@ def _is_claimed(this: Run, mine: Progress) -> bool:
 
 
 def _done(attempt: Attempt) -> Record:
-    """Do a run that this process has claimed, or keep its earlier result; see `run`."""
+    """Train and measure a run that this process has claimed, or keep the record of an earlier run."""
     this, spare = attempt.this, [bytearray(SPARE)]
     try:
         model, scene = attempt.prepare()
@@ -92,39 +92,39 @@ def _done(attempt: Attempt) -> Record:
         return kept
     try:
         write(record, this.folder)
-    except OSError as error:  # the other runs of the sweep go on; this one's checkpoint is what it was
+    except OSError as error:  # the sweep continues with its other runs; the checkpoint of this run is unchanged
         raise UnrecordedError(f"{summary(record)}; its record cannot be written: {error.strerror}") from None
     for line in messages.lines(record.on_demand) if record.on_demand else []:
         print(f"{this.name}: {line}")
     print(f"{this.name}: {summary(record)}; {this.folder / records.FILE_NAME}")
     try:
         attempt.draw()
-    except Exception as error:  # the record is there; pictures are worth less than the next run
+    except Exception as error:  # the record is written, so an error in the pictures must not end the sweep
         print(f"{this.name}: no pictures: {one_line(error)}", file=sys.stderr)
     return record
 
 
 def _ended_badly(attempt: Attempt, error: Exception) -> Record:
-    """Describe a run that an error has ended.
+    """Return the record of a run that an error has ended.
 
     Raises:
-        InputError: the model is unknown, so the run has no row in a table.
+        InputError: the model is unknown, so that the run has no place in a table.
     """
     is_diverged = isinstance(error, DivergedError)
     if is_out_of_memory(error):
-        error.__traceback__ = None  # its frames hold what filled the memory, and a record takes some
+        error.__traceback__ = None  # the frames of the traceback keep the large objects alive
         gc.collect()
     reason = one_line(error) if is_diverged else reason_of(error, attempt.this.folder)
     if is_diverged and attempt.model is not None:
         try:
             reason = f"{reason}; {explain(attempt.model)}"
-        except Exception as unexplained:  # what it resembles is worth less than that it diverged
+        except Exception as unexplained:  # an error in the explanation must not hide that the run diverged
             reason = f"{reason}; it cannot be explained: {one_line(unexplained)}"
     return attempt.describe("diverged" if is_diverged else "failed", reason)
 
 
 def reason_of(error: Exception, folder: Path) -> str:
-    """Say in one line why a run failed; the stack trace of an unexpected error goes to TRACEBACK in `folder`."""
+    """Return in one line why a run failed; the stack trace of an unexpected error is written to `folder`."""
     text = one_line(error)
     if is_out_of_memory(error):
         return f"out of memory: {text}"
@@ -138,7 +138,7 @@ def reason_of(error: Exception, folder: Path) -> str:
 
 
 def write(record: Record, folder: Path) -> None:
-    """Write the record of a run; if the run failed, the record of an earlier success is kept as STALE."""
+    """Write the record of a run; if the run failed, keep the record of an earlier success as record.stale.json."""
     path, stale = folder / records.FILE_NAME, folder / STALE
     if record.status == "ok":
         records.write(record, path)
@@ -155,7 +155,7 @@ def write(record: Record, folder: Path) -> None:
 
 
 def summary(record: Record) -> str:
-    """Summarise a record in one line: its quality, size and speed, or why it has none."""
+    """Return a record in one line: PSNR, size and speed, or the reason for a failure."""
     if record.metrics is None or record.cost is None:
         return f"{record.status}: {record.reason}"
     psnr = record.metrics["psnr"]

@@ -1,4 +1,4 @@
-"""Build the model and load the scene that a config names."""
+"""Build the model and load the scene that the settings name."""
 
 from typing import Any
 
@@ -14,11 +14,11 @@ from gsbench.scenes import Scene
 
 
 def build(config: Config) -> GaussianModel:
-    """Build the model of a config, without Gaussians yet.
+    """Build the model that the settings name, without Gaussians.
 
     Raises:
-        InputError: as `models.build`, an option has a key of its own, or effects cannot be removed from this model
-            although the config asks for it.
+        InputError: the model or an option is unknown, or `effects.gate` asks to remove time, direction or AGR from
+            Gaussians and the model does not support this.
     """
     own: dict[str, Any] = {
         "module": config.model.module,
@@ -37,10 +37,10 @@ def build(config: Config) -> GaussianModel:
 
 
 def load_scene(config: Config) -> Scene:
-    """Load the scene of a config onto its device.
+    """Load the scene that the settings name, and move it to the device.
 
     Raises:
-        InputError: the data set is missing or has a fault.
+        InputError: the data set does not exist or is invalid.
     """
     background = BACKGROUNDS[config.data.background]
     chosen = config.scene

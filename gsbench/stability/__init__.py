@@ -1,1 +1,1 @@
-"""Compare models and backends with an oracle on numerically hard cases, and check the bounds of the defaults."""
+"""Compare models and backends with high-precision results on numerically hard inputs, and check error bounds."""

@@ -1,4 +1,8 @@
-"""Audit hard cases and write the page (``python -m gsbench.stability``): exit with 1 if a default breaks its bound."""
+"""Run the numerical stability audit (`python -m gsbench.stability`) and write its results.
+
+The audit computes numerically hard inputs with every model and backend. The exit code is 1 if the error of a default
+setting exceeds its bound.
+"""
 
 import argparse
 import importlib.util
@@ -12,7 +16,11 @@ EXTRA = ("matplotlib", "mpmath")  # the packages of gsbench[stability]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the audit or measure a checkpoint, see `--help`; return the exit code, 2 where neither can be done."""
+    """Run the stability audit, or measure the condition numbers in the checkpoint given by `--checkpoint`.
+
+    Return the exit code: 0, or 1 if a default setting exceeds its error bound, or 2 if a package is missing or the file
+    is not a checkpoint.
+    """
     parser = argparse.ArgumentParser(prog="python -m gsbench.stability", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/stability"), help="folder of the results")
     length = parser.add_mutually_exclusive_group()
@@ -45,7 +53,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def show_spectrum(checkpoint: Path, folder: Path) -> int:
-    """Print and plot the condition numbers in a checkpoint; return 2 where the file is not a checkpoint."""
+    """Print and plot the condition numbers of the Gaussians in a checkpoint.
+
+    Return the exit code: 0, or 2 if the file is not a checkpoint.
+    """
     from gsbench.stability import spectrum
 
     try:

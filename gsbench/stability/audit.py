@@ -1,4 +1,4 @@
-"""Run the stability audit: every case for every model, scheme and backend, a million hard slices, and their costs."""
+"""Run the stability audit: compute numerically hard inputs with every model and backend, and measure the errors."""
 
 import sys
 import time
@@ -20,11 +20,11 @@ from gsbench.stability.training_cases import LONG_STEPS
 
 BACKENDS = ("cpu", "cuda", "reference")
 MILLION = 1_000_000
-NOT_DEFAULT = 100_000  # hard slices for the factor order that is not the default, in the short audit
-SUBTRACTING = 50_000  # Gaussians for the schemes that subtract, which fail often
+NOT_DEFAULT = 100_000  # Gaussians that are sliced in the factor order that is not the default
+SUBTRACTING = 50_000  # Gaussians that are sliced by the schemes that subtract covariances
 DEFAULT_ORDER = "conditioned_first"
 SEED = 0
-# Of the short audit: hard slices, steps of trainings, and the case that is left out.
+# The short audit: random Gaussians per factor order, training steps, and the test case that is left out.
 FEW, SHORT_STEPS, SLOWEST = 4_000, 60, "faint_crowd"
 T = TypeVar("T")
 Step = Callable[[], None]
@@ -32,11 +32,11 @@ Step = Callable[[], None]
 
 @dataclass
 class Audit:
-    """The results of an audit."""
+    """The results of a stability audit: errors, condition numbers and times."""
 
     backends: list[str]
     cells: list[Cell] = field(default_factory=list)
-    verified: dict[str, float] = field(default_factory=dict)  # float64 against mpmath, by factor order
+    verified: dict[str, float] = field(default_factory=dict)  # errors of float64 against mpmath, by factor order
     conditions: list[curves.ConditionCurve] = field(default_factory=list)
     accuracy: list[curves.AccuracyPoint] = field(default_factory=list)
     safety: list[curves.SliceTime] = field(default_factory=list)
@@ -44,12 +44,12 @@ class Audit:
 
     @property
     def broken(self) -> list[Cell]:
-        """Return the results in which a default setting breaks its error bound."""
+        """Return the results in which a default setting exceeds its error bound."""
         return [cell for cell in self.cells if cell.is_default and not cell.holds]
 
 
 def present() -> list[str]:
-    """List the backends that work on this machine."""
+    """Return the names of the backends (CPU kernels, CUDA kernels, torch) that work on this machine."""
     found = []
     for name in BACKENDS:
         try:
@@ -60,12 +60,14 @@ def present() -> list[str]:
 
 
 def run(million: int = MILLION, *, long: bool = False, short: bool = False) -> Audit:
-    """Run the whole audit, with a progress bar on stderr.
+    """Run the stability audit with a progress bar on stderr.
 
     Args:
-        million: the number of random hard slices, by default a million.
-        long: train for 2,000 steps instead of 150, and use as many hard slices for each factor order.
-        short: judge only the defaults, with few slices and steps, one seed and no costs.
+        million: the number of random Gaussians with ill-conditioned factors to slice, by default a million.
+        long: train for 2,000 steps instead of 150, and slice this many Gaussians in both factor orders (by default,
+            only in
+            the default order).
+        short: test only default settings, with fewer Gaussians and training steps, one seed and no timings.
     """
     began = time.perf_counter()
     audit = Audit(present())
@@ -79,11 +81,11 @@ def run(million: int = MILLION, *, long: bool = False, short: bool = False) -> A
 
 
 def _short_steps(audit: Audit) -> list[tuple[str, Step]]:
-    """List the steps of the short audit."""
+    """Return the names and functions of the tests in a short audit, which tests only default settings."""
     fastest = audit.backends[0]
     judged: list[tuple[Case, Callable[[Case], Iterable[Cell]]]] = []
     for case in of_area("slicing"):
-        some = only(case, *(model for model in case.subjects if model != "6dgs"))  # it is 7DGS without time
+        some = only(case, *(model for model in case.subjects if model != "6dgs"))  # 6DGS is 7DGS without time
         judged.append((some, partial(slices.judge, backends=audit.backends, schemes=["square_root"])))
     for area, judge in (("colour", colors.judge), ("projection", pictures.judge), ("blending", pictures.judge)):
         judged += [(case, partial(judge, backends=audit.backends)) for case in of_area(area) if case.name != SLOWEST]
@@ -98,7 +100,7 @@ def _short_steps(audit: Audit) -> list[tuple[str, Step]]:
 
 
 def only(case: Case, *subjects: str) -> Case:
-    """Return a case with some of its models."""
+    """Return a copy of a test case that is restricted to the given models."""
     return replace(case, subjects=subjects)
 
 
@@ -107,7 +109,7 @@ def _extend(cells: list[Cell], judge: Callable[[Case], Iterable[Cell]], case: Ca
 
 
 def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Step]]:
-    """List the steps of the audit, as names and calls."""
+    """Return the names and functions of all tests and timings in a full audit."""
     steps: list[tuple[str, Step]] = []
 
     def add(name: str, found: list[T], more: Callable[[], Iterable[T]]) -> None:
@@ -133,9 +135,9 @@ def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Step]]:
 
 
 def hard_slices(audit: Audit, order: str, N: int) -> None:
-    """Slice N random 7D Gaussians whose factors have diagonals down to 1e-5.
+    """Slice N random 7D Gaussians with ill-conditioned factors, and add the errors to the audit.
 
-    Return 99.9th percentiles of the errors.
+    The diagonal entries of the factors go down to 1e-5. An error is the 99.9th percentile over the Gaussians.
     """
     hard = population.draw(torch.Generator().manual_seed(SEED), N, order)
     known = population.truth(hard, order)

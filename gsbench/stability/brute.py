@@ -1,7 +1,7 @@
-"""Render exact images by brute force in float64: every Gaussian at every pixel, without tiles or bounds.
+"""Render exact images by brute force in float64: evaluate every Gaussian at every pixel, without tiles or bounds.
 
-This follows the definition of the image (3DGS: Kerbl et al. 2023; EWA: Zwicker et al. 2001) and shares no code with a
-rasterizer. Gradients are those of autograd.
+The code follows the definition of the image (3DGS: Kerbl et al. 2023; EWA: Zwicker et al. 2001) and shares nothing with
+the rasterizers that it tests. Gradients come from autograd.
 """
 
 from collections.abc import Iterator
@@ -11,23 +11,27 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-PRODUCTS = 1 << 21  # (Gaussian, pixel) products at a time, which bounds memory
+PRODUCTS = 1 << 21  # (Gaussian, pixel) pairs in one chunk, to limit memory
 Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors")
 
 
 @dataclass(frozen=True)
 class Picture:
-    """The exact image, and which of its pixels are not at a threshold, so that rounding cannot change them much."""
+    """An exact image, and how close each pixel is to a threshold of alpha or transmittance.
+
+    A pixel that is close to a threshold may change by a visible amount in float32, because a Gaussian may be skipped
+    there.
+    """
 
     image: Tensor  # [C, H, W, D]
     alpha: Tensor  # [C, H, W, 1]
-    touched: Tensor  # [C, N, H, W] bool: the Gaussian's alpha is at least 1/255 here
-    slack: Tensor  # [C, H, W] relative distance of a decision to its threshold; if small, float32 may differ
+    touched: Tensor  # [C, N, H, W] bool: whether the Gaussian's alpha is at least 1/255 at this pixel
+    slack: Tensor  # [C, H, W] relative distance to the nearest threshold; if it is small, float32 may differ
 
 
 class _Splats(NamedTuple):
-    """Gaussians on the image plane of one camera, front to back."""
+    """Gaussians projected to the image plane of one camera, sorted front to back."""
 
     order: Tensor  # [M] their indices, without those outside near and far
     centers: Tensor  # [M, 2] pixels
@@ -40,20 +44,20 @@ def render(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     width: int, height: int, *, offsets2d: Tensor | None = None, background: Tensor | None = None, **options: Any,
 ) -> Picture:  # fmt: skip
-    """Render the image of `gsbench.raster.rasterize` in float64.
+    """Render exact images of 3D Gaussians in float64, from the arguments of `gsbench.raster.rasterize`.
 
     Args:
-        means: [N, 3], and so on as in `gsbench.raster.rasterize`, but in float64.
-        factors: [N, 3, 3].
+        means: [N, 3], float64 as all tensors here.
+        factors: [N, 3, 3], factors F of the covariances F F^T.
         opacities: [N].
         colors: [N, D] or [C, N, D].
-        viewmats: [C, 4, 4].
-        Ks: [C, 3, 3].
+        viewmats: [C, 4, 4], world to camera.
+        Ks: [C, 3, 3], intrinsics.
         width: width of the images, pixels.
         height: height of the images, pixels.
-        offsets2d: [C, N, 2] moves the projected means, pixels.
+        offsets2d: [C, N, 2] is added to the projected means, pixels.
         background: colour [D].
-        options: near, far, eps2d and antialias.
+        options: near, far, eps2d and antialias of `rasterize`.
     """
     C, N, D = len(viewmats), len(means), colors.shape[-1]
     background = torch.zeros(D).double() if background is None else background
@@ -71,7 +75,10 @@ def render(
 
 
 def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) -> dict[str, Tensor]:
-    """Compute the gradients of the sum of weight [C, H, W, D] x image + weight_alpha [C, H, W, 1] x alpha."""
+    """Compute exact gradients of a loss by autograd in float64.
+
+    The loss is the sum of weight [C, H, W, D] x image + weight_alpha [C, H, W, 1] x alpha.
+    """
     inputs = {name: arguments[name].detach().requires_grad_() for name in DIFFERENTIABLE}
     rest = {name: value for name, value in arguments.items() if name not in DIFFERENTIABLE}
     viewmats, Ks, width, height = (rest.pop(name) for name in ("viewmats", "Ks", "width", "height"))
@@ -90,7 +97,7 @@ def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) ->
 
 
 def _pixels(width: int, height: int, N: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield the indices [P] and the centres [P, 2] of all pixels, some at a time."""
+    """Yield the indices [P] and the centres [P, 2] of all pixels in chunks, to limit memory."""
     for at in torch.arange(width * height).split(max(1, PRODUCTS // max(1, N))):
         yield at, torch.stack([at % width, at // width], -1) + 0.5
 
@@ -123,7 +130,11 @@ def _project(
 
 
 def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Compute image [P, D], alpha [P, 1], touched [M, P] and slack [P] of some pixels."""
+    """Blend all Gaussians front to back at P pixels.
+
+    Return the image [P, D], the alpha [P, 1], which Gaussians contribute [M, P], and each pixel's relative distance [P]
+    to the nearest threshold of alpha or transmittance.
+    """
     dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
     xx, xy, yy = (splats.covs[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     power = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)

@@ -1,4 +1,4 @@
-"""Define hard cases: each has a name, a bound on its errors, and a severity that hypothesis can search."""
+"""Define the test cases of the stability audit: numerically hard inputs, each with a bound on its errors."""
 
 import math
 import zlib
@@ -13,7 +13,7 @@ AREAS = ("slicing", "colour", "projection", "blending", "training", "drift")
 
 @dataclass(frozen=True)
 class Bound:
-    """The largest errors that the defaults may have in a case. They are relative unless the case says otherwise."""
+    """The largest errors, usually relative, that a default setting may have in a test case."""
 
     forward: float = 1e-4
     gradient: float = 1e-3
@@ -21,60 +21,73 @@ class Bound:
 
 @dataclass(frozen=True)
 class Case:
-    """A hard case, made by `build(generator, severity, **more)`: ordinary at severity 0 and hardest at 1."""
+    """A test case of the stability audit: a function that builds numerically hard inputs, and a bound on the errors.
+
+    The inputs are ordinary at severity 0 and hardest at severity 1, so that tests can search the values between.
+    """
 
     name: str
     area: str
     build: Callable[..., Any]
-    subjects: tuple[str, ...]  # the models that are tested with it; empty: it needs none
+    subjects: tuple[str, ...]  # the models that are tested with it; empty if the case has no model
     bound: Bound
 
     @property
     def stresses(self) -> str:
-        """Return what the case stresses, and where it was met in practice: the builder's docstring."""
+        """Return the docstring of the function that builds the inputs, which says why they are numerically hard."""
         return " ".join((self.build.__doc__ or "").split())
 
     def __call__(self, severity: float = 1.0, seed: int = 0, **more: Any) -> Any:
-        """Build the case; the same arguments give the same numbers."""
+        """Build the inputs of this test case at a severity between 0 and 1; the same seed gives the same inputs."""
         mixed = zlib.crc32(f"{self.name}/{seed}".encode())
         return self.build(torch.Generator().manual_seed(mixed), severity, **more)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """The result of a case for one model, scheme and backend."""
+    """The errors and the time of one test case with one model, backend and slicing scheme.
+
+    The slicing scheme is the algorithm that computes the conditional 3D Gaussian at a time and view direction.
+    """
 
     area: str
     case: str
-    subject: str  # the model; "-" where there is none
+    subject: str  # the model; "-" if the case has none
     scheme: str
     backend: str
-    forward: float  # error of the result; NaN where it is not finite
-    gradient: float  # error of its gradient; NaN where it is not finite or not judged
-    bad: float  # share of Gaussians (pixels, steps) whose result or gradient is not finite, or is indefinite
-    ms: float  # forward and backward
+    forward: float  # error of the result; NaN if it is not finite
+    gradient: float  # error of its gradient; NaN if it is not finite or not tested
+    bad: float  # share of Gaussians (pixels, steps) whose result is not finite or is an indefinite covariance
+    ms: float  # milliseconds of forward and backward
     bound: Bound
     note: str = ""
 
     @property
     def is_default(self) -> bool:
-        """Tell whether the result is that of a default setting; other slicing schemes are only for comparison."""
+        """Return whether the result comes from a default setting.
+
+        The other algorithms for conditional Gaussians (`schur`, `cholesky`) are measured for comparison only.
+        """
         return self.scheme in ("square_root", "-")
 
     @property
     def holds(self) -> bool:
-        """Tell whether both errors are within their bounds, and no number is NaN, infinite or otherwise wrong."""
+        """Return whether both errors are within their bounds, all values finite and all covariances definite."""
         gradient = math.isnan(self.bound.gradient) or self.gradient <= self.bound.gradient
         return self.bad == 0 and self.forward <= self.bound.forward and gradient
 
 
 def device_of(backend: str) -> str:
-    """Return the kind of device on which a backend computes."""
+    """Return the torch device type on which a backend computes: "cuda" or "cpu"."""
     return "cuda" if backend == "cuda" else "cpu"
 
 
 def backends_with(scheme: str, model: str, backends: list[str]) -> list[str]:
-    """List the backends with code for a scheme: square_root all, cholesky for 6D and 7D the CPU too, schur torch."""
+    """Return the backends that implement a slicing scheme, which computes the conditional 3D Gaussian.
+
+    All backends implement `square_root`. `cholesky` runs in torch, and for 6D and 7D also in the CPU kernels. `schur`
+    runs in torch only.
+    """
     if scheme == "square_root":
         return backends
     if scheme == "cholesky" and model != "4dgs":
@@ -86,7 +99,7 @@ CASES: dict[str, Case] = {}
 
 
 def case(area: str, *subjects: str, forward: float = 1e-4, gradient: float = 1e-3) -> Callable[..., Any]:
-    """Decorate a builder so that CASES lists its case under its name.
+    """Return a decorator that adds a function to CASES, the test cases of the stability audit.
 
     Args:
         area: the part of gsbench that the case tests, one of AREAS.
@@ -104,5 +117,5 @@ def case(area: str, *subjects: str, forward: float = 1e-4, gradient: float = 1e-
 
 
 def of_area(area: str) -> list[Case]:
-    """List the cases of one area, in the order of their definition."""
+    """Return the test cases of one area, such as "slicing" or "blending", in the order of their definition."""
     return [found for found in CASES.values() if found.area == area]

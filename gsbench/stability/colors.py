@@ -1,4 +1,4 @@
-"""Compare hard colours, of spherical harmonics and waves in time, with mpmath."""
+"""Test view- and time-dependent colours (spherical harmonics, Fourier series) on hard inputs, against mpmath."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from gsbench.stability import oracle
 from gsbench.stability.cases import Case, Cell, case, device_of
 from gsbench.stability.slices import fastest, worst
 
-COUNT = 3  # Gaussians in a case
+COUNT = 3  # Gaussians in a test case
 WAVES = {"3dgs": 1, "4dgs": 3}
-COPIES = 1024  # of a case's Gaussians, for its timing
+COPIES = 1024  # copies of the Gaussians in a test case, for timing
 
 
 @dataclass
 class ColorInputs:
-    """Gaussians of one model, with the camera centre and the time for which colours are computed."""
+    """Gaussians of one model, and the camera centre and time for which their colours are computed."""
 
     model: str
     means: Tensor  # [COUNT, 3]
@@ -32,7 +32,7 @@ class ColorInputs:
 
 
 def ordinary(g: Generator, model: str) -> ColorInputs:
-    """Make colours of the size that training finds."""
+    """Draw random Gaussians whose colour coefficients are as large as in trained models."""
     sh = 0.3 * torch.randn(COUNT, 16 * WAVES[model], 3, generator=g)
     return ColorInputs(model, torch.randn(COUNT, 3, generator=g), torch.rand(COUNT, 1, generator=g), sh,
                  torch.tensor([0.3, -0.2, -4.0]))  # fmt: skip
@@ -40,13 +40,13 @@ def ordinary(g: Generator, model: str) -> ColorInputs:
 
 @case("colour", "3dgs", "4dgs")
 def ordinary_colors(g: Generator, severity: float, model: str) -> ColorInputs:  # noqa: ARG001
-    """Stress nothing: the other rows are compared with this one."""
+    """Test ordinary colours, in which nothing is numerically hard, as the baseline of the hard cases."""
     return ordinary(g, model)
 
 
 @case("colour", "3dgs", "4dgs")
 def seen_from_within(g: Generator, severity: float, model: str) -> ColorInputs:
-    """Put the camera on a mean, and 10^-12 and 10^-6 beside it: d is 0/0, by definition 0 with gradient 0."""
+    """Put the camera on a mean, or 10^-12 or 10^-6 away: the view direction is 0/0, and must be 0 with gradient 0."""
     shown = ordinary(g, model)
     aside = torch.tensor([0.0, 1e-12, 1e-6])[:, None] + 1 - severity
     shown.center, shown.means = torch.zeros(3), aside * torch.tensor([[1.0, -2.0, 0.5]])
@@ -55,7 +55,7 @@ def seen_from_within(g: Generator, severity: float, model: str) -> ColorInputs:
 
 @case("colour", "3dgs", "4dgs")
 def loud_harmonics(g: Generator, severity: float, model: str) -> ColorInputs:
-    """Make coefficients of 10^4: harmonics of degree 3 cancel to a visible colour."""
+    """Use SH coefficients of about 10^4, so that large harmonics up to degree 3 cancel."""
     shown = ordinary(g, model)
     shown.sh *= 10 ** (4 * severity)
     return shown
@@ -63,14 +63,17 @@ def loud_harmonics(g: Generator, severity: float, model: str) -> ColorInputs:
 
 @case("colour", "4dgs", forward=1e-3, gradient=1e-2)
 def far_in_time(g: Generator, severity: float, model: str) -> ColorInputs:
-    """Put t 1000 periods from mu_t: mu_t itself has an ulp of 6e-5 there, which is 8e-4 in the second wave's phase."""
+    """Test Fourier colours 1000 periods from a Gaussian's mean time mu_t.
+
+    Float32 stores such a mu_t to 6e-5, which is an error of 8e-4 in the phase of the second frequency.
+    """
     shown = ordinary(g, model)
     shown.times += 1000 * severity
     return shown
 
 
 def judge(found: Case, backends: list[str]) -> Iterator[Cell]:
-    """Compare colours and gradients of every model and backend with the exact ones."""
+    """Yield the errors of colours and their gradients for each model and backend, compared with exact values."""
     for model in found.subjects:
         shown = found(model=model)
         g = torch.Generator().manual_seed(1)
@@ -89,7 +92,11 @@ def judge(found: Case, backends: list[str]) -> Iterator[Cell]:
 
 
 def truth(shown: ColorInputs, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute exact colours [COUNT, 3] and gradients [COUNT, 5]: by mean, time, and along one line of coefficients."""
+    """Compute exact colours [COUNT, 3] and gradients [COUNT, 5] in mpmath.
+
+    The five derivatives are with respect to the mean (3), to mu_t, and to a step along the direction `along` in the
+    space of coefficients.
+    """
     layout = {"means": 3, "times": 1, "sh": len(along)}
     time = float(torch.tensor(shown.time))
     colors, slopes = [], []
@@ -107,7 +114,10 @@ def truth(shown: ColorInputs, weight: Tensor, along: Tensor) -> tuple[Tensor, Te
 
 
 def differentiate(shown: ColorInputs, backend: str, weight: Tensor, copies: int) -> tuple[Tensor, Tensor]:
-    """Compute colours [N, 3] and their gradients [N, 4 + coefficients] in float32."""
+    """Compute colours [N, 3] in float32, and their gradients [N, 4 + coefficients].
+
+    The gradients are with respect to the mean (3), to the mean time mu_t (1) and to the colour coefficients.
+    """
     model, device = build(shown.model, backend=BACKENDS[backend]), device_of(backend)
     rows = torch.arange(COUNT).repeat(copies)
     inputs = [value[rows].requires_grad_() for value in (shown.means, shown.times, shown.sh)]

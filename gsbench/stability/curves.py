@@ -1,4 +1,7 @@
-"""Measure errors by condition number and by time, and the cost of the square-root scheme beside the others."""
+"""Measure the errors of slicing schemes against condition number and precision, and the time of each scheme.
+
+A slicing scheme is an algorithm that computes the conditional 3D Gaussian at a time and view direction.
+"""
 
 import itertools
 import time
@@ -20,32 +23,38 @@ from gsbench.stability import picture_cases, pictures, population, slices
 from gsbench.stability.cases import backends_with, device_of
 from gsbench.stability.picture_cases import Arguments
 
-SPREAD = 40_000  # Gaussians of the curve by condition number
-DECADES = 8.0  # factors' diagonals go down to 10^-DECADES, those of each Gaussian to a random part of that
+SPREAD = 40_000  # Gaussians in the measurement of errors against condition number
+DECADES = 8.0  # diagonal entries go down to 10^-u, with u random in [0, DECADES] for each Gaussian
 BINS = np.arange(0, 13)  # powers of ten of the condition number
 LEAST = 50  # a bin with fewer Gaussians is not shown
-TIMED = 100_000  # Gaussians of the comparison of costs
-REPEATS = 9  # one for the slow schemes in torch
-SLICED = 20_000  # Gaussians, and ..
-DRAWN = 1_500  # .. Gaussians in an image of PICTURE pixels a side, for the accuracy-for-time curve
+TIMED = 100_000  # Gaussians in the comparison of times
+REPEATS = 9  # torch, which is slow, is timed once
+SLICED = 20_000  # 7D Gaussians that are sliced ..
+DRAWN = 1_500  # .. and 3D Gaussians that are rendered, for the plots of error against time
 PICTURE = 96
-PERCENTILE = 0.999  # of the errors of a population, to which the bounds apply
+PERCENTILE = 0.999  # the quantile of errors over random Gaussians that must be below the bound
 
 
 @dataclass(frozen=True)
 class ConditionCurve:
-    """Errors of one scheme by the condition number of the factor, in float32."""
+    """The float32 errors of one slicing scheme as a function of the condition number of the covariance's factor.
+
+    A slicing scheme is an algorithm that computes the conditional 3D Gaussian.
+    """
 
     scheme: str
     condition: list[float]  # middle of each bin
     median: list[float]
     percentile99: list[float]
-    bad: list[float]  # share not finite or indefinite
+    bad: list[float]  # share of covariances that are not finite or indefinite
 
 
 @dataclass(frozen=True)
 class SliceTime:
-    """Milliseconds of slicing TIMED 7D Gaussians; for kernels the medians over REPEATS."""
+    """The milliseconds that one slicing scheme takes for 7D Gaussians (`TIMED` of them), forward and backward.
+
+    For kernels this is the median of several calls (`REPEATS`), for torch one call.
+    """
 
     order: str
     scheme: str
@@ -56,16 +65,20 @@ class SliceTime:
 
 @dataclass(frozen=True)
 class AccuracyPoint:
-    """The accuracy and the time of one way to slice or render."""
+    """The error and the time of one scheme or backend that slices or renders Gaussians, as a point of a plot."""
 
     thing: str  # "slicing" or "picture"
     way: str
-    error: float  # 99.9th percentile of a covariance; largest of a decided pixel
+    error: float  # slicing: 99.9th percentile over covariances; picture: largest error of a pixel
     ms: float  # forward and backward
 
 
 def accuracy_for_time(backends: list[str]) -> Iterator[AccuracyPoint]:
-    """Slice SLICED hard Gaussians and render a crowd, in every scheme, precision and instruction set."""
+    """Yield error and time of slicing (each algorithm and precision) and of rendering (each CPU instruction set).
+
+    The inputs are 7D Gaussians with ill-conditioned factors (`SLICED` of them) for slicing, and 3D Gaussians (`DRAWN`
+    of them) for rendering.
+    """
     hard = population.draw(torch.Generator().manual_seed(4), SLICED, "paper")
     known = population.truth(hard, "paper")
     for scheme in SCHEMES:
@@ -126,12 +139,16 @@ def _drawn(
 
 
 def percentile(errors: population.Floats) -> float:
-    """Return the 99.9th percentile; an error that is not finite counts as infinite."""
+    """Return the 99.9th percentile of errors; NaN counts as infinite."""
     return float(np.quantile(np.nan_to_num(errors, nan=np.inf), PERCENTILE, method="higher"))
 
 
 def by_condition() -> Iterator[ConditionCurve]:
-    """Measure errors by condition number in torch, in the paper's factor order, in which no scheme is trivial."""
+    """Yield, for each algorithm of slicing, its float32 errors in torch against the condition number of the factor.
+
+    The rows of the factors are in the paper's order, with position first. In the default order the conditional Gaussian
+    is a block of the factor, so that the default algorithm would have nothing to compute.
+    """
     order = "paper"
     generator = torch.Generator().manual_seed(2)
     decades = DECADES * torch.rand(SPREAD, 1, generator=generator, dtype=torch.float64)
@@ -153,7 +170,7 @@ def by_condition() -> Iterator[ConditionCurve]:
 
 
 def safety(backends: list[str]) -> Iterator[SliceTime]:
-    """Time every scheme on every backend that has it."""
+    """Yield the time of each algorithm for conditional Gaussians on each backend that has it, forward and backward."""
     for order in FACTOR_ORDERS:
         hard = population.draw(torch.Generator().manual_seed(3), TIMED, order, 1.0)
         for scheme in SCHEMES:

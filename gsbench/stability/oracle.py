@@ -1,8 +1,8 @@
-"""Compute exact slices, splats, colours and gradients of single Gaussians in mpmath, by the textbook formulas.
+"""Compute exact slices, alphas, colours and gradients of single Gaussians in mpmath, by the formulas of the papers.
 
-This shares no code with the models. Covariances are formed, inverted and subtracted as in the papers, which is safe in
-DIGITS digits: the hardest case (a factor with four diagonals of 1e-7) has a squared condition number of 1e56, for which
-50 digits would not suffice. A gradient is a central difference with a step of 1e-30, whose error is 1e-60 of the third
+The code shares nothing with the models. It forms, inverts and subtracts covariances, which is safe with DIGITS decimal
+digits: the hardest case (a factor with four diagonal entries of 1e-7) has a squared condition number of 1e56, too large
+for 50 digits. Gradients are central differences with a step of 1e-30, so that their error is about 1e-60 of the third
 derivative.
 """
 
@@ -13,7 +13,7 @@ from mpmath import mp, mpf
 
 DIGITS = 120
 STEP = mpf(10) ** -30
-LOG_SIZE_MAX = 16  # by definition, a larger logarithm of a size acts as this one (docs/stability.md)
+LOG_SIZE_MAX = 16  # larger log sizes act as this one, by definition (docs/stability.md)
 TIME_OPACITY_FACTOR_MIN = mpf("0.05")  # 4DGS culls a Gaussian unless its f_temp is above this
 UNDEFINED = mpf(10) ** -20  # |v|^2 of a vector too short to have a direction; it becomes zero
 
@@ -23,7 +23,10 @@ Function = Callable[[Vector], Vector]
 
 
 def gradient(function: Function, at: Sequence[float], weights: Sequence[float], first: int | None = None) -> Vector:
-    """Compute d(weights . function)/dx by central differences, for the `first` (default: all) numbers of `at`."""
+    """Compute the gradient of the dot product `weights . function(x)` at the point x = `at` by central differences.
+
+    If `first` is given, return only the derivatives with respect to the first `first` entries of x.
+    """
     with mp.workdps(DIGITS):
         x = [mpf(v) for v in at]
         out = []
@@ -38,7 +41,7 @@ def gradient(function: Function, at: Sequence[float], weights: Sequence[float], 
 
 
 def evaluate(function: Function, at: Sequence[float]) -> Vector:
-    """Evaluate function(at) in DIGITS digits."""
+    """Evaluate `function(at)` with DIGITS decimal digits."""
     with mp.workdps(DIGITS):
         return function([mpf(v) for v in at])
 
@@ -48,17 +51,19 @@ def evaluate(function: Function, at: Sequence[float]) -> Vector:
 
 def slice_triangular(x: Vector, layout: dict[str, int], order: str, half: float, log_lambda: dict[str, float],
                      center: Sequence[float], time: float | None, relative: bool = True) -> Vector:  # fmt: skip
-    """Slice a Gaussian of 6DGS or 7DGS (7DGS eq. 9 to 12).
+    """Compute the conditional 3D Gaussian of a 6DGS or 7DGS Gaussian in mpmath (7DGS eq. 9 to 12).
+
+    Return mean (3), covariance (9, by rows) and opacity.
 
     Args:
-        x: the raw parameters, one after the other.
-        layout: their names, and how many numbers each has.
-        order: the variable of each row of the triangular factor, such as "dddtppp".
-        half: the factor in the exponent of f_dir.
-        log_lambda: ln lambda_d ("direction") and ln lambda_t ("time").
+        x: the raw parameters (before exp and sigmoid), concatenated.
+        layout: the name and the length of each parameter in x.
+        order: the variable of each row of the triangular factor, such as "dddtppp" (direction, time, position).
+        half: the constant in the exponent of the opacity factor for direction, 0.5 or 1.
+        log_lambda: ln lambda_d ("direction") and ln lambda_t ("time"), the learned scales of these exponents.
         center: the camera's centre.
         time: the time at which to slice; None for 6DGS.
-        relative: whether entries of shape are in units of their row's diagonal.
+        relative: whether off-diagonal entries between position rows are in units of their row's diagonal entry.
     """
     raw = _unpack(x, layout)
     n = len(order)
@@ -81,7 +86,11 @@ def slice_triangular(x: Vector, layout: dict[str, int], order: str, half: float,
 
 
 def slice_rotated(x: Vector, layout: dict[str, int], log_lambda: dict[str, float], time: float) -> Vector:
-    """Slice a Gaussian of 4DGS: S = (R s)(R s)^T, R = M_left(l) M_right(r) (4DGS eq. 5 to 9)."""
+    """Compute the conditional 3D Gaussian of a 4DGS Gaussian in mpmath: mean (3), covariance (9, by rows) and opacity.
+
+    The 4D covariance is (R s)(R s)^T with the diagonal matrix s of the four sizes. Two quaternions l and r give the
+    rotation R = M_left(l) M_right(r) (4DGS eq. 5 to 9).
+    """
     raw = _unpack(x, layout)
     a, b, c, d = _normalised(raw["left_quats"])
     p, q, r, s = _normalised(raw["right_quats"])
@@ -97,7 +106,10 @@ def slice_rotated(x: Vector, layout: dict[str, int], log_lambda: dict[str, float
 
 
 def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vector) -> tuple[Vector, Vector]:
-    """Compute mu_p + K delta and S_pp - K S_qp with K = S_pq S_qq^-1."""
+    """Return the conditional mean mu_p + K delta and the conditional covariance S_pp - K S_qp, with K = S_pq S_qq^-1.
+
+    Here p are the rows of position, q those of time and direction, and delta is the query minus mu_q.
+    """
     S_pq = _block(S, p, q)
     K = [_solve(_block(S, q, q), row) for row in S_pq]
     moved = [m + mp.fdot(k, delta) for m, k in zip(mean, K, strict=True)]
@@ -109,14 +121,16 @@ def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vecto
 
 def alphas(x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[float]], size: tuple[int, int],
            pixels: Sequence[tuple[float, float]], eps2d: float) -> Vector:  # fmt: skip
-    """Compute opacity exp(-power) at pixel centres (EWA: Zwicker et al. 2001 eq. 29), without limits 0.999 and 1/255.
+    """Compute the alpha of one Gaussian at pixel centres in mpmath, by EWA splatting (Zwicker et al. 2001 eq. 29).
+
+    Alpha is opacity exp(-power), without the cut-offs of 3DGS at 0.999 and 1/255.
 
     Args:
         x: mean (3), factor (9) and opacity.
         viewmat: world to camera.
         K: intrinsics.
         size: width and height of the image, pixels.
-        pixels: their centres.
+        pixels: the pixel centres.
         eps2d: added to the diagonal of the 2D covariance, pixels^2.
     """
     mean, F, opacity = x[:3], [x[3:6], x[6:9], x[9:12]], x[12]
@@ -139,17 +153,18 @@ def alphas(x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[f
 
 
 def colors(x: Vector, layout: dict[str, int], center: Sequence[float], waves: int, time: float) -> Vector:
-    """Compute max(0, sum beta Y_lm(d) cos(2 pi n (t - mu_t)) + 1/2) to degree 3 (3DGS; 4DGS eq. 12).
+    """Compute the RGB colour of one Gaussian in mpmath, from SH and Fourier coefficients (3DGS; 4DGS eq. 12).
 
-    Y_lm are real harmonics in the signs of 3DGS, by the general formula with associated Legendre functions of
-    cos(theta). Where d is undefined, all but the constant one are zero by definition.
+    The colour is max(0, 1/2 + sum of beta Y_lm(d) cos(2 pi n (t - mu_t))) with coefficients beta, SH up to degree 3 in
+    the signs of 3DGS, and frequencies n. If the camera is on the mean, the direction d is undefined, and only the
+    constant Y_00 is used.
 
     Args:
-        x: means, times and sh.
-        layout: their names, and how many numbers each has.
+        x: means, times and sh, concatenated.
+        layout: the name and the length of each parameter in x.
         center: the camera's centre.
-        waves: frequencies in time, with the constant one.
-        time: the time at which to compute the colours.
+        waves: the number of frequencies in time, including frequency 0.
+        time: the time at which to compute the colour.
     """
     raw = _unpack(x, layout)
     dx, dy, dz = unit([m - mpf(c) for m, c in zip(raw["means"], center, strict=True)])
@@ -165,7 +180,11 @@ LEGENDRE = ((1,), (0, 1), (-0.5, 0, 1.5), (0, -1.5, 0, 2.5))  # coefficients of 
 
 
 def _harmonic(degree: int, order: int, x: Any, y: Any, z: Any) -> Any:
-    """Compute N_lm d^m P_l/dz^m Re or Im (x + i y)^m, with the Condon-Shortley phase (-1)^m as in 3DGS."""
+    """Evaluate one real spherical harmonic of degree l and order m at the unit vector (x, y, z).
+
+    The value is N_lm (d^m P_l / dz^m) times the real or imaginary part of (x + i y)^m, with Legendre polynomial P_l,
+    normalisation N_lm and the Condon-Shortley phase (-1)^m, as in 3DGS.
+    """
     m = abs(order)
     scale = mp.sqrt((2 * degree + 1) / (4 * mp.pi) * mp.factorial(degree - m) / mp.factorial(degree + m))
     legendre = [mpf(c) for c in LEGENDRE[degree]]
@@ -181,7 +200,7 @@ def _harmonic(degree: int, order: int, x: Any, y: Any, z: Any) -> Any:
 
 
 def unit(v: Vector) -> Vector:
-    """Normalise v; a vector too short to have a direction becomes zero."""
+    """Normalise the vector v; return zero if v is too short to have a direction."""
     square = mp.fdot(v, v)
     return [x / mp.sqrt(square) for x in v] if square > UNDEFINED else [mpf(0)] * 3
 
@@ -216,7 +235,10 @@ def _mahalanobis(S: Matrix, delta: Vector) -> Any:
 
 
 def _solve(A: Matrix, b: Vector) -> Vector:
-    """Compute A^-1 b by Gaussian elimination; A is positive definite and digits are many, so it needs no pivoting."""
+    """Solve A x = b by Gaussian elimination, for a positive definite matrix A.
+
+    No pivoting is needed, because the arithmetic has many digits.
+    """
     n = len(b)
     rows = [[*row, value] for row, value in zip(A, b, strict=True)]
     for i in range(n):

@@ -1,4 +1,4 @@
-"""Write the audit to files: table.md, table.csv, audit.json, plots, and page.md, which shows them all."""
+"""Write the results of the stability audit as tables, JSON, plots, and a Markdown page that shows them all."""
 
 import csv
 import io
@@ -17,11 +17,11 @@ from gsbench.stability.cases import AREAS, CASES, Cell
 
 COLUMNS = ("area", "case", "subject", "scheme", "backend", "forward", "gradient", "bad", "ms", "holds", "note")
 MARK = "**over** "
-RUNS = ("training", "drift")  # areas whose cells are whole trainings
+RUNS = ("training", "drift")  # areas in which each test case is a training
 
 
 def write(audit: Audit, folder: Path) -> None:
-    """Write all files to `folder`."""
+    """Write the tables, the JSON, the plots and the Markdown page of a stability audit to `folder`."""
     tables = table(audit)
     write_atomically(folder / "table.md", tables.encode())
     write_atomically(folder / "table.csv", csv_of(audit.cells).encode())
@@ -31,7 +31,7 @@ def write(audit: Audit, folder: Path) -> None:
 
 
 def page(audit: Audit, tables: str, figures: list[plots.Plot]) -> str:
-    """Compose the whole report in Markdown."""
+    """Return the report of the stability audit as Markdown."""
     lines = ["# Stability audit", "", verdict(audit), "", *conditions(audit), ""]
     for figure in figures:
         lines += [f"## {figure.title}", "", f"![{figure.title}]({figure.file})", "", figure.caption, ""]
@@ -39,7 +39,7 @@ def page(audit: Audit, tables: str, figures: list[plots.Plot]) -> str:
 
 
 def verdict(audit: Audit) -> str:
-    """Say in one line which bounds the defaults break."""
+    """Return a sentence that says which error bounds the default settings exceed, if any."""
     if audit.broken:
         names = ", ".join(sorted({f"{cell.case} ({cell.subject}, {cell.backend})" for cell in audit.broken}))
         return f"**{len(audit.broken)} cells of the defaults are over their bound:** {names}."
@@ -48,7 +48,7 @@ def verdict(audit: Audit) -> str:
 
 
 def conditions(audit: Audit) -> list[str]:
-    """State on which machine and how the audit was measured."""
+    """Return lines that name the machine, the software versions and the meaning of a table cell."""
     checks = ", ".join(f"{value:.0e} ({order})" for order, value in audit.verified.items())
     return [
         f"{processor_name()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the end; commit {git_commit()}; "
@@ -64,7 +64,7 @@ def conditions(audit: Audit) -> list[str]:
 
 
 def table(audit: Audit) -> str:
-    """Make a table for each area and model, of the trainings, and of the costs."""
+    """Return Markdown tables of all errors (one table per area and model), of the trainings, and of the times."""
     lines = []
     for area in ("population", *(area for area in AREAS if area not in RUNS)):
         for subject in dict.fromkeys(cell.subject for cell in audit.cells if cell.area == area):
@@ -74,7 +74,7 @@ def table(audit: Audit) -> str:
 
 
 def runs(audit: Audit) -> list[str]:
-    """Make the table of trainings: whether they ended as they should, and their results."""
+    """Return the Markdown table of the trainings: whether each one ended as expected, and its result."""
     lines = ["## training", "", "| case | model | backend | result | not finite | s | what came out |",
              "| --- | --- | --- | --- | ---: | ---: | --- |"]  # fmt: skip
     for cell in (cell for cell in audit.cells if cell.area in RUNS):
@@ -97,7 +97,7 @@ def _grid(cells: list[Cell]) -> list[str]:
 
 
 def show(cell: Cell) -> str:
-    """Format a cell of the table."""
+    """Format one table cell: both errors, the share of invalid results, and milliseconds."""
     numbers = f"{_number(cell.forward)} / {_number(cell.gradient)} / {100 * cell.bad:.3g} % / {cell.ms:.3g}"
     return ("" if cell.holds else MARK) + numbers
 
@@ -107,7 +107,10 @@ def _number(x: float) -> str:
 
 
 def costs(audit: Audit) -> list[str]:
-    """Make the table of the time of square_root beside schur and cholesky, which subtract covariances."""
+    """Return the Markdown table of the times of the algorithms for conditional Gaussians.
+
+    It compares the default `square_root` with `schur` and `cholesky`, which subtract covariances.
+    """
     lines = [
         "## what safety costs", "",
         "Milliseconds of slicing 100,000 7D Gaussians, medians of nine (torch: one). The kernel of `cholesky` does",
@@ -126,13 +129,13 @@ def costs(audit: Audit) -> list[str]:
 
 
 def stresses() -> list[str]:
-    """List what each case stresses."""
+    """Return the Markdown table that says why each test case is numerically hard."""
     lines = ["## the cases", "", "| case | what it stresses, and where it was met |", "| --- | --- |"]
     return [*lines, *(f"| {case.name} | {case.stresses} |" for case in CASES.values()), ""]
 
 
 def csv_of(cells: list[Cell]) -> str:
-    """Write every cell as a line of CSV."""
+    """Return all results of the stability audit as CSV, one line per test case, model, algorithm and backend."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)

@@ -1,4 +1,4 @@
-"""Define hard images: single Gaussians whose projection loses digits, and crowds whose blending does."""
+"""Define numerically hard inputs of the rasterizer: single Gaussians for projection, many Gaussians for blending."""
 
 import math
 from typing import Any
@@ -11,13 +11,13 @@ from gsbench.stability.cases import case
 Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`, float32
 WIDTH, HEIGHT = 16, 12
 FOCAL = 24.0
-DEPTH = 4.0  # the default; a power of two, so that a camera without rotation gives it exactly
+DEPTH = 4.0  # the default depth of means; a power of two, so that it is exact in float32
 CROWD = 100_000
-NO_GRADIENT = math.nan  # the bound of a gradient that is not judged
+NO_GRADIENT = math.nan  # means that the gradient is not tested
 
 
 def single(mean: Tensor, factor: Tensor, opacity: float = 0.9) -> Arguments:
-    """Make the arguments for one Gaussian and one camera at the origin that looks along z."""
+    """Return rasterizer arguments for one Gaussian, and one camera at the origin that looks along z."""
     return {
         "means": mean.float()[None], "factors": factor.float()[None], "opacities": torch.tensor([opacity]),
         "colors": torch.ones(1, 1), "viewmats": torch.eye(4)[None], "Ks": intrinsics(),
@@ -26,18 +26,18 @@ def single(mean: Tensor, factor: Tensor, opacity: float = 0.9) -> Arguments:
 
 
 def intrinsics(fx: float = FOCAL, fy: float = FOCAL, cx: float = WIDTH / 2, cy: float = HEIGHT / 2) -> Tensor:
-    """Make intrinsics [1, 3, 3], pixels."""
+    """Return an intrinsic matrix [1, 3, 3], in pixels."""
     return torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]])
 
 
 def ordinary(g: Generator, size: float = 0.2) -> Arguments:
-    """Make a Gaussian in view that is a few pixels large."""
+    """Draw a random Gaussian that is visible and a few pixels large."""
     mean = torch.tensor([0.2, -0.1, DEPTH]) + 0.1 * torch.randn(3, generator=g)
     return single(mean, size * torch.randn(3, 3, generator=g))
 
 
 def turned(g: Generator, sizes: Tensor) -> Tensor:
-    """Make a factor with these sizes along axes in random directions."""
+    """Return a covariance factor [3, 3] with the given axis lengths and a random rotation."""
     return torch.linalg.qr(torch.randn(3, 3, generator=g))[0] * sizes
 
 
@@ -46,13 +46,13 @@ def turned(g: Generator, sizes: Tensor) -> Tensor:
 
 @case("projection")
 def ordinary_splats(g: Generator, severity: float) -> list[Arguments]:  # noqa: ARG001
-    """Stress nothing: the other rows are compared with this one."""
+    """Project ordinary Gaussians, for which nothing is numerically hard, as the baseline of the hard cases."""
     return [ordinary(g) for _ in range(3)]
 
 
 @case("projection")
 def at_the_near_plane(g: Generator, severity: float) -> list[Arguments]:
-    """Put means on the near plane, an ulp before and behind it, and behind the camera: 1/z explodes, z < 0 mirrors."""
+    """Put means within rounding error of the near plane and behind the camera, where 1/z is infinite or negative."""
     near = 0.25
     just_before, just_behind = near * (1 + 2**-22), near * (1 - 2**-22)
     depths = [near, just_before, just_behind, 0.0, -1.0, -near]
@@ -65,7 +65,10 @@ def at_the_near_plane(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def far_off_axis(g: Generator, severity: float) -> list[Arguments]:
-    """Put means up to x/z = 100 that reach into the image: EWA's Jacobian grows (diff-gaussian-rasterization #75)."""
+    """Put means at x/z up to 100, of Gaussians that still reach into the image; EWA's Jacobian is large there.
+
+    Met in practice: diff-gaussian-rasterization issue 75.
+    """
     made = []
     for tangent in (1.0, 10.0, 100.0):
         x = DEPTH * tangent**severity
@@ -76,7 +79,10 @@ def far_off_axis(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def needle(g: Generator, severity: float) -> list[Arguments]:
-    """Make axes 10^5 : 1 : 1 and 10^5 : 10^5 : 1, as training does at edges: det = ab - c^2 cancels (UnityGS #14)."""
+    """Use axis ratios 10^5 : 1 : 1 and 10^5 : 10^5 : 1, for which the 2D determinant ab - c^2 cancels.
+
+    Training makes such Gaussians at edges. Met in practice: UnityGaussianSplatting issue 14.
+    """
     thin = 10 ** (-5 * severity)
     return [
         ordinary(g) | {"factors": turned(g, torch.tensor(sizes))[None]}
@@ -86,14 +92,17 @@ def needle(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def pointlike(g: Generator, severity: float) -> list[Arguments]:
-    """Make sizes of 10^-8 and zero: only eps2d is visible, and nothing may divide by the size."""
+    """Use Gaussians of size 10^-8 and 0, whose projection has only the blur eps2d: no code may divide by their size."""
     sizes = (10 ** (-8 * severity), 0.0 if severity == 1 else 0.1)
     return [ordinary(g) | {"factors": size * torch.randn(1, 3, 3, generator=g)} for size in sizes]
 
 
 @case("projection")
 def larger_than_the_scene(g: Generator, severity: float) -> list[Arguments]:
-    """Make sizes of 10^3 to 10^7, the largest that log sizes allow: det of 2D covariances overflows (UnityGS #196)."""
+    """Use Gaussians of size 10^3 to 10^7, the limit of log sizes, for which the 2D determinant overflows.
+
+    Met in practice: UnityGaussianSplatting issue 196.
+    """
     made = []
     for power in (3, 5, 7):
         made.append(ordinary(g) | {"factors": 10 ** (power * severity) * torch.randn(1, 3, 3, generator=g)})
@@ -102,7 +111,7 @@ def larger_than_the_scene(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def extreme_focal_lengths(g: Generator, severity: float) -> list[Arguments]:
-    """Use focal lengths of 10 and 10^5 pixels, as in crops of a fisheye's or a telescope's image."""
+    """Use focal lengths of 10 and 10^5 pixels, as in crops of fisheye or telescope images."""
     wide, tele = 24 ** (1 - severity) * 10**severity, 24 ** (1 - severity) * 1e5**severity
     shrink = FOCAL / tele
     far = ordinary(g, 0.2 * shrink)
@@ -112,14 +121,17 @@ def extreme_focal_lengths(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def oblong_pixels(g: Generator, severity: float) -> list[Arguments]:
-    """Use fx / fy = 100 and 1/100, as anamorphic lenses do: a renderer with one focal length is wrong."""
+    """Use focal lengths with fx / fy = 100 or 1/100 (anamorphic lenses); a renderer with one focal length fails."""
     stretch = 10**severity
     return [ordinary(g, 0.1) | {"Ks": intrinsics(FOCAL * s, FOCAL / s)} for s in (stretch, 1 / stretch)]
 
 
 @case("projection")
 def principal_point_outside(g: Generator, severity: float) -> list[Arguments]:
-    """Put the principal point ten widths outside the image, as in crops: clamps about the centre fail (gsplat #305)."""
+    """Put the principal point ten image widths outside the image, as in crops.
+
+    A renderer that clamps x/z around the image centre is wrong here. Met in practice: gsplat issue 305.
+    """
     away = 10 * WIDTH * severity
     made = ordinary(g)
     shift = away / FOCAL * DEPTH
@@ -131,7 +143,7 @@ def principal_point_outside(g: Generator, severity: float) -> list[Arguments]:
 
 
 def crowd(g: Generator, N: int, size: float) -> Arguments:
-    """Make N Gaussians of about `size` in view, at different depths."""
+    """Return rasterizer arguments for N visible Gaussians of about the same size at different depths."""
     spread = torch.tensor([1.0, 0.7, 1.0])
     means = (torch.rand(N, 3, generator=g) * 2 - 1) * spread + torch.tensor([0.0, 0.0, DEPTH])
     return {
@@ -144,13 +156,13 @@ def crowd(g: Generator, N: int, size: float) -> Arguments:
 
 @case("blending")
 def ordinary_crowd(g: Generator, severity: float) -> list[Arguments]:  # noqa: ARG001
-    """Stress nothing: the other rows are compared with this one."""
+    """Blend ordinary Gaussians, for which nothing is numerically hard, as the baseline of the hard cases."""
     return [crowd(g, 200, 0.15)]
 
 
 @case("blending")
 def faint_crowd(g: Generator, severity: float) -> list[Arguments]:
-    """Put 10^5 Gaussians of opacity 1/100 over each other in the whole image: many small terms are combined."""
+    """Blend 10^5 Gaussians of opacity 1/100 that all cover the image, so that each pixel sums many small terms."""
     made = crowd(g, max(10, int(CROWD**severity)), 5.0)
     few = {"width": 8, "height": 6, "Ks": intrinsics(cx=4.0, cy=3.0)}  # brute force takes seconds for these
     return [made | few | {"opacities": torch.full((len(made["means"]),), 0.01)}]
@@ -158,14 +170,14 @@ def faint_crowd(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending")
 def opaque_stack(g: Generator, severity: float) -> list[Arguments]:
-    """Put a thousand opaque Gaussians behind each other: backward must not compute 0/0 from 1 - alpha."""
+    """Blend a thousand opaque Gaussians behind each other; the backward pass must not compute 0/0 from 1 - alpha."""
     made = crowd(g, 1000, 1.0)
     return [made | {"opacities": 1 - 0.4 * (1 - severity) * torch.rand(1000, generator=g)}]
 
 
 @case("blending")
 def equal_depths(g: Generator, severity: float) -> list[Arguments]:
-    """Put all at one depth, as on a plane that faces the camera: the lower index is in front, in every backend."""
+    """Put all Gaussians at the same depth: every backend must then blend them in the order of their indices."""
     made = crowd(g, 200, 0.3)
     made["means"][:, 2] = DEPTH + (1 - severity) * (made["means"][:, 2] - DEPTH)
     return [made]
@@ -173,7 +185,10 @@ def equal_depths(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending", forward=1.01 / 255, gradient=NO_GRADIENT)
 def alpha_at_its_limits(g: Generator, severity: float) -> list[Arguments]:
-    """Put alpha within an ulp of 1/255 and of 0.999: a Gaussian may be skipped or not, which changes at most 1/255."""
+    """Use alphas within rounding error of the cut-offs at 1/255 and 0.999.
+
+    In float32 a Gaussian at 1/255 may be skipped or not, which changes a pixel by at most 1/255.
+    """
     made = crowd(g, 3, 1.0)
     made["factors"] = 1e4 * torch.eye(3).repeat(3, 1, 1)  # constant over the image
     faint = torch.tensor([1 / 255]) * torch.tensor([1 - 2**-23, 1.0, 1 + 2**-22]) ** severity
@@ -185,7 +200,10 @@ def alpha_at_its_limits(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending", forward=1e-3, gradient=NO_GRADIENT)
 def transmittance_at_the_stop(g: Generator, severity: float) -> list[Arguments]:
-    """Blend four Gaussians of alpha 0.9, which leave 1e-4: the fourth may be left out, which changes at most 9e-4."""
+    """Blend four Gaussians of alpha 0.9, so that the transmittance ends within rounding error of the limit 1e-4.
+
+    In float32 the fourth Gaussian may be skipped or not, which changes a pixel by at most 9e-4.
+    """
     made = crowd(g, 6, 1.0)
     made["factors"] = 1e4 * torch.eye(3).repeat(6, 1, 1)
     return [made | {"opacities": torch.full((6,), 0.9 * severity + 0.5 * (1 - severity))}]
@@ -193,14 +211,14 @@ def transmittance_at_the_stop(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending")
 def brilliant_colors(g: Generator, severity: float) -> list[Arguments]:
-    """Make colours of 10^4, which 3DGS allows: large terms are added; errors are relative to the brightest colour."""
+    """Blend colours of about 10^4, which 3DGS allows; errors are relative to the largest colour value."""
     made = crowd(g, 200, 0.15)
     return [made | {"colors": made["colors"] * 10 ** (4 * severity)}]
 
 
 @case("blending")
 def no_gaussians(g: Generator, severity: float) -> list[Arguments]:
-    """Render no Gaussian, and only culled ones: pruning can remove the last one, and the background remains."""
+    """Render no Gaussians, or only culled ones: the image must be the background."""
     made = crowd(g, 20, 0.1)
     away = made["means"] - torch.tensor([0.0, 0.0, 50.0 * severity])
     return [made | _only(made, slice(0)), made | {"means": away}]

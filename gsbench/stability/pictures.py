@@ -1,4 +1,4 @@
-"""Judge images of the rasterizer: single Gaussians against mpmath, crowds against brute force in float64."""
+"""Test the rasterizer in float32: single Gaussians against mpmath, many Gaussians against brute force in float64."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -14,17 +14,17 @@ from gsbench.stability import brute, oracle
 from gsbench.stability.cases import Case, Cell, device_of
 from gsbench.stability.slices import fastest, worst
 
-UNDECIDED = 1e-3  # a pixel relatively nearer to a threshold may fall to either side of it in float32
+UNDECIDED = 1e-3  # relative distance to a threshold below which float32 may decide either way
 Arguments = dict[str, Any]
 # image and alpha [1, H, W, .], decided [1, H, W], gradients
 ImageTruth = tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]
 
 
 def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
-    """Yield a result for each backend: the largest errors over the images of a case."""
+    """Yield, for each backend, the largest errors of image and gradients over all images of one test case."""
     pictures = case()
     truths = [(alone if case.area == "projection" else together)(arguments) for arguments in pictures]
-    if case.bound.gradient != case.bound.gradient:  # every pixel is at a threshold, and these are judged
+    if case.bound.gradient != case.bound.gradient:  # NaN: pixels are at a threshold on purpose, so all of them count
         truths = [(image, alpha, torch.ones_like(decided), {}) for image, alpha, decided, _ in truths]
     for backend in backends:
         found = [compare(a, known, backend) for a, known in zip(pictures, truths, strict=True)]
@@ -44,7 +44,7 @@ def _all(pictures: list[Arguments], backend: str) -> None:
 
 
 def weights(arguments: Arguments) -> tuple[Tensor, Tensor]:
-    """Make the weights of image and alpha in the loss, float64."""
+    """Return fixed random float64 weights of image and alpha; the loss is the weighted sum of their pixels."""
     shape = (1, arguments["height"], arguments["width"])
     g = torch.Generator().manual_seed(1)
     D = arguments["colors"].shape[-1]
@@ -53,7 +53,7 @@ def weights(arguments: Arguments) -> tuple[Tensor, Tensor]:
 
 
 def together(arguments: Arguments) -> ImageTruth:
-    """Render the exact image and gradients by brute force."""
+    """Compute the exact image of many Gaussians and the exact gradients of the loss by brute force in float64."""
     exact: Arguments = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
     with torch.no_grad():
         picture = brute.render(**exact)
@@ -64,7 +64,10 @@ def together(arguments: Arguments) -> ImageTruth:
 
 
 def alone(arguments: Arguments) -> ImageTruth:
-    """Compute the exact image and gradients by mpmath, for one Gaussian whose one channel is 1: image equals alpha."""
+    """Compute the exact image of one Gaussian and the exact gradients of the loss in mpmath.
+
+    The Gaussian has one colour channel with value 1, so that the image equals alpha.
+    """
     size = (arguments["width"], arguments["height"])
     pixels = [(i + 0.5, j + 0.5) for j in range(size[1]) for i in range(size[0])]
     parts = [arguments[name].flatten() for name in ("means", "factors", "opacities")]
@@ -90,7 +93,7 @@ def alone(arguments: Arguments) -> ImageTruth:
 def differentiate(
     arguments: Arguments, backend: str, weight: Tensor, weight_alpha: Tensor
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """Compute image, alpha and the gradients of the loss by a rasterizer in float32."""
+    """Render image and alpha in float32 with one backend, and compute the gradients of the loss."""
     inputs = {name: arguments[name].detach().clone().requires_grad_() for name in brute.DIFFERENTIABLE}
     device = device_of(backend)
     there: Arguments = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in (arguments | inputs).items()}
@@ -102,12 +105,16 @@ def differentiate(
 
 
 def compare(arguments: Arguments, known: ImageTruth, backend: str) -> tuple[float, float, float]:
-    """Return the largest error of decided pixels, relative to the brightest colour or 1, and of gradients; 1 if bad."""
+    """Return the largest error of image and alpha, the largest error of gradients, and 1 if a value is not finite.
+
+    Image errors are relative to the largest colour value, or to 1 if that is larger. Pixels within rounding error of a
+    threshold do not count.
+    """
     image, alpha, decided, exact = known
     weight, weight_alpha = (w * decided[..., None] for w in weights(arguments))
     try:
         got, covered, gradients = differentiate(arguments, backend, weight, weight_alpha)
-    except InputError:  # a refusal is not a wrong image, but every case here must be rendered
+    except InputError:  # each test case must be rendered, so a refusal is an error
         return float("nan"), float("nan"), 1.0
     finite = got.isfinite().all() & covered.isfinite().all() & all(g.isfinite().all() for g in gradients.values())
     brightest = max(1.0, float(arguments["colors"].abs().max())) if arguments["colors"].numel() else 1.0
@@ -118,6 +125,6 @@ def compare(arguments: Arguments, known: ImageTruth, backend: str) -> tuple[floa
 
 
 def _relative(found: Tensor, exact: Tensor) -> float:
-    """Compute |found - exact| / |exact|, or |found| where the exact gradient is zero."""
+    """Return |found - exact| / |exact|, or |found| if the exact gradient is zero."""
     size = float(exact.norm())
     return float((found - exact).norm()) / (size if size > 0 else 1.0)

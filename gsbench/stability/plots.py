@@ -1,4 +1,4 @@
-"""Plot the results of the audit by matplotlib."""
+"""Plot the results of the stability audit with matplotlib."""
 
 import io
 from collections.abc import Callable
@@ -13,12 +13,12 @@ from gsbench.measure.atomic import write_atomically
 from gsbench.stability.audit import Audit
 
 COLORS = {"square_root": "tab:blue", "schur": "tab:red", "cholesky": "tab:orange"}
-LEAST, MOST = 1e-16, 1e3  # the range of errors; one beyond it is plotted at the edge
+LEAST, MOST = 1e-16, 1e3  # the range of plotted errors; values outside are plotted at the edge
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot on the page."""
+    """The title, file name and caption of a plot on the page of the stability audit."""
 
     title: str
     file: str
@@ -48,7 +48,7 @@ BY_TIME = (
 
 
 def write(audit: Audit, folder: Path) -> list[Plot]:
-    """Write all plots; return what the page shows."""
+    """Write all plots of the stability audit to `folder`; return their titles, file names and captions."""
     save(folder / BY_CONDITION.file, lambda axes: by_condition(axes, audit))
     for figure, thing in zip(BY_TIME, ("slicing", "picture"), strict=True):
         save(folder / figure.file, partial(by_time, audit=audit, thing=thing))
@@ -56,7 +56,7 @@ def write(audit: Audit, folder: Path) -> list[Plot]:
 
 
 def save(path: Path, draw: Callable[[Axes], None], size: tuple[float, float] = (7.5, 4.5)) -> None:
-    """Plot on one pair of axes and write it as PNG."""
+    """Create a figure with one pair of axes, plot on these with `draw`, and write the figure as PNG."""
     figure, axes = plt.subplots(figsize=size, layout="constrained")
     draw(axes)
     data = io.BytesIO()
@@ -66,7 +66,10 @@ def save(path: Path, draw: Callable[[Axes], None], size: tuple[float, float] = (
 
 
 def by_condition(axes: Axes, audit: Audit) -> None:
-    """Plot errors on the left axis and the share of failures on the right."""
+    """Plot errors (left axis) and the share of invalid covariances (right axis) over the condition number.
+
+    There is a curve for each algorithm that computes conditional covariances.
+    """
     shares = axes.twinx()
     for curve in audit.conditions:
         color = COLORS[curve.scheme]
@@ -81,7 +84,7 @@ def by_condition(axes: Axes, audit: Audit) -> None:
 
 
 def by_time(axes: Axes, audit: Audit, thing: str) -> None:
-    """Plot a labelled point for each way."""
+    """Plot errors over milliseconds as labelled points, one for each slicing algorithm or rasterizer backend."""
     points = [point for point in audit.accuracy if point.thing == thing]
     points.sort(key=lambda point: point.ms)
     for i, (point, height) in enumerate(zip(points, shown([point.error for point in points]), strict=True)):
@@ -100,5 +103,5 @@ def by_time(axes: Axes, audit: Audit, thing: str) -> None:
 
 
 def shown(errors: list[float]) -> list[float]:
-    """Clamp errors to the range of the axes."""
+    """Clamp errors to the range of the plot, [1e-16, 1e3]."""
     return [min(max(error, LEAST), MOST) for error in errors]

@@ -1,7 +1,7 @@
-"""Judge a million random hard slices against modified Gram-Schmidt in float64.
+"""Test slicing of a million random 7D Gaussians with ill-conditioned factors, against an exact float64 method.
 
-mpmath would need weeks for a million Gaussians. Gram-Schmidt is done twice ("twice is enough": Giraud et al. 2005), and
-every audit compares it with mpmath on a sample (`verify`).
+The exact method is modified Gram-Schmidt, done twice ("twice is enough": Giraud et al. 2005). mpmath would need weeks
+for a million Gaussians, so each audit compares Gram-Schmidt with mpmath on a few of them (`verify`).
 """
 
 from dataclasses import dataclass
@@ -20,14 +20,17 @@ from gsbench.stability import oracle
 from gsbench.stability.cases import device_of
 
 Floats = NDArray[np.float64]
-CHUNK = 50_000  # Gaussians at a time, which bounds memory
+CHUNK = 50_000  # Gaussians in one chunk, to limit memory
 BELOW = np.tril_indices(7, -1)
 NEVER = -110.0  # log lambda; its exp is zero in float32, so that no Gaussian is culled at any query
 
 
 @dataclass(frozen=True)
 class Hard:
-    """Raw parameters of 7D Gaussians with mu_p = 0, queried from there at t = 0: (d, t) is 0 and exact."""
+    """Raw parameters of 7D Gaussians with ill-conditioned factors and means at the origin.
+
+    They are sliced for a camera at the origin at time 0, so that direction and time are exactly 0, without rounding.
+    """
 
     log_diagonal: Tensor  # [N, 7] float32
     off_diagonal: Tensor  # [N, 21] entries of the factor, row by row
@@ -37,13 +40,16 @@ class Hard:
         return len(self.offset)
 
     def rows(self, which: slice) -> "Hard":
-        """Select some of the Gaussians."""
+        """Return the Gaussians that `which` selects."""
         return Hard(self.log_diagonal[which], self.off_diagonal[which], self.offset[which])
 
 
 @dataclass(frozen=True)
 class PopulationTruth:
-    """The mean [N, 3] and the covariance [N, 3, 3] of each slice, and the gradient of the loss by raw parameters."""
+    """The exact conditional mean [N, 3] and covariance [N, 3, 3] of each Gaussian, and the gradient of a loss.
+
+    The gradient is with respect to the raw parameters of the factor.
+    """
 
     mean: Floats
     cov: Floats
@@ -52,15 +58,19 @@ class PopulationTruth:
 
 @dataclass(frozen=True)
 class Errors:
-    """The relative errors of each Gaussian; NaN and inf are kept."""
+    """The relative errors of covariance and gradient of each Gaussian; NaN and infinity are kept."""
 
     cov: Floats
     gradient: Floats
-    bad: NDArray[np.bool_]  # not finite, or not semi-definite where the scheme forms a covariance
+    bad: NDArray[np.bool_]  # not finite, or an indefinite covariance
 
 
 def draw(generator: torch.Generator, N: int, order: str, decades: Tensor | float = 5.0) -> Hard:
-    """Sample factors with diagonals 10^-u, u uniform in [0, decades], normal entries below, queries a sigma away."""
+    """Draw N random 7D Gaussians with ill-conditioned triangular factors.
+
+    Diagonal entries are 10^-u with u uniform in [0, decades], and entries below are standard normal. The direction and
+    time at which the Gaussians are sliced are about one standard deviation from their means.
+    """
     u = torch.rand(N, 7, generator=generator, dtype=torch.float64)
     log_diagonal = -(decades * u) * np.log(10.0)
     off_diagonal = torch.randn(N, 21, generator=generator, dtype=torch.float64)
@@ -71,7 +81,7 @@ def draw(generator: torch.Generator, N: int, order: str, decades: Tensor | float
 
 
 def factor(hard: Hard) -> Floats:
-    """Compute the triangular factor in float64, [N, 7, 7]."""
+    """Return the lower triangular factors [N, 7, 7] of the 7D covariances in float64."""
     L = np.zeros((len(hard), 7, 7))
     L[:, *BELOW] = hard.off_diagonal.double().numpy()
     L[:, range(7), range(7)] = np.exp(hard.log_diagonal.double().numpy())
@@ -79,21 +89,21 @@ def factor(hard: Hard) -> Floats:
 
 
 def conditioned(order: str) -> list[int]:
-    """Return the rows of d and then t in the triangular factor of an order."""
+    """Return the rows of direction and then of time in the triangular factor, for a given row order of this factor."""
     return [4, 5, 6, 3] if order == "paper" else [0, 1, 2, 3]
 
 
 def weights(N: int) -> tuple[Floats, Floats]:
-    """Make the weights of means [N, 3] and (symmetric) covariances [N, 3, 3] in the loss."""
+    """Return fixed random weights of means [N, 3] and covariances [N, 3, 3] in the loss."""
     random = np.random.default_rng(1)
     W = random.standard_normal((N, 3, 3))
     return random.standard_normal((N, 3)), W + W.transpose(0, 2, 1)
 
 
 def truth(hard: Hard, order: str) -> PopulationTruth:
-    """Compute means, covariances and the gradient of a loss in float64. The loss is w .
+    """Compute the exact conditional means and covariances, and the gradient of a loss, in float64.
 
-    Mean / |mean| + <W, cov> / |cov| with the random `weights` w and W.
+    The loss is w . mean / |mean| + <W, cov> / |cov| with the random `weights` w and W.
     """
     w, W = weights(len(hard))
     chunks = [slice(i, i + CHUNK) for i in range(0, len(hard), CHUNK)]
@@ -104,7 +114,7 @@ def truth(hard: Hard, order: str) -> PopulationTruth:
 
 
 def _truth(hard: Hard, order: str, w: Floats, W: Floats) -> tuple[Floats, Floats, Floats]:
-    """Compute `truth` from arrays whose last axis counts the Gaussians."""
+    """Compute `truth` (exact conditional Gaussians and gradients) for arrays whose last axis counts the Gaussians."""
     L, q = np.ascontiguousarray(factor(hard).transpose(1, 2, 0)), conditioned(order)
     p = [i for i in range(7) if i not in q]
     Q, R = gram_schmidt(L[q + p])  # L = R^T Q^T
@@ -123,7 +133,7 @@ def _truth(hard: Hard, order: str, w: Floats, W: Floats) -> tuple[Floats, Floats
 
 
 def gram_schmidt(rows: Floats) -> tuple[Floats, Floats]:
-    """Compute Q, R with rows^T = Q R for rows [n, n, N], orthogonalising twice."""
+    """Compute the QR decomposition rows^T = Q R of N matrices [n, n, N] by Gram-Schmidt, orthogonalising twice."""
     Q, R = np.zeros_like(rows), np.zeros_like(rows)
     for i in range(len(rows)):
         v = rows[i].copy()
@@ -160,7 +170,7 @@ def _solve_upper(T: Floats, B: Floats) -> Floats:
 
 
 def verify(hard: Hard, order: str, count: int = 8) -> float:
-    """Return the largest relative error of `truth` against mpmath on the first Gaussians: covariance and gradient."""
+    """Return the largest relative error of the float64 `truth` against mpmath, on the first `count` Gaussians."""
     some = hard.rows(slice(count))
     found = truth(some, order)
     w, W = weights(count)
@@ -202,13 +212,13 @@ def _relative(found: Floats, exact: Floats) -> float:
 
 
 def judge(hard: Hard, known: PopulationTruth, order: str, scheme: str, backend: str) -> Errors:
-    """Measure the errors of 7DGS in float32 on hard slices.
+    """Measure the errors of slicing ill-conditioned 7D Gaussians in float32.
 
     Args:
         hard: the Gaussians to slice.
         known: the exact slices of these Gaussians.
         order: the order of rows in the triangular factor.
-        scheme: the slicing scheme.
+        scheme: the slicing scheme, which computes the conditional Gaussian.
         backend: the name of the backend.
     """
     model = all_seen(order, scheme, backend)
@@ -219,7 +229,7 @@ def judge(hard: Hard, known: PopulationTruth, order: str, scheme: str, backend: 
 
 
 def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
-    """Make a 7DGS in which f_temp and f_dir are 1 everywhere."""
+    """Make a 7DGS model in which opacity does not depend on time and direction (the factors f_temp and f_dir are 1)."""
     model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme, off_diagonal="raw",
                   backend=BACKENDS[backend])  # fmt: skip
     assert isinstance(model, TriangularModel)
@@ -253,7 +263,10 @@ def _judge(
 
 @torch.no_grad()
 def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
-    """Tell whether the covariance of a scheme that subtracts has a negative eigenvalue, [N]; F F^T never has one."""
+    """Return which conditional covariances [N] have a negative eigenvalue or are not finite.
+
+    The scheme `square_root` returns a factor F of the covariance F F^T, which has no negative eigenvalue.
+    """
     scheme: str = model.scheme  # type: ignore[assignment]  # every model that slices has one
     if scheme == "square_root":
         return torch.zeros(len(raw["means"]), dtype=torch.bool)
@@ -264,7 +277,7 @@ def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
 
 
 def raw_parameters(hard: Hard, model: TriangularModel) -> dict[str, Tensor]:
-    """Make the raw parameters of a 7DGS from `all_seen`."""
+    """Return the raw parameters of the given Gaussians for a model made by `all_seen`."""
     N = len(hard)
     return {"means": torch.zeros(N, 3), "directions": hard.offset[:, :3], "times": hard.offset[:, 3:],
             "log_diagonal": hard.log_diagonal, **model.triangle.split(hard.off_diagonal),

@@ -1,4 +1,4 @@
-"""Judge slices of models in float32 against the oracle in mpmath."""
+"""Test the conditional 3D Gaussians that models compute in float32, against exact ones from mpmath."""
 
 import functools
 import time
@@ -25,21 +25,21 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "7dgs": {"lambda_d": 0.35, "lambda_t": 0.35},
 }
 SLOW_MS = 500.0
-COPIES = 1024  # of a case's Gaussians, for its timing
+COPIES = 1024  # copies of the Gaussians in a test case, for timing
 
 
 @dataclass(frozen=True)
 class SliceTruth:
-    """The exact mean, covariance (by rows), opacity and gradient of the loss of the Gaussians of a case."""
+    """The exact conditional mean, covariance and opacity of Gaussians in a test case, and the gradient of a loss."""
 
     outputs: Tensor  # [COUNT, 13] float64
-    weights: Tensor  # [COUNT, 13]: the loss is their product with the outputs, summed
-    scale: Tensor  # [COUNT] what errors of the mean are relative to
+    weights: Tensor  # [COUNT, 13]: the loss is the sum of weights x outputs
+    scale: Tensor  # [COUNT]: errors of the mean are divided by this
     gradient: Tensor  # [COUNT, parameters], in the order of `Observed.raw`
 
 
 def judge(case: Case, backends: list[str], schemes: Sequence[str] = SCHEMES) -> Iterator[Cell]:
-    """Compare the slices of every model, scheme and backend with the exact ones."""
+    """Yield the errors of conditional 3D Gaussians in one test case, for each model, algorithm and backend."""
     for model in case.subjects:
         observed = case(model=model)
         known = truth(observed)
@@ -49,9 +49,10 @@ def judge(case: Case, backends: list[str], schemes: Sequence[str] = SCHEMES) -> 
 
 
 def truth(observed: Observed) -> SliceTruth:
-    """Evaluate mpmath, and choose the loss: a sum of mean, covariance and opacity, each relative to its size.
+    """Compute exact conditional Gaussians in mpmath, and the exact gradient of a loss.
 
-    A Gaussian that is too faint to be rendered counts by its opacity alone, so that its gradient is nearly zero.
+    The loss is a random weighted sum of mean, covariance and opacity, each divided by its size. If a Gaussian is too
+    faint to be rendered, only its opacity counts.
     """
     outputs, scales, gradients = [], [], []
     weights = torch.randn(COUNT, 13, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -63,7 +64,7 @@ def truth(observed: Observed) -> SliceTruth:
         scale = mean.norm() + (values[:3] - mean).norm() + values[[3, 7, 11]].sum().sqrt()
         weights[i, :3] /= scale
         weights[i, 3:12] /= values[3:12].norm()
-        if values[12] < ALPHA_MIN:  # it is culled, so its place and shape do not matter
+        if values[12] < ALPHA_MIN:  # it is culled, so its mean and covariance do not matter
             weights[i, :12] = 0
         outputs.append(values)
         scales.append(scale)
@@ -72,7 +73,11 @@ def truth(observed: Observed) -> SliceTruth:
 
 
 def exact(observed: Observed) -> oracle.Function:
-    """Return the oracle's function of the raw parameters of a Gaussian, with constants rounded to float32."""
+    """Return the mpmath function from the raw parameters of a Gaussian to its conditional 3D Gaussian.
+
+    The time and the learned coefficients lambda_t and lambda_d are rounded to float32, because the models get them in
+    float32.
+    """
     layout = {name: value[0].numel() for name, value in observed.raw.items()}
     log_lambda = {name: _single(value) for name, value in observed.log_lambda.items()}
     if observed.model == "4dgs":
@@ -87,7 +92,7 @@ def exact(observed: Observed) -> oracle.Function:
 
 
 def load(observed: Observed, scheme: str, backend: str, copies: int = 1) -> tuple[GaussianModel, dict[str, Tensor]]:
-    """Make a model with the Gaussians of a case, `copies` times."""
+    """Make a model and raw parameters that repeat the Gaussians of a test case `copies` times."""
     model = build(observed.model, scheme=scheme, backend=BACKENDS[backend], **OPTIONS[observed.model])
     for name, value in observed.log_lambda.items():
         model.log_lambda[name] = nn.Parameter(torch.tensor(value))
@@ -99,7 +104,10 @@ def load(observed: Observed, scheme: str, backend: str, copies: int = 1) -> tupl
 def differentiate(
     model: GaussianModel, raw: dict[str, Tensor], observed: Observed, weights: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Compute outputs [N, 13] and gradients [N, parameters] in float32 by the model's backend; return float64."""
+    """Slice Gaussians in float32 and compute the gradients of their raw parameters; return both as float64.
+
+    The outputs [N, 13] are mean (3), covariance (9) and opacity. The gradients are [N, parameters].
+    """
     device = device_of(model.backend.name)
     moment = torch.tensor(observed.time, device=device) if "time" in model.observes else None
     there = {name: value.to(device) for name, value in raw.items()}
@@ -131,7 +139,7 @@ def _cell(case: Case, observed: Observed, known: SliceTruth, scheme: str, backen
 
 
 def worst(errors: Tensor) -> float:
-    """Return the largest error; NaN if one is not finite."""
+    """Return the largest error, or NaN if an error is not finite."""
     return float(errors.max()) if bool(errors.isfinite().all()) else float("nan")
 
 
@@ -142,7 +150,10 @@ def _milliseconds(observed: Observed, known: SliceTruth, scheme: str, backend: s
 
 
 def fastest(call: Callable[[], object], repeats: int = 3) -> float:
-    """Time the fastest of a few calls in ms, as the machine may be shared; only one call if it takes half a second."""
+    """Return the milliseconds of the fastest of `repeats` calls, because other processes may slow some of them.
+
+    A call that takes more than half a second is not repeated.
+    """
     times: list[float] = []
     while len(times) < repeats and (not times or times[0] < SLOW_MS):
         start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Define hard slices: raw parameters of a few Gaussians, as training can leave them, and their query."""
+"""Define numerically hard inputs of slicing: a few Gaussians with extreme parameters, a camera and a time."""
 
 import math
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ ALL = ("4dgs", "6dgs", "7dgs")
 
 @dataclass
 class Observed:
-    """Gaussians of one model, with the camera centre and the time at which they are sliced."""
+    """Gaussians of one model, and the camera centre and time at which they are sliced."""
 
     model: str
     raw: dict[str, Tensor]  # float32, by the model's own names
@@ -29,12 +29,12 @@ class Observed:
 
 
 def variables(model: str) -> str:
-    """Return the variable of each row of the default triangular factor, with the conditioned ones first."""
+    """Return the variable of each row of the triangular factor: d (direction), t (time) or p (position)."""
     return "dddtppp" if model == "7dgs" else "dddppp"
 
 
 def ordinary(g: Generator, model: str) -> Observed:
-    """Make Gaussians like those at the start of a training: nothing is hard, and all are visible."""
+    """Draw random visible Gaussians like those at the start of training, which are not numerically hard."""
     means = torch.rand(COUNT, 3, generator=g) * 2 - 1
     center, time = torch.tensor([0.3, -0.2, -4.0]), 0.4
     raw = {"means": means, "opacities": torch.randn(COUNT, generator=g)}
@@ -56,7 +56,7 @@ def ordinary(g: Generator, model: str) -> Observed:
 
 
 def sizes(observed: Observed, variable: str) -> Tensor:
-    """Return the log sizes of one variable, [COUNT, width], as a view that can be written to."""
+    """Return the log sizes (log diagonal entries) [COUNT, width] of one variable, as a writable view."""
     if observed.model == "4dgs":
         return observed.raw["scales"][:, 3:] if variable == "t" else observed.raw["scales"][:, :3]
     rows = [i for i, name in enumerate(variables(observed.model)) if name == variable]
@@ -64,38 +64,38 @@ def sizes(observed: Observed, variable: str) -> Tensor:
 
 
 def below(observed: Observed) -> Tensor:
-    """Return the parameters below the diagonal, [COUNT, n (n - 1) / 2] row by row."""
+    """Return the entries below the diagonal of the triangular factors, [COUNT, n (n - 1) / 2], row by row."""
     return Triangle(variables(observed.model)).join(observed.raw)
 
 
 def set_below(observed: Observed, values: Tensor) -> None:
-    """Set the parameters below the diagonal."""
+    """Set the entries below the diagonal of the triangular factors."""
     observed.raw |= Triangle(variables(observed.model)).split(values)
 
 
 def upright(observed: Observed) -> None:
-    """Turn a 4D Gaussian so that its last axis is time."""
+    """Remove the rotation of 4D Gaussians, so that their fourth axis is time."""
     for name in ("left_quats", "right_quats"):
         observed.raw[name][:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
 
 
 def entries(observed: Observed, variable: str) -> list[int]:
-    """Return the places of the entries in the rows of one variable among the parameters below the diagonal."""
+    """Return the indices of the entries in one variable's rows, among all entries below the diagonal."""
     rows = [i for i, name in enumerate(variables(observed.model)) if name == variable]
     return [i * (i - 1) // 2 + j for i in rows for j in range(i)]
 
 
 @case("slicing", *ALL)
 def ordinary_gaussians(g: Generator, severity: float, model: str) -> Observed:  # noqa: ARG001
-    """Stress nothing: every scheme must compute this correctly, and the other rows are compared with it."""
+    """Slice ordinary Gaussians, for which nothing is numerically hard, as the baseline of the hard cases."""
     return ordinary(g, model)
 
 
 @case("slicing", *ALL)
 def diagonals_over_eight_decades(g: Generator, severity: float, model: str) -> Observed:
-    """Make factor diagonals from 1 to 1e-8 with correlations of 1: forming S squares the condition number.
+    """Use factors with diagonal entries from 1 to 1e-8: forming the covariance S squares the condition number.
 
-    The camera is on the means, so that d = 0 has no rounding: this tests the factor and not the query.
+    The camera is on the means, so that the view direction is exactly 0 and only the factor is tested.
     """
     observed = ordinary(g, model)
     name = "scales" if model == "4dgs" else "log_diagonal"
@@ -114,7 +114,10 @@ def diagonals_over_eight_decades(g: Generator, severity: float, model: str) -> O
 
 @case("slicing", *TRIANGULAR)
 def narrow_in_direction(g: Generator, severity: float, model: str) -> Observed:
-    """Make a highlight 10^-3 wide: d has an ulp of 6e-8, so float32 cannot place it better than 6e-5 of its width."""
+    """Use Gaussians that are visible from a range of directions 10^-3 wide, such as highlights.
+
+    Float32 stores a unit direction to 6e-8, which is 6e-5 of this width; no scheme can be more exact.
+    """
     observed = ordinary(g, model)
     sizes(observed, "d")[:] = -3 * LN_10 * severity
     values = below(observed)
@@ -128,7 +131,10 @@ def narrow_in_direction(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def nearly_certain(g: Generator, severity: float, model: str) -> Observed:
-    """Correlate position and the conditioned variable to 1 - 1e-12: S_pp - K S_qp is a difference of equals."""
+    """Correlate position with time or direction to 1 - 1e-12, so that S_pp and K S_qp are nearly equal.
+
+    Their difference is the conditional covariance, and its subtraction cancels.
+    """
     observed = ordinary(g, model)
     thin = -severity * 0.5 * math.log(5e11)  # sqrt(1 - rho^2) = sqrt(2e-12)
     if model == "4dgs":
@@ -146,7 +152,10 @@ def nearly_certain(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *TIME_LIKE)
 def instant(g: Generator, severity: float, model: str) -> Observed:
-    """Let S_t -> 0, log sigma_t to -80: Gaussians of one frame, as 4DGS makes on video; half are seen at their time."""
+    """Use Gaussians with nearly no extent in time (log sigma_t = -80), as 4DGS learns for single frames of a video.
+
+    Half of the Gaussians have their mean exactly at the rendered time.
+    """
     observed = ordinary(g, model)
     if model == "4dgs":
         upright(observed)
@@ -161,7 +170,7 @@ def instant(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *TIME_LIKE)
 def static(g: Generator, severity: float, model: str) -> Observed:
-    """Let S_t -> inf, log sigma_t to 80: no gradient ends the growth of S_t of a Gaussian that does not move."""
+    """Use Gaussians with nearly infinite extent in time (log sigma_t = 80), which training makes of static ones."""
     observed = ordinary(g, model)
     if model == "4dgs":
         upright(observed)
@@ -171,7 +180,10 @@ def static(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def far_from_the_query(g: Generator, severity: float, model: str) -> Observed:
-    """Put t and d 10^3 sigma away: f underflows and must be 0 with gradient 0, not 0 x inf = NaN (4DGaussians #35)."""
+    """Slice Gaussians whose mean time and direction are 10^3 standard deviations away from the view.
+
+    The opacity must underflow to 0 with gradient 0, not to 0 x inf = NaN. Met in practice: 4DGaussians issue 35.
+    """
     observed = ordinary(g, model)
     if model == "4dgs":
         upright(observed)
@@ -186,7 +198,10 @@ def far_from_the_query(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def insensitive(g: Generator, severity: float, model: str) -> Observed:
-    """Let lambda -> 0: f is 1 for every query, and only the mean still moves with it."""
+    """Let lambda go to 0: opacity no longer depends on time and direction, and only the mean does.
+
+    Lambda is the coefficient in the exponent by which opacity decreases with the distance in time or direction.
+    """
     observed = ordinary(g, model)
     observed.log_lambda = dict.fromkeys(observed.log_lambda, -110.0 * severity)  # exp(-110) is 0 in float32
     return observed
@@ -194,7 +209,10 @@ def insensitive(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def oversensitive(g: Generator, severity: float, model: str) -> Observed:
-    """Set lambda = 10^4, as after a training in which lambda grew without bound: f is 0 or 1."""
+    """Set lambda to 10^4, as when training increases lambda without bound: opacity is 0 except near mu_t and mu_d.
+
+    Lambda is the coefficient in the exponent by which opacity decreases with the distance in time or direction.
+    """
     observed = ordinary(g, model)
     observed.log_lambda = dict.fromkeys(observed.log_lambda, 4 * LN_10 * severity)
     near = 10 ** (-2 * severity)
@@ -208,7 +226,10 @@ def oversensitive(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def camera_on_a_mean(g: Generator, severity: float, model: str) -> Observed:
-    """Put the camera on a mean, or 1e-12, 1e-6 and 1e-3 beside it: d is 0/0, by definition 0 (walk-throughs, SLAM)."""
+    """Put the camera on a mean, or 1e-12, 1e-6 and 1e-3 away: the view direction is 0/0, and must be 0.
+
+    This happens in walk-throughs and in SLAM.
+    """
     observed = ordinary(g, model)
     aside = torch.tensor([0.0, 1e-12, 1e-6, 1e-3])[:, None] + 1 - severity
     observed.center = torch.zeros(3)
@@ -220,7 +241,7 @@ def camera_on_a_mean(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *TRIANGULAR)
 def direction_off_the_sphere(g: Generator, severity: float, model: str) -> Observed:
-    """Put mu_d 10^4 away from the unit sphere of all d: nothing stops its rate of 2.5e-2 for each step."""
+    """Put the mean direction mu_d 10^4 away from the unit sphere, as training may, because mu_d is not normalised."""
     observed = ordinary(g, model)
     observed.raw["directions"] *= 10 ** (4 * severity)
     sizes(observed, "d")[:] += 4 * LN_10 * severity
@@ -229,7 +250,7 @@ def direction_off_the_sphere(g: Generator, severity: float, model: str) -> Obser
 
 @case("slicing", *ALL)
 def refinement_pushes_sizes(g: Generator, severity: float, model: str) -> Observed:
-    """Make AGR residuals that push log sizes to +-80: exp overflows float32 at 89, and its square at 45."""
+    """Shift log sizes by +-80, as AGR's networks may do: in float32 exp overflows at 89, and its square at 45."""
     observed = ordinary(g, model)
     name = "scales" if model == "4dgs" else "log_diagonal"
     sign = torch.where(torch.rand(observed.raw[name].shape, generator=g) < 0.5, -1.0, 1.0)
@@ -239,7 +260,7 @@ def refinement_pushes_sizes(g: Generator, severity: float, model: str) -> Observ
 
 @case("slicing", "4dgs")
 def vanishing_quaternion(g: Generator, severity: float, model: str) -> Observed:
-    """Make quaternions of length 1e-6, as weight decay does: only the loss normalises them, never the parameters."""
+    """Use quaternions of length 1e-6, as weight decay makes: models normalise a copy, not the parameters."""
     observed = ordinary(g, model)
     for name in ("left_quats", "right_quats"):
         observed.raw[name] *= 10 ** (-6 * severity)

@@ -1,4 +1,4 @@
-"""Measure the condition numbers of the factors of a trained model."""
+"""Measure the condition numbers of the covariance factors in a trained model."""
 
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,13 @@ PERCENTILES = (50, 90, 99, 99.9, 100)
 
 
 def measure(path: Path) -> dict[str, Floats]:
-    """Measure the condition numbers of the joint and the sliced factor of each Gaussian of a checkpoint, before AGR.
+    """Return the condition numbers of each Gaussian's covariance factors in a checkpoint.
+
+    There are two factors: that of the full covariance (4D, 6D or 7D), and that of the conditional 3D covariance. Both
+    are computed from the trained parameters, without AGR (the neural refinement).
 
     Raises:
-        InputError: the file is not a checkpoint, or its model has nothing to slice.
+        InputError: the file is not a checkpoint, or its model is 3DGS, which has no conditional Gaussians.
     """
     joint, k = joint_factors(_splats(path), path)
     sliced = reduce(joint).T_pp
@@ -31,9 +34,10 @@ def measure(path: Path) -> dict[str, Floats]:
 
 
 def failures(path: Path) -> dict[str, tuple[float, float]]:
-    """Measure the errors of schur and cholesky, which subtract covariances, on a checkpoint's Gaussians, in float32.
+    """Measure the float32 errors of the methods `schur` and `cholesky` on the Gaussians of a checkpoint.
 
-    For each scheme, return the share of covariances that are indefinite and the 99th percentile of relative errors.
+    Both methods compute conditional covariances by a subtraction. Return, for each of them, the share of indefinite
+    conditional covariances and the 99th percentile of relative errors.
     """
     joint, _ = joint_factors(_splats(path), path)
     exact = reduce(joint).T_pp
@@ -52,7 +56,11 @@ def _splats(path: Path) -> dict[str, Tensor]:
 
 
 def joint_factors(splats: dict[str, Tensor], path: Path) -> tuple[Tensor, int]:
-    """Compute factors [N, 3+k, 3+k] with rows (p, q), and k, of a model with the default factor order and form."""
+    """Return the covariance factors [N, 3+k, 3+k] of a trained 4DGS, 6DGS or 7DGS, and k.
+
+    The first three rows are position, and the k others time and direction. The model must store its factors in the
+    default row order.
+    """
     if "log_diagonal" in splats:
         k = splats["log_diagonal"].shape[1] - 3
         L = Triangle("dddtppp" if k == 4 else "dddppp").factor(splats["log_diagonal"], splats)
@@ -64,7 +72,7 @@ def joint_factors(splats: dict[str, Tensor], path: Path) -> tuple[Tensor, int]:
 
 
 def report(found: dict[str, Floats]) -> str:
-    """Format percentiles as a table."""
+    """Return percentiles of condition numbers as a Markdown table."""
     lines = [f"| condition number of | {' | '.join(f'{p:g} %' for p in PERCENTILES)} |",
              "| --- |" + " ---: |" * len(PERCENTILES)]  # fmt: skip
     for name, values in found.items():
@@ -73,7 +81,7 @@ def report(found: dict[str, Floats]) -> str:
 
 
 def draw(found: dict[str, Floats], folder: Path, title: str) -> Path:
-    """Write a histogram to `folder`; return its path."""
+    """Write a histogram of condition numbers to `folder`; return its path."""
 
     def histogram(axes: Axes) -> None:
         most = max(float(values.max()) for values in found.values())

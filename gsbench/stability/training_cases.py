@@ -1,4 +1,4 @@
-"""Define hard trainings: tiny scenes with recipes that drive parameters to extremes."""
+"""Define short trainings of tiny scenes, with settings or data that drive parameters to extreme values."""
 
 import math
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ DRIFT_STEPS, DRIFT_POINTS = 150, 1_000
 
 @dataclass
 class Training:
-    """A training to do: its recipe and its scene."""
+    """A training of the stability audit: its model, settings and scene."""
 
     model: str
     config: Config
@@ -36,7 +36,7 @@ class Training:
 
 
 def compose(model: str, steps: int, *overrides: str) -> Config:
-    """Compose the config of `+exp=mini` with few steps; its scene is not loaded."""
+    """Return the settings of a short training with the experiment `+exp=mini`, without loading its scene."""
     register_schema()
     names = ["+exp=mini", "scene=moving-matte", f"model={model}", f"train.iterations={steps}",
              "train.densify.every=25", *overrides]  # fmt: skip
@@ -50,7 +50,7 @@ def compose(model: str, steps: int, *overrides: str) -> Config:
 
 
 def moving_square(views: int = VIEWS, dtype: torch.dtype = torch.float32) -> Scene:
-    """Make a scene of a white square on black that moves with time, and cameras on a circle around it."""
+    """Make a scene in which a bright square on black moves with time, seen by cameras on a circle."""
     made = []
     for i in range(views):
         moment, angle = i / max(1, views - 1), 2 * math.pi * i / views
@@ -64,7 +64,7 @@ def moving_square(views: int = VIEWS, dtype: torch.dtype = torch.float32) -> Sce
 
 
 def camera_on_circle(angle: float, dtype: torch.dtype) -> Camera:
-    """Make a camera that is four units from the origin and looks at it."""
+    """Make a camera four units from the origin that looks at the origin."""
     c, s = math.cos(angle), math.sin(angle)
     viewmat = torch.eye(4, dtype=dtype)
     viewmat[:3, :3] = torch.tensor([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
@@ -75,7 +75,7 @@ def camera_on_circle(angle: float, dtype: torch.dtype) -> Camera:
 
 
 def faster(config: Config, factor: float) -> Config:
-    """Multiply every learning rate of a recipe by `factor`."""
+    """Multiply all learning rates in the settings by `factor`."""
     for rate in config.model.lr.values():
         rate.start *= factor
         rate.end = rate.end if rate.end is None else rate.end * factor
@@ -84,13 +84,13 @@ def faster(config: Config, factor: float) -> Config:
 
 @case("training", *MODELS, forward=0.0, gradient=math.nan)
 def learning_rates_times_30(g: Generator, severity: float, model: str, steps: int = STEPS) -> Training:  # noqa: ARG001
-    """Multiply every learning rate by 30: parameters run to the ends of their ranges (long audit: 2,000 steps)."""
+    """Multiply all learning rates by 30, so that parameters reach the ends of their ranges."""
     return Training(model, faster(compose(model, steps), 30**severity), moving_square())
 
 
 @case("training", *MODELS, forward=0.0, gradient=math.nan)
 def one_frame(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """Train on one image: depth, time and direction are all free, and the cameras' extent is zero."""
+    """Train on a single image, which determines neither depth, motion nor view dependence; the scene extent is zero."""
     scene = moving_square()
     views = scene.train[: max(1, round(VIEWS * (1 - severity)))]
     return Training(model, compose(model, STEPS), replace(scene, train=views, extent=4.4 * (1 - severity)))
@@ -98,7 +98,7 @@ def one_frame(g: Generator, severity: float, model: str) -> Training:  # noqa: A
 
 @case("training", *MODELS, forward=0.0, gradient=math.nan)
 def all_images_equal(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """Make every image black: opacities sink, and all Gaussians may be pruned."""
+    """Train on black images: opacities decrease, and all Gaussians may be pruned."""
     scene = moving_square()
     views = [replace(view, pixels=view.image * (1 - severity)) for view in scene.train]
     return Training(model, compose(model, STEPS), replace(scene, train=views))
@@ -106,7 +106,7 @@ def all_images_equal(g: Generator, severity: float, model: str) -> Training:  # 
 
 @case("training", *MODELS, forward=0.0, gradient=math.nan)
 def seen_by_no_view(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """Put half of the Gaussians where no camera looks: their gradient is 0, and Adam divides it by sqrt(0) + eps."""
+    """Put half of the Gaussians outside all views: their gradients are 0, and Adam divides them by sqrt(0) + eps."""
     scene = moving_square()
     assert scene.points is not None
     means: Tensor = scene.points.means.clone()
@@ -116,7 +116,7 @@ def seen_by_no_view(g: Generator, severity: float, model: str) -> Training:  # n
 
 @case("training", "7dgs", forward=0.0, gradient=math.nan)
 def reset_into_refinement(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """Reset opacities in the step before AGR starts to act, with its learning rate times 100."""
+    """Reset opacities just before AGR (neural refinement) starts, with 100 times the usual learning rate of AGR."""
     config = compose(model, 2 * STEPS, "train.recipe_iterations=300", "train.densify.start=20",
                      "train.densify.reset_every=100", "train.densify.stop=500",
                      "train.refine_from=100", "train.batch_size=1")  # fmt: skip
@@ -126,7 +126,10 @@ def reset_into_refinement(g: Generator, severity: float, model: str) -> Training
 
 @case("training", "6dgs", "7dgs", forward=0.0, gradient=math.nan)
 def lambda_switched_on(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """Let lambda start to learn in the middle, at 1000 times the usual rate: it goes to 0 or grows without bound."""
+    """Start to train lambda halfway at 1000 times the usual rate, so that lambda goes to 0 or infinity.
+
+    Lambda is the coefficient in the exponent by which opacity decreases with the distance in time or direction.
+    """
     config = compose(model, STEPS, "train.lambda_from=15000")
     config.model.lr["lambda"].start = 1e-3 * 1000**severity
     return Training(model, config, moving_square())
@@ -134,7 +137,7 @@ def lambda_switched_on(g: Generator, severity: float, model: str) -> Training:  
 
 @case("training", "3dgs", forward=0.0, gradient=math.nan)
 def poisoned_photograph(g: Generator, severity: float, model: str) -> Training:  # noqa: ARG001
-    """Make one pixel of an image NaN: it must be refused before step 0, not found in every parameter later."""
+    """Make one pixel of a training image NaN: training must refuse the data before the first step."""
     scene = moving_square()
     scene.train[3].image[2, 5, 1] = math.nan
     return Training(model, compose(model, STEPS), scene, refused=True)
@@ -144,7 +147,10 @@ def poisoned_photograph(g: Generator, severity: float, model: str) -> Training: 
 def single_against_double(
     g: Generator, severity: float, model: str, run_seed: int = 0, steps: int = DRIFT_STEPS,  # noqa: ARG001
 ) -> Training:  # fmt: skip
-    """Train 150 steps of suzanne at 40 x 40 in float32 and float64: rounding decides what splits; errors are dB."""
+    """Train 150 steps of the embedded scene suzanne at 40 x 40 pixels in float32 and in float64, and compare PSNR.
+
+    Rounding may decide which Gaussians are split. The error is the difference in dB.
+    """
     config = compose(model, steps, "scene=suzanne", "scene.downscale=4", f"seed={run_seed}", "train.batch_size=1",
                      f"train.densify.every={steps // 3}")  # fmt: skip
     points = random_points(DRIFT_POINTS, 1.0, generator(run_seed))

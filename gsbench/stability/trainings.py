@@ -1,4 +1,4 @@
-"""Judge trainings: whether they end well and finite, and how far float32 drifts from float64."""
+"""Test whether hard trainings end with finite parameters, and how far float32 training drifts from float64."""
 
 import contextlib
 import io
@@ -24,7 +24,7 @@ SEEDS = (0, 1, 2)  # of the trainings whose drift is measured
 
 
 def judge(case: Case, backend: str, **more: Any) -> Iterator[Cell]:
-    """Yield a result for each model: error 0 for a training that ends as it should, else 1."""
+    """Yield a result for each model: error 0 if the training ends as expected, otherwise error 1."""
     for name in case.subjects:
         training: Training = case(model=name, **more)
         start, end, bad, note = time.perf_counter(), 1.0, 1.0, ""
@@ -44,7 +44,10 @@ def judge(case: Case, backend: str, **more: Any) -> Iterator[Cell]:
 
 
 def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS, **more: Any) -> Iterator[Cell]:
-    """Compare PSNR on test of trainings in float32 with the same in float64 by the reference; the worst seed counts."""
+    """Yield, for each model, the largest difference over seeds between the test PSNR of float32 and float64 training.
+
+    The float64 training uses the torch implementation.
+    """
     for name in case.subjects:
         differences, notes, bad, ms = [], [], 0.0, 0.0
         for seed in seeds:
@@ -63,11 +66,11 @@ def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS, **more: Any) -
 
 
 def fit(training: Training, backend: str) -> Trainer:
-    """Train to the end, in the precision of the scene's images.
+    """Train to the last step, in the floating-point type of the scene's images.
 
     Raises:
-        DivergedError: a number was not finite; the message says where.
-        InputError: the data was refused.
+        DivergedError: a loss or gradient was not finite; the message names the parameter.
+        InputError: the training refused the data.
     """
     config, scene = training.config, training.scene
     config.raster.backend = backend
@@ -88,18 +91,18 @@ def fit(training: Training, backend: str) -> Trainer:
 
 
 def psnr(trainer: Trainer) -> float:
-    """Measure the mean PSNR over the training views, dB."""
+    """Return the mean PSNR over the training views, in dB."""
     return trainer.psnr(trainer.scene.train)
 
 
 def share_not_finite(model: GaussianModel) -> float:
-    """Return the share of all parameters, with networks and lambdas, that are not finite."""
+    """Return the share of the model's parameter values (including network weights) that are NaN or infinite."""
     values = torch.cat([p.detach().flatten() for p in model.parameters()])
     return float((~values.isfinite()).double().mean()) if values.numel() else 0.0
 
 
 def double(scene: Scene) -> Scene:
-    """Convert a scene to float64, except its points, so that both trainings start from the same numbers."""
+    """Convert a scene to float64, except its points, so that float32 and float64 training start from equal values."""
 
     def view(seen: View) -> View:
         camera = Camera(seen.camera.viewmat.double(), seen.camera.K.double(), seen.camera.width, seen.camera.height)

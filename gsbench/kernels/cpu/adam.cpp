@@ -1,4 +1,5 @@
-// Adam on some rows of a parameter, where those that are not drawn are neither read nor written; and on parameters whole.
+// Adam on the selected rows of a parameter, without reading or writing the others; and Adam on several whole
+// parameters.
 #include "../math/adam.h"
 
 #include "isa.h"

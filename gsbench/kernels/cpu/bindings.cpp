@@ -1,4 +1,4 @@
-// The extension of the CPU kernels.
+// The Python extension of the CPU kernels.
 #include "../bindings.h"
 
 #include <nanobind/stl/string.h>

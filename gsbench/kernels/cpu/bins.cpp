@@ -1,4 +1,5 @@
-// Which splats each tile sees, front to back: sort by depth once, then deal out to tiles in that order.
+// Lists the projected Gaussians (splats) of each tile, front to back: sorts them once by depth, then appends each to
+// the lists of its tiles in this order.
 #include "bins.h"
 
 #include <cstring>
@@ -18,14 +19,16 @@ struct Key {
     int32_t entry;
 };
 
-// A splat that has tiles. They are visited in order of depth, which is no order in memory, so they lie close together.
+// A splat that touches tiles. Splats are visited in order of depth, which is random in memory, so the entries are small
+// and adjacent.
 struct Entry {
     int32_t id;
     uint16_t x0, y0, x1, y1;  // its TileRect: no picture is more than FARTHEST / TILE tiles wide
 };
 static_assert(FARTHEST / TILE < 65536);
 
-// Stable radix sort by depth, least digit first; a digit that all keys share is skipped. Returns where the result is.
+// Stable radix sort by depth, least significant digit first; a digit that is equal in all keys is skipped. Returns the
+// address of the result.
 Key* radix_sort(Key* keys, Key* spare, int64_t n) {
     for (int shift = 0; shift < 32; shift += DIGIT_BITS) {
         int64_t starts[DIGITS] = {};
@@ -45,7 +48,7 @@ Key* radix_sort(Key* keys, Key* spare, int64_t n) {
     return keys;
 }
 
-// Calls f(i, rect) for each splat of a camera that has tiles.
+// Calls f(i, rect) for each splat of a camera that touches tiles.
 template <class F>
 void each_rect(const BinArgs& a, int64_t camera, F f) {
     const float *means2d = a.means2d + camera * a.N * 2, *half_sizes = a.half_sizes + camera * a.N * 2;
@@ -65,7 +68,8 @@ void count_tiles(const BinArgs& a, const TileOffsets& out) {
     const int across = tiles_along(a.width), down = tiles_along(a.height);
     const int64_t tiles = static_cast<int64_t>(across) * down;
     Buffer<int64_t> counts(static_cast<size_t>(a.C * tiles));
-    // Four additions a splat, whatever its size: differences first, summed up along both axes after.
+    // Each splat needs four additions for any size: the differences are written first, and summed along both axes
+    // afterwards.
     Buffer<int64_t> corners(static_cast<size_t>(across + 1) * (down + 1));
     for (int64_t c = 0; c < a.C; ++c) {
         corners.zero();
@@ -111,7 +115,8 @@ void fill_tiles(const BinArgs& a, const TileLists& lists) {
         });
         const Key* sorted = radix_sort(keys.data(), spare.data(), n);
         std::memcpy(cursors.data(), begin, sizeof(int32_t) * static_cast<size_t>(tiles));
-        // A task walks all splats but deals to its own rows of tiles, so that every list keeps the depth order.
+        // A task reads all splats but appends them only to its own rows of tiles, so that each list stays in order of
+        // depth.
         const int tasks = a.threads < down ? a.threads : down;
 #pragma omp parallel for num_threads(a.threads) schedule(static, 1)
         for (int task = 0; task < tasks; ++task) {

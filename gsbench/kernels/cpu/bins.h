@@ -1,4 +1,5 @@
-// The rectangle of tiles that a splat can touch: binning and blending must agree on it to the last tile.
+// The rectangle of tiles that a projected Gaussian (splat) may touch; the lists of tiles and the blending use the same
+// one.
 #pragma once
 
 #include <cstdint>
@@ -24,7 +25,8 @@ GSB_HD inline Vec floor(Vec x) {
     return nearest - select(nearest > x, Vec(1.0f), Vec(0.0f));
 }
 
-// The tiles from the first pixel centre at or after low to the last at or before high, half open.
+// Computes the half-open range of tiles from the first pixel centre at or after `low` to the last one at or before
+// `high`.
 GSB_HD inline void tile_span(Vec low, Vec high, int pixels, float* begin, float* end) {
     const Vec bounded_low = clamp(low, Vec(-FARTHEST), Vec(FARTHEST)), bounded_high = clamp(high, Vec(-FARTHEST), Vec(FARTHEST));
     const Vec first = max(-floor(Vec(0.5f) - bounded_low), Vec(0.0f));
@@ -34,7 +36,7 @@ GSB_HD inline void tile_span(Vec low, Vec high, int pixels, float* begin, float*
     select(some, floor(last * (1.0f / TILE)) + 1.0f, Vec(0.0f)).store(end);
 }
 
-// Of the splats i .. i + n - 1; a splat that is not drawn has half sizes of zero, and no tiles.
+// Computes the rectangles of the splats i .. i + n - 1. A culled splat has half sizes of zero and no tiles.
 inline void tile_rects(const float* means2d, const float* half_sizes, int64_t i, int n, int width, int height,
                        TileRect (&out)[LANES]) {
     Vec mean[2], half[2];

@@ -1,4 +1,4 @@
-// Blending splats into pictures, front to back, tile by tile.
+// Blends projected Gaussians (splats) into images, front to back, tile by tile.
 #include "buffer.h"
 #include "isa.h"
 #include "tile.h"
@@ -18,8 +18,8 @@ struct TileJob {
     float* state;  // scratch, see Blocks
 };
 
-// The state of a tile's pixels: block by block the transmittance and D sums of colour, so that no two of them are a
-// multiple of 4 kB apart. A pixel that is done, or outside of the picture, has transmittance <= 0.
+// The state of a tile's pixels: for each block the transmittance and D sums of colour, placed so that no two of them
+// are a multiple of 4 kB apart. A pixel that has ended or is outside of the image has transmittance <= 0.
 struct Blocks {
     float* state;
     int channels;
@@ -29,7 +29,7 @@ struct Blocks {
     static size_t size(int channels) { return static_cast<size_t>(1 + channels) * TILE_PIXELS; }
 };
 
-// One splat, the i-th of its tile, over one block.
+// Blends one splat, the i-th of its tile, into one block.
 template <int D>
 GSB_HD inline void blend_block(const Record& s, const float* color, int channels, const TileGrid& grid, int64_t i,
                                uint32_t b, Blocks blocks, float* stop) {
@@ -47,7 +47,7 @@ GSB_HD inline void blend_block(const Record& s, const float* color, int channels
     store_where(seen & !enough & (before > zero), Vec(static_cast<float>(i)), stop + b * LANES);
 }
 
-// The tile's colours over the background to the picture, and its state for backward.
+// Writes the tile's colours over the background to the image, and its state for the backward pass.
 template <int D>
 void write_picture(const TileJob& job, const TileGrid& grid, Blocks blocks) {
     const BlendArgs& a = job.args;
@@ -73,7 +73,7 @@ void write_picture(const TileJob& job, const TileGrid& grid, Blocks blocks) {
     }
 }
 
-// D channels, 0: as many as the arguments say.
+// Blends one tile with D channels; D = 0 means the number of channels in the arguments.
 template <int D>
 void blend_tile(const TileJob& job) {
     const BlendArgs& a = job.args;
@@ -95,8 +95,8 @@ void blend_tile(const TileJob& job) {
         alive |= static_cast<uint32_t>(any(inside)) << b;
     }
 
-    // Which blocks a splat touches is found for many splats at once, before any is blended: the loop over a list of
-    // (splat, block) has no branch to mispredict.
+    // The blocks that a splat touches are computed for many splats before any is blended. So the loop over (splat,
+    // block) has no branches that could be mispredicted.
     uint32_t work[BATCH * BLOCKS + LANES];
     for (int64_t first = 0; first < count && alive; first += BATCH) {
         const int64_t end = first + BATCH < count ? first + BATCH : count;

@@ -1,7 +1,7 @@
-// The gradient of blending: every tile back to front, then every splat over its tiles.
+// The gradients of blending: each tile back to front, then each projected Gaussian (splat) over its tiles.
 //
-// A pair of tile and splat writes its sums to a place of its own, and each splat adds up its pairs in their order, so
-// that the result has the same bits for any number of threads.
+// The sums of each tile intersection are written to memory of their own, and each splat adds the sums of its
+// intersections in order. So the result has the same bits for any number of threads.
 #include "buffer.h"
 #include "isa.h"
 #include "tile.h"
@@ -28,8 +28,8 @@ struct TileJob {
     float* background;   // [D] of this tile
 };
 
-// The state of a tile's pixels, block by block: the transmittance behind what is still to come, the colour seen there
-// (as its product with the picture's gradient), where blending stopped, and the gradient of D channels.
+// The state of a tile's pixels, block by block: the transmittance, the colour seen behind the next splat (as its dot
+// product with the image gradient), the position at which blending ended, and the gradient of D channels.
 struct Blocks {
     float* state;
     int channels;
@@ -41,7 +41,7 @@ struct Blocks {
     static size_t size(int channels) { return static_cast<size_t>(3 + channels) * TILE_PIXELS; }
 };
 
-// The state behind all splats, where the background is seen; and the background's gradient.
+// Loads the state behind all splats, where the background is seen, and computes the background's gradient.
 template <int D>
 void load_state(const TileJob& job, const TileGrid& grid, Blocks blocks) {
     const BlendArgs& a = job.args;
@@ -87,7 +87,8 @@ void store_sums(const FalloffMoments<Vec>& m, const Vec* color, int channels, fl
     }
 }
 
-// One splat, the i-th of its tile, over the blocks it touches: its sums; the pixels' state is then that before it.
+// Computes the sums of one splat, the i-th of its tile, over the blocks that it touches, and sets the pixels' state to
+// that in front of this splat.
 template <int D>
 GSB_HD inline void backward_splat(const Record& s, const float* c, int channels, const TileGrid& grid, int64_t i,
                                   uint32_t touched, Blocks blocks, FalloffMoments<Vec>& moments, Vec* color) {
@@ -109,7 +110,7 @@ GSB_HD inline void backward_splat(const Record& s, const float* c, int channels,
             g += g_color * c[k];
             color[k] += weight * g_color;
         }
-        // dC/dalpha = T (c - what is seen behind the splat); seen behind the next one nearer: a mix of the two.
+        // dC/dalpha = T (c - the colour behind the splat). The colour behind the next nearer splat mixes both by alpha.
         const Vec back = Vec::load(behind), difference = g - back;
         (back + alpha * difference).store(behind);
         moments.add(f, select(f.free <= Vec(ALPHA_MAX), weight * difference, zero));
@@ -156,7 +157,8 @@ void backward_tile(const TileJob& job) {
     }
 }
 
-// One splat's gradient from its pairs [begin, end); without any it has no record.
+// Computes one splat's gradient from the sums of its tile intersections [begin, end); a splat without any has no
+// record.
 void reduce_splat(const BlendArgs& a, const BlendGrads& out, int64_t camera, int64_t i, const Record& s, int64_t begin,
                   int64_t end, const float* pair_sums, const uint8_t* pair_seen, float* color) {
     const int width = GEOMETRY + a.D;

@@ -1,4 +1,5 @@
-// Scratch memory of a thread, aligned to cache lines; std::vector would be shared between the instruction sets by the linker.
+// Scratch memory of a thread, aligned to cache lines. std::vector is not used, because the linker would merge its code
+// across instruction sets.
 #pragma once
 
 #include <cstddef>

@@ -1,8 +1,10 @@
-// Colours of Gaussians, sixteen at a time; the mathematics is math/harmonics.h. What cannot be drawn costs nothing.
+// Colours of Gaussians, sixteen at a time; math/harmonics.h has the formulas. Gaussians with an opacity below 1/255 are
+// skipped.
 //
-// A 4D Gaussian has 144 coefficients and is drawn for part of the time, so memory is what counts here: those with
-// something to do are packed first, and the rows of all others are neither read nor worked on. Where rows have orders,
-// the packed are sorted by order: a vector is of one, and no coefficient above it is read.
+// A 4DGS Gaussian has 144 coefficients and is visible for part of the time, so the speed depends on memory: the
+// Gaussians that need a colour are packed first, and the rows of the others are not read. If Gaussians have different
+// orders (SH degree and number of frequencies), they are sorted by order, so that a vector has one order and no
+// coefficient above it is read.
 #include "../math/projection.h"
 #include "../math/harmonics.h"
 
@@ -16,7 +18,7 @@ namespace {
 constexpr int64_t CHUNK = 512;  // Gaussians a task
 constexpr float TURN = 6.28318531f;
 
-// The numbers, within a chunk, of those of its Gaussians that have something to do.
+// The indices, within a chunk, of the Gaussians that need a colour or a gradient.
 struct Picked {
     int count = 0;
     uint32_t which[CHUNK + LANES];  // append_bits writes up to a vector past the end
@@ -41,7 +43,7 @@ struct Picked {
     }
 };
 
-// Sixteen picked rows, or what is left of them; lanes without one read zero.
+// Sixteen picked rows, or the remaining ones; lanes without a row read zero.
 struct Rows {
     const uint32_t* which;
     int left, count, stride;  // left: these rows and those that are picked after them
@@ -55,7 +57,8 @@ struct Rows {
             all[k] = ones[k] * stride;
         }
     }
-    // Asks memory for the first floats of the row sixteen further on: picked rows are apart, so nothing else would.
+    // Prefetches the first floats of the row sixteen rows further on; picked rows are not adjacent, so the processor
+    // would not.
     template <bool WRITE>
     GSB_HD void prefetch(const float* p, int width, int i) const {
         if (!width || i + LANES >= left || which[i + LANES] == which[i + LANES - 1] + 1) return;
@@ -73,8 +76,8 @@ struct Rows {
     }
 };
 
-// A row of shN is read in pieces as it lies in memory: up to five coefficients of one wave, of three channels each. So a
-// lane's channel is its number modulo three in every piece, and only sums and weights are turned from rows to columns.
+// A row of shN is read in pieces as it is stored: up to five coefficients of one frequency, with three channels each.
+// So the channel of a lane is its index modulo three in every piece, and only sums and weights have to be transposed.
 constexpr int PIECE_BASES = 5;
 
 struct Piece {
@@ -88,7 +91,7 @@ struct Pieces {
     int count = 0, width = 0;  // width: floats of a row up to the last of them
     Piece piece[MAX_WAVES * ((MAX_BASIS + PIECE_BASES - 1) / PIECE_BASES)];
 
-    // The constant's coefficients are kept in an array of their own, sh0.
+    // The constant coefficients are stored in a separate array, sh0.
     GSB_HD explicit Pieces(const ColorArgs& a) {
         const int used = (a.degree + 1) * (a.degree + 1);
         for (int wave = 0; wave < a.waves; ++wave) {
@@ -114,7 +117,7 @@ alignas(64) constexpr int32_t CHANNELS[LANES] = {0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1
 alignas(64) constexpr int32_t NEXT[LANES] = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 15};
 alignas(64) constexpr int32_t AFTER_NEXT[LANES] = {2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 15, 15};
 
-// What the colours of sixteen Gaussians are made of.
+// Everything that the colours of sixteen Gaussians need except coefficients.
 struct Shades {
     Unit<Vec> unit;
     Vec Y[LANES];                                                   // a Gaussian's harmonics in each vector
@@ -133,7 +136,7 @@ struct Shades {
         }
     }
 
-    // Of each channel before it is clamped.
+    // Computes the colour channels before they are clamped.
     GSB_HD void sum(const ColorArgs& a, const Pieces& pieces, const Rows& rows, Vec (&color)[3]) const {
         Vec sums[LANES];
         for (int i = 0; i < rows.count; ++i) {
@@ -164,7 +167,7 @@ struct Shades {
 
 GSB_HD inline int stride_of(const ColorArgs& a) { return (a.waves * a.bases - 1) * 3; }
 
-// The same Gaussians' arguments, from the one at `first` on, as many as a task has.
+// Returns the arguments of one task: CHUNK Gaussians from `first` on, or those that remain.
 GSB_HD inline ColorArgs chunk_of(ColorArgs a, int64_t first) {
     a.N = a.N - first < CHUNK ? a.N - first : CHUNK;
     a.sh0 += first * 3;
@@ -197,7 +200,7 @@ GSB_HD inline ColorArgs at_order(ColorArgs a, ColorOrder order) {
     return a;
 }
 
-// Where the rows of each order begin among those picked, once they are sorted by order.
+// The picked rows sorted by order (SH degree and number of frequencies), and the first row of each order.
 struct Sorted {
     static constexpr int ORDERS = 4 * MAX_WAVES;
     int begin[ORDERS + 1] = {};
@@ -231,7 +234,7 @@ struct Sorted {
     }
 };
 
-// Calls f(arguments, picked) for the rows of each order, whose arguments have its degree and waves.
+// Calls f(arguments, picked) for the rows of each order; the arguments have the degree and frequencies of this order.
 template <class F>
 GSB_HD inline void each_order(const ColorArgs& a, Picked& picked, F f) {
     const Sorted sorted(a, picked);
@@ -241,7 +244,7 @@ GSB_HD inline void each_order(const ColorArgs& a, Picked& picked, F f) {
     }
 }
 
-// Not inlined: what the compiler then knows of an order's range would change what it rounds.
+// Not inlined: otherwise the compiler would use the known range of the order, which changes the rounding.
 __attribute__((noinline)) void show_rows(const ColorArgs& a, const uint32_t* which, int count, int stride, float* out) {
     const Pieces pieces(a);
     for (int k = 0; k < count; k += LANES) {
@@ -258,7 +261,7 @@ GSB_HD inline void backward_rows(const ColorArgs& a, const Pieces& pieces, const
     const Vec zero(0.0f);
     const Shades s(a, rows);
     Vec g_Y[LANES], g_time[LANES];  // of a Gaussian in each vector
-    // What is added is rounded first, so that it does not depend on which views share a sum.
+    // The added values are rounded first, so that the result does not depend on which views share a sum.
     const auto add = [](Vec x, float* p, int n) { store_first(load_some(p, n) + rounded(x), p, n); };
     for (int i = 0; i < rows.count; ++i) {
         const Vec color = load_some(colors + rows.threes[i], 3);

@@ -1,4 +1,4 @@
-// Which instruction sets this build has, and the best that this machine runs.
+// The instruction sets for which the kernels are built, and the best one that this processor supports.
 #pragma once
 
 #include <string>
@@ -8,10 +8,10 @@
 
 namespace gsb {
 
-// Names that are built in and run here, the best last.
+// Returns the instruction sets that are built and that this processor supports, the best last.
 std::vector<std::string> instruction_sets();
 
-// The kernels of one of those; std::invalid_argument for any other name.
+// Returns the kernels of one of these instruction sets; throws std::invalid_argument for any other name.
 const Kernels& kernels_of(const std::string& isa);
 
 }  // namespace gsb

@@ -1,4 +1,4 @@
-// The kernels of one instruction set, which its own namespace keeps apart from the others'.
+// Declares the kernels of one instruction set, in a namespace of its own.
 #pragma once
 
 #include "../math/scalar.h"

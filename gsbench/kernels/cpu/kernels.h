@@ -1,4 +1,5 @@
-// The CPU kernels: those of arguments.h and what only the CPU has, and the table that each instruction set fills.
+// The CPU kernels: those of arguments.h, kernels that exist only on the CPU, and the table of kernels of each
+// instruction set.
 #pragma once
 
 #include <cstdint>
@@ -29,7 +30,7 @@ struct TileLists {
 };
 GSB_FIELDS(TileLists, OUTPUTS, offsets, ids)
 
-// Adam on all numbers of several parameters; a GPU has torch's own.
+// Adam on several whole parameters; on a GPU torch's own Adam does this.
 struct AdamAllArgs {
     int count;
     int64_t numbers[MAX_ADAM];

@@ -1,4 +1,4 @@
-// Sixteen sliced Gaussians to the arrays of a slice, and their gradients from those given.
+// Stores sixteen conditional 3D Gaussians to arrays, and loads their gradients.
 #pragma once
 
 #include "../math/triangular.h"
@@ -20,7 +20,7 @@ GSB_HD inline void load(const ObservationGrads& given, int64_t i, int n, Observe
     out.opacity = load_first(given.opacities + i, n);
 }
 
-// Whether a view shows none of them.
+// Returns whether all given gradients of these Gaussians are zero, for instance because no pixel shows them.
 GSB_HD inline bool is_zero(const ObservationGrads& given, int64_t i, int n) {
     return all_zero(given.opacities, 1, i, n) && all_zero(given.means, 3, i, n) && all_zero(given.factors, 9, i, n);
 }

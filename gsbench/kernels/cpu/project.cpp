@@ -1,4 +1,4 @@
-// Gaussians to splats, sixteen at a time, for every camera; the mathematics is math/projection.h.
+// Projects Gaussians to the image planes of all cameras, sixteen at a time; math/projection.h has the formulas.
 #include "../math/projection.h"
 
 #include "buffer.h"

@@ -1,8 +1,9 @@
-// AGR (7DGS, section 4.3): four perceptrons of two layers move every Gaussian, a block of Gaussians at a time.
+// AGR, the neural refinement of 7DGS (section 4.3): a few two-layer MLPs change the parameters of every Gaussian, a
+// block of Gaussians at a time.
 //
-// Gaussians lie along the vectors, so each layer is a product of a small matrix with a tall one that stays in cache:
-// hidden layers are never written to memory, and backward computes them again. Blocks are packed: at this time many
-// Gaussians may stay where they are, and backward many are not seen in a view.
+// Gaussians lie along the SIMD vectors, so each layer is a product of a small matrix with a tall one that stays in
+// cache. Hidden layers are never written to memory; the backward pass computes them again. Blocks are packed, because
+// many Gaussians may not change at a given time, and many are not seen in a view.
 #include "../math/awake.h"
 #include "buffer.h"
 #include "isa.h"
@@ -15,15 +16,15 @@ namespace {
 constexpr int BLOCK = 128;             // Gaussians
 constexpr int64_t TASK = 8 * BLOCK;    // of the forward pass
 constexpr int64_t CHUNK = 32 * BLOCK;  // a task of the backward pass; the weights' gradients are summed by chunks
-// Tiles of `product` and `outer`: as many sums as registers hold.
+// The tile sizes of `product` and `outer`: as many sums as there are registers.
 #if defined(__AVX512F__)
 constexpr int TILE_ROWS = 8, TILE_SUMS = 16, OUTER_ROWS = 4;
 #else
 constexpr int TILE_ROWS = 4, TILE_SUMS = 4, OUTER_ROWS = 1;
 #endif
 
-// out = finish((bias | 0 | out) + W X, place) at `at` and on, for R rows of W and V vectors of Gaussians. Rows of X and
-// out are BLOCK apart.
+// Computes finish(start + W X) for R rows of W and V vectors of Gaussians, in which `start` is the bias, zero or `out`.
+// Rows of X and out are BLOCK floats apart.
 template <int R, int V, class Finish>
 GSB_HD inline void product_tile(const float* W, int inner, const float* bias, bool add, const float* X, float* out,
                                 int at, Finish finish) {
@@ -49,15 +50,15 @@ GSB_HD inline void product_tile(const float* W, int inner, const float* bias, bo
     }
 }
 
-// The vectors of Gaussians in a tile of R rows, a power of two.
+// Returns the number of vectors of Gaussians in a tile of R rows, a power of two.
 constexpr int vectors_beside(int R) {
     int V = 1;
     while (2 * V * R <= TILE_SUMS && 2 * V * LANES <= BLOCK) V *= 2;
     return V;
 }
 
-// Rows of W [rows, inner] from `first` on. Those left over from whole tiles are a tile of their own, of more Gaussians:
-// a sum waits for the one before it, and meanwhile the others go on.
+// Computes the product for the rows of W [rows, inner] from `first` on. Rows that do not fill a tile get a tile with
+// fewer rows and more Gaussians: each sum waits for the previous addition, and the other sums continue in the meantime.
 template <int R = TILE_ROWS, class Finish>
 void product(const float* W, int rows, int inner, const float* bias, bool add, const float* X, float* out,
              Finish finish, int first = 0) {
@@ -73,7 +74,7 @@ void product(const float* W, int rows, int inner, const float* bias, bool add, c
     }
 }
 
-// out[r][c] += sum over the block of A[r] B[c], for R rows of A and four of B.
+// Computes out[r][c] += the sum over the block of A[r] B[c], for R rows of A and four rows of B.
 template <int R>
 GSB_HD inline void outer_tile(const float* A, const float* B, int stride, float* out) {
     Vec sums[R][4];
@@ -95,7 +96,7 @@ GSB_HD inline void outer_tile(const float* A, const float* B, int stride, float*
     }
 }
 
-// `columns` is a multiple of four. Rows of out are `stride` apart.
+// Computes the same for all rows; `columns` is a multiple of four. Rows of out are `stride` floats apart.
 template <int R = OUTER_ROWS>
 void outer(const float* A, int rows, const float* B, int columns, float* out, int stride, int first = 0) {
     for (; first + R <= rows; first += R) {
@@ -122,18 +123,18 @@ void transpose(const float* A, int rows, int columns, float* out) {
     }
 }
 
-// Up to BLOCK Gaussians: those `rows` after `first`.
+// A block of up to BLOCK Gaussians, given as `rows` relative to `first`.
 struct Block {
     int64_t first;
     const int32_t* rows;
     int count;
 
     GSB_HD int64_t at(int i) const { return first + rows[i]; }
-    // Whether sixteen rows from the i-th on follow one another.
+    // Returns whether the sixteen rows from the i-th on are adjacent.
     GSB_HD bool is_whole(int i) const { return i + LANES <= count && rows[i + LANES - 1] - rows[i] == LANES - 1; }
 };
 
-// Calls f<W>() for the width of an array; the widths that models have are known to the compiler.
+// Calls f<W>() for the width of an array; the compiler knows the widths that the models have.
 template <class F>
 GSB_HD inline void with_width(int width, F f) {
     switch (width) {
@@ -148,7 +149,7 @@ GSB_HD inline void with_width(int width, F f) {
     }
 }
 
-// Calls whole<W>(i) for sixteen rows of a block that follow one another from its i-th on, and one(i) for each other row.
+// Calls whole<W>(i) for each sixteen adjacent rows of a block, from its i-th on, and one(i) for each other row.
 template <class Whole, class One>
 GSB_HD inline void each_row(const Block& block, int width, Whole whole, One one) {
     with_width(width, [&]<int W>() {
@@ -164,7 +165,8 @@ GSB_HD inline void each_row(const Block& block, int width, Whole whole, One one)
     });
 }
 
-// The block's rows of an array [N, width] as `width` rows of BLOCK; zero past the block's end.
+// Loads the block's rows of an array [N, width], transposed: `width` rows of BLOCK floats, with zeros after the block's
+// end.
 void load_block(const Block& block, const float* array, int width, float* out) {
     for (int k = 0; k < width; ++k) {
         for (int i = block.count; i < BLOCK; ++i) out[k * BLOCK + i] = 0.0f;
@@ -180,7 +182,7 @@ void load_block(const Block& block, const float* array, int width, float* out) {
     });
 }
 
-// What load_block reads, plus the `width` rows at `moved`, to another array.
+// Stores the block's rows of `array` plus the `width` rows at `moved` to another array.
 void store_block(const Block& block, const float* moved, const float* array, int width, float* out) {
     const auto whole = [&]<int W>(int i) {
         Vec columns[W];
@@ -194,7 +196,7 @@ void store_block(const Block& block, const float* moved, const float* array, int
     });
 }
 
-// The first `count` of several arrays as rows of the block, one array below the other.
+// Loads the block's rows of the first `count` arrays, one array below the other.
 void load_blocks(const RefineArgs& a, const Block& block, const float* const* arrays, int count, float* out) {
     for (int i = 0; i < count; ++i) {
         load_block(block, arrays[i], a.value_widths[i], out);
@@ -202,7 +204,7 @@ void load_blocks(const RefineArgs& a, const Block& block, const float* const* ar
     }
 }
 
-// What load_blocks reads, plus `moved`, to other arrays.
+// Stores the block's rows of the first `count` arrays plus `moved` to other arrays.
 void store_blocks(const RefineArgs& a, const Block& block, const float* moved, const float* const* arrays, int count,
                   float* const* out) {
     for (int i = 0; i < count; ++i) {
@@ -211,7 +213,7 @@ void store_blocks(const RefineArgs& a, const Block& block, const float* moved, c
     }
 }
 
-// Row i of the first `count` of several arrays, which stays as it is.
+// Copies row i of the first `count` arrays, which AGR does not change.
 void copy_row(const RefineArgs& a, const float* const* arrays, int count, float* const* out, int64_t i) {
     for (int k = 0; k < count; ++k) {
         const int width = a.value_widths[k];
@@ -219,7 +221,7 @@ void copy_row(const RefineArgs& a, const float* const* arrays, int count, float*
     }
 }
 
-// The first `count` of several arrays, of the rows that stay where they are.
+// Copies the rows of the first `count` arrays that AGR never changes.
 void copy_rest(const RefineArgs& a, const float* const* arrays, int count, float* const* out) {
     for (int i = 0; i < count; ++i) copy_rows(arrays[i], out[i], a.value_widths[i], a.refined, a.N);
 }
@@ -231,7 +233,7 @@ void hidden_layer(const RefineArgs& a, int network, const float* X, float* H) {
             false, X, H, [](Vec x, int) { return max(x, Vec(0.0f)); });
 }
 
-// How many floats the gradients of all weights are, and where each part begins.
+// The layout of the gradients of all weights: the number of floats, and the offset of each part.
 struct WeightLayout {
     int weight_in, bias_in, weight_out, bias_out, size;
 
@@ -264,7 +266,7 @@ void backward_block(const RefineArgs& a, const Block& block, const WeightLayout&
                     const float* weight_out_T, const float* const* grads, float* const* g_features, float* g_weights,
                     const Scratch& s) {
     load_blocks(a, block, a.values, a.networks - 1, s.X);
-    // A last feature that is one: what its weights would be is the bias, whose gradient follows weight_in's.
+    // The last feature is one: its weights are the biases, whose gradient follows that of weight_in.
     for (int v = 0; v < BLOCK; v += LANES) Vec(1.0f).store(s.X + a.features * BLOCK + v);
     load_blocks(a, block, grads, a.arrays, s.G);
     int output = 0;
@@ -296,8 +298,8 @@ bool has_gradient(const RefineArgs& a, const float* const* grads, int64_t i) {
     return false;
 }
 
-// Writes the rows of [first, last) that are moved and have a gradient, less `first`, and returns their number; the
-// features' gradient of the others is what is given.
+// Writes the rows of [first, last) that AGR changes and that have a gradient, relative to `first`, and returns their
+// number. For the other rows the given gradient is copied to the features' gradient.
 int rows_with_gradient(const RefineArgs& a, const float* const* grads, int64_t first, int64_t last,
                        float* const* g_features, int32_t* rows) {
     int count = 0;
@@ -323,7 +325,8 @@ void refine_block(const RefineArgs& a, const Block& block, float* const* out, co
     store_blocks(a, block, s.G, a.values, a.arrays, out);
 }
 
-// Writes the rows of [first, last) that are moved, less `first`, and returns their number; the others are copied.
+// Writes the rows of [first, last) that AGR changes, relative to `first`, and returns their number; the others are
+// copied.
 int rows_awake(const RefineArgs& a, int64_t first, int64_t last, float* const* out, int32_t* rows) {
     int count = 0;
     for (int64_t i = first; i < last; ++i) {

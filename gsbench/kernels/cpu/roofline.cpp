@@ -1,4 +1,4 @@
-// What one thread of this machine can do at most, measured with the same vectors that the kernels use.
+// Measures the peak performance of one thread on this machine, with the same SIMD vectors that the kernels use.
 #include "../math/blending.h"
 
 #include "isa.h"
@@ -7,7 +7,7 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-// `rounds` of ten independent multiply-adds on vectors: 20 * LANES * rounds floating point operations.
+// Runs `rounds` rounds of ten independent vector multiply-adds: 20 * LANES * rounds floating-point operations.
 float roofline_flops(int64_t rounds) {
     constexpr int CHAINS = 10;  // two a cycle of four cycles' latency need eight
     Vec sums[CHAINS];
@@ -21,12 +21,12 @@ float roofline_flops(int64_t rounds) {
     return sum(total);
 }
 
-// a = b + s c, 12 bytes an element to and from memory.
+// Computes a = b + s c, which moves 12 bytes per element to and from memory.
 void roofline_triad(float* a, const float* b, const float* c, int64_t n) {
     for (int64_t i = 0; i + LANES <= n; i += LANES) (Vec::load(b + i) + Vec::load(c + i) * 0.5f).store(a + i);
 }
 
-// The bare inner loop of blending, all in registers: LANES * rounds alphas, each blended into three channels.
+// Runs the inner loop of blending in registers: LANES * rounds alphas, each blended into three channels.
 float roofline_alphas(int64_t rounds) {
     constexpr int CHAINS = 4;
     Vec T[CHAINS], color[CHAINS][3], x = Vec(0.3f);

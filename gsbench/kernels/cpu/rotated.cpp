@@ -1,5 +1,5 @@
-// Slices of 4D Gaussians with rotated factors, sixteen at a time; the mathematics is math/rotated.h; that of
-// static rows is math/static.h.
+// Conditional 3D Gaussians of 4DGS Gaussians, sixteen at a time. math/rotated.h has the formulas, and math/static.h
+// those of static Gaussians.
 #include "../math/rotated.h"
 #include "../math/static.h"
 
@@ -13,7 +13,8 @@ namespace {
 
 constexpr int64_t CHUNK = 512;  // Gaussians a task; the gradient of lambda is summed by chunks
 
-// Times are as long as the clock says: a rotation of space and time needs one unit for both.
+// Times are multiplied by `clock` (world units per sequence length), because a rotation of space and time needs one
+// unit.
 GSB_HD inline void load(const RotatedArgs& a, int64_t i, int n, RotatedParameters<Vec>& p) {
     gather_row(a.means, i, n, p.mean);
     p.time = load_first(a.times + i, n) * *a.clock;

@@ -1,4 +1,4 @@
-// Sixteen rows of a row-major array as columns of vectors, and back; rows that are copied, or zero.
+// Loads sixteen rows of a row-major array as columns of SIMD vectors, stores them, and copies or clears rows.
 #pragma once
 
 #include <cstddef>
@@ -11,12 +11,12 @@ inline namespace GSB_ISA {
 
 alignas(64) constexpr float INDEX[LANES] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
-// How many of the rows i, i + 1, .. of `size` a vector holds.
+// Returns how many of the rows from i on, in an array of `size` rows, a SIMD vector holds.
 GSB_HD inline int lanes_from(int64_t i, int64_t size) { return static_cast<int>(size - i < LANES ? size - i : LANES); }
 
-// Sixteen rows of `width` floats from row i on, of which there are n: where they lie, or copied, with zeros for the others.
-// One question for an array, not one for each lane of each column: those took the compiler half a minute, and AVX2 up to
-// half of a forward pass.
+// Returns the address of sixteen rows of `width` floats from row i on. If the array has only n of them, they are copied
+// to `copy` and followed by zeros. The number is tested once per array and not for each lane of each column, which
+// would take half a minute to compile, and with AVX2 up to half of a forward pass.
 GSB_HD inline const float* sixteen_rows(const float* rows, int width, int64_t i, int n, float* copy) {
     const float* first = rows + i * width;
     if (n == LANES) return first;
@@ -25,7 +25,8 @@ GSB_HD inline const float* sixteen_rows(const float* rows, int width, int64_t i,
     return copy;
 }
 
-// Writes the first n of sixteen rows that are not where they belong.
+// Copies the first n of sixteen rows from `copy` to the array. If n is sixteen, they were written to the array
+// directly.
 GSB_HD inline void keep_rows(const float* copy, int width, float* rows, int64_t i, int n) {
     if (n < LANES) __builtin_memcpy(rows + i * width, copy, sizeof(float) * static_cast<size_t>(n * width));
 }
@@ -43,7 +44,8 @@ GSB_HD inline void scatter_row(const Vec (&x)[W], float* rows, int64_t i, int n)
     keep_rows(copy, W, rows, i, n);
 }
 
-// The same, added to what is there. What is added is rounded first, so that it does not depend on which views share a sum.
+// Adds instead of storing. The added values are rounded first, so that the result does not depend on which views share
+// a sum.
 template <int W>
 GSB_HD inline void add_row(const Vec (&x)[W], float* rows, int64_t i, int n) {
     Vec sum[W];
@@ -67,7 +69,7 @@ GSB_HD inline void scatter_matrix(const Vec (&x)[H][W], float* rows, int64_t i, 
     scatter_row(flat, rows, i, n);
 }
 
-// Columns `first` to first + W of rows of any width.
+// Loads columns `first` to first + W - 1 of rows of any width.
 template <int W>
 GSB_HD inline void gather_columns(const float* rows, int width, int first, int64_t i, int n, Vec (&out)[W]) {
     GSB_UNROLL for (int k = 0; k < W; ++k) out[k] = gather(rows + i * width + first + k, width, n);
@@ -80,7 +82,8 @@ GSB_HD inline void add_columns(const Vec (&x)[W], float* rows, int width, int fi
     GSB_UNROLL for (int k = 0; k < W; ++k) scatter(sum[k] + rounded(x[k]), rows + i * width + first + k, width, n);
 }
 
-// Whether rows i to i + n - 1 of `width` floats hold nothing but zeros: where no gradient comes in, none goes out.
+// Returns whether rows i to i + n - 1 of `width` floats are all zero; if a given gradient is zero, the result is zero
+// too.
 GSB_HD inline bool all_zero(const float* rows, int width, int64_t i, int n) {
     const float* p = rows + i * width;
     const int size = n * width;
@@ -91,7 +94,7 @@ GSB_HD inline bool all_zero(const float* rows, int width, int64_t i, int n) {
     return true;
 }
 
-// Rows [first, end). Arrays of no rows have no address, which memcpy and memset do not take.
+// Copies the rows [first, end). An array without rows has no address, which memcpy and memset do not accept.
 GSB_HD inline void copy_rows(const float* from, float* to, int width, int64_t first, int64_t end) {
     if (first == end) return;
     __builtin_memcpy(to + first * width, from + first * width, sizeof(float) * static_cast<size_t>((end - first) * width));

@@ -1,4 +1,4 @@
-// Sixteen floats at once on any CPU: one AVX-512 register, two of AVX, or four of SSE or NEON.
+// A SIMD vector of sixteen floats on any CPU: one AVX-512 register, two AVX registers, or four SSE or NEON registers.
 #pragma once
 
 #include <cstdint>
@@ -11,7 +11,7 @@ inline namespace GSB_ISA {
 constexpr int LANES = 16;
 constexpr uint32_t ALL_LANES = 0xffff;
 
-// The polynomial of least relative error (1.5e-7 in float) for 2^r, 0 <= r < 1, exact at 0.
+// The polynomial with the smallest relative error (1.5e-7 in float) for 2^r with 0 <= r < 1, exact at 0.
 template <class T>
 GSB_HD inline T exp2_fraction(T r) {
     T y = r * 0.00186712993f + 0.00901703065f;
@@ -39,7 +39,8 @@ GSB_HD inline Vec& operator-=(Vec& a, Vec b) { return a = a - b; }
 GSB_HD inline Mask operator>(Vec a, Vec b) { return b < a; }
 GSB_HD inline Mask operator>=(Vec a, Vec b) { return b <= a; }
 
-// To the nearest integer, where |x| < 2^22: beyond the point where a float has no fraction, adding rounds.
+// Rounds to the nearest integer, for |x| < 2^22. The sum is so large that a float has no fraction, so the addition
+// rounds.
 GSB_HD inline Vec round(Vec x) {
     constexpr float no_fraction = 12582912.0f;  // 1.5 * 2^23
     return (x + no_fraction) - no_fraction;
@@ -47,7 +48,8 @@ GSB_HD inline Vec round(Vec x) {
 
 GSB_HD inline Vec load_first(const float* p, int n) { return n == LANES ? Vec::load(p) : gather(p, 1, n); }
 
-// log2 by the series of atanh on mantissas in [0.75, 1.5): relative error 1e-7 where the result is not near zero.
+// Computes log2 by the series of atanh on mantissas in [0.75, 1.5), with relative error 1e-7 unless the result is near
+// zero.
 GSB_HD inline Vec log2(Vec x) {
     Vec m, e;
     split(x, m, e);
@@ -59,7 +61,7 @@ GSB_HD inline Vec log2(Vec x) {
     return e + s * y * (2.0f * LOG2_E);
 }
 
-// The sum of the lanes, always in the same order.
+// Returns the sum of the lanes, always in the same order.
 GSB_HD inline float sum(Vec x) {
     alignas(64) float lane[LANES];
     x.store(lane);

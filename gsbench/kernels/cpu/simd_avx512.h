@@ -1,4 +1,4 @@
-// Sixteen floats as one AVX-512 register.
+// The SIMD vector of sixteen floats as one AVX-512 register.
 #pragma once
 
 #include <immintrin.h>
@@ -36,7 +36,7 @@ GSB_HD inline Mask operator!(Mask a) { return {static_cast<__mmask16>(~a.m)}; }
 GSB_HD inline bool any(Mask a) { return a.m != 0; }
 GSB_HD inline uint32_t bits(Mask a) { return a.m; }
 GSB_HD inline Vec select(Mask m, Vec yes, Vec no) { return _mm512_mask_mov_ps(no.v, m.m, yes.v); }
-// -|x| where m, x elsewhere.
+// Returns -|x| in lanes of the mask m, and x in the others.
 GSB_HD inline Vec negative_where(Mask m, Vec x) {
     const __m512i bits = _mm512_castps_si512(x.v);
     return _mm512_castsi512_ps(_mm512_mask_or_epi32(bits, m.m, bits, _mm512_set1_epi32(INT32_MIN)));
@@ -62,7 +62,8 @@ GSB_HD inline void split(Vec x, Vec& mantissa, Vec& exponent) {
     exponent = _mm512_getexp_ps((x / mantissa).v);
 }
 
-// p[by] .. p[by + 15] of an aligned p, |by| < 16, from aligned loads: one that crosses cache lines counts twice.
+// Loads p[by] .. p[by + 15] with |by| < 16 by aligned loads from an aligned p, because a load that crosses cache lines
+// takes twice as long.
 template <int by>
 GSB_HD inline Vec load_beside(const float* p) {
     const __m512i low = _mm512_load_si512(by < 0 ? p - LANES : p), high = _mm512_load_si512(by < 0 ? p : p + LANES);
@@ -71,8 +72,8 @@ GSB_HD inline Vec load_beside(const float* p) {
 
 GSB_HD inline __mmask16 first(int n) { return static_cast<__mmask16>((1u << n) - 1); }
 
-// Floats at(0) .. at(15) as one register: the gathers and scatters of AVX-512 take twice as long as moving each float
-// (Zen 4: 81 and 124 operations of the processor).
+// Loads the floats at(0) .. at(15) one by one, because gathers and scatters of AVX-512 take twice as long (on Zen 4, 81
+// and 124 operations of the processor).
 template <class At>
 GSB_HD inline Vec collect(At at) {
     const __m256 low = _mm256_set_m128(_mm_setr_ps(at(4), at(5), at(6), at(7)), _mm_setr_ps(at(0), at(1), at(2), at(3)));
@@ -81,7 +82,7 @@ GSB_HD inline Vec collect(At at) {
     return _mm512_insertf32x8(_mm512_castps256_ps512(low), high, 1);
 }
 
-// p[lane * stride] of the first n lanes, zero in the others; and back.
+// Loads p[lane * stride] to the first n lanes, and zero to the others; `scatter` stores them.
 GSB_HD inline Vec gather(const float* p, int stride, int n = LANES) {
     if (n == LANES) return collect([&](int i) { return p[i * stride]; });
     return collect([&](int i) { return i < n ? p[i * stride] : 0.0f; });
@@ -96,7 +97,7 @@ GSB_HD inline void scatter(Vec x, float* p, int stride, int n = LANES) {
     }
 }
 
-// Sixteen offsets, for reading and writing p[offset] of the lanes whose bit is set.
+// Sixteen offsets for reading and writing p[offset] in the lanes whose mask bit is set.
 struct Places {
     __m512i offset;
 
@@ -109,7 +110,7 @@ GSB_HD inline void scatter_at(Vec x, float* p, Places places, uint32_t bits) {
     _mm512_mask_i32scatter_ps(p, static_cast<__mmask16>(bits), places.offset, x.v, 4);
 }
 
-// Four rows of four pixels of three channels, `stride` floats apart.
+// Stores four rows of four pixels with three channels; the rows are `stride` floats apart.
 GSB_HD inline void store_rgb(Vec r, Vec g, Vec b, float* out, int64_t stride) {
     for (int row = 0; row < 4; ++row) {
         const __m512i at = _mm512_set1_epi32(4 * row);
@@ -131,7 +132,7 @@ GSB_HD inline void load_rgb(const float* in, int64_t stride, Vec (&channels)[3])
     }
 }
 
-// p[offsets[lane]] of the first n lanes, zero in the others; and back.
+// Loads p[offsets[lane]] to the first n lanes, and zero to the others; `scatter_rows` stores them.
 GSB_HD inline Vec gather_rows(const float* p, const int32_t* offsets, int n) {
     if (n == LANES) return collect([&](int i) { return p[offsets[i]]; });
     return collect([&](int i) { return i < n ? p[offsets[i]] : 0.0f; });
@@ -142,18 +143,18 @@ GSB_HD inline void scatter_rows(Vec x, float* p, const int32_t* offsets, int n) 
     for (int i = 0; i < n; ++i) p[offsets[i]] = lane[i];
 }
 
-// x, rounded: the compiler fuses no product with the sum that it goes into.
+// Returns x, rounded: the compiler cannot fuse a product with the sum that follows.
 GSB_HD inline Vec rounded(Vec x) {
     __asm__("" : "+v"(x.v));
     return x;
 }
 
-// Lane i is lane from[i] of x; `from` is aligned.
+// Returns the vector whose lane i is lane from[i] of x; `from` is aligned.
 GSB_HD inline Vec permute(Vec x, const int32_t* from) {
     return _mm512_permutexvar_ps(_mm512_load_si512(from), x.v);
 }
 
-// Sixteen rows of sixteen floats as sixteen columns.
+// Transposes sixteen rows of sixteen floats.
 GSB_HD inline void transpose(Vec (&x)[LANES]) {
     __m512 a[LANES], b[LANES];
     for (int i = 0; i < LANES; i += 2) {
@@ -203,7 +204,7 @@ struct Interleaved {
 template <int W>
 constexpr Interleaved<W> INTERLEAVED{};
 
-// Sixteen rows of W floats, one after the other, as W columns; and back.
+// Loads sixteen adjacent rows of W floats as W columns; `store_columns` stores them.
 template <int W>
 GSB_HD inline void load_columns(const float* p, Vec (&out)[W]) {
     if constexpr (W <= 4) {
@@ -244,19 +245,19 @@ GSB_HD inline void store_columns(const Vec (&x)[W], float* p) {
         Vec rows[LANES];
         GSB_UNROLL for (int k = 0; k < LANES; ++k) rows[k] = k < W ? x[k] : Vec(0.0f);
         transpose(rows);
-        // A row's last lanes are written over by the next row.
+        // The excess lanes of a row are overwritten by the next row.
         GSB_UNROLL for (int i = 0; i < LANES; ++i) {
             i * W + LANES <= LANES * W ? rows[i].store(p + i * W) : store_first(rows[i], p + i * W, W);
         }
     }
 }
 
-// The first n floats of p, zero in the other lanes.
+// Loads the first n floats of p, and zero to the other lanes.
 GSB_HD inline Vec load_some(const float* p, int n) { return _mm512_maskz_loadu_ps(first(n), p); }
 
 GSB_HD inline void store_first(Vec x, float* p, int n) { _mm512_mask_storeu_ps(p, first(n), x.v); }
 
-// Writes base + k for each bit k that is set, in order, and returns their number; 16 places are overwritten.
+// Writes base + k for each bit k that is set, in order, and returns their number; up to 16 entries are overwritten.
 GSB_HD inline int append_bits(uint32_t bits, uint32_t base, uint32_t* out) {
     const __m512i all = _mm512_add_epi32(_mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15),
                                          _mm512_set1_epi32(static_cast<int>(base)));
@@ -264,7 +265,7 @@ GSB_HD inline int append_bits(uint32_t bits, uint32_t base, uint32_t* out) {
     return __builtin_popcount(bits);
 }
 
-// The sums of four vectors' lanes, to out[0..3].
+// Writes the lane sums of four vectors to out[0..3].
 GSB_HD inline void sum4(Vec a, Vec b, Vec c, Vec d, float* out) {
     const __m512 ab = _mm512_add_ps(_mm512_shuffle_f32x4(a.v, b.v, 0x44), _mm512_shuffle_f32x4(a.v, b.v, 0xee));
     const __m512 cd = _mm512_add_ps(_mm512_shuffle_f32x4(c.v, d.v, 0x44), _mm512_shuffle_f32x4(c.v, d.v, 0xee));

@@ -1,4 +1,4 @@
-// Sixteen floats as two registers of AVX, or as four of SSE or NEON: a register, and pairs of halves.
+// The SIMD vector of sixteen floats as two AVX registers, or as four SSE or NEON registers, built from pairs of halves.
 #pragma once
 
 #include <cstdint>
@@ -162,7 +162,7 @@ using Vec = Pair<Pair<Register>>;
 using Mask = Vec::Mask;
 static_assert(Vec::size == LANES);
 
-// -|x| where m, x elsewhere.
+// Returns -|x| in lanes of the mask m, and x in the others.
 GSB_HD inline Vec negative_where(Mask m, Vec x) { return select(m, min(x, Vec(0.0f) - x), x); }
 GSB_HD inline void store_where(Mask m, Vec x, float* p) { select(m, x, Vec::load(p)).store(p); }
 GSB_HD inline bool any(Mask m) { return bits(m) != 0; }
@@ -181,7 +181,7 @@ GSB_HD inline void scatter(Vec x, float* p, int stride, int n = LANES) {
     for (int i = 0; i < n; ++i) p[i * stride] = lane[i];
 }
 
-// Sixteen rows of W floats, one after the other, as W columns; and back.
+// Loads sixteen adjacent rows of W floats as W columns; `store_columns` stores them.
 template <int W>
 GSB_HD inline void load_columns(const float* p, Vec (&out)[W]) {
     GSB_UNROLL for (int k = 0; k < W; ++k) out[k] = gather(p + k, W);
@@ -191,7 +191,7 @@ GSB_HD inline void store_columns(const Vec (&x)[W], float* p) {
     GSB_UNROLL for (int k = 0; k < W; ++k) scatter(x[k], p + k, W);
 }
 
-// p[offsets[lane]] of the first n lanes, zero in the others; and back.
+// Loads p[offsets[lane]] to the first n lanes, and zero to the others; `scatter_rows` stores them.
 GSB_HD inline Vec gather_rows(const float* p, const int32_t* offsets, int n) {
     alignas(64) float lane[LANES];
     if (n == LANES) {
@@ -207,7 +207,7 @@ GSB_HD inline void scatter_rows(Vec x, float* p, const int32_t* offsets, int n) 
     for (int i = 0; i < n; ++i) p[offsets[i]] = lane[i];
 }
 
-// x, rounded: the compiler fuses no product with the sum that it goes into.
+// Returns x, rounded: the compiler cannot fuse a product with the sum that follows.
 GSB_HD inline Register rounded(Register x) {
 #if defined(__x86_64__)
     __asm__("" : "+x"(x.v));
@@ -221,7 +221,7 @@ GSB_HD inline Pair<Half> rounded(Pair<Half> x) {
     return {rounded(x.lo), rounded(x.hi)};
 }
 
-// Lane i is lane from[i] of x.
+// Returns the vector whose lane i is lane from[i] of x.
 GSB_HD inline Vec permute(Vec x, const int32_t* from) {
 #if defined(__AVX2__)
     const auto half = [&](const int32_t* p) {
@@ -238,23 +238,23 @@ GSB_HD inline Vec permute(Vec x, const int32_t* from) {
 #endif
 }
 
-// Sixteen rows of sixteen floats as sixteen columns.
+// Transposes sixteen rows of sixteen floats.
 GSB_HD inline void transpose(Vec (&x)[LANES]) {
     alignas(64) float rows[LANES][LANES];
     for (int i = 0; i < LANES; ++i) x[i].store(rows[i]);
     for (int k = 0; k < LANES; ++k) x[k] = Vec::gather(rows[0] + k, LANES);
 }
 
-// p[by] .. p[by + 15] of an aligned p, |by| < 16.
+// Loads p[by] .. p[by + 15] with |by| < 16, from an aligned p.
 template <int by>
 GSB_HD inline Vec load_beside(const float* p) {
     return Vec::load(p + by);
 }
 
-// The first n floats of p, zero in the other lanes.
+// Loads the first n floats of p, and zero to the other lanes.
 GSB_HD inline Vec load_some(const float* p, int n) { return n == LANES ? Vec::load(p) : gather(p, 1, n); }
 
-// Sixteen offsets, for reading and writing p[offset] of the lanes whose bit is set.
+// Sixteen offsets for reading and writing p[offset] in the lanes whose mask bit is set.
 struct Places {
     const int32_t* offset;
 
@@ -279,7 +279,7 @@ GSB_HD inline void scatter_at(Vec x, float* p, Places places, uint32_t bits) {
     }
 }
 
-// Four rows of four pixels of three channels, `stride` floats apart.
+// Stores four rows of four pixels with three channels; the rows are `stride` floats apart.
 GSB_HD inline void store_rgb(Vec r, Vec g, Vec b, float* out, int64_t stride) {
     alignas(64) float lane[3][LANES];
     r.store(lane[0]);
@@ -306,7 +306,7 @@ GSB_HD inline int append_bits(uint32_t bits, uint32_t base, uint32_t* out) {
     return n;
 }
 
-// The sums of four vectors' lanes, to out[0..3].
+// Writes the lane sums of four vectors to out[0..3].
 GSB_HD inline Floats fold(Register x) { return x.v; }
 template <class Half>
 GSB_HD inline Floats fold(Pair<Half> x) {

@@ -1,8 +1,8 @@
-// The training loss (1 - w) L1 + w (1 - SSIM) and its gradient in one pass over the rows of two pictures.
+// The training loss (1 - w) L1 + w (1 - SSIM) and its gradient, in one pass over the rows of two images.
 //
-// A row of pixels is filtered along x when it is read, and along y, four rows at a time, when the rows about them have
-// been; the derivatives of SSIM go through the same filter once more on their way to the gradient. Only the last few
-// rows of each are kept, of so many columns at a time that everything stays in cache.
+// A row of pixels is filtered along x when it is read, and along y, four rows at a time, when the rows around them have
+// been read. The derivatives of SSIM pass through the same filter once more for the gradient. Only the last few rows
+// are kept, with so few columns at a time that everything stays in cache.
 #include "../math/similarity.h"
 
 #include "buffer.h"
@@ -43,7 +43,7 @@ struct Window {
     }
 };
 
-// The last rows of `planes` filtered quantities, and a row of zeros for all rows outside of the picture.
+// The last rows of `planes` filtered quantities, and a row of zeros for all rows outside of the image.
 struct Ring {
     int planes, stride, height, kept;
     Buffer<float> rows;
@@ -58,7 +58,7 @@ struct Ring {
     float* row(int y) { return at(y >= 0 && y < height ? y % kept : kept); }
 };
 
-// The first n lanes; zero in the others.
+// Returns the first n lanes of x, and zero in the others.
 GSB_HD inline Vec first_of(Vec x, int n) {
     if (n == LANES) return x;
     alignas(64) float lanes[LANES] = {};
@@ -66,8 +66,8 @@ GSB_HD inline Vec first_of(Vec x, int n) {
     return Vec::load(lanes);
 }
 
-// Columns `first` to last - 1 of a horizontal strip of the picture, rows [begin, end), with memory of its own. Beside
-// them HALO columns are read: what is wrong at a cut does not reach farther.
+// A part of the image, rows [begin, end) and columns [first, last), with memory of its own. HALO columns beside it are
+// read too, so that wrong values at the cut do not reach it.
 struct Strip {
     const SimilarityArgs& args;
     float* gradient;  // null: not wanted
@@ -88,21 +88,21 @@ struct Strip {
 
     float* padded_row(int plane) { return padded.data() + static_cast<size_t>(plane) * (stride + 2 * MARGIN) + MARGIN; }
 
-    // What the pixels up to D away add to `sum`, the farthest first.
+    // Returns `sum` plus the contributions of the pixels up to D away, the farthest first.
     template <int D = SSIM_RADIUS>
     GSB_HD Vec filtered_along_x(const float* p, Vec sum = Vec(0.0f)) const {
         if constexpr (D == 0) {
             return sum + Vec::load(p) * window.weight[0];
         } else {
             constexpr int to = D * CHANNELS;
-            // The farthest two are loaded across cache lines: a processor does that while it shifts the others.
+            // The two farthest are loaded across cache lines, which a processor does while it shifts the others.
             const Vec pair =
                 D == SSIM_RADIUS ? Vec::load(p - to) + Vec::load(p + to) : load_beside<-to>(p) + load_beside<to>(p);
             return filtered_along_x<D - 1>(p, sum + pair * window.weight[D]);
         }
     }
 
-    // padded_row(first) and those that follow, filtered along x, to row y of a ring.
+    // Filters padded_row(first) and the following ones along x, to row y of a ring.
     void filter_along_x(int first, Ring& ring, int y) {
         for (int k = 0; k < ring.planes; ++k) {
             const float* in = padded_row(first + k);
@@ -111,8 +111,8 @@ struct Strip {
         }
     }
 
-    // The rows that rows y .. y + GROUP - 1 of a ring are filtered from. Where fewer than GROUP are wanted, the last of
-    // them may hold anything.
+    // The rows from which rows y .. y + GROUP - 1 of a ring are filtered. If fewer than GROUP rows are needed, the last
+    // of these may hold arbitrary values.
     struct Rows {
         const float* row[SPAN];
 
@@ -121,7 +121,7 @@ struct Strip {
         }
     };
 
-    // Values at x of a group's planes, filtered along y.
+    // Filters the planes of a group of rows along y at column x.
     template <int PLANES>
     GSB_HD void filter_along_y(const Rows& rows, int x, Vec (&out)[GROUP][PLANES]) const {
         for (int k = 0; k < PLANES; ++k) {
@@ -137,7 +137,7 @@ struct Strip {
         }
     }
 
-    // Of the first float that is read of a row.
+    // Returns the index of the first float that is read in row y.
     int64_t place(int y) const { return static_cast<int64_t>(y) * args.width * CHANNELS + left; }
 
     void read_row(int y) {
@@ -152,7 +152,8 @@ struct Strip {
         filter_along_x(0, moments, y);
     }
 
-    // SSIM of `count` rows from y on, each row's sum to row_sums[row][0]; its derivatives, filtered along x.
+    // Computes SSIM of `count` rows from y on: each row's sum to row_sums[row][0], and its derivatives, filtered along
+    // x.
     void compare_rows(int y, int count, float* row_sums) {
         const Rows rows(moments, y);
         Vec totals[GROUP];
@@ -175,7 +176,7 @@ struct Strip {
         }
     }
 
-    // The gradient of `count` rows from y on; each row's sum of |a - b| to row_sums[row][1].
+    // Computes the gradient of `count` rows from y on, and each row's sum of |a - b| to row_sums[row][1].
     void finish_rows(int y, int count, float* row_sums) {
         const float pixels = static_cast<float>(args.height) * static_cast<float>(args.width * CHANNELS);
         const Vec l1((1.0f - args.ssim_weight) / pixels), ssim(-args.ssim_weight / pixels), zero(0.0f);
@@ -198,7 +199,7 @@ struct Strip {
         for (int j = 0; j < count; ++j) row_sums[(y + j) * 2 + 1] += sum(totals[j]);
     }
 
-    // Adds to row_sums [height][2]: of SSIM and of |a - b|.
+    // Processes the part and adds to row_sums [height][2]: sums of SSIM and of |a - b|.
     void run(float* row_sums) {
         const int reach = gradient ? SSIM_RADIUS : 0;
         const auto within = [&](int y) { return y < 0 ? 0 : y > args.height ? args.height : y; };
@@ -208,7 +209,7 @@ struct Strip {
         for (int y = begin; y < end; y += GROUP) {
             const int count = at_most(end - y);
             while (compared < within(y + count + reach)) {
-                // Rows are read into the ring only as far as this group's window; older ones may go by then.
+                // Rows are read into the ring only as far as this group needs; older rows may be overwritten.
                 const int group = at_most(last - compared);
                 for (; read < within(compared + group + SSIM_RADIUS); ++read) read_row(read);
                 compare_rows(compared, group, row_sums);

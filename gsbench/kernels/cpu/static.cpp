@@ -1,4 +1,4 @@
-// Factors and opacities of Gaussians that are their own slice, sixteen at a time; the mathematics is math/static.h.
+// Factors and opacities of 3DGS Gaussians, sixteen at a time; math/static.h has the formulas.
 #include "../math/static.h"
 
 #include "isa.h"

@@ -1,4 +1,4 @@
-// The table of one instruction set's kernels, which dispatch.cpp chooses from.
+// The table of kernels of one instruction set; dispatch.cpp chooses one of these tables.
 #include "isa.h"
 
 #define GSB_TEXT_(x) #x

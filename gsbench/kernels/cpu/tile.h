@@ -1,4 +1,4 @@
-// A tile of 16x16 pixels as sixteen blocks of 4x4, one SIMD vector each: small splats waste few lanes on them.
+// A tile of 16 x 16 pixels as sixteen blocks of 4 x 4, one SIMD vector each, so that small Gaussians waste few lanes.
 #pragma once
 
 #include "../math/blending.h"
@@ -12,11 +12,11 @@ constexpr int BLOCKS = 16, BLOCK = 4;
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int BATCH = 64;     // splats whose blocks are found at once
 
-// Of a lane in its block, and of a block in its tile.
+// The column and row of a lane in its block, and of a block in its tile.
 alignas(64) constexpr float COLUMN[LANES] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
 alignas(64) constexpr float ROW[LANES] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
 
-// A splat as blending reads it: one cache line.
+// A projected Gaussian (splat) in the form that blending reads: one cache line.
 struct alignas(64) Record {
     float x, y, p, q, r, opacity;
     float color[3];        // where there are three channels
@@ -52,8 +52,8 @@ inline Record make_record(const BlendArgs& a, int64_t camera, int64_t i, const T
     return s;
 }
 
-// The records of those of a camera's splats that have tiles; first_pair is left to `number_pairs`. `pairs` [N]: how many
-// each has; null: not wanted.
+// Makes the records of a camera's splats that touch tiles, without first_pair (see `number_pairs`). `pairs` [N] gets
+// the number of tiles of each splat; it may be null.
 inline void make_records(const BlendArgs& a, int64_t camera, Record* records, int32_t* pairs) {
     const int64_t base = camera * a.N;
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > 1024)
@@ -68,8 +68,8 @@ inline void make_records(const BlendArgs& a, int64_t camera, Record* records, in
     }
 }
 
-// Gives each splat the places of its pairs, all splats' in a row. `pairs` [N + 1]: as make_records left them, and after
-// where those of each splat begin.
+// Sets first_pair of each splat, so that the tile intersections (pairs) of all splats are numbered consecutively.
+// `pairs` [N + 1] holds the number of pairs of each splat on entry, and the number of its first pair afterwards.
 inline void number_pairs(const BlendArgs& a, Record* records, int32_t* pairs) {
     int32_t total = 0;
     for (int64_t i = 0; i < a.N; ++i) {
@@ -81,7 +81,7 @@ inline void number_pairs(const BlendArgs& a, Record* records, int32_t* pairs) {
     pairs[a.N] = total;
 }
 
-// Where the pixels and blocks of one tile are.
+// The positions of the pixels and blocks of one tile.
 struct TileGrid {
     int left, top, width, height;        // of the tile; of the part of it that is in the picture
     Vec lane_x[4], lane_y[4];            // pixel centres of the block columns and rows
@@ -101,7 +101,7 @@ struct TileGrid {
         for (int i = 0; i < LANES; ++i) places[i] = i / BLOCK * picture_width + i % BLOCK;
     }
 
-    // Of a block: its first pixel in the picture, and which of its pixels are in the picture, one bit each.
+    // Returns the index of a block's first pixel in the image, and a mask of its pixels that are inside the image.
     int64_t first_pixel(int b, int64_t camera, int picture_width, int picture_height) const {
         return (camera * picture_height + top + (b >> 2) * BLOCK) * picture_width + left + (b & 3) * BLOCK;
     }
@@ -110,7 +110,7 @@ struct TileGrid {
         return bits((lane_x[b & 3] < right) & (lane_y[b >> 2] < bottom));
     }
 
-    // Which blocks have a pixel that the splat may reach, one bit each.
+    // Returns a mask of the blocks that have a pixel which the splat may reach.
     GSB_HD uint32_t touched(const Record& s) const {
         const Vec x0 = block_x - s.x, y0 = block_y - s.y;
         const Vec power = least_power<Vec>(x0, x0 + (BLOCK - 1), y0, y0 + (BLOCK - 1), s.p, s.q, s.r, s.foot_x, s.foot_y);

@@ -1,5 +1,5 @@
-// Slices of Gaussians with triangular factors, sixteen at a time; the mathematics is math/triangular.h; that of
-// static rows is math/static_triangular.h.
+// Conditional 3D Gaussians of 6DGS and 7DGS Gaussians, sixteen at a time. math/triangular.h has the formulas, and
+// math/static_triangular.h those of static Gaussians.
 #include "../math/static_triangular.h"
 #include "../math/triangular.h"
 
@@ -83,7 +83,7 @@ void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, co
     if (a.times) *out.log_lambda_t = static_cast<float>(totals[1]) * model.lambda_t;
 }
 
-// What a static row is made of: of its log_diagonal, the columns of p only.
+// The rows of static Gaussians, which use only the position columns of log_diagonal.
 struct StaticRows {
     const TriangularArgs& a;
     int width, space;  // of log_diagonal; where the columns of p begin
@@ -97,7 +97,7 @@ struct StaticRows {
         p.opacity = load_first(a.opacities + i, n);
     }
 
-    // Calls f(first, end) for tasks of CHUNK rows at most.
+    // Calls f(first, end) for tasks of at most CHUNK rows.
     template <class F>
     void each_chunk(F f) const {
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > CHUNK)
@@ -141,7 +141,7 @@ void slice_static_rows_backward(const TriangularArgs& a, const ObservationGrads&
     });
 }
 
-// Calls run<Query, Reduction>() as the arguments say.
+// Calls run<Query, Reduction>() with the template parameters that the arguments ask for.
 template <class Run>
 void dispatch(const TriangularArgs& a, Run run) {
     observing(a.directions, a.times, [&]<Query Q>() {

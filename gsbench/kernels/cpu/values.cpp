@@ -1,4 +1,4 @@
-// Looks whether the rasterizer's numbers are finite and in range, in one pass; math/values.h says what the ranges are.
+// Checks in one pass whether the rasterizer's inputs are finite and in range; math/values.h has the ranges.
 #include "../math/values.h"
 
 #include "isa.h"
@@ -9,7 +9,7 @@ namespace {
 
 constexpr int64_t PART = 1 << 17;  // numbers that are worth a second thread
 
-// Not zero where one of `count` numbers is not in [low, high]. Inside a parallel region GCC 12 does not
+// Returns a nonzero value if one of `count` numbers is not in [low, high]. Inside a parallel region GCC 12 does not
 // vectorise this loop.
 int any_outside(const float* x, int64_t count, float low, float high) {
     int bad = 0;

@@ -1,7 +1,7 @@
-"""Load the CUDA kernels: the extension `_cuda`, which is not linked to torch.
+"""Load the CUDA kernels from the compiled extension `_cuda`, which does not link to torch.
 
-The extension is optional. If it was built, it can be imported on machines without a GPU too. Torch's caching allocator
-gives the memory of outputs and scratch, and kernels run on torch's current stream.
+The extension is optional, and it can be imported on machines without a GPU. Torch allocates the memory of outputs and
+scratch, and kernels run on torch's current stream.
 """
 
 import functools
@@ -19,12 +19,12 @@ if importlib.util.find_spec("gsbench.kernels._cuda") is not None:  # an extensio
 
 
 def built() -> bool:
-    """Tell whether the CUDA kernels are part of this installation."""
+    """Return whether the CUDA kernels are installed."""
     return _cuda is not None
 
 
 def available() -> bool:
-    """Tell whether the CUDA kernels were built and there is a GPU to run them."""
+    """Return whether the CUDA kernels are installed and a GPU is available."""
     return built() and _has_device()
 
 
@@ -34,10 +34,10 @@ def _has_device() -> bool:
 
 
 def cuda() -> ModuleType:
-    """Return the compiled extension.
+    """Return the compiled extension with the CUDA kernels.
 
     Raises:
-        InputError: it was not built.
+        InputError: the extension is not built.
     """
     if _cuda is None:
         raise InputError("the CUDA kernels are not built in this installation: reinstall where nvcc is on the PATH "

@@ -1,4 +1,4 @@
-// Adam on the rows of a parameter that were drawn, a number a thread; the mathematics is math/adam.h.
+// Adam on the selected rows of a parameter, one number per thread; math/adam.h has the formulas.
 #include "../math/adam.h"
 
 #include <cmath>
@@ -11,7 +11,8 @@ namespace {
 __global__ void adam_kernel(AdamArgs a, AdamState state, AdamRule rule, float log_beta1, float log_beta2) {
     const int64_t k = global_thread();
     if (k >= a.N * a.width || !a.drawn[k / a.width]) return;
-    // 1 - beta^step, exact where beta^step is near 1; the step stays on the device, where nothing waits for it.
+    // 1 - beta^step, accurate if beta^step is near 1. The step is read on the device, so that the CPU does not wait for
+    // it.
     const float left1 = -expm1f(*a.step * log_beta1), left2 = -expm1f(*a.step * log_beta2);
     rule.unbias1 = 1.0f / left1, rule.unbias2 = 1.0f / sqrtf(left2);
     adam_update(rule, a.gradient[k], state.parameter[k], state.mean[k], state.square[k]);

@@ -1,4 +1,4 @@
-// The extension of the CUDA kernels.
+// The Python extension of the CUDA kernels.
 #include "../bindings.h"
 
 #include "kernels.h"

@@ -1,5 +1,6 @@
-// From splats to each tile's list of them, front to back: sort by depth, list the tiles each one reaches, sort stably
-// by tile. A warp takes a splat, its lanes the tiles within the splat's bounds.
+// Lists the projected Gaussians (splats) of each tile, front to back: sorts them by depth, lists the tiles that each
+// one reaches, and sorts these intersections stably by tile. A warp processes one splat, and its lanes the tiles in its
+// bounds.
 #include "launch.h"
 #include "reach.h"
 #include "sort.h"
@@ -10,7 +11,7 @@ namespace {
 __global__ void key_kernel(BinArgs a, uint32_t* keys, uint32_t* indices) {
     const int64_t s = global_thread();
     if (s >= a.N * a.C) return;
-    // The bits of positive floats sort as the floats do.
+    // Positive floats have the same order as their bits.
     keys[s] = a.half_sizes[s * 2] > 0.0f ? __float_as_uint(a.depths[s]) : 0xffffffffu;
     indices[s] = static_cast<uint32_t>(s);
 }
@@ -19,8 +20,8 @@ struct Span {
     int begin, end;
 };
 
-// The tiles from the first pixel centre at or after low to the last at or before high; bounded as floats, since the
-// bounds of a huge splat overflow integers.
+// Returns the tiles from the first pixel centre at or after `low` to the last one at or before `high`. They are clamped
+// as floats, because the bounds of a huge splat overflow integers.
 __device__ Span tile_span(float low, float high, int pixels) {
     const float first = max(ceilf(low - 0.5f), 0.0f);
     const float last = min(floorf(high - 0.5f), static_cast<float>(pixels - 1));
@@ -28,7 +29,8 @@ __device__ Span tile_span(float low, float high, int pixels) {
     return {static_cast<int>(first) / TILE, static_cast<int>(last) / TILE + 1};
 }
 
-// Calls visit(lane reaches a tile, its index, lanes that do) for 32 tiles at a time, by all lanes of a warp.
+// Calls visit(whether the lane's tile is reached, the tile's index, the mask of lanes that reach theirs) for 32 tiles
+// at a time, in all lanes of a warp.
 template <class Visit>
 __device__ void each_tile(const BinArgs& a, int64_t s, Visit visit) {
     const float2 half = reinterpret_cast<const float2*>(a.half_sizes)[s];
@@ -54,7 +56,7 @@ __global__ void count_kernel(BinArgs a, const uint32_t* order, int64_t* counts) 
     if (threadIdx.x % WARP == 0) counts[k] = count;
 }
 
-// Pairs beyond the number there is room for are left out.
+// Intersections for which there is no memory are left out.
 __global__ void fill_kernel(BinArgs a, TileOrder by_depth, int64_t no_tile, uint32_t* tiles, uint32_t* splats) {
     const int64_t k = global_thread() / WARP;
     if (k >= a.N * a.C) return;
@@ -70,14 +72,15 @@ __global__ void fill_kernel(BinArgs a, TileOrder by_depth, int64_t no_tile, uint
         }
         at += __popc(others);
     });
-    // The same test compiled twice may round differently: what was counted and is not found now goes to no tile.
+    // The same test, compiled twice, may round differently. An intersection that was counted and is not found here gets
+    // no tile.
     for (int64_t rest = at + lane; rest < end; rest += WARP) {
         tiles[rest] = static_cast<uint32_t>(no_tile);
         splats[rest] = static_cast<uint32_t>(s);
     }
 }
 
-// Tile t's list is [offsets[t], offsets[t + 1]) of the sorted pairs.
+// Tile t's list is [offsets[t], offsets[t + 1]) of the sorted intersections.
 __global__ void offset_kernel(const uint32_t* tiles, int64_t pairs, int64_t count, int32_t* offsets) {
     const int64_t k = global_thread();
     if (k > pairs) return;

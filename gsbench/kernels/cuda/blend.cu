@@ -1,4 +1,4 @@
-// Blending splats into pictures, front to back: a warp a patch, a pixel a lane.
+// Blends projected Gaussians into images, front to back: one warp per patch, one lane per pixel.
 #include "patch.h"
 
 namespace gsb::cuda {

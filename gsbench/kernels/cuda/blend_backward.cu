@@ -1,11 +1,11 @@
-// The derivative of blending: sums over pixels by one of two kernels, then each splat's gradient from its sums; and the
-// background's.
+// The gradients of blending: sums over pixels by one of two kernels, then the gradients of each projected Gaussian
+// (splat) from its sums, and the gradient of the background.
 #include "blend_backward.h"
 
 namespace gsb::cuda {
 namespace {
 
-// A Gaussian's rows of sums to the gradients of its splats and of its colour.
+// Computes the gradients of a Gaussian's splats and of its colour from their sums.
 __global__ void finish_kernel(BlendArgs a, BlendGrads out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
@@ -29,7 +29,7 @@ __global__ void finish_kernel(BlendArgs a, BlendGrads out) {
     }
 }
 
-// What is seen of the background at a pixel is what the splats have left of the light.
+// A pixel shows the background with the transmittance that is left after all splats.
 __global__ void background_kernel(BlendArgs a, BlendState picture, PictureGrads grads, float* out, int first_channel) {
     const int64_t pixels = a.C * a.height * a.width, step = static_cast<int64_t>(gridDim.x) * blockDim.x;
     const int count = a.D - first_channel < CHANNELS ? a.D - first_channel : CHANNELS;

@@ -1,5 +1,6 @@
-// The derivative of blending, back to front: what its two kernels share. Both give a warp a patch of pixels and leave
-// sums over pixels for each splat; they differ in what a lane holds, a pixel or a splat.
+// Shared code of the two kernels for the gradients of blending, back to front. In both, a warp processes a patch of 8 x
+// 4 pixels and sums over these pixels for each projected Gaussian (splat). A lane of the warp holds a pixel in one
+// kernel, and a splat in the other.
 #pragma once
 
 #include "patch.h"
@@ -9,8 +10,9 @@ namespace gsb::cuda {
 constexpr int GEOMETRY = 6;
 constexpr int SUMS = GEOMETRY + CHANNELS;
 
-// A pixel of the picture: where, how much of the tile's list it blended, the gradients of the loss by its alpha and by
-// its colour. Two arrays of four numbers each, so that lanes that read 32 of them meet in no bank of shared memory.
+// A pixel of the image: its position, how many splats of the tile's list it blended, and the gradients of the loss by
+// its alpha and its colour. They are two structures of four numbers each, so that 32 lanes read them without bank
+// conflicts in shared memory.
 struct alignas(16) Place {
     float x, y;
     int stop;
@@ -20,8 +22,9 @@ struct alignas(16) ColorGrad {
     float of[CHANNELS];
 };
 
-// What changes at a pixel from splat to splat: the transmittance before those already seen, and what they show of
-// themselves, times the pixel's gradient. At first the background, whose alpha is zero.
+// What changes at a pixel from splat to splat: the transmittance T in front of the splats processed so far, and the
+// colour seen of these splats, multiplied by the pixel's gradient. At first this is the background, whose alpha is
+// zero.
 struct Behind {
     float T, seen;
 };
@@ -31,7 +34,7 @@ struct BackwardPixel {
     ColorGrad color{};
     Behind behind{1.0f, 0.0f};
 
-    // Pixel number `k` of the patch; outside the picture nothing was blended.
+    // Loads pixel number `k` of the patch; outside of the image nothing was blended.
     __device__ BackwardPixel(const Patch& patch, int k, const BlendState& picture, const PictureGrads& grads) {
         place.x = static_cast<float>(patch.x(k)) + 0.5f, place.y = static_cast<float>(patch.y(k)) + 0.5f;
         if (!patch.inside(k)) return;
@@ -47,7 +50,7 @@ struct BackwardPixel {
     }
 };
 
-// The place in the tile's list where the last of the patch's pixels stopped.
+// Returns the largest `stop` of the warp's pixels: the position in the tile's list at which the last of them ended.
 __device__ inline int last_stop(int stop) {
     for (int offset = WARP / 2; offset > 0; offset /= 2) {
         const int other = __shfl_xor_sync(ALL_LANES, stop, offset);
@@ -56,7 +59,7 @@ __device__ inline int last_stop(int stop) {
     return stop;
 }
 
-// Takes a splat that was blended off the pixel again, and adds to the splat's sums: moments, then colours.
+// Removes a splat that was blended from the pixel's state, and adds to the splat's sums: moments, then colours.
 __device__ inline void unblend(const Falloff<float>& f, const float (&color)[CHANNELS], const Place& place,
                                const ColorGrad& grad, Behind& behind, float (&sums)[SUMS]) {
     behind.T = __fdividef(behind.T, 1.0f - f.alpha);  // which is at least 1/1000
@@ -74,13 +77,14 @@ __device__ inline void unblend(const Falloff<float>& f, const float (&color)[CHA
     sums[0] = m.v, sums[1] = m.u, sums[2] = m.w, sums[3] = m.w_dx, sums[4] = m.u_dx, sums[5] = m.u_dy;
 }
 
-// Where sum `column` of a splat is added up, for a launch that blends channels from `first_channel` on.
+// Returns the address at which sum `column` of a splat is accumulated, for a launch that blends channels from
+// `first_channel` on.
 __device__ inline float* sum_of(const BlendGrads& out, const Patch& patch, int32_t id, int column) {
     const int at = column < GEOMETRY ? column : column + patch.first_channel;
     return out.scratch + static_cast<int64_t>(id) * (GEOMETRY + patch.args.D) + at;
 }
 
-// One kernel for each, with the same arguments.
+// The two kernels have the same arguments.
 using SumUp = void(const BlendArgs&, const BlendState&, const PictureGrads&, const BlendGrads&, int first_channel,
                    Stream);
 SumUp sum_by_pixel, sum_by_splat;

@@ -1,12 +1,13 @@
-// The derivative of blending with a pixel a lane: a splat's sums over the patch are reduced across the lanes and added to
-// its row with one atomic instruction of nine lanes.
+// The gradients of blending with one lane per pixel: a splat's sums over the patch are reduced across the lanes and
+// added to its row by one atomic instruction in nine lanes.
 #include "blend_backward.h"
 
 namespace gsb::cuda {
 namespace {
 
-// The sum over the warp of nine values, lane l holding that of value `value_of(l)`. Eight of them are summed at once, each
-// step of the butterfly halving how many a lane is responsible for: 9 shuffles instead of 40, and 5 for the ninth.
+// The sums over the warp of nine values; lane l gets the sum of value `value_of(l)`. Eight values are reduced together,
+// and each step of the butterfly halves the number of values in a lane. This takes 9 shuffles instead of 40, and 5 for
+// the ninth value.
 struct NineSums {
     static __device__ int value_of(int lane) { return lane % 4 == 0 ? lane / 4 : lane == 1 ? SUMS - 1 : -1; }
 

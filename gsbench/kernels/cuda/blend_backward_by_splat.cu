@@ -1,13 +1,15 @@
-// The derivative of blending with a splat a lane, which keeps its sums in registers: nothing is reduced across lanes.
+// The gradients of blending with one lane per projected Gaussian (splat), which keeps its sums in registers, so that
+// nothing is reduced across lanes.
 //
-// The 32 pixels of a patch travel along the warp, back to front: pixel p meets splat i in step p + i, in lane i % 32. So
-// every lane works in every step, once the first have come by; lane i takes its next splat as the last pixel leaves it.
+// The 32 pixels of a patch move along the lanes of the warp, with the splats back to front: pixel p meets splat i in
+// step p + i, in lane i % 32. After the first steps every lane works in every step, and lane i takes its next splat
+// when the last pixel has passed.
 #include "blend_backward.h"
 
 namespace gsb::cuda {
 namespace {
 
-// Of a warp, in shared memory.
+// The shared memory of a warp.
 struct Traffic {
     Place places[WARP];
     ColorGrad colors[WARP];
@@ -16,14 +18,15 @@ struct Traffic {
     int32_t ids[WARP];                 // theirs; -1: none
 };
 
-// A lane without a splat: its alpha is zero.
+// Returns a splat with alpha zero, for a lane that has none.
 __device__ StagedSplat nobody() {
     StagedSplat s{};
     s.id = -1;
     return s;
 }
 
-// Lets splats of the list wait until there is one for every lane or no more; `end` is where the list is not yet read.
+// Reads the list backwards and queues splats that reach the patch, until there is one for every lane or the list ends;
+// `end` is the end of its unread part.
 __device__ void let_wait(const Patch& patch, int* waiting, int first, int& count, int& end) {
     while (count < WARP && end > 0) {
         const int position = end - 1 - patch.lane;
@@ -44,7 +47,7 @@ __global__ void __launch_bounds__(PATCHES * WARP)
     __shared__ Traffic shared[PATCHES];
     Traffic& traffic = shared[threadIdx.x / WARP];
     const Patch patch(a, first_channel);
-    // The pixel that lane l begins with is the one that is to be in lane 0 after 32 - l steps.
+    // Lane l starts with the pixel that reaches lane 0 after 32 - l steps.
     const int mine = (WARP - patch.lane) % WARP;
     const BackwardPixel start(patch, mine, picture, grads);
     traffic.places[mine] = start.place;

@@ -1,5 +1,5 @@
-// Colours of Gaussians and their derivative, one a thread; the mathematics is math/harmonics.h. What cannot be drawn is
-// left out.
+// Colours of Gaussians and their gradients, one Gaussian per thread; math/harmonics.h has the formulas. Gaussians with
+// an opacity below 1/255 are skipped.
 #include "../math/harmonics.h"
 
 #include "launch.h"
@@ -9,7 +9,7 @@ namespace {
 
 constexpr float TURN = 6.28318531f;
 
-// What a colour is made of: everything but the coefficients.
+// Everything that a colour needs except its coefficients.
 struct Weights {
     Unit<float> unit;
     int used;  // harmonics
@@ -22,19 +22,19 @@ struct Weights {
     }
 };
 
-// How much of its colour a Gaussian has.
+// Returns the SH degree and the number of frequencies of a Gaussian.
 __device__ ColorOrder order_of(const ColorArgs& a, int64_t i) {
     const ColorOrder all{a.degree, a.waves};
     return a.orders ? ColorOrder::of(static_cast<uint32_t>(a.orders[i])).at_most(all) : all;
 }
 
-// Coefficient k of Gaussian i, three channels: that of the constant is kept apart from the others.
+// Returns the address of coefficient k (three channels) of Gaussian i; the constant one is in an array of its own.
 template <class F>
 __device__ F* coefficient(const ColorArgs& a, F* sh0, F* shN, int64_t i, int k) {
     return k ? shN + (i * (a.waves * a.bases - 1) + k - 1) * 3 : sh0 + i * 3;
 }
 
-// Calls visit(coefficient's number, harmonic, wave) for all in use.
+// Calls visit(index of the coefficient, harmonic, frequency) for all coefficients in use.
 template <class Visit>
 __device__ void each_coefficient(const ColorArgs& a, ColorOrder order, Visit visit) {
     for (int wave = 0; wave < order.waves; ++wave) {
@@ -64,7 +64,7 @@ __global__ void color_kernel(ColorArgs a, Colors out) {
     }
 }
 
-// Adds to the gradients of Gaussian i's coefficients, and returns that of its mean.
+// Adds to the gradients of Gaussian i's coefficients and of its mean time, and returns the gradient of its mean.
 __device__ Vec3<float> color_vjp(const ColorArgs& a, const float* color, const float (&given)[3], const ColorGrads& out,
                                  int64_t i, float& g_time) {
     const ColorOrder order = order_of(a, i);
@@ -88,7 +88,7 @@ __device__ Vec3<float> color_vjp(const ColorArgs& a, const float* color, const f
     return w.unit.vjp(harmonics_vjp(w.unit.direction, order.degree, g_Y));
 }
 
-// The rows of coefficients of a Gaussian that is not drawn, or whose colour has no gradient, are left alone.
+// Coefficients of a Gaussian that is skipped, or whose colour has no gradient, are not touched.
 __global__ void color_backward_kernel(ColorArgs a, ShownColors shown, GivenColors given, ColorGrads out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;

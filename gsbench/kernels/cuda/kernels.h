@@ -1,7 +1,9 @@
-// The CUDA kernels: those of arguments.h, with device pointers, and what only a GPU has. A stream to run on comes last.
+// The CUDA kernels: those of arguments.h with device pointers, and kernels that exist only on a GPU. The last argument
+// of each function is a stream.
 //
-// Every function only enqueues work. Memory is the caller's, outputs and scratch alike, so that it comes from torch's
-// caching allocator. N Gaussians before C cameras give C x N splats. The arguments' `threads` are the CPU's.
+// Every function only enqueues work. The caller provides the memory of outputs and scratch, so that it comes from
+// torch's caching allocator. N Gaussians and C cameras give C x N projected Gaussians (splats). `threads` is used only
+// on the CPU.
 #pragma once
 
 #include <cstddef>
@@ -13,7 +15,7 @@ struct CUstream_st;
 
 namespace gsb {
 
-// Splats to each tile's list.
+// The inputs of the kernels that list the splats of each tile.
 struct BinArgs {
     int64_t N, C;
     const float *means2d, *roots, *depths, *half_sizes;
@@ -21,7 +23,7 @@ struct BinArgs {
 };
 GSB_FIELDS(BinArgs, INPUTS, N, C, means2d, roots, depths, half_sizes, width, height)
 
-// All arrays are [C * N].
+// The arrays are [C * N].
 struct TileCounts {
     uint32_t *keys, *indices, *sorted_keys;
     uint32_t* order;  // splats by depth
@@ -31,8 +33,8 @@ struct TileCounts {
 };
 GSB_FIELDS(TileCounts, OUTPUTS, keys, indices, sorted_keys, order, ends, scratch, scratch_bytes)
 
-// Where `pairs` is not the last of `ends`, but the room there is, `tiles` are 0xffffffff on entry, and pairs beyond it
-// are left out.
+// `pairs` is the number of tile intersections for which there is memory. If it is not the last entry of `ends`, `tiles`
+// must be 0xffffffff on entry, and further intersections are left out.
 struct TileOrder {
     const uint32_t* order;
     const int64_t* ends;
@@ -40,7 +42,7 @@ struct TileOrder {
 };
 GSB_FIELDS(TileOrder, INPUTS, order, ends, pairs)
 
-// The arrays are [pairs], but for `offsets`.
+// The arrays are [pairs], except `offsets`.
 struct TileLists {
     uint32_t *tiles, *splats, *sorted_tiles;
     uint32_t* ids;     // splats of all cameras, each tile's front to back
@@ -52,7 +54,8 @@ GSB_FIELDS(TileLists, OUTPUTS, tiles, splats, sorted_tiles, ids, offsets, scratc
 
 }  // namespace gsb
 
-// `blend_backward` has a pixel a lane, and `blend_backward_by_splat` a splat: the same gradients.
+// `blend_backward` has one lane per pixel, and `blend_backward_by_splat` one lane per splat; the gradients are the
+// same.
 #define GSB_CUDA_KERNELS(kernel)                                                                   \
     GSB_KERNELS(kernel)                                                                            \
     kernel(count_tiles, BinArgs, TileCounts)                                                       \
@@ -67,10 +70,10 @@ using Stream = CUstream_st*;
 GSB_CUDA_KERNELS(GSB_DECLARATION)
 #undef GSB_DECLARATION
 
-// What `refine` has room for: numbers that the networks read, and numbers that one of them moves.
+// The limits of `refine` (AGR): how many numbers the MLPs read, and how many one MLP changes.
 constexpr int MAX_FEATURES = 7, MAX_WIDTH = 28;
 
-// Parts that `l1_ssim` leaves of its loss.
+// Returns the number of partial sums of the loss that `l1_ssim` writes.
 int similarity_parts(int height, int width);
 
 }  // namespace gsb::cuda

@@ -1,4 +1,5 @@
-// Starting a kernel. A build for the CPU (tests/kernels/cuda_shim.h) brings its own `launch`.
+// Launches a kernel. A build that runs the kernels on the CPU for tests (tests/kernels/cuda_shim.h) has its own
+// `launch`.
 #pragma once
 
 #include "../math.h"
@@ -20,7 +21,7 @@ inline void check(cudaError_t status) {
     if (status != cudaSuccess) throw std::runtime_error(std::string("CUDA: ") + cudaGetErrorString(status));
 }
 
-// The parameters are those of the kernel, so that arguments convert as in a call.
+// Arguments are converted to the types of the kernel's parameters, as in a function call.
 template <class... Parameters, class... Arguments>
 void launch(void (*kernel)(Parameters...), dim3 grid, dim3 block, Stream stream, Arguments... arguments) {
     kernel<<<grid, block, 0, stream>>>(static_cast<Parameters>(arguments)...);

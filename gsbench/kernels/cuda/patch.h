@@ -1,9 +1,9 @@
-// What blending forward and backward share: a warp's patch of 8 x 4 pixels, and the splats that reach it, staged in
-// shared memory.
+// Shared code of blending, forward and backward: a warp's patch of 8 x 4 pixels, and the projected Gaussians (splats)
+// that reach it, staged in shared memory.
 //
-// A tile is 8 patches, each drawn by a warp that never waits for the others: it reads the tile's list 32 splats at a
-// time, one a lane, tests them against its own patch and keeps those that reach it. Most of a tile's splats do not, so
-// this test, a thirty-second of an instruction each, saves most of the alphas.
+// A tile has 8 patches, one per warp, and warps do not wait for each other. A warp reads the tile's list 32 splats at a
+// time, one per lane, tests them against its patch and keeps those that reach it. Most splats of a tile do not reach a
+// given patch, so this cheap test saves most evaluations of alpha.
 #pragma once
 
 #include "reach.h"
@@ -43,13 +43,13 @@ struct Patch {
         size = a.offsets[tile + 1] - begin;
     }
 
-    // Of pixel number k: where, whether in the picture, its place in the pictures' arrays.
+    // The position of pixel number k, whether it is inside the image, and its index in the image arrays.
     __device__ int x(int k) const { return left + k % PATCH_X; }
     __device__ int y(int k) const { return top + k / PATCH_X; }
     __device__ bool inside(int k) const { return x(k) < args.width && y(k) < args.height; }
     __device__ int64_t pixel(int k) const { return (camera * args.height + y(k)) * args.width + x(k); }
 
-    // The splat at a position of the list, but for its colour.
+    // Loads the splat at a position of the tile's list, without its colour.
     __device__ StagedSplat splat_at(int position) const {
         StagedSplat s{};
         s.id = args.ids[begin + position];
@@ -71,7 +71,8 @@ struct Patch {
         for (int k = 0; k < CHANNELS; ++k) s.color[k] = k < count ? color[k] : 0.0f;
     }
 
-    // The splats at positions [first, first + 32) of the list that reach the patch, in order. Returns how many.
+    // Stages the splats at positions [first, first + 32) of the list that reach the patch, in order. Returns their
+    // number.
     __device__ int stage(int first, StagedSplat* staged) const {
         const int position = first + lane;
         bool reached = false;

@@ -1,4 +1,4 @@
-// Projecting Gaussians to splats, one Gaussian before one camera a thread, and its derivative.
+// Projects Gaussians to the image planes, and computes the gradients: one Gaussian and one camera per thread.
 #include "launch.h"
 
 namespace gsb::cuda {
@@ -50,7 +50,7 @@ __device__ Splat<float> splat_grad(const SplatGrads& g, int64_t at) {
     return out;
 }
 
-// Adds a warp's sums to the gradient of one camera; `grad` is zero in lanes that have none.
+// Adds a warp's sums to the gradient of one camera; `grad` is zero in lanes without a Gaussian.
 __device__ void add_camera_grad(const GaussianGrad<float>& grad, float* viewmat) {
     for (int row = 0; row < 3; ++row) {
         const Vec3<float>& r = grad.rotation[row];

@@ -1,12 +1,13 @@
-// Whether a splat reaches a rectangle of pixels with alpha >= 1/255 anywhere: exact, up to a margin for rounding.
+// Tests whether a projected Gaussian has alpha >= 1/255 anywhere in a rectangle of pixels; exact up to a rounding
+// margin.
 #pragma once
 
 #include "launch.h"
 
 namespace gsb::cuda {
 
-constexpr float POWER_MARGIN = 0.01f;  // on log2(255 opacity), so that rounding cuts off no pixel; far above that of the
-                                       // instructions that divide and take logarithms fast
+constexpr float POWER_MARGIN = 0.01f;  // added to log2(255 opacity), so that rounding cuts off no pixel; far above the
+                                       // errors of the fast division and logarithm
 
 struct Reach {
     float x, y, p, q, r, foot_x, foot_y, most_power;
@@ -17,7 +18,7 @@ struct Reach {
         most_power = __log2f(255.0f * root.w) + POWER_MARGIN;
     }
 
-    // By the centres of the pixels [left, left + width) x [top, top + height).
+    // Tests the centres of the pixels [left, left + width) x [top, top + height).
     __device__ bool touches(int left, int top, int width, int height) const {
         const float x0 = static_cast<float>(left) + 0.5f - x, y0 = static_cast<float>(top) + 0.5f - y;
         return least_power(x0, x0 + static_cast<float>(width - 1), y0, y0 + static_cast<float>(height - 1), p, q, r,

@@ -1,6 +1,6 @@
-// AGR (7DGS, section 4.3): a few perceptrons of two layers move every Gaussian. Weights lie in shared memory and hidden
-// units in registers, so that nothing but the Gaussians' values is read or written; backward computes the hidden units
-// again, 32 Gaussians at a time.
+// AGR, the neural refinement of 7DGS (section 4.3): a few two-layer MLPs change the parameters of every Gaussian.
+// Weights are in shared memory and hidden units in registers, so that only parameters of Gaussians are read and
+// written. The backward pass computes the hidden units again, 32 Gaussians at a time.
 #include <algorithm>
 #include <numeric>
 #include <stdexcept>
@@ -13,14 +13,14 @@ namespace {
 
 constexpr int INPUTS = MAX_FEATURES + 1;  // a one comes last, whose weight is the bias
 
-// A column of a value [N, stride]: what is read, and where what comes of it goes.
+// A column of an array [N, stride]: the address to read, and the address for the result.
 struct Column {
     const float* from;
     float* to;
     int64_t stride;
 };
 
-// All networks, as the kernels find the columns of the values.
+// All MLPs, with the columns of the arrays that they read and change.
 struct Networks {
     int64_t N;  // Gaussians that are moved
     int features, count, widths[MAX_NETWORKS];
@@ -31,17 +31,17 @@ struct Networks {
     __device__ bool moves(int64_t i) const { return i < N && is_awake(intervals, time, i); }
 };
 
-// The features as columns of gradients.
+// The gradients of the features (the inputs of the MLPs), by column.
 struct FeatureGrads {
     Column column[MAX_FEATURES];
 };
 
-// One network's weights as its inner loops read them: everything of a hidden unit side by side.
+// The weights of one MLP in the order of its inner loops: all weights of a hidden unit are adjacent.
 struct Network {
     float in[HIDDEN][INPUTS];  // the last column is the bias
     float out[HIDDEN][MAX_WIDTH];
 
-    // By all threads of the block; the caller has them wait for it.
+    // Called by all threads of the block; the caller synchronises them afterwards.
     __device__ void load(const Networks& a, int network, int first_output) {
         const int width = a.widths[network];
         for (int k = static_cast<int>(threadIdx.x); k < HIDDEN * INPUTS; k += static_cast<int>(blockDim.x)) {
@@ -63,7 +63,7 @@ struct Network {
     }
 };
 
-// A Gaussian's features, and a one for the bias.
+// Loads a Gaussian's features, followed by a one for the bias.
 __device__ void load_features(const Networks& a, int64_t i, float (&x)[INPUTS]) {
     GSB_UNROLL for (int f = 0; f < MAX_FEATURES; ++f) {
         x[f] = i < a.N && f < a.features ? a.read[f].from[i * a.read[f].stride] : 0.0f;
@@ -80,7 +80,7 @@ __device__ int first_output_of(const Networks& a, int network) {
 constexpr int AT_ONCE = 4;  // Gaussians of a thread: a weight that is read from shared memory serves all of them
 constexpr int MOVERS = 128;  // threads of a block
 
-// A row of blocks a network, the last and widest first.
+// The grid has one row of blocks per MLP, the last and widest MLP first.
 __global__ void __launch_bounds__(MOVERS) refine_kernel(const __grid_constant__ Networks a) {
     __shared__ Network net;
     const int network = a.count - 1 - static_cast<int>(blockIdx.y);
@@ -127,7 +127,8 @@ struct BackwardBatch {
     float g_x[PARTS][BATCH][INPUTS];
 };
 
-// A row of blocks a network; each block sums the weights' gradients over the batches it takes, and adds them at the end.
+// The grid has one row of blocks per MLP. Each block sums the gradients of the weights over its batches of Gaussians,
+// and adds them to the result at the end.
 __global__ void __launch_bounds__(BATCH * PARTS)
     refine_backward_kernel(const __grid_constant__ Networks a, RefineGrads out) {
     __shared__ Network net;
@@ -192,7 +193,7 @@ __global__ void __launch_bounds__(BATCH * PARTS)
     if (thread < width) atomicAdd(out.bias_out + first + thread, g_bias);
 }
 
-// A feature moves through every network, and itself.
+// The gradient of a feature: its own, plus those through all MLPs.
 __global__ void feature_kernel(const __grid_constant__ Networks a, const __grid_constant__ FeatureGrads grads,
                                const float* by_network) {
     const int64_t i = global_thread(), step = a.N * a.features;
@@ -208,7 +209,7 @@ __global__ void feature_kernel(const __grid_constant__ Networks a, const __grid_
     }
 }
 
-// Arrays of numbers that are copied as they are, a row of blocks each.
+// Arrays that are copied without change, one row of blocks each.
 struct Copies {
     const float* from[MAX_VALUES];
     float* to[MAX_VALUES];
@@ -220,7 +221,7 @@ __global__ void copy_kernel(const __grid_constant__ Copies all) {
     if (k < all.size[blockIdx.y]) all.to[blockIdx.y][k] = all.from[blockIdx.y][k];
 }
 
-// Of the first `count` arrays the rows that are not moved.
+// Copies the rows that AGR does not change, in the first `count` arrays.
 void copy_rest(const RefineArgs& a, const float* const* from, int count, float* const* to, Stream stream) {
     Copies all{};
     int64_t most = 0;
@@ -234,14 +235,15 @@ void copy_rest(const RefineArgs& a, const float* const* from, int count, float* 
     if (most > 0) launch(copy_kernel, dim3(blocks_for(most), static_cast<unsigned>(count)), THREADS, stream, all);
 }
 
-// Column `c` of arrays [N, value_widths], counted through one array after the other. `to` may be null.
+// Returns column `c` of the arrays [N, value_widths], counted through all arrays in order. `to` may be null.
 Column column_of(const RefineArgs& a, const float* const* from, float* const* to, int c) {
     int array = 0;
     while (c >= a.value_widths[array]) c -= a.value_widths[array++];
     return {from[array] + c, to ? to[array] + c : nullptr, a.value_widths[array]};
 }
 
-// `from` and `to` are what the networks move. Each moves the columns that follow those of the network before it.
+// Returns the MLPs with the columns that they change, from arrays `from` to arrays `to`. Each MLP changes the columns
+// after those of the MLP before it.
 Networks networks_of(const RefineArgs& a, const float* const* from, float* const* to) {
     Networks all{a.refined,   a.features, a.networks,   {},         {},      {},
                  a.weight_in, a.bias_in,  a.weight_out, a.bias_out, a.intervals, a.time};
@@ -280,7 +282,7 @@ void refine_backward(const RefineArgs& a, const RefinedGrads& grads, const Refin
     if (a.refined == 0) return;
     FeatureGrads features{};
     for (int f = 0; f < a.features; ++f) features.column[f] = column_of(a, grads.values, out.values, f);
-    // Each block adds its sums by atomics once: few blocks, but enough to fill the largest GPUs.
+    // Each block adds its sums once by atomics, so there are few blocks, but enough for the largest GPUs.
     constexpr unsigned MOST_BLOCKS = 512;
     const auto batches = static_cast<unsigned>((a.refined + BATCH - 1) / BATCH);
     const dim3 grid(batches < MOST_BLOCKS ? batches : MOST_BLOCKS, static_cast<unsigned>(a.networks));

@@ -1,5 +1,5 @@
-// Slices of 4D Gaussians with rotated factors and their derivative, one a thread; the mathematics is math/rotated.h, and
-// that of static rows is math/static.h.
+// Conditional 3D Gaussians of 4DGS Gaussians and their gradients, one Gaussian per thread. math/rotated.h has the
+// formulas, and math/static.h those of static Gaussians.
 #include "../math/rotated.h"
 #include "../math/static.h"
 
@@ -8,7 +8,8 @@
 namespace gsb::cuda {
 namespace {
 
-// Times are as long as the clock says: a rotation of space and time needs one unit for both.
+// Times are multiplied by `clock` (world units per sequence length), because a rotation of space and time needs one
+// unit.
 __device__ RotatedParameters<float> parameters(const RotatedArgs& a, int64_t i) {
     RotatedParameters<float> p{};
     load_row(a.means, i, p.mean);

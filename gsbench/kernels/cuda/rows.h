@@ -1,4 +1,4 @@
-// Rows of arrays to registers and back, for the kernels in which a thread slices one Gaussian.
+// Loads rows of arrays to registers and stores them, for kernels in which one thread slices one Gaussian.
 #pragma once
 
 #include "../math/triangular.h"
@@ -38,7 +38,7 @@ __device__ inline void store_observed(const Observed<float>& seen, const Observa
     out.opacities[i] = seen.opacity;
 }
 
-// A Gaussian that is its own slice, but for its mean.
+// Stores a static Gaussian, whose mean is copied.
 template <class Gaussian>
 __device__ void store_static(const Gaussian& gaussian, const float* means, const Observation& out, int64_t i) {
     float mean[3];

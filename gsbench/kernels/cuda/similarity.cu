@@ -1,5 +1,6 @@
-// L1 and SSIM of two pictures with their gradient: tiles of one channel with their border in shared memory, filtered
-// along x and then along y. The gradient is the same filter over the derivatives of SSIM by its filtered moments.
+// L1 and SSIM of two images with their gradient. Tiles of one channel with their border are in shared memory and are
+// filtered along x, then along y. The gradient applies the same filter to the derivatives of SSIM by its filtered
+// moments.
 #include <cmath>
 
 #include "launch.h"
@@ -24,7 +25,7 @@ Window gaussian_window() {
     return window;
 }
 
-// Where this block's tile lies, and this thread's pixel in it.
+// The position of this block's tile, and of this thread's pixel in the tile.
 struct Place {
     int left, top, x, y, channel, thread;
 
@@ -34,7 +35,8 @@ struct Place {
           channel(static_cast<int>(blockIdx.z)), thread(static_cast<int>(threadIdx.y * SIDE + threadIdx.x)) {}
 };
 
-// Calls visit(row, column, x, y, inside the picture) for the tile with its border, each once among the threads.
+// Calls visit(row, column, x, y, whether inside the image) for each pixel of the tile and its border, each in one
+// thread.
 template <class Visit>
 __device__ void each_bordered(const SimilarityArgs& a, const Place& place, Visit visit) {
     for (int i = place.thread; i < BORDERED * BORDERED; i += SIDE * SIDE) {
@@ -44,7 +46,7 @@ __device__ void each_bordered(const SimilarityArgs& a, const Place& place, Visit
     }
 }
 
-// The block's sum, in its first thread.
+// Returns the sum over the block, in its first thread.
 __device__ float block_sum(float x, int thread) {
     __shared__ float warps[SIDE * SIDE / WARP];
     const float sum = warp_sum(x);

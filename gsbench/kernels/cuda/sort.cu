@@ -1,5 +1,5 @@
-// Sorting and summing by CUB. Items are counted by int, for which CUB has kernels with 32-bit offsets; the caller sees to
-// it that there are no more (MAX_ITEMS of raster.py).
+// Sorting and cumulative sums by CUB. The number of items is an int, for which CUB has kernels with 32-bit offsets; the
+// caller checks that there are not more (raster.py).
 #include "sort.h"
 
 #include <algorithm>

@@ -1,4 +1,4 @@
-// Factors and opacities of Gaussians that are their own slice, one a thread; the mathematics is math/static.h.
+// Factors and opacities of 3DGS Gaussians and their gradients, one Gaussian per thread; math/static.h has the formulas.
 #include "../math/static.h"
 
 #include "rows.h"

@@ -1,5 +1,5 @@
-// Slices of Gaussians with triangular factors and their derivative, one a thread; the mathematics is math/triangular.h,
-// and that of static rows is math/static_triangular.h.
+// Conditional 3D Gaussians of 6DGS and 7DGS Gaussians and their gradients, one Gaussian per thread. math/triangular.h
+// has the formulas, and math/static_triangular.h those of static Gaussians.
 #include "../math/static_triangular.h"
 #include "../math/triangular.h"
 
@@ -10,7 +10,8 @@
 namespace gsb::cuda {
 namespace {
 
-// CONDITIONED is known to the compiler: where the factor is triangular in the right order, no reflection is compiled in.
+// CONDITIONED (whether the rows of the factor are in the default order) is a template parameter, so that no reflections
+// are compiled for the default order, which needs none.
 template <Query Q, bool CONDITIONED>
 __device__ TriangularModel model_of(const TriangularArgs& a) {
     using P = TriangularParameters<float, Q>;
@@ -32,7 +33,7 @@ __device__ TriangularParameters<float, Q> parameters(const TriangularArgs& a, in
     return p;
 }
 
-// The rows of p in log_diagonal.
+// The first row of position in log_diagonal.
 template <Query Q, bool CONDITIONED>
 constexpr int SPACE = CONDITIONED ? TriangularParameters<float, Q>::K : 0;
 
@@ -101,7 +102,7 @@ __global__ void observe_backward_kernel(TriangularArgs a, ObservationGrads grads
     }
 }
 
-// Calls run<Query, CONDITIONED>() as the arguments say.
+// Calls run<Query, CONDITIONED>() with the template parameters that the arguments ask for.
 template <class Run>
 void dispatch(const TriangularArgs& a, Run run) {
     if (a.subtracts) {

@@ -1,4 +1,4 @@
-// Looks whether the rasterizer's numbers are finite and in range, in one pass; math/values.h says what the ranges are.
+// Checks in one pass whether the rasterizer's inputs are finite and in range; math/values.h has the ranges.
 #include "../math/values.h"
 
 #include "launch.h"

@@ -1,4 +1,4 @@
-// Adam's update of one number (Kingma & Ba 2015, algorithm 1).
+// The Adam update of one number (Kingma & Ba 2015, algorithm 1).
 #pragma once
 
 #include "scalar.h"
@@ -12,7 +12,7 @@ struct AdamRule {
 
 inline namespace GSB_ISA {
 
-// p by its gradient g; m and v are the running means of g and g^2.
+// Updates p by its gradient g; m and v are the running means of g and g^2.
 template <class T>
 GSB_HD inline void adam_update(const AdamRule& a, T g, T& p, T& m, T& v) {
     m = m + (g - m) * (1.0f - a.beta1);

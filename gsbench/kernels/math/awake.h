@@ -1,4 +1,4 @@
-// When AGR moves a Gaussian.
+// The time interval in which AGR changes a Gaussian.
 #pragma once
 
 #include <cstdint>
@@ -8,8 +8,8 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-// `intervals` [., 2] and `time` []: a Gaussian is moved from the first to the last time of its visible interval. Null:
-// always.
+// Returns whether Gaussian i is changed by AGR at `time`: from the first to the last time of its interval in
+// `intervals` [., 2]. If `intervals` is null, always.
 GSB_HD inline bool is_awake(const float* intervals, const float* time, int64_t i) {
     return !intervals || (intervals[2 * i] <= *time && *time <= intervals[2 * i + 1]);
 }

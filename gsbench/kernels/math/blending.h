@@ -1,4 +1,4 @@
-// One splat over one pixel (3DGS eq. 3): its alpha, and the derivative of the blended colour.
+// One projected Gaussian at one pixel (3DGS eq. 3): its alpha, and the gradients of blending.
 #pragma once
 
 #include "projection.h"
@@ -6,7 +6,7 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-// The falloff of a splat at a pixel: alpha and the two coordinates in which the splat is round.
+// The falloff of a projected Gaussian at a pixel: alpha, and the coordinates u, w in which the Gaussian is isotropic.
 template <class T>
 struct Falloff {
     T dx, dy, u, w;
@@ -21,7 +21,7 @@ struct Falloff {
     }
 };
 
-// What backward sums over a splat's pixels: with v = alpha dLoss/dalpha, moments of v; then the splat's gradient.
+// The sums over a Gaussian's pixels that its gradient needs: moments of v = alpha dLoss/dalpha.
 template <class T>
 struct FalloffMoments {
     T v, u, w, w_dx, u_dx, u_dy;
@@ -37,7 +37,8 @@ struct FalloffMoments {
     }
 };
 
-// Moments to the gradient of x, y, p, q, r, opacity: dalpha = alpha (dlog2 o - dpower) ln 2, power = u^2 + w^2.
+// Computes the gradients of x, y, p, q, r, opacity from the moments, by dalpha = alpha (dlog2 o - dpower) ln 2 with
+// power = u^2 + w^2 and opacity o.
 GSB_HD inline void splat_gradient(const FalloffMoments<float>& m, float p, float q, float r, float opacity,
                                   float (&g)[6]) {
     constexpr float two_ln2 = 2.0f * LN_2;
@@ -49,9 +50,10 @@ GSB_HD inline void splat_gradient(const FalloffMoments<float>& m, float p, float
     g[5] = m.v / opacity;
 }
 
-// The least u^2 + w^2 over the rectangle [x0, x1] x [y0, y1] about the splat's mean: zero if the mean lies in it, else
-// on one of the edges that face it, at the foot of the perpendicular (in the splat's metric) or at a corner.
-// foot_y = -q / r and foot_x = -q r / (p^2 + q^2) are where the minimum lies along a vertical and a horizontal line.
+// Returns the minimum of the power u^2 + w^2 in the rectangle [x0, x1] x [y0, y1], whose origin is the Gaussian's mean.
+// The minimum is zero if the rectangle contains the mean. Otherwise it lies on an edge that faces the mean, at the foot
+// of the perpendicular (in the Gaussian's metric) or at a corner. foot_y = -q / r and foot_x = -q r / (p^2 + q^2) give
+// the positions of the minimum on a vertical and a horizontal line.
 template <class T>
 GSB_HD inline T least_power(T x0, T x1, T y0, T y1, T p, T q, T r, T foot_x, T foot_y) {
     const T zero(0.0f);

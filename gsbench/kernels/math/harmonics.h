@@ -1,4 +1,4 @@
-// Colours from real spherical harmonics of the viewing direction (3DGS), times a Fourier series of time (4DGS eq. 12).
+// Colours from real spherical harmonics of the viewing direction (3DGS), times a Fourier series in time (4DGS eq. 12).
 #pragma once
 
 #include <cstdint>
@@ -11,7 +11,7 @@ inline namespace GSB_ISA {
 
 constexpr float SH_0 = 0.28209479177387814f, SH_1 = 0.4886025119029199f;
 
-// Tables within functions: those of a namespace do not exist on a GPU.
+// The tables are inside functions, because arrays at namespace scope are not available on a GPU.
 GSB_HD constexpr float SH_2(int m) {
     constexpr float table[5] = {1.0925484305920792f, -1.0925484305920792f, 0.31539156525252005f, -1.0925484305920792f,
                                 0.5462742152960396f};
@@ -23,7 +23,7 @@ GSB_HD constexpr float SH_3(int m) {
     return table[m];
 }
 
-// Y_lm up to `degree` of a unit direction, in 3DGS' order and signs; returns how many.
+// Evaluates Y_lm up to `degree` at a unit direction, in the order and signs of 3DGS; returns their number.
 template <class T>
 GSB_HD inline int harmonics(const Vec3<T>& d, int degree, T (&Y)[MAX_BASIS]) {
     const T x = d.x, y = d.y, z = d.z;
@@ -53,7 +53,7 @@ GSB_HD inline int harmonics(const Vec3<T>& d, int degree, T (&Y)[MAX_BASIS]) {
     return (degree + 1) * (degree + 1);
 }
 
-// The gradient of the direction from that of Y.
+// Returns the gradient of the direction from the gradient g of Y.
 template <class T>
 GSB_HD inline Vec3<T> harmonics_vjp(const Vec3<T>& d, int degree, const T (&g)[MAX_BASIS]) {
     const T x = d.x, y = d.y, z = d.z;
@@ -77,7 +77,8 @@ GSB_HD inline Vec3<T> harmonics_vjp(const Vec3<T>& d, int degree, const T (&g)[M
     return out;
 }
 
-// How much of a colour there is: harmonics up to a degree, and frequencies of time. As a number: degree + 4 (waves - 1).
+// The SH degree and the number of frequencies in time of a colour; they are stored as the number degree + 4 (waves -
+// 1).
 struct ColorOrder {
     int degree, waves;
 
@@ -90,7 +91,7 @@ struct ColorOrder {
     }
 };
 
-// A vector at length 1, and zero where it is too short to have a direction (as its gradient then is).
+// A vector normalised to length 1. If it is too short to have a direction, the result and its gradient are zero.
 template <class T>
 struct Unit {
     Vec3<T> direction;
@@ -105,7 +106,7 @@ struct Unit {
     GSB_HD Vec3<T> vjp(const Vec3<T>& g) const { return (g - direction * dot(direction, g)) * inverse_length; }
 };
 
-// cos and sin of 2 pi x for any x of moderate size.
+// Computes cos and sin of 2 pi x.
 template <class T>
 GSB_HD inline void circle(T x, T& cosine, T& sine) {
     const T half(0.5f), quarter(0.25f), zero(0.0f);
@@ -124,7 +125,7 @@ GSB_HD inline void circle(T x, T& cosine, T& sine) {
     cosine = select((r > quarter) | (r < zero - quarter), zero - cosine, cosine);
 }
 
-// cos and sin of 2 pi n x, n = 0 .. waves - 1, by the addition theorem.
+// Computes cos and sin of 2 pi n x for n = 0 .. waves - 1 by the addition theorem.
 template <class T>
 GSB_HD inline void waves_of(T x, int waves, T (&cosines)[MAX_WAVES], T (&sines)[MAX_WAVES]) {
     cosines[0] = T(1.0f);

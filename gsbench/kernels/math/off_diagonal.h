@@ -1,12 +1,13 @@
-// What the parameters of a triangular factor below its diagonal are; gsbench.models.factors has the forms in this order.
+// How parameters map to entries below the diagonal of a triangular factor; gsbench.models.factors lists the same forms
+// in the same order.
 #pragma once
 
 namespace gsb {
 
 enum class OffDiagonal : int {
-    relative,    // shape in units of its row's diagonal, motion and coupling as they are
-    raw,         // all as they are
-    row_scaled,  // all (2 sigmoid(x) - 1) times their row's diagonal
+    relative,    // `shape` in units of its row's diagonal entry, `motion` and `coupling` unchanged
+    raw,         // all unchanged
+    row_scaled,  // all (2 sigmoid(x) - 1) times the diagonal entry of their row
 };
 
 }  // namespace gsb

@@ -1,4 +1,5 @@
-// What raw parameters of every model mean: sizes by exp, rotations by quaternions, entries below a factor's diagonal.
+// How raw parameters of all models are mapped: log sizes by exp, quaternions to rotations, entries below a factor's
+// diagonal.
 #pragma once
 
 #include "off_diagonal.h"
@@ -8,7 +9,7 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-// exp of a log size held to +-LOG_SIZE_MAX, and its derivative from the value, zero where it was held.
+// The exp of a log size that is clamped to +-LOG_SIZE_MAX; the derivative is zero if the log size was clamped.
 template <class T>
 GSB_HD inline T size_of(T log) {
     return exp(clamp(log, T(-LOG_SIZE_MAX), T(LOG_SIZE_MAX)));
@@ -19,15 +20,16 @@ GSB_HD inline T size_vjp(T log, T size, T g) {
     return select(max(log, T(0.0f) - log) <= T(LOG_SIZE_MAX), g * size, T(0.0f));
 }
 
-// An entry below the diagonal of a triangular factor, from its parameter; `relative`: it is stated in units of its row's
-// diagonal.
+// Returns an entry below the diagonal of a triangular factor from its parameter. If `relative`, the parameter is in
+// units of the diagonal entry of its row.
 template <class T>
 GSB_HD inline T entry_of(T x, T diagonal, OffDiagonal form, bool relative) {
     const T bounded = form == OffDiagonal::row_scaled ? sigmoid(x) * 2.0f - 1.0f : x;
     return relative ? bounded * diagonal : bounded;
 }
 
-// The gradient of the parameter from that of the entry; adds to that of the diagonal.
+// Returns the gradient of the parameter from the gradient g of the entry, and adds to the gradient of the diagonal
+// entry.
 template <class T>
 GSB_HD inline T entry_vjp(T x, T diagonal, OffDiagonal form, bool relative, T g, T& g_diagonal) {
     if (form == OffDiagonal::row_scaled) {
@@ -40,7 +42,7 @@ GSB_HD inline T entry_vjp(T x, T diagonal, OffDiagonal form, bool relative, T g,
     return g * diagonal;
 }
 
-// A quaternion at length 1, as torch normalises it.
+// A quaternion normalised to length 1, as by torch.nn.functional.normalize.
 template <class T>
 struct UnitQuaternion {
     T q[4], inverse_length;

@@ -1,12 +1,13 @@
-// A 3D Gaussian to its splat on the image plane (EWA splatting, Zwicker et al. 2001, eq. 29), on square roots throughout.
+// Projects a 3D Gaussian to the image plane (EWA splatting, Zwicker et al. 2001, eq. 29), computed on square roots.
 //
-// The covariance is F F^T, so that of the splat is M M^T + eps2d I with the rows m1, m2 of M = J W F. Neither its
-// determinant nor its inverse is ever the difference of large numbers:
+// The 3D covariance is F F^T. The 2D covariance is M M^T + eps2d I with the rows m1, m2 of M = J W F. Its determinant
+// and its inverse are computed without subtracting large numbers:
 //   det = |m1 x m2|^2 + eps2d (|m1|^2 + |m2|^2) + eps2d^2            (Lagrange's identity)
 //   power = w^2 + u^2,  w = p dx,  u = q dx + r dy                    (a triangular root of the inverse)
-// so a needle's falloff is exact to rounding and never negative. p, q, r are scaled to powers of two: alpha = o 2^-power.
-// det is of the fourth degree in pixels, and leaves float32 for a splat of 10^9: everything is in units of `size`, the
-// splat's own, which is a constant to the derivatives since the result does not depend on it.
+// So the falloff of a needle-shaped Gaussian is exact up to rounding, and the power is never negative. p, q, r are
+// scaled such that alpha = opacity 2^-power. Since det has the unit pixels^4, it would overflow float32 for a Gaussian
+// of 10^9 pixels. Therefore everything is computed in units of `size`, the size of the projected Gaussian. The result
+// does not depend on `size`, so derivatives treat it as a constant.
 #pragma once
 
 #include "scalar.h"
@@ -19,7 +20,7 @@ constexpr float HALF_LOG2_E = 0.721347520f;       // exp(-x/2) = 2^(-HALF_LOG2_E
 constexpr float SQRT_HALF_LOG2_E = 0.849321800f;  // so this scales the root
 constexpr float BOUNDS_MARGIN = 0.01f;            // pixels, so that rounding cuts off no pixel
 
-// A pinhole camera and what the caller asked of the projection.
+// A pinhole camera and the settings of the projection.
 struct Camera {
     float rotation[3][3], translation[3];  // world to camera
     float fx, fy, cx, cy;                  // pixels
@@ -27,7 +28,8 @@ struct Camera {
     float near, far, eps2d;
     bool antialias;
 
-    // The Jacobian is taken no farther than 15 % of the picture outside of it (3DGS), where it would blow up.
+    // The Jacobian is evaluated at most 15 % of the image size outside of the image (3DGS), because it diverges far
+    // away.
     GSB_HD float tangent_min(float center, float focal, float size) const { return (-center - 0.15f * size) / focal; }
     GSB_HD float tangent_max(float center, float focal, float size) const {
         return (size - center + 0.15f * size) / focal;
@@ -51,7 +53,7 @@ struct GaussianGrad {
     Vec3<T> rotation[3], translation;  // of the camera
 };
 
-// One Gaussian before one camera: `splat` is the function, `vjp` its derivative.
+// The projection of one Gaussian by one camera: `splat` computes it, and `vjp` computes the gradients.
 template <class T>
 struct Projection {
     const Camera& camera;
@@ -117,7 +119,7 @@ struct Projection {
         s.q = zero - xy / xx * s.r;
         s.opacity = opacity * compensation;
         s.depth = depth;
-        // alpha >= 1/255 only where power <= log2(255 o): that ellipse's bounding box.
+        // alpha >= 1/255 only inside the ellipse power <= log2(255 opacity); this is the bounding box of the ellipse.
         const T reach = log2(max(s.opacity * 255.0f, one)) * (1.0f / HALF_LOG2_E);
         s.half_x = sqrt(reach * xx) * size + BOUNDS_MARGIN;
         s.half_y = sqrt(reach * yy) * size + BOUNDS_MARGIN;
@@ -128,7 +130,8 @@ struct Projection {
         return s;
     }
 
-    // After `splat`: the gradient of what was drawn; g.half_* are ignored, being bounds and not values.
+    // Returns the gradients of the inputs; call it after `splat`. g.half_* are ignored, because bounds have no
+    // gradient.
     GSB_HD GaussianGrad<T> vjp(const Splat<T>& s, const Splat<T>& g) const {
         const T zero(0.0f);
         GaussianGrad<T> out;

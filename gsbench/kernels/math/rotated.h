@@ -1,4 +1,5 @@
-// One Gaussian over position and time with a rotated factor (4DGS): its slice at a time, and backwards.
+// One 4DGS Gaussian, over position and time with a rotated factor: its conditional 3D Gaussian at a time, and the
+// gradients.
 #pragma once
 
 #include "parameters.h"
@@ -14,8 +15,9 @@ struct RotatedParameters {
     T lambda_t;                                              // in gradients only
 };
 
-// R = M_left(l) M_right(r) (4DGS eq. 7): entry (i, j) of either matrix is +- entry i xor j of its quaternion. Tables
-// within functions: those of a namespace do not exist on a GPU.
+// The 4D rotation is R = M_left(l) M_right(r) (4DGS eq. 7). Entry (i, j) of either matrix is entry (i xor j) of its
+// quaternion, with a sign from these tables. The tables are inside functions, because arrays at namespace scope are not
+// available on a GPU.
 GSB_HD constexpr float LEFT_SIGN(int i, int j) {
     constexpr float table[4][4] = {{1, -1, -1, -1}, {1, 1, -1, 1}, {1, 1, 1, -1}, {1, -1, 1, 1}};
     return table[i][j];
@@ -25,9 +27,9 @@ GSB_HD constexpr float RIGHT_SIGN(int i, int j) {
     return table[i][j];
 }
 
-// The quaternion of a static Gaussian's rotation from its left one. M_left(l) M_right(r) keeps the axis of t where it is
-// for one right quaternion only, r = (l0, -l1, -l2, l3), and then turns space by this one. Twice, nothing is changed: it
-// is the inverse too, and what takes a gradient back.
+// Returns the 3D rotation of a static 4D Gaussian, as a quaternion, from its left quaternion l. M_left(l) M_right(r)
+// keeps the time axis fixed only for the right quaternion r = (l0, -l1, -l2, l3), and then it rotates space by this 3D
+// rotation. The function is its own inverse, so it also maps the gradient back.
 template <class T>
 GSB_HD inline void turn_of_space(const T (&left)[4], T (&quat)[4]) {
     quat[0] = left[0];
@@ -76,7 +78,7 @@ struct RotatedGaussian {
         const T delta[1] = {T(observed) - raw.time};
         whiten(t, delta, white);
         opacity_factor = exp(white[0] * white[0] * (-0.5f * lambda_t));
-        // What is not drawn stays where it is: its huge numbers must not reach a gradient.
+        // A Gaussian that is culled keeps its mean, so that huge numbers do not reach a gradient.
         const auto seen = opacity_factor > T(TIME_OPACITY_FACTOR_MIN);
         opacity_factor = select(seen, opacity_factor, zero);
         white[0] = select(seen, white[0], zero);
@@ -95,7 +97,7 @@ struct RotatedGaussian {
         return out;
     }
 
-    // After `observe`.
+    // Computes the gradients of the parameters; call it after `observe`.
     GSB_HD void vjp(const Observed<T>& g, RotatedParameters<T>& out) const {
         const T zero(0.0f);
         Reduced<T, 1> g_t;
@@ -139,9 +141,9 @@ struct RotatedGaussian {
     }
 
 private:
-    // Columns of F differ by factors of 10^7 where a Gaussian is long in time. A reflection is accurate in each of them,
-    // and not only in the largest, if it starts with the column that is largest in the row it clears (Powell and Reid
-    // 1969; Cox and Higham 1998). F F^T does not depend on the order of columns.
+    // If a Gaussian is long in time, the columns of F differ by factors of 10^7. A reflection is accurate in every
+    // column, and not only in the largest one, if it starts with the column that has the largest entry in the row to be
+    // cleared (Powell and Reid 1969; Cox and Higham 1998). F F^T does not depend on the order of columns.
     GSB_HD void lead() {
         const T zero(0.0f), one(1.0f);
         T most(-1.0f);
@@ -153,7 +155,7 @@ private:
         }
     }
 
-    // Swaps the first column with the leading one; twice, nothing is changed.
+    // Swaps the first column with the one that has the largest entry in t; a second call undoes the first.
     GSB_HD void swap_columns(T (&rows)[4][4]) const {
         const T half(0.5f);
         GSB_UNROLL for (int j = 1; j < 4; ++j) {

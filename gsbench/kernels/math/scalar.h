@@ -1,4 +1,4 @@
-// What the mathematics needs of its number type T, here for `float`; cpu/simd.h has the same for vectors.
+// The functions that math/ needs for its number type T, here for `float`; cpu/simd.h has them for SIMD vectors.
 #pragma once
 
 #include <cmath>
@@ -9,8 +9,8 @@
 #define GSB_HD __attribute__((always_inline))  // a vector that crosses a call goes through memory
 #endif
 
-// Small loops over the entries of a matrix: unrolled where there are registers to keep the entries in. Elsewhere that
-// would gain nothing, and take the compiler minutes.
+// Small loops over the entries of a matrix are unrolled if there are enough registers for the entries. Otherwise
+// unrolling would gain nothing and take minutes to compile.
 #if defined(__CUDACC__)
 #define GSB_UNROLL _Pragma("unroll")
 #elif defined(__AVX512F__) && !defined(__clang__)
@@ -19,7 +19,8 @@
 #define GSB_UNROLL
 #endif
 
-// The same sources are compiled once for each instruction set: a namespace each, so that the linker keeps them apart.
+// The same sources are compiled once for each instruction set, each in its own namespace, so that the linker keeps them
+// apart.
 #ifndef GSB_ISA
 #define GSB_ISA portable
 #endif

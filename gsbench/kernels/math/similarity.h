@@ -1,4 +1,4 @@
-// The structural similarity of two pictures at one pixel (Wang et al. 2004, eq. 13) from filtered moments.
+// SSIM of two images at one pixel (Wang et al. 2004, eq. 13) from filtered moments, and its derivatives.
 #pragma once
 
 #include "scalar.h"
@@ -15,7 +15,7 @@ struct Similarity {
     T value;
     T g_mean, g_square, g_product;  // its derivatives by the filtered a, a^2 and a b
 
-    // Of filtered a, b, a^2, b^2 and a b; a is what is fitted, b the truth.
+    // The arguments are the filtered a, b, a^2, b^2 and a b; a is the render and b the ground truth.
     GSB_HD Similarity(T mean_a, T mean_b, T aa, T bb, T ab) {
         constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
         const T product = mean_a * mean_b, squares = mean_a * mean_a + mean_b * mean_b;

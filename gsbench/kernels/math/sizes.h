@@ -1,4 +1,4 @@
-// The sizes that kernels are compiled for. gsbench/kernels/headers.py reads these lines for Python's side of them.
+// Sizes that are fixed when the kernels are compiled. gsbench/kernels/headers.py reads these lines for Python.
 #pragma once
 
 namespace gsb {

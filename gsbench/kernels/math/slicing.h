@@ -1,8 +1,10 @@
-// The slicing equation on square roots (7DGS, section 4.2): a joint Gaussian over (q, p), observed at q, is one over p.
+// The conditional Gaussian computed on square roots (7DGS, section 4.2): from a joint Gaussian over a query q (time,
+// direction or both) and position p, to the Gaussian over p at a given q.
 //
-// With the rows of its factor turned to [T_qq 0; T_pq T_pp], T_qq lower triangular of size K,
+// Reflections bring the rows of the joint factor to the form [T_qq 0; T_pq T_pp] with a lower triangular T_qq of size
+// K:
 //   white = T_qq^-1 (q - mu_q)        mean = mu_p + T_pq white        cov = T_pp T_pp^T
-// A factor that is triangular in the order (q, p) is in that form already; any other is turned by K reflections.
+// A factor that is triangular in the row order (q, p) already has this form. Any other factor needs K reflections.
 #pragma once
 
 #include "scalar.h"
@@ -10,7 +12,7 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-// K rows of q above three of p: [T_qq 0; T_pq T_pp].
+// The reduced factor [T_qq 0; T_pq T_pp]: K rows of q, then three rows of p.
 template <class T, int K>
 struct Reduced {
     T qq[K][K];  // lower triangle
@@ -28,7 +30,7 @@ struct Reduced {
     }
 };
 
-// white = T_qq^-1 delta, by forward substitution.
+// Computes white = T_qq^-1 delta by forward substitution.
 template <class T, int K>
 GSB_HD inline void whiten(const Reduced<T, K>& t, const T (&delta)[K], T (&white)[K]) {
     GSB_UNROLL for (int i = 0; i < K; ++i) {
@@ -38,7 +40,7 @@ GSB_HD inline void whiten(const Reduced<T, K>& t, const T (&delta)[K], T (&white
     }
 }
 
-// Adds to g_t; g_white is used up, and becomes the gradient of delta.
+// The derivative of `whiten`: adds to g_t, and replaces g_white by the gradient of delta.
 template <class T, int K>
 GSB_HD inline void whiten_vjp(const Reduced<T, K>& t, const T (&white)[K], T (&g_white)[K], Reduced<T, K>& g_t) {
     GSB_UNROLL for (int i = K - 1; i >= 0; --i) {
@@ -60,7 +62,7 @@ GSB_HD inline Vec3<T> moved_mean(const Reduced<T, K>& t, const Vec3<T>& mean, co
     return {moved[0], moved[1], moved[2]};
 }
 
-// Adds to g_white and g_t; the gradient of mean is g itself.
+// The derivative of `moved_mean`: adds to g_white and g_t. The gradient of `mean` is g itself.
 template <class T, int K>
 GSB_HD inline void moved_mean_vjp(const Reduced<T, K>& t, const T (&white)[K], const Vec3<T>& g, T (&g_white)[K],
                                   Reduced<T, K>& g_t) {
@@ -73,8 +75,8 @@ GSB_HD inline void moved_mean_vjp(const Reduced<T, K>& t, const T (&white)[K], c
     }
 }
 
-// K reflections from the right that turn the first K of K + 3 rows of width N = K + 3 to a lower triangle
-// (Householder, with the sign that avoids cancellation: Golub and Van Loan, section 5.1).
+// K Householder reflections from the right, which make the first K of N = K + 3 rows lower triangular. The sign of each
+// reflection avoids cancellation (Golub and Van Loan, section 5.1).
 template <class T, int K>
 struct Reflections {
     static constexpr bool KEEPS_REDUCED = true;  // what is in that form already may be left as it is
@@ -119,7 +121,7 @@ struct Reflections {
         }
     }
 
-    // The gradient of `rows`.
+    // Computes the gradient of `rows`.
     GSB_HD void vjp(const Reduced<T, K>& g_t, T (&g)[N][N]) const {
         const T zero(0.0f), one(1.0f);
         GSB_UNROLL for (int i = 0; i < N; ++i) {
@@ -143,7 +145,7 @@ struct Reflections {
                     g[i][j] = g[i][j] - g_along * v[k][j];
                 }
             }
-            // Row k became -signed_length; v is the row plus signed_length in its first place.
+            // Row k became -signed_length; v is the row with signed_length added to its first entry.
             T square = zero;
             GSB_UNROLL for (int j = k; j < N; ++j) square = square + before[k][k][j] * before[k][k][j];
             const T first = before[k][k][k];

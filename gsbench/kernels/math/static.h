@@ -1,4 +1,5 @@
-// One Gaussian that nothing is observed of, its own slice (3DGS): its factor R S (eq. 6) and opacity, and backwards.
+// One 3DGS Gaussian, which does not depend on time or direction: its factor R S (eq. 6), its opacity, and the
+// gradients.
 #pragma once
 
 #include "parameters.h"
@@ -40,7 +41,7 @@ struct StaticGaussian {
             out.scales[j] = size_vjp(raw.scales[j], T(1.0f), along);
         }
         const T w = unit.q[0], x = unit.q[1], y = unit.q[2], z = unit.q[3], two(2.0f);
-        // R is made of sums and differences of products of two entries.
+        // The entries of R are sums and differences of products of two quaternion entries.
         const T xy = g[0][1] + g[1][0], xz = g[0][2] + g[2][0], yz = g[1][2] + g[2][1];
         const T wx = g[2][1] - g[1][2], wy = g[0][2] - g[2][0], wz = g[1][0] - g[0][1];
         const T g_q[4] = {two * (x * wx + y * wy + z * wz),

@@ -1,4 +1,5 @@
-// One Gaussian with a triangular factor that no query changes (6DGS, 7DGS): the block L_pp alone, and backwards.
+// One Gaussian of 6DGS or 7DGS that is static (it does not change with camera or time): its 3D factor is the block
+// L_pp.
 #pragma once
 
 #include "parameters.h"

@@ -1,7 +1,9 @@
-// The slicing equation as papers write it, for comparison with the square root: it forms S = F F^T and subtracts.
+// The conditional Gaussian as in the papers, for comparison with the square-root method: it forms S = F F^T and
+// subtracts.
 //
-// A Cholesky factor of S with the rows of q first is [T_qq 0; T_pq T_pp], and T_pp that of S_pp - S_pq S_qq^-1 S_pq^T. It
-// solves where published code inverts, so it is the cheaper of the two; it loses the same digits (docs/stability.md).
+// A Cholesky factor of S with the rows of q first is [T_qq 0; T_pq T_pp], in which T_pp is the Cholesky factor of the
+// conditional covariance S_pp - S_pq S_qq^-1 S_pq^T. The code solves where published code inverts, which is cheaper and
+// loses the same digits (docs/stability.md).
 #pragma once
 
 #include "slicing.h"
@@ -42,7 +44,7 @@ struct Subtraction {
         }
     }
 
-    // The gradient of `rows`.
+    // Computes the gradient of `rows`.
     GSB_HD void vjp(const Reduced<T, K>& g_t, T (&g)[N][N]) const {
         T g_C[N][N];
         for (int i = 0; i < N; ++i) {

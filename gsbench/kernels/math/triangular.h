@@ -1,5 +1,5 @@
-// One Gaussian over position and direction, time or both with a triangular factor (6DGS, 7DGS, 7DGS without direction):
-// its slice, and backwards.
+// One Gaussian of 6DGS, 7DGS or 7DGS without direction, over position and direction, time or both with a triangular
+// factor: its conditional 3D Gaussian, and the gradients.
 #pragma once
 
 #include "harmonics.h"
@@ -9,26 +9,26 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-// What a Gaussian is conditioned on. Rows of a factor are ordered d before t.
+// The variables on which a Gaussian is conditioned. Rows of direction come before rows of time.
 enum class Query { direction, time, both };
 
-// Calls run<Query>() for what is observed: one of the two at least.
+// Calls run<Query>() for direction, time or both; at least one of them must be true.
 template <class Run>
 void observing(bool direction, bool time, Run run) {
     if (direction && time) return run.template operator()<Query::both>();
     time ? run.template operator()<Query::time>() : run.template operator()<Query::direction>();
 }
 
-// What is the same for all Gaussians of a model.
+// The values that are equal for all Gaussians of a model, and the camera centre and time.
 struct TriangularModel {
     bool conditioned_first;  // rows of the factor are (d, t, p); else (p, t, d), as in the paper
-    OffDiagonal form;        // what the parameters below the diagonal are
-    float half;              // of f_dir's exponent: 1/2 (7DGS eq. 12) or 1 (6DGS)
+    OffDiagonal form;        // how parameters map to entries below the diagonal
+    float half;              // the constant in the exponent of f_dir: 1/2 (7DGS eq. 12) or 1 (6DGS)
     float lambda_d, lambda_t;
-    float center[3], time;  // where from and when it is observed
+    float center[3], time;  // the camera centre and the time of the view
 };
 
-// The Gaussian a rasterizer draws.
+// The conditional 3D Gaussian, which the rasterizer gets.
 template <class T>
 struct Observed {
     T mean[3], factor[3][3], opacity;
@@ -38,7 +38,7 @@ template <class T, Query Q>
 struct TriangularParameters {
     static constexpr bool DIRECTION = Q != Query::time, TIME = Q != Query::direction;
     static constexpr int TIME_ROW = DIRECTION ? 3 : 0, K = TIME_ROW + TIME, N = K + 3;
-    static constexpr bool COUPLED = K > 1;  // else there is no entry within q, and `coupling` is not used
+    static constexpr bool COUPLED = K > 1;  // otherwise `coupling` has no entries and is not used
     T mean[3], direction[3], time, log_diagonal[N];
     T shape[3], motion[3 * K], coupling[COUPLED ? K * (K - 1) / 2 : 1];  // row by row: `entry` says which is which
     T opacity;                                                           // a logit
@@ -61,7 +61,7 @@ struct TriangularGaussian {
 
     GSB_HD TriangularGaussian(const TriangularModel& model, const Parameters& raw) : model(model), raw(raw) {}
 
-    // The factor's row of each row of (d, t, p).
+    // Returns the row of the factor that belongs to row i in the order (d, t, p).
     GSB_HD int row(int i) const { return model.conditioned_first ? i : i < TIME_ROW ? N - 3 + i : i < K ? 3 : i - K; }
 
     GSB_HD Observed<T> observe() {
@@ -101,7 +101,8 @@ struct TriangularGaussian {
             delta_t = delta[TIME_ROW] / spread_t;
             exponent = exponent + delta_t * delta_t * (0.5f * model.lambda_t);
         }
-        // What is too far from the query to be seen stays where it is: its huge numbers must not reach a gradient.
+        // A Gaussian that is too far from the query (direction, time) to be seen keeps its mean, so that huge numbers
+        // do not reach a gradient.
         const auto seen = exponent < T(EXPONENT_MAX);
         opacity_factor = select(seen, exp(zero - exponent), zero);
         GSB_UNROLL for (int i = 0; i < K; ++i) white[i] = select(seen, white[i], zero);
@@ -120,7 +121,7 @@ struct TriangularGaussian {
         return out;
     }
 
-    // After `observe`.
+    // Computes the gradients of the parameters; call it after `observe`.
     GSB_HD void vjp(const Observed<T>& g, Parameters& out) const {
         const T zero(0.0f);
         Reduced<T, K> g_t;
@@ -162,14 +163,14 @@ struct TriangularGaussian {
     }
 
 private:
-    // |white_d|^2
+    // Returns |white_d|^2, the squared Mahalanobis distance in direction.
     GSB_HD T squares_d() const { return white[0] * white[0] + white[1] * white[1] + white[2] * white[2]; }
 
-    // Nothing is left to do for a square root of that order; a scheme that subtracts never knows.
+    // Returns whether the factor already has the reduced form, so that the square-root method has nothing to compute.
     GSB_HD bool is_reduced() const { return model.conditioned_first && Reduction<T, K>::KEEPS_REDUCED; }
 
-    // The parameter of the entry (i, j) below the diagonal: shape in a row and a column of p, motion in one of them,
-    // coupling in neither.
+    // Returns the parameter of the entry (i, j) below the diagonal: one of `shape` if row and column both belong to p,
+    // of `motion` if one of them does, and of `coupling` if neither does.
     template <bool FIRST, class P>
     GSB_HD static auto& entry(P& p, int i, int j) {
         constexpr int QUERY = FIRST ? 0 : 3, SPACE = FIRST ? K : 0;  // the first row of q, and of p
@@ -180,7 +181,7 @@ private:
         return p.coupling[(i - QUERY) * (i - QUERY - 1) / 2 + j - QUERY];
     }
 
-    // Whether the entry (i, j) is stated in units of its row's diagonal.
+    // Returns whether the parameter of the entry (i, j) is in units of the diagonal entry of its row.
     template <bool FIRST>
     GSB_HD bool is_relative(int i, int j) const {
         const bool is_shape = FIRST ? j >= K : i < 3;

@@ -1,4 +1,4 @@
-// What the rasterizer's numbers may be: the ranges that `flag_values` looks at, on the CPU and on a GPU.
+// The valid ranges of the rasterizer's inputs, which `flag_values` checks on the CPU and on a GPU.
 #pragma once
 
 #include <cfloat>
@@ -7,7 +7,7 @@
 
 namespace gsb {
 
-// `count` numbers, `stride` apart, are to be in [low, high]; else bit `bit` of the flags is set.
+// An array of `count` numbers, `stride` apart, which must be in [low, high]; otherwise bit `bit` of the flags is set.
 struct Range {
     const float* values;
     int64_t count, stride;
