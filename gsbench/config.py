@@ -18,15 +18,15 @@ CONF = HERE / "conf" if (HERE / "conf").is_dir() else HERE.parent / "conf"  # in
 class DataConfig:
     """Say where the files of a data set are and how they are read; an experiment (`+exp=`) sets these keys."""
 
-    dataset: str = MISSING  # name of the data set in tables
-    paper_dataset: str | None = None  # name in the paper, whose rows tables show
+    dataset: str = MISSING  # name in tables
+    paper_dataset: str | None = None  # name in the paper's tables
     root: str = MISSING  # folder with a folder for each scene, or pkg://MODULE
     published: str = ""  # where to get the data
     scenes: list[str] = field(default_factory=list)  # scenes of scene=all
-    background: str = "black"  # or white: colour behind images and renders
+    background: str = "black"  # or white: background of images
     initial_lambda: float = 0.5  # initial lambda_t and lambda_d of 7DGS
     initial_points: int = 100_000  # random points, if the data have none
-    initial_half_width: float | None = 1.3  # w of their cube [-w, w]^3; None: the frustum that all cameras share
+    initial_half_width: float | None = 1.3  # they fill the cube [-w, w]^3; None: the frustum that all cameras share
 
 
 @dataclass
@@ -34,9 +34,9 @@ class SceneConfig:
     """Choose one scene of the data set."""
 
     name: str = MISSING  # folder in data.root
-    released_as: str | None = None  # the folder's name in the published release, if another
+    released_as: str | None = None  # the folder's name in the published data, if another
     downscale: int = 1  # divisor of the image size (area filter)
-    eval_split: str = "test"  # or val, if the test split is wrong (D-NeRF lego)
+    eval_split: str = "test"  # or val (D-NeRF lego, whose test split is wrong)
     frames: list[int] | None = None  # first and last frame of a Technicolor scene; None: all
 
 
@@ -50,7 +50,7 @@ class InitConfig:
 
 @dataclass
 class LearningRate:
-    """A learning rate that changes from `start` to `end` over the run, linearly in its logarithm."""
+    """A learning rate that falls log-linearly from `start` to `end` over the run."""
 
     start: float = MISSING
     end: float | None = None  # None: constant
@@ -63,10 +63,10 @@ class ModelConfig:
     """Choose the model and its settings."""
 
     name: str = MISSING  # name of the model's class
-    module: str | None = None  # Python module of your own model (docs/adding_a_model.md)
+    module: str | None = None  # Python module of your own model
     published_with_agr: bool = False  # whether the published method has AGR
     agr: bool = "${.published_with_agr}"  # type: ignore[assignment]  # default of the key agr
-    agr_octaves: int = 4  # octaves of AGR's time encoding (docs/tuning.md)
+    agr_octaves: int = 4  # octaves of AGR's time encoding
     sh_degree: int = 3  # SH degree, 0 to 3
     min_opacity: float = 0.005  # Gaussians of lower opacity are pruned
     gate: str = "off"  # default of effects.gate
@@ -77,9 +77,9 @@ class ModelConfig:
 
 @dataclass
 class DensifyConfig:
-    """Adaptive density control (3DGS, section 5.2). Steps, except `every`, scale with the length of the run."""
+    """Set the adaptive density control of 3DGS (section 5.2). All steps but `every` scale with `train.iterations`."""
 
-    kind: str = "gradient"  # rule that adds and removes Gaussians
+    kind: str = "gradient"  # rule of density control
     start: int = 500  # step after which Gaussians are cloned, split and pruned
     stop: int = 15_000  # step at which this ends
     every: int = 100  # least number of steps between two rounds
@@ -94,7 +94,7 @@ class DensifyConfig:
 
 @dataclass
 class PenaltyConfig:
-    """A term that is added to the loss of every view (gsbench/train/penalties.py)."""
+    """Set one term that is added to the loss of every view."""
 
     weight: float = 0.0  # factor of the term; 0: none
     start: int = 0  # first step
@@ -103,7 +103,7 @@ class PenaltyConfig:
 
 @dataclass
 class PenaltiesConfig:
-    """Terms that are added to the loss."""
+    """Add terms to the loss of every view."""
 
     opacity: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean opacity
     size: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean largest scale, in parts of the scene's extent
@@ -111,7 +111,7 @@ class PenaltiesConfig:
 
 @dataclass
 class TrainConfig:
-    """Set schedule and loss. Steps are those of a run of `recipe_iterations` and scale with the length of the run."""
+    """Set the schedule and the loss. Steps are those of a run of `recipe_iterations`, and scale with `iterations`."""
 
     iterations: int = 30_000  # steps of this run
     recipe_iterations: int = 30_000  # length of the run that other steps refer to
@@ -131,7 +131,7 @@ class TrainConfig:
 class RasterConfig:
     """Choose how images are rendered."""
 
-    backend: str = "auto"  # or reference, cpu, cuda: the code of slices, images and losses
+    backend: str = "auto"  # or reference, cpu, cuda (docs/glossary.md)
     antialias: bool = False  # Mip-Splatting: scale opacities for the area that the 2D filter adds
 
 
@@ -140,8 +140,8 @@ class ProtocolConfig:
     """Choose how results are measured."""
 
     name: str = MISSING  # gsbench or published
-    quantise: bool = False  # round renders to 8 bits before they are measured
-    best_on_test: bool = False  # also record the best test PSNR in training; it leaks
+    quantise: bool = False  # measure renders rounded to 8 bits
+    best_on_test: bool = False  # also record the best test PSNR (a leak)
     lpips_alex: str | None = None  # file of AlexNet's weights; None: in $TORCH_HOME/hub/checkpoints
     lpips_vgg: str | None = None  # file of VGG16's weights
     renders: int = 30  # least number of timed renders
@@ -152,22 +152,22 @@ class ProtocolConfig:
 class EffectsConfig:
     """Remove time, direction and AGR from Gaussians that do not need them (docs/effects.md)."""
 
-    gate: str = "${model.gate}"  # off; end: after the training; both: in the training too
-    budget_db: float = 0.05  # PSNR on val that the gate at the end may cost
+    gate: str = "${model.gate}"  # off; end: after the training; both: also during it
+    budget_db: float = 0.05  # PSNR on val that this may cost after the training
 
 
 @dataclass
 class LaunchConfig:
     """Launch runs here (`+launch=local`), in parallel processes (`parallel`) or as Slurm jobs (`slurm`)."""
 
-    at_once: int = -1  # runs at a time; -1: one for each CPU (parallel), as many as possible (slurm)
-    partition: str | None = None  # partition of Slurm; all keys below are of Slurm too
-    minutes: int = 240  # time limit of a job; a longer run continues in another job
+    at_once: int = -1  # runs at a time; -1: one for each CPU (parallel) or all (slurm)
+    partition: str | None = None  # this and all keys below: Slurm only
+    minutes: int = 240  # time limit of a job; longer runs continue in another
     cpus: int = 4  # CPUs of a job
     gpus: int | None = None  # GPUs of a job; use device=cuda
     memory: str = "8G"  # memory of a job, as in sbatch
-    setup: str = ":"  # shell line before the run, such as `module load cuda`
-    requeues: int = 20  # how often a job may continue in another one
+    setup: str = ":"  # shell line before the run: `module load cuda`
+    requeues: int = 20  # most jobs in which a run may continue
     signal_seconds: int = 120  # seconds before the time limit at which a job saves
     sbatch: dict[str, Any] = field(default_factory=dict)  # other options of sbatch: +launch.sbatch.account=NAME
 
@@ -176,13 +176,13 @@ class LaunchConfig:
 class Config:
     """Configure one run, or with `scene=all` a run for each scene of the data set."""
 
-    experiment: str = MISSING  # name of the +exp= file and of the folder in results/
+    experiment: str = MISSING  # name of the +exp= file
     seed: int = 0  # seed of every random number
     device: str = "cpu"  # or cuda, cuda:1
     agr: bool = "${model.agr}"  # type: ignore[assignment]  # whether the model has AGR, the neural refinement
-    optim: str = "adam"  # or sparse_adam: moves only Gaussians that the batch sees
+    optim: str = "adam"  # or sparse_adam: updates only visible Gaussians
     results: str = "results"  # folder of all results
-    resume: bool = True  # continue from a checkpoint, keep finished runs; false: start over
+    resume: bool = True  # false: start over
     model: ModelConfig = field(default_factory=ModelConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     data: DataConfig = field(default_factory=DataConfig)
