@@ -50,7 +50,7 @@ class InitConfig:
 
 @dataclass
 class LearningRate:
-    """A learning rate that falls log-linearly from `start` to `end` over the run."""
+    """Set a learning rate that falls log-linearly from `start` to `end` over the run."""
 
     start: float = MISSING
     end: float | None = None  # None: constant
