@@ -26,7 +26,7 @@ class DataConfig:
     background: str = "black"  # or white: background of images
     initial_lambda: float = 0.5  # initial lambda_t and lambda_d of 7DGS
     initial_points: int = 100_000  # random points, if the data have none
-    initial_half_width: float | None = 1.3  # they fill the cube [-w, w]^3; None: the frustum that all cameras share
+    initial_half_width: float | None = 1.3  # random points fill [-w, w]^3; None: the frustum that all cameras share
 
 
 @dataclass
@@ -81,13 +81,13 @@ class DensifyConfig:
 
     kind: str = "gradient"  # rule of density control
     start: int = 500  # step after which Gaussians are cloned, split and pruned
-    stop: int = 15_000  # step at which this ends
+    stop: int = 15_000  # step at which densification ends
     every: int = 100  # least number of steps between two rounds
     rounds: int | None = None  # most rounds of a run; None: 36
     reset_every: int = 3_000  # steps between two resets of the opacities
     grad_threshold: float = 2e-4  # least mean gradient of a 2D mean, in units of half the image
     clone_below: float = 0.01  # clone if the largest scale is below this share of the extent, else split
-    prune_above: float = 0.1  # prune if it is above this share, after the first opacity reset
+    prune_above: float = 0.1  # prune if the largest scale is above this share, after the first opacity reset
     thin_to: float | None = None  # share of Gaussians that stay after `stop`, by blend weight; None: all
     max_gaussians: int | None = None  # most Gaussians; None: 2,000,000
 
