@@ -1,6 +1,6 @@
-"""Declare the schema of conf/: the type and the default of every key. A typo in a YAML fails and names the key.
+"""Declare the type and the default of every key of the YAML files in conf/, so that Hydra refuses an unknown key.
 
-This module needs no torch, so that `--help` and the message about a wrong key appear at once.
+This module does not import torch, so that `--help` and the message about a wrong key appear at once.
 """
 
 from dataclasses import dataclass, field
@@ -16,94 +16,94 @@ CONF = HERE / "conf" if (HERE / "conf").is_dir() else HERE.parent / "conf"  # in
 
 @dataclass
 class DataConfig:
-    """A data set: where its files are and how they are read. An experiment sets these."""
+    """Say where the files of a data set are and how they are read; an experiment (`+exp=`) sets these keys."""
 
     dataset: str = MISSING  # name in tables
-    paper_dataset: str | None = None  # the paper's data set: its rows are shown in tables
-    root: str = MISSING  # folder with one folder per scene; or pkg://module, for data in a package
-    published: str = ""  # where to get the data; shown if it is missing
+    paper_dataset: str | None = None  # name in the paper's tables
+    root: str = MISSING  # folder with a folder for each scene, or pkg://MODULE
+    published: str = ""  # where to get the data
     scenes: list[str] = field(default_factory=list)  # scenes of scene=all
-    background: str = "black"  # or white: colour behind images and renders
+    background: str = "black"  # or white: background of images
     initial_lambda: float = 0.5  # initial lambda_t and lambda_d of 7DGS
-    initial_points: int = 100_000  # random points, if the data set has no points
-    initial_half_width: float | None = 1.3  # w of their cube [-w, w]^3; None: the frustum that all cameras share
+    initial_points: int = 100_000  # random points, if the data have none
+    initial_half_width: float | None = 1.3  # random points fill [-w, w]^3; None: the frustum that all cameras share
 
 
 @dataclass
 class SceneConfig:
-    """One scene of the data set."""
+    """Choose one scene of the data set."""
 
     name: str = MISSING  # folder in data.root
-    released_as: str | None = None  # name of the folder in the published release, if not `name`
-    downscale: int = 1  # images become smaller by this integer factor (area filter)
-    eval_split: str = "test"  # or val, if the test split is wrong (D-NeRF lego)
+    released_as: str | None = None  # the folder's name in the published data, if another
+    downscale: int = 1  # divisor of the image size (area filter)
+    eval_split: str = "test"  # or val (D-NeRF lego, whose test split is wrong)
     frames: list[int] | None = None  # first and last frame of a Technicolor scene; None: all
 
 
 @dataclass
 class InitConfig:
-    """Start from trained Gaussians instead of points: +init.ply=FILE."""
+    """Start the training from the Gaussians of a PLY file instead of points: `+init.ply=FILE`."""
 
     ply: str | None = None  # trained 3D Gaussians in the format of 3DGS
-    ply_sha256: str | None = None  # hash of that file; the run computes it if it is not given
+    ply_sha256: str | None = None  # hash of that file; computed if not given
 
 
 @dataclass
 class LearningRate:
-    """A learning rate over the run, log-linear from start to end."""
+    """Set a learning rate that falls log-linearly from `start` to `end` over the run."""
 
     start: float = MISSING
     end: float | None = None  # None: constant
-    per_extent: bool = False  # multiplied by the scene's extent
-    per_run: bool = False  # multiplied by sqrt(recipe_iterations / iterations): a shorter run has fewer steps
+    per_extent: bool = False  # multiplied by the radius of the scene's cameras
+    per_run: bool = False  # multiplied by sqrt(recipe_iterations / iterations)
 
 
 @dataclass
 class ModelConfig:
-    """A model: keys of every model, and options of its class."""
+    """Choose the model and its settings."""
 
     name: str = MISSING  # name of the model's class
-    module: str | None = None  # Python module of a model of your own (docs/adding_a_model.md)
+    module: str | None = None  # Python module of your own model
     published_with_agr: bool = False  # whether the published method has AGR
-    agr: bool = "${.published_with_agr}"  # type: ignore[assignment]  # default of agr
-    agr_octaves: int = 4  # octaves K of AGR's time encoding; the paper has 10 (docs/tuning.md)
+    agr: bool = "${.published_with_agr}"  # type: ignore[assignment]  # default of the key agr
+    agr_octaves: int = 4  # octaves of AGR's time encoding
     sh_degree: int = 3  # SH degree, 0 to 3
     min_opacity: float = 0.005  # Gaussians of lower opacity are pruned
     gate: str = "off"  # default of effects.gate
     candidates: dict[str, Any] = field(default_factory=dict)  # models from which model=auto chooses
     lr: dict[str, LearningRate] = field(default_factory=dict)  # learning rate of each parameter group
-    options: dict[str, Any] = field(default_factory=dict)  # keyword arguments of the model's class
+    options: dict[str, Any] = field(default_factory=dict)  # arguments of the model's class
 
 
 @dataclass
 class DensifyConfig:
-    """Adaptive density control (3DGS, section 5.2). Steps are of a run of `recipe_iterations`, but not `every`."""
+    """Set the adaptive density control of 3DGS (section 5.2). All steps but `every` scale with `train.iterations`."""
 
-    kind: str = "gradient"  # rule that adds and removes Gaussians
+    kind: str = "gradient"  # rule of density control
     start: int = 500  # step after which Gaussians are cloned, split and pruned
-    stop: int = 15_000  # step at which this ends
-    every: int = 100  # least number of steps between two rounds, in a run of any length
-    rounds: int | None = None  # most rounds of a run: a long run takes more steps between two; None: 36
+    stop: int = 15_000  # step at which densification ends
+    every: int = 100  # least number of steps between two rounds
+    rounds: int | None = None  # most rounds of a run; None: 36
     reset_every: int = 3_000  # steps between two resets of the opacities
     grad_threshold: float = 2e-4  # least mean gradient of a 2D mean, in units of half the image
     clone_below: float = 0.01  # clone if the largest scale is below this share of the extent, else split
-    prune_above: float = 0.1  # prune if it is above this share, after the first opacity reset
+    prune_above: float = 0.1  # prune if the largest scale is above this share, after the first opacity reset
     thin_to: float | None = None  # share of Gaussians that stay after `stop`, by blend weight; None: all
-    max_gaussians: int | None = None  # limit; largest gradients come first; None: 2,000,000
+    max_gaussians: int | None = None  # most Gaussians; None: 2,000,000
 
 
 @dataclass
 class PenaltyConfig:
-    """A penalty on the loss of every view (gsbench/train/penalties.py)."""
+    """Set one term that is added to the loss of every view."""
 
-    weight: float = 0.0  # 0: no penalty
-    start: int = 0  # first step, in a run of `recipe_iterations`
+    weight: float = 0.0  # factor of the term; 0: none
+    start: int = 0  # first step
     stop: int | None = None  # step at which it ends; None: with the run
 
 
 @dataclass
 class PenaltiesConfig:
-    """The penalties."""
+    """Add terms to the loss of every view."""
 
     opacity: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean opacity
     size: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean largest scale, in parts of the scene's extent
@@ -111,7 +111,7 @@ class PenaltiesConfig:
 
 @dataclass
 class TrainConfig:
-    """The recipe. Steps are of a run of `recipe_iterations` and scale with the length of the run."""
+    """Set the schedule and the loss. Steps are those of a run of `recipe_iterations`, and scale with `iterations`."""
 
     iterations: int = 30_000  # steps of this run
     recipe_iterations: int = 30_000  # length of the run that other steps refer to
@@ -130,60 +130,60 @@ class TrainConfig:
 
 @dataclass
 class RasterConfig:
-    """How images are rendered."""
+    """Choose how images are rendered."""
 
-    backend: str = "auto"  # or reference, cpu, cuda: the code of slices, images and losses
-    antialias: bool = False  # scale opacities for the area that the 2D filter adds (Mip-Splatting)
+    backend: str = "auto"  # or reference, cpu, cuda (docs/glossary.md)
+    antialias: bool = False  # Mip-Splatting: scale opacities for the area that the 2D filter adds
 
 
 @dataclass
 class ProtocolConfig:
-    """How results are measured. Every record holds it."""
+    """Choose how results are measured."""
 
     name: str = MISSING  # gsbench or published
-    quantise: bool = False  # round renders to 8 bits before they are measured
-    best_on_test: bool = False  # also record the best test PSNR in training; it leaks
+    quantise: bool = False  # measure renders rounded to 8 bits
+    best_on_test: bool = False  # also record the best test PSNR (a leak)
     lpips_alex: str | None = None  # file of AlexNet's weights; None: in $TORCH_HOME/hub/checkpoints
-    lpips_vgg: str | None = None  # the same for VGG16
+    lpips_vgg: str | None = None  # file of VGG16's weights
     renders: int = 30  # least number of timed renders
     pictures: int = 3  # test views in pictures.png
 
 
 @dataclass
 class EffectsConfig:
-    """Effects on demand (docs/effects.md)."""
+    """Remove time, direction and AGR from Gaussians that do not need them (docs/effects.md)."""
 
-    gate: str = "${model.gate}"  # off; end: after the training; both: in the training too
-    budget_db: float = 0.05  # PSNR on val that the gate at the end may cost
+    gate: str = "${model.gate}"  # off; end: after the training; both: also during it
+    budget_db: float = 0.05  # PSNR on val that this may cost after the training
 
 
 @dataclass
 class LaunchConfig:
-    """Where runs are done: +launch=local, parallel or slurm. No result depends on it."""
+    """Launch runs here (`+launch=local`), in parallel processes (`parallel`) or as Slurm jobs (`slurm`)."""
 
-    at_once: int = -1  # runs at a time; -1: one for each CPU (parallel), as many as possible (slurm)
-    partition: str | None = None  # this and the keys below are of Slurm
-    minutes: int = 240  # time limit of a job; a longer run continues in another job
+    at_once: int = -1  # runs at a time; -1: one for each CPU (parallel) or all (slurm)
+    partition: str | None = None  # this and all keys below: Slurm only
+    minutes: int = 240  # time limit of a job; longer runs continue in another
     cpus: int = 4  # CPUs of a job
     gpus: int | None = None  # GPUs of a job; use device=cuda
     memory: str = "8G"  # memory of a job, as in sbatch
-    setup: str = ":"  # shell line before the run, such as `module load cuda`
-    requeues: int = 20  # how often a job may continue in another one
-    signal_seconds: int = 120  # how long before the time limit a job saves
+    setup: str = ":"  # shell line before the run: `module load cuda`
+    requeues: int = 20  # most jobs in which a run may continue
+    signal_seconds: int = 120  # seconds before the time limit at which a job saves
     sbatch: dict[str, Any] = field(default_factory=dict)  # other options of sbatch: +launch.sbatch.account=NAME
 
 
 @dataclass
 class Config:
-    """A run; with scene=all, a run for each scene of the data set."""
+    """Configure one run, or with `scene=all` a run for each scene of the data set."""
 
-    experiment: str = MISSING  # name of the +exp= file and of the folder in results/
+    experiment: str = MISSING  # name of the +exp= file
     seed: int = 0  # seed of every random number
     device: str = "cpu"  # or cuda, cuda:1
-    agr: bool = "${model.agr}"  # type: ignore[assignment]  # whether the model has AGR
-    optim: str = "adam"  # or sparse_adam: moves only Gaussians that the batch sees
+    agr: bool = "${model.agr}"  # type: ignore[assignment]  # whether the model has AGR, the neural refinement
+    optim: str = "adam"  # or sparse_adam: updates only visible Gaussians
     results: str = "results"  # folder of all results
-    resume: bool = True  # continue from a checkpoint, keep finished runs; false: start over
+    resume: bool = True  # false: start over
     model: ModelConfig = field(default_factory=ModelConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     data: DataConfig = field(default_factory=DataConfig)
