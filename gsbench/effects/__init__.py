@@ -1,1 +1,1 @@
-"""Choose what a scene and each Gaussian depend on: time, direction of view, AGR and colour harmonics."""
+"""Choose whether a scene needs time, and which Gaussians need time, view direction, AGR and higher SH degrees."""

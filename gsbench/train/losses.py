@@ -14,7 +14,7 @@ SIGMA = 1.5
 
 
 def photometric(image: Tensor, target: Tensor, ssim_weight: float, backend: Backend = AUTO) -> Tensor:
-    """Compute the loss (1 - ssim_weight) L1 + ssim_weight (1 - SSIM) between an image and its target, [H, W, 3] each."""
+    """Compute the loss (1 - ssim_weight) L1 + ssim_weight (1 - SSIM) of an image and its target, [H, W, 3] each."""
     if backend.serves(image):
         return l1_ssim(image, target, ssim_weight)
     loss = F.l1_loss(image, target)
