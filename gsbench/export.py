@@ -156,7 +156,7 @@ def shots(asked: ExportRequest) -> list[paths.Shot]:
 
 
 def find_view(scene: Scene, name: str) -> View:
-    """Return the view with a name such as test/r_003, or the training view with a number, counted from 0.
+    """Return the view whose name is `name`, such as test/r_003; if `name` is a number, the training view number `name`.
 
     Raises:
         InputError: no view has this name or number.

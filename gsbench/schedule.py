@@ -23,15 +23,15 @@ MOST_ROUNDS = 36
 
 # The step, in a run of 30,000, after which Gaussians with small blend weights are removed, if densification is over.
 THIN = 15_600
-# The step, in a run of 30,000, after which time, direction or AGR is removed from Gaussians that do not need it, if
-# densification is over and STEPS_TO_RECOVER steps are left. With 120 steps left of 300, PSNR was 0.4 dB lower.
+# The step, in a run of 30,000, after which Gaussians are made independent of time, direction or AGR, if densification
+# is over and STEPS_TO_RECOVER steps are left. With 120 steps left of 300, PSNR was 0.4 dB lower.
 GATE = 18_000
 STEPS_TO_RECOVER = 300
 
 
 @dataclass(frozen=True)
 class ActiveComponents:
-    """Hold the parts of a model that are active at a step: SH degree, AGR (the neural refinement), learned lambdas."""
+    """Hold which parts of a model are active at a step: the SH degree, AGR (neural refinement), and learned lambdas."""
 
     sh_degree: int
     refine: bool  # AGR changes the Gaussians and learns
@@ -70,7 +70,7 @@ class Schedule:
         return max(1, round(step * self.config.iterations / self.config.recipe_iterations))
 
     def active(self, step: int) -> ActiveComponents:
-        """Return the SH degree at a step, counted from 0, and whether AGR is on and lambda_t and lambda_d learn."""
+        """Return which parts of the model are active at a step: SH degree, AGR (neural refinement), learned lambdas."""
         return ActiveComponents(
             sh_degree=min(self.sh_degree, step // self.scaled(self.config.sh_every)),
             refine=self.agr and step >= self.scaled(self.config.refine_from),
@@ -107,7 +107,7 @@ class Schedule:
         return self.config.densify.thin_to is not None and step + 1 == max(self.scaled(THIN), self.densify_stop)
 
     def gates(self, step: int) -> bool:
-        """Return whether time, direction or AGR is removed from Gaussians that do not need them after this step.
+        """Return whether Gaussians are made independent of time, direction or refinement (AGR) after a step.
 
         This is done once after densification, if at least STEPS_TO_RECOVER steps are left.
         """

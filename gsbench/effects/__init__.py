@@ -1,1 +1,1 @@
-"""Choose whether a scene needs time, and which Gaussians need time, view direction, AGR and higher SH degrees."""
+"""Choose whether a scene needs time, and which Gaussians need time, direction, AGR (neural refinement) or SH."""

@@ -1,4 +1,4 @@
-"""Test whether a scene needs time, or remove time, direction and AGR from Gaussians of a trained model, or draw them.
+"""Test whether a scene needs time, or simplify the Gaussians of a trained model, or draw what its Gaussians depend on.
 
 python -m gsbench.effects SCENE_FOLDER [--json]
 python -m gsbench.effects --checkpoint RUN_FOLDER [--budget-db 0.05] [--data-root PATH]

@@ -1,4 +1,4 @@
-"""Remove time, direction or AGR from as many Gaussians of a model as a given loss of PSNR allows."""
+"""Make as many Gaussians independent of time, direction or refinement as a given loss of PSNR allows."""
 
 import copy
 import math
@@ -21,7 +21,7 @@ MOST_PREDICTED = 2.0  # the predicted loss of PSNR is at most this times the all
 
 @dataclass(frozen=True)
 class Gated:
-    """Hold a model after time, direction or AGR was removed from some of its Gaussians, with the loss of PSNR."""
+    """Hold a model with Gaussians that were made independent of time, direction or refinement, and the loss of PSNR."""
 
     model: GatedModel
     gate: Gate  # the decisions and measurements, for record.json
@@ -36,18 +36,19 @@ def gate_within(
     measure: Callable[[GaussianModel], float],
     intervals: Tensor | None = None,  # [N, 2]
 ) -> Gated | None:
-    """Remove time, direction, AGR or SH degrees from as many Gaussians as the allowed loss of PSNR permits.
+    """Simplify as many Gaussians as the allowed loss of PSNR permits.
 
-    The function tries the squared errors of SHARES, from the largest to the smallest. For each it simplifies a copy of
-    the model until the predicted errors add up to this share of the model's squared error, and measures PSNR. It
-    returns the first copy whose loss of PSNR is allowed, or None.
+    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+    removed. For each share in SHARES, from the largest, the function simplifies a copy of the model until the predicted
+    errors add up to this share of the model's squared error. It returns the first copy whose measured loss of PSNR is
+    allowed, or None.
 
     Args:
         model: the model, trained or in training; it does not change.
         sensitivity: the predicted error of each simplification of each Gaussian.
         budget_db: the largest allowed loss of PSNR, dB.
         measure: a function that returns the PSNR of a model in dB, on views that were not used for `sensitivity`.
-        intervals: the first and the last time at which each Gaussian is visible; AGR skips it at other times.
+        intervals: the first and the last time at which AGR changes each Gaussian, because it is visible.
     """
     before = measure(model)
     for share in SHARES:

@@ -3,10 +3,10 @@
 If several images come from the same camera position, they are compared with one another (gsbench.effects.rig).
 
 For other views, a static 3DGS is fitted in a few steps. If the scene moves, the gradients of the views' squared errors
-by the means of the Gaussians change slowly with time. The test measures the share of these gradients that follows four
-slow cosines of time, and compares it with the share under random permutations of time (Freedman and Lane 1983). The
-effect of the camera position is removed by regression first. If the camera moves along with time, as on an orbit, the
-two effects cannot be separated, and the answer is undecided.
+with respect to the means of the Gaussians change slowly with time. The test measures the share of these gradients that
+follows four slow cosines of time, cos(pi k t) with k = 1 .. 4. It compares this share with the shares under random
+permutations of time (Freedman and Lane 1983). The influence of the camera position is removed by regression first. If
+the camera moves along with time, as on an orbit, the two influences cannot be separated, and the answer is undecided.
 """
 
 import math
@@ -70,7 +70,7 @@ def import_compiler() -> None:
 
 
 def _answer(scene: Scene, seed: int, backend: str) -> ScreenResult:
-    """Run the test for repeated camera positions, the test for other views, or both, and combine the answers."""
+    """Test for change with time by views from the same camera position, by other views, or by both tests combined."""
     views = scene.train
     if not scene.has_time:
         return ScreenResult(OFF, "the views have no times")
@@ -163,5 +163,5 @@ def _both(fixed: ScreenResult, loose: ScreenResult) -> ScreenResult:
 
 
 def _is_blind(loose: ScreenResult) -> bool:
-    """Return whether the camera position explains most of the cosines of time, so that the p-value is meaningless."""
+    """Return whether time and camera position are so correlated that the test for change with time says nothing."""
     return loose.free is not None and loose.free < LEAST_FREE

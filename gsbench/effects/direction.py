@@ -19,7 +19,7 @@ from gsbench.scenes import View
 def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianModel | None:
     """Return a copy of a model whose slices do not depend on the view direction; None for a model without direction.
 
-    AGR, time and the SH coefficients of the colours stay.
+    The neural refinement (AGR), the dependence on time and the SH coefficients of the colours stay.
 
     Args:
         model: the trained model.

@@ -54,7 +54,7 @@ def changes(
 def _telling(
     saturated: Mask,  # [n, 3, P]
 ) -> NDArray[np.int64]:
-    """Choose pixels for the fit of gains and offsets: FIT_PIXELS that no image saturates, and FIT_PIXELS of all."""
+    """Choose the pixels for the fit of exposure: up to FIT_PIXELS that no image saturates, and FIT_PIXELS of all."""
     inside = np.flatnonzero((~saturated.any(0)).any(0))
     spaced = [every[:: max(1, -(-len(every) // FIT_PIXELS))] for every in (inside, np.arange(saturated.shape[2]))]
     return np.unique(np.concatenate(spaced))
@@ -67,7 +67,7 @@ def _fit(
 ) -> tuple[Array, Array]:
     """Fit gains a and offsets b, [n, 3, 1], of y = a x + b to the pixels in `use`, for n images and 3 channels.
 
-    A pixel with x = y = 0 and a small weight is added.
+    A black pixel (x = y = 0) with a small weight is added, so that an image of one shade determines only a gain.
     """
     number = use.sum(-1, keepdims=True)
     enough = number >= LEAST_PIXELS
@@ -101,9 +101,10 @@ def _seen(
     saturated: Mask,  # [n, 3, P]
     full: Mask,  # [3, P] where the first image is saturated, whether it is white and not black
 ) -> Array:  # [3, P]
-    """Return the median over n images of the unsaturated values of each pixel.
+    """Return for each pixel the median over n images of its unsaturated values.
 
-    If all values are saturated, return the largest of white values or the smallest of black values.
+    A pixel that is saturated in all images gets its largest value if it is white, and its smallest value if it is
+    black.
     """
     ordered = np.sort(np.where(saturated, np.float32(np.inf), values), 0)
     number = (~saturated).sum(0)

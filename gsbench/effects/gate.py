@@ -1,8 +1,10 @@
-"""Simplify Gaussians: remove time, direction, AGR or SH degrees from a Gaussian, or the Gaussian itself.
+"""Choose a simplification for each Gaussian of a model, and apply it.
 
-For each Gaussian, the rule chooses the simplification that minimises cost + lambda error. The cost is the rendering
-time of the Gaussian in a frame, and the error is the predicted squared error of images (gsbench.effects.sensitivity).
-lambda is the same for all Gaussians. It is chosen so that the errors add up to a given bound.
+A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+removed. For each Gaussian, the rule chooses the simplification that minimises cost + lambda error. The cost is the
+rendering time of the Gaussian in a frame, and the error is the predicted growth of the images' squared error
+(gsbench.effects.sensitivity). lambda is the same for all Gaussians. It is chosen so that the errors add up to a given
+bound.
 """
 
 from dataclasses import dataclass
@@ -23,14 +25,14 @@ REFINING = 195.0  # AGR
 SLICING = 28.0
 COSTS = {CONDITIONED: SLICING, STATIC: 8.0, REMOVED: -60.0}  # without the 60 that the rasterizer takes for a Gaussian
 COLORING = (13.0, 19.0, 23.0, 28.0)  # by SH degree, for each frequency of time
-LESS_TO_READ = 1.0  # saved if a Gaussian lost time or direction but not both: fewer parameters, the same arithmetic
+LESS_TO_READ = 1.0  # saved if a Gaussian depends on only one of time and direction: it has fewer parameters to read
 BITS = {"time": TIME, "direction": DIRECTION}
 BISECTIONS = 32
 
 
 @dataclass(frozen=True)
 class ChosenSimplifications:
-    """Hold the simplification that was chosen for each Gaussian, and the predicted error of all together."""
+    """Hold the simplification that was chosen for each Gaussian, such as independent of time, and the total error."""
 
     geometry: dict[str, Tensor]  # for each simplification by name: which Gaussians it is chosen for, [N] bool
     orders: Tensor  # [N] int32: SH degree and frequencies of each colour, as in `ColorOrder`
@@ -39,6 +41,9 @@ class ChosenSimplifications:
 
 def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> ChosenSimplifications:
     """Choose a simplification for each Gaussian so that the predicted errors add up to at most a given bound.
+
+    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+    removed.
 
     For Gaussian i, the simplification s minimises cost(i, s) + lambda error(i, s). The cost is its time in a frame
     (COSTS, COLORING), and the error is the predicted squared error. Bisection finds the smallest lambda for which the
@@ -64,7 +69,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     shading = _shading(orders)
 
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the best simplifications of geometry and colour for one lambda, and the error of each Gaussian."""
+        """Return for one weight lambda of the error the best simplification of each Gaussian, and its error."""
         shade, hue = (shading + price * hues).min(0)
         _, form = (costs + price * forms + torch.where(removes, 0.0, shade)).min(0)  # argmin takes 8 to 30 times longer
         error = forms.gather(0, form[None])[0] + hues.gather(0, hue[None])[0] * ~removes[form, 0]
@@ -83,7 +88,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
 
 
 def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
-    """Return the time of slicing and AGR for each Gaussian in a frame, nanoseconds, [N]."""
+    """Return the time that slicing and neural refinement (AGR) of each Gaussian take in a frame, nanoseconds, [N]."""
     like = model.splats["opacities"].detach()
     cost = torch.full_like(like, COSTS[STATIC])
     cost[: now.conditioned] = SLICING
@@ -94,14 +99,14 @@ def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
 
 
 def cost_of(model: GaussianModel) -> Tensor:
-    """Return the time of slicing, AGR and colour for each Gaussian in a frame, nanoseconds, [N]."""
+    """Return the time that slicing, refinement (AGR) and colour of each Gaussian take in a frame, nanoseconds, [N]."""
     now = effect_sets_of(model)
     assert now.orders is not None
     return _live_cost(model, now) + _shading(now.orders)
 
 
 def most_cost(model: GaussianModel) -> float:
-    """Return the time of AGR, slicing and full colour for one Gaussian in a frame, nanoseconds."""
+    """Return the time that a Gaussian with slicing, refinement (AGR) and full colour takes in a frame, nanoseconds."""
     return REFINING + SLICING + float(_shading(torch.tensor(model.full_order())))
 
 
@@ -112,7 +117,7 @@ def _shading(orders: Tensor) -> Tensor:
 
 
 def effect_sets_of(model: GaussianModel) -> EffectSets:
-    """Return which effects (time, direction, AGR, SH degrees) each Gaussian of a model has."""
+    """Return what each Gaussian of a model depends on: time, direction, AGR (neural refinement), and its SH degree."""
     if model.effect_sets is not None:
         return model.effect_sets
     rows = model.count_by_effects()
@@ -129,13 +134,16 @@ def apply(
     choice: ChosenSimplifications,
     intervals: Tensor | None = None,  # [N, 2]
 ) -> tuple[Tensor, Tensor]:
-    """Apply the chosen simplifications to the Gaussians of a model, and sort these by the effects that remain.
+    """Simplify each Gaussian of a model as chosen, and sort the Gaussians by what they still depend on.
+
+    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+    removed.
 
     Args:
         model: the model, which is changed in place.
         sensitivity: the parameters of each simplified Gaussian.
         choice: the simplification of each Gaussian, from `choose`.
-        intervals: the first and the last time at which each Gaussian is visible; AGR skips it at other times.
+        intervals: the first and the last time at which AGR changes each Gaussian.
 
     Returns:
         The former index of each remaining Gaussian, [M], and whether it was simplified, [M] bool.

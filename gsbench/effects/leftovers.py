@@ -1,4 +1,4 @@
-"""Fit a static 3DGS in a few steps, and compute the gradient of each view's squared error by the Gaussians' means."""
+"""Fit a static 3DGS in a few steps, and compute gradients of each view's error with respect to the Gaussians' means."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 def leftovers(views: Sequence[View], scene: Scene, seed: int, backend: str) -> Array:
     """Fit a static 3DGS to V views for STEPS steps, and return the scalar products of the views' gradients, [V, V].
 
-    The gradient of a view is that of its squared error by the means of the Gaussians, after the fit.
+    The gradient of a view is that of its squared error with respect to the means of the Gaussians, after the fit.
     """
     random = torch.Generator().manual_seed(seed)
     points = scene_points(views, scene, random)
@@ -63,7 +63,7 @@ def leftovers(views: Sequence[View], scene: Scene, seed: int, backend: str) -> A
 
 
 def _gradients(model: Gaussians3DModel, by: list[nn.Parameter], background: Tensor, view: View) -> list[Tensor]:
-    """Compute the gradients of the mean squared error of a view by the parameters `by` of a 3DGS model."""
+    """Compute the gradients of a view's mean squared error with respect to the parameters `by` of a 3DGS model."""
     with Tape() as tape:
         gaussians = model.slice(Query.of(view.camera, None))
         image = rasterize_slice(gaussians, view.camera, background, model.backend).image
@@ -89,7 +89,7 @@ def smaller(view: View) -> View:
 
 
 def scene_points(views: Sequence[View], scene: Scene, random: torch.Generator) -> Points:
-    """Return POINTS initial points of a fit: a random choice of the scene's points, or random points in its centre."""
+    """Return POINTS initial points for a fit: a random subset of the scene's points, or random points at its centre."""
     if scene.points is not None:
         chosen = torch.randperm(len(scene.points.means), generator=random)[:POINTS]
         return Points(scene.points.means[chosen], scene.points.colors[chosen])

@@ -1,4 +1,4 @@
-"""Write the messages about the test for time and the removal of effects (time, direction, AGR) from Gaussians.
+"""Write messages about the test for time, and about Gaussians made independent of time, direction or refinement.
 
 This module does not import torch.
 """
@@ -32,7 +32,7 @@ def of_screen(screen: TimeScreen) -> str:
 
 
 def of_gate(gate: Gate) -> str:
-    """Return a message on one removal of effects: the number of Gaussians with each effect, PSNR, frame time, bytes."""
+    """Return a message on a simplification of a model: what its Gaussians still depend on, PSNR, frame time, bytes."""
     left = sum(number for name, number in gate.rows.items() if name != "removed")
     when = "at the end" if gate.step is None else f"after step {gate.step}"
     kept = ", ".join(f"{gate.rows[name]} {words}" for name, words in _KEEP.items() if gate.rows.get(name))
@@ -49,13 +49,13 @@ def of_gate(gate: Gate) -> str:
 
 
 def of_direction(found: Direction) -> str:
-    """Return a message that says how many Gaussians depend on view direction, and what removing it would change."""
+    """Return a message: how many Gaussians depend on direction, and what would change if none did."""
     return (f"direction: {found.kept:.0%} of the Gaussians keep it; freezing it in all would change PSNR by "
             f"{-found.loss_db:+.2f} dB and a frame from {found.frame_ms:.2f} to "
             f"{found.frame_ms_without:.2f} ms")  # fmt: skip
 
 
 def lines(found: OnDemand) -> list[str]:
-    """Return the messages on the removals of effects (time, direction, AGR) from Gaussians in one run."""
+    """Return the messages of one run about Gaussians made independent of time, direction or refinement (AGR)."""
     said = [of_gate(gate) for gate in found.gates]
     return said + ([of_direction(found.direction)] if found.direction else []) + found.notes

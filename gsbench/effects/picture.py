@@ -1,8 +1,8 @@
-"""Draw three panels: a rendered image, the Gaussians coloured by their effects, and the rendering cost of each pixel.
+"""Draw three panels: a rendered image, what each Gaussian depends on, and the rendering cost of each pixel.
 
-In the second panel, the colour of a Gaussian shows which effects (time, direction, AGR) it has. In the third, the time
-that each Gaussian takes in a frame (constants of gsbench.effects.gate) is alpha-composited like a colour. Bright
-yellow is a Gaussian with AGR and the full SH degree, black is no cost.
+In the second panel, the colour of a Gaussian shows whether it depends on time, direction and AGR (the neural
+refinement). In the third, the time that each Gaussian takes in a frame (constants of gsbench.effects.gate) is
+alpha-composited like a colour. Bright yellow is a Gaussian with AGR and the full SH degree, black is no cost.
 """
 
 import cv2
@@ -37,10 +37,10 @@ COLUMNS = 3
 def draw(
     model: GaussianModel, camera: Camera, time: float | None, background: Tensor, antialias: bool = False
 ) -> Pixels:
-    """Draw an image of a model, its Gaussians coloured by their effects, and the cost of each pixel, with a legend.
+    """Draw three panels with a legend: an image, what each Gaussian depends on, and the rendering cost of each pixel.
 
     Args:
-        model: the model; if no effects were removed, all Gaussians have the same colour in the second panel.
+        model: the model; if its Gaussians were not simplified, all have the same colour in the second panel.
         camera: the camera of the image.
         time: the time of the image in [0, 1]; None if the scene has no time.
         background: the background colour of the first panel, [3].
@@ -68,7 +68,7 @@ def draw(
 
 
 def effect_set_colors(model: GaussianModel) -> Tensor:
-    """Return a colour for each Gaussian that shows which effects (time, direction, AGR) it has, [N, 3] in [0, 1]."""
+    """Return a colour for each Gaussian that shows whether it depends on time, direction and refinement, [N, 3]."""
     return torch.tensor([COLOURS[name] for name in NAMES]).to(model.splats["means"])[kinds_of(model)] / 255
 
 
@@ -78,7 +78,7 @@ def cost_colors(model: GaussianModel, most: float) -> Tensor:
 
 
 def kinds_of(model: GaussianModel) -> Tensor:
-    """Return for each Gaussian the index in NAMES of the set of effects (time, direction, AGR) that it has, [N]."""
+    """Return what each Gaussian depends on (refinement, time, direction, nothing) as an index into NAMES, [N]."""
     effect_sets = effect_sets_of(model)
     assert effect_sets.frozen is not None
     place = torch.arange(len(model), device=effect_sets.frozen.device)
@@ -92,7 +92,7 @@ def kinds_of(model: GaussianModel) -> Tensor:
 
 
 def _arranged(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixels:
-    """Put the three panels side by side, with titles above and a legend of the Gaussians' effects below."""
+    """Put the three panels side by side, with titles above and the legend of the Gaussians' colours below."""
     height, width = panels[0].shape[:2]
     factor = max(1, -(-LEAST_WIDTH // width))
     if width > MOST_WIDTH:

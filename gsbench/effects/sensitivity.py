@@ -1,18 +1,19 @@
 """Predict how much the squared error of the images grows if a Gaussian is simplified, for all Gaussians at once.
 
-To simplify a Gaussian is to remove its dependence on time, direction or AGR, to lower its SH degree, or to remove it.
-This changes the image of view v by x_v. With r_v the present image less the true one, the predicted error is
+A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+removed. This changes the image of view v by x_v. Let r_v be the present image less the true one. The predicted error is
 
     E = sum over v of max(0, 2 <r_v, x_v>) + <g_v, x_v>^2,
 
 where g_v has random signs, so that <g, x>^2 is |x|^2 on average. The maximum ignores improvements on training views.
 One backward pass with r and one with g give the scalar products of all Gaussians. Let J be the derivative of the image
-by the parameters of the slice, and delta the change of these parameters.
+with respect to the parameters of a sliced Gaussian, and delta the change of these parameters.
 
 - An image is linear in colour and opacity, so x = J delta for a lower SH degree and for a removal.
 - If a Gaussian moves by less than its size, x = (J + J') delta / 2, where J' is the derivative at the simplified
   Gaussian. For J', the simplified Gaussians are rendered together with the present ones, with small opacities.
-- If a Gaussian moves farther, |x|^2 is the sum of the squares at the two positions.
+- If a Gaussian moves farther, the image changes at the old and at the new position, and the squares of the two changes
+  are added.
 
 The last two cases are mixed with the weights w and 1 - w. Here w = exp(-d^2 / 4) is the overlap of two equal Gaussians
 at a distance of d standard deviations.
@@ -47,7 +48,11 @@ OPACITY, COLOR = 12, slice(13, 16)  # columns of `_rows_of`
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Hold the predicted growth of the squared error of training views for each simplification of each Gaussian."""
+    """Hold the predicted growth of the images' squared error if a Gaussian is simplified, for each Gaussian.
+
+    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+    removed.
+    """
 
     simplifications: list[Simplification]
     errors: dict[str, Tensor]  # for each simplification by name: [N], summed over pixels, channels and views
@@ -67,7 +72,10 @@ def probe(
     by_halves: bool = True,
     hidden: Tensor | None = None,  # [N] bool
 ) -> Sensitivity:
-    """Predict how much the squared error grows if time, direction, AGR or SH degrees are removed from each Gaussian.
+    """Predict how much the squared error of training views grows if a Gaussian is simplified, for each Gaussian.
+
+    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+    removed.
 
     Args:
         model: the model, trained or in training.
@@ -77,7 +85,7 @@ def probe(
         most: the largest number of views that are used, evenly spaced.
         draws: the number of random images g for each view; more draws reduce the variance.
         antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
-        by_halves: whether to predict also for Gaussians that lose time alone or direction alone.
+        by_halves: whether to include Gaussians that are independent of only one of time and direction.
         hidden: which Gaussians no training view shows.
     """
     looked_at = evenly(views, most)
@@ -89,7 +97,7 @@ def probe(
     seeds = torch.randint(2**62, (len(looked_at),), generator=random).tolist()
 
     def errors_in(v: int) -> tuple[float, list[Tensor]]:
-        """Return the squared error of view `v`, and for each simplification its predicted growth, [N]."""
+        """Return the squared error of view `v`, and how much it grows if each Gaussian is simplified, in each way."""
         view = looked_at[v]
         drawing = ViewRasterizer(model, view.camera, background, antialias)
         here = drawing(seen[v])
@@ -114,7 +122,7 @@ def probe(
 
 
 class Drawn(NamedTuple):
-    """Hold a rendered image together with the tape for the derivatives by its 3D Gaussians."""
+    """Hold a rendered image, its 3D Gaussians, and the recorded operations (tape) for backward passes."""
 
     at: Gaussians3D  # the 3D Gaussians
     tape: Tape  # the operations of the rendering, for the backward pass
@@ -128,7 +136,7 @@ class Drawn(NamedTuple):
         return self.images[0].detach()
 
     def products(self, vectors: list[Tensor]) -> Tensor:
-        """Return the gradients of K scalar products <image, vector> by the 16 numbers of each Gaussian, [K, N, 16]."""
+        """Return gradients of K scalar products <image, vector> with respect to the Gaussians' numbers, [K, N, 16]."""
         found = []
         for vector in vectors:
             sums: dict[int, Tensor] = {}
@@ -147,7 +155,7 @@ class ViewRasterizer(NamedTuple):
 
     @torch.enable_grad()
     def __call__(self, gaussians: Gaussians3D) -> Drawn:
-        """Rasterize 3D Gaussians for the camera, and return the image with its tape."""
+        """Rasterize 3D Gaussians for the camera; return the image and the recorded operations for backward passes."""
         at = Gaussians3D(*(x.detach().requires_grad_() for x in tensors_of(gaussians)))
         with Tape() as tape:
             output = rasterize_slice(at, self.camera, self.background, self.model.backend, self.antialias)
@@ -155,7 +163,7 @@ class ViewRasterizer(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Hold the slice of a model in one view, its image, and the derivatives that predictions of errors need."""
+    """Hold the slice of a model in one view, its image, and the derivatives from which errors are predicted."""
 
     model: GaussianModel
     query: Query

@@ -1,4 +1,4 @@
-"""Test by random permutations of time whether data follow slow cosines of time."""
+"""Test by random permutations of time whether data follow slow cosines of time, cos(pi k t)."""
 
 import math
 from collections.abc import Sequence
@@ -50,7 +50,7 @@ def evidence(
     random = np.random.default_rng(seed)
 
     def share(rows: NDArray[np.int64]) -> float:
-        """Return the share of the permuted gradients that follows the cosines, after the camera's part is removed."""
+        """Return the share of gradients, permuted by `rows`, that follows the cosines and not the camera."""
         turned = np.concatenate([slow, known], 1)[rows]
         energies = np.einsum("vk,vk->k", turned, gram @ turned)
         left = total - energies[slow.shape[1] :].sum()

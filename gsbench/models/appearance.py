@@ -1,4 +1,4 @@
-"""Compute the colours of Gaussians by spherical harmonics (3DGS), in 4DGS times a Fourier series of time."""
+"""Compute colours of Gaussians: by spherical harmonics (3DGS), or by these times a Fourier series of time (4DGS)."""
 
 import math
 
@@ -40,7 +40,7 @@ def sh_colors(coefficients: Tensor, directions: Tensor, degree: int, orders: Ten
         coefficients: SH coefficients beta of each Gaussian, [N, K, 3].
         directions: unit vectors d from the camera to the Gaussians, [N, 3].
         degree: the SH degree in use, 0 to 3.
-        orders: a lower SH degree for each Gaussian, [N] int32, encoded as in `ColorOrder`; None: `degree` for all.
+        orders: the SH degree of each Gaussian if it is lower, [N] int32; None: `degree` for all.
 
     Returns:
         The colours, [N, 3].
@@ -60,7 +60,8 @@ def sh_time_colors(
         directions: unit vectors d from the camera to the Gaussians, [N, 3].
         degree: the SH degree in use, 0 to 3.
         time_offset: the time less the mean time of each Gaussian, t - mu_t, [N].
-        orders: a lower SH degree and number of frequencies for each Gaussian, [N] int32, encoded as in `ColorOrder`.
+        orders: the SH degree and number of frequencies of each Gaussian if these are lower, encoded in one number
+            degree + 4 (frequencies - 1), [N] int32; None: all coefficients are used.
     """
     frequencies = torch.arange(coefficients.shape[1], device=time_offset.device, dtype=time_offset.dtype)
     waves = torch.cos(2 * math.pi * frequencies * time_offset[:, None])  # [N, M]

@@ -1,7 +1,7 @@
 """Define the base class of all models: N Gaussians with parameters, their slices, and the edits of density control.
 
-`gsbench.models.gated` adds optional methods. With them, time, direction or AGR (the neural refinement) can be removed
-from single Gaussians.
+`gsbench.models.gated` adds optional methods that make single Gaussians independent of time, direction or AGR (the
+neural refinement).
 """
 
 import math
@@ -61,12 +61,12 @@ class Geometry(NamedTuple):
 
 
 def tensors_of(parts: Iterable[Tensor | None]) -> list[Tensor]:
-    """Return the tensors of a slice in their order; leave out the exponents of alpha profiles if these are None."""
+    """Return the tensors of a slice in their order, without fields that are None."""
     return [part for part in parts if part is not None]
 
 
 def joined_shapes(first: Tensor | None, second: Tensor | None) -> Tensor | None:
-    """Concatenate the exponents of the alpha profiles of two groups of Gaussians; return None if neither has them.
+    """Concatenate the exponents b of the alpha profiles (1 - r^2)^b of two groups of Gaussians; None if both are None.
 
     Raises:
         InputError: only one of the groups has exponents.
@@ -121,7 +121,7 @@ class GaussianModel(nn.Module, ABC):
 
     @abstractmethod
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Return the initial raw parameters of the geometry, except `means`.
+        """Return the initial raw parameters of the covariances, and of the means in time and direction.
 
         Args:
             points: the points at which the Gaussians start.
@@ -131,7 +131,7 @@ class GaussianModel(nn.Module, ABC):
 
     @abstractmethod
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Slice Gaussians with raw parameters `raw` at the camera centre and time of `query`."""
+        """Slice Gaussians with the raw parameters `raw` (before exp and sigmoid) at a camera centre and time."""
 
     @abstractmethod
     def scales(self) -> Tensor:
@@ -139,10 +139,15 @@ class GaussianModel(nn.Module, ABC):
 
     @abstractmethod
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Return the raw geometry of the two children of each split Gaussian; `raw` has each parent twice, in a row."""
+        """Return means and covariance parameters of the two children of each split Gaussian.
+
+        Args:
+            raw: the raw parameters of the parents, of which each has two copies, one after the other.
+            generator: the source of all random numbers.
+        """
 
     def log_sizes(self, index: int) -> Tensor:
-        """Return the logarithms of a Gaussian's sizes in its n dimensions, [n]; by default of the largest in space."""
+        """Return the logarithms of the sizes of one Gaussian in its n dimensions, [n]; here only of the largest one."""
         return self.scales()[index : index + 1].log()
 
     def log_duration(self, index: int) -> float | None:
@@ -158,7 +163,7 @@ class GaussianModel(nn.Module, ABC):
         return
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
-        """Return raw geometry whose spatial covariance is that of trained 3D Gaussians.
+        """Return covariance parameters of the model for which the spatial covariance is that of trained 3D Gaussians.
 
         By default the Gaussians become spheres of the same volume.
 
@@ -184,7 +189,7 @@ class GaussianModel(nn.Module, ABC):
         return {"sh0": dc[:, None], "shN": rest}
 
     def full_order(self) -> int:
-        """Return the SH degree and the number of frequencies in time that are in use, encoded as in `ColorOrder`."""
+        """Return the SH degree in use and the number of frequencies in time, as degree + 4 (frequencies - 1)."""
         return ColorOrder(self.active.sh_degree, 1).packed
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
@@ -250,11 +255,11 @@ class GaussianModel(nn.Module, ABC):
 
     @property
     def orders(self) -> Tensor | None:
-        """The SH degree of each Gaussian's colour, [N] int32, encoded as in `ColorOrder`; None: the full degree."""
+        """The SH degree and frequencies of each Gaussian's colour, degree + 4 (frequencies - 1), [N]; None: all."""
         return None if self.effect_sets is None else self.effect_sets.orders
 
     def count_by_effects(self) -> dict[str, int]:
-        """Count the Gaussians by the effects that they have: refined by AGR, sliced by time or direction, static."""
+        """Count Gaussians by what they depend on: neural refinement, time and direction, one of the two, or nothing."""
         N, effect_sets = len(self), self.effect_sets
         if effect_sets is not None:
             return effect_sets.by_name(N)
@@ -299,7 +304,7 @@ class GaussianModel(nn.Module, ABC):
         return self.log_lambda[name].exp()
 
     def set_active(self, active: ActiveComponents) -> None:
-        """Set the SH degree in use, and whether AGR acts and learns and lambda_t and lambda_d learn."""
+        """Set which parts of the model are active: SH degree, neural refinement (AGR), and learning of the lambdas."""
         self.active = active
         for parameter in self.log_lambda.parameters():
             parameter.requires_grad_(active.tunes_lambda)
@@ -321,9 +326,9 @@ class GaussianModel(nn.Module, ABC):
     def visible_intervals(self) -> Tensor | None:
         """Return the first and the last time at which each Gaussian can be visible, [N, 2]; None without time.
 
-        A Gaussian is visible at time t if its opacity o exp(-lambda_t (t - mu_t)^2 / (2 S_t)) is at least ALPHA_MIN.
-        Times are in [0, 1]; (inf, inf) marks a Gaussian that is never visible. AGR is ignored, so the intervals are
-        not exact: they only serve to sort the Gaussians.
+        A Gaussian with opacity o, mean time mu_t and variance S_t in time is visible at time t if
+        o exp(-lambda_t (t - mu_t)^2 / (2 S_t)) is at least ALPHA_MIN. Times are in [0, 1]; (inf, inf) marks a Gaussian
+        that is never visible. The intervals only serve to sort the Gaussians: they ignore AGR, the neural refinement.
         """
         deviations = self.durations()
         if deviations is None:
@@ -336,14 +341,19 @@ class GaussianModel(nn.Module, ABC):
 
     @torch.no_grad()
     def select(self, rows: Tensor) -> None:
-        """Keep the Gaussians `rows`, in this order; an index may occur several times. The parameter objects stay."""
+        """Keep the Gaussians with the indices `rows`, in this order; an index that occurs twice copies a Gaussian."""
         for parameter in self.splats.values():
             parameter.data = parameter.data[rows]
             parameter.grad = None
 
     @torch.no_grad()
     def split_rows(self, rows: Tensor, generator: torch.Generator) -> None:
-        """Overwrite copies of split Gaussians by their children; `rows` [M] has the two copies of each in a row."""
+        """Replace copies of split Gaussians by their children.
+
+        Args:
+            rows: the indices of the copies, [M]; the two copies of a Gaussian follow each other.
+            generator: the source of all random numbers.
+        """
         raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.geometry)}
         for name, value in self.split(raw, generator).items():
             self.splats[name].data[rows] = value
@@ -356,7 +366,7 @@ class GaussianModel(nn.Module, ABC):
     # ---- what a checkpoint holds
 
     def pack(self) -> dict[str, Tensor]:
-        """Return the tensors of the model by name, as a checkpoint stores them."""
+        """Return the tensors of the model for a checkpoint, by name."""
         state: dict[str, Tensor] = self.state_dict()
         return state
 

@@ -1,7 +1,7 @@
-"""Record which effects (time, direction, AGR, higher SH degrees) each Gaussian of a model keeps.
+"""Record what each Gaussian of a model depends on: time, direction and AGR (the neural refinement).
 
-If a Gaussian lacks an effect, some of its parameters change no image, for example the motion of a static Gaussian.
-These parameters are constant, do not learn, and are not stored.
+If a Gaussian does not depend on time, for example, its parameters of motion change no image. Such parameters are
+constant, do not learn, and are not stored.
 """
 
 from typing import NamedTuple
@@ -9,11 +9,11 @@ from typing import NamedTuple
 from torch import Tensor
 
 TIME, DIRECTION = 1, 2  # in EffectSets.frozen
-NAMES = ("refined", "conditioned", "time", "direction", "static")  # the sets of effects that a Gaussian may have
+NAMES = ("refined", "conditioned", "time", "direction", "static")  # groups; "time" are Gaussians independent of time
 
 
 class EffectSets(NamedTuple):
-    """Record which effects each Gaussian has.
+    """Record what each Gaussian depends on.
 
     Gaussians are sorted: first those that AGR, the neural refinement, changes (refined), then those that change with
     time or direction but not through AGR (conditioned), then the static ones.
@@ -26,7 +26,11 @@ class EffectSets(NamedTuple):
     intervals: Tensor | None = None  # [refined, 2]: the first and last time at which AGR changes a row; None: always
 
     def by_name(self, rows: int) -> dict[str, int]:
-        """Return the number of Gaussians with each set of effects, keyed by NAMES; `rows` is the number of all."""
+        """Return the number of Gaussians in each group of NAMES, for a model of `rows` Gaussians.
+
+        The groups are: refined by AGR; sliced by time and direction; independent of time; independent of direction;
+        static.
+        """
         frozen = [0, 0] if self.frozen is None else [int((self.frozen == bit).sum()) for bit in (TIME, DIRECTION)]
         conditioned = self.conditioned - self.refined - sum(frozen)
         return dict(zip(NAMES, (self.refined, conditioned, *frozen, rows - self.conditioned), strict=True))

@@ -35,7 +35,7 @@ class Triangle:
             letters: the variable of each row, "p", "t" or "d"; for example "dddtppp".
             form: how a parameter x gives an entry below the diagonal. `raw`: the entry is x, as in the 7DGS paper.
                 `row_scaled`: it is (2 sigmoid(x) - 1) times the diagonal entry of its row, as in the authors' later
-                code. `relative`: it is x, or for `shape` x times the diagonal entry of its row.
+                code. `relative`: it is x times the diagonal entry of its row if row and column are "p", else x.
 
         Raises:
             InputError: the form is unknown.
@@ -68,7 +68,8 @@ class Triangle:
 
         Args:
             log_diagonal: the logarithms of the diagonal, [N, n] with n = 3 + k.
-            kinds: the parameters below the diagonal: shape [N, 3], motion [N, 3 k] and coupling [N, k (k - 1) / 2].
+            kinds: the parameters below the diagonal: `shape` (within position) [N, 3], `motion` (position with time or
+                direction) [N, 3 k], `coupling` (within time and direction) [N, k (k - 1) / 2].
         """  # [N, n, n]
         n = log_diagonal.shape[-1]
         diagonal = sizes(log_diagonal)
@@ -97,11 +98,15 @@ class Triangle:
         return {"log_diagonal": diagonal.log()} | self.split(x)
 
     def split(self, below: Tensor) -> dict[str, Tensor]:
-        """Split parameters below the diagonal [N, n (n - 1) / 2], row by row, into shape, motion and coupling."""
+        """Split the factor's parameters below the diagonal, [N, n (n - 1) / 2], into three kinds.
+
+        These are `shape` (within position), `motion` (position with time or direction) and `coupling` (within time and
+        direction).
+        """
         return {kind: below[:, self.places[kind]] for kind in self.kinds}
 
     def join(self, kinds: dict[str, Tensor]) -> Tensor:
-        """Join shape, motion and coupling to the parameters below the diagonal, row by row: the inverse of `split`."""
+        """Concatenate the three kinds of parameters from `split` to all parameters below the diagonal, row by row."""
         return torch.cat([kinds[kind] for kind in self.kinds], -1)[:, self.columns]
 
 

@@ -1,7 +1,6 @@
-"""Define the base class of models from whose Gaussians time, direction or SH degrees can be removed one by one.
+"""Define the base class of models in which single Gaussians can be made independent of time, direction or refinement.
 
-The gates (`gsbench.effects.gate`) remove what a Gaussian does not need. A model that gates need not simplify derives
-from `GaussianModel` instead.
+`gsbench.effects.gate` chooses these Gaussians. A model that does not support this derives from `GaussianModel` instead.
 """
 
 from abc import abstractmethod
@@ -22,9 +21,9 @@ _STATE = "effect_sets."  # prefix of the names of these tensors in a checkpoint
 
 
 class GatedModel(GaussianModel):
-    """The base class of models in which each Gaussian has its own subset of effects (time, direction, AGR).
+    """The base class of models in which single Gaussians may not depend on time, direction or neural refinement (AGR).
 
-    `effect_sets` stores the subsets.
+    `effect_sets` stores what each Gaussian still depends on.
     """
 
     # ---- what a subclass provides
@@ -51,14 +50,14 @@ class GatedModel(GaussianModel):
         """
 
     def lower_orders(self) -> list[int]:
-        """List the lower SH degrees and frequencies that a colour may be reduced to, encoded as in `ColorOrder`."""
+        """List the lower SH degrees to which colours can be reduced, as degree + 4 (frequencies in time - 1)."""
         return [ColorOrder(degree, 1).packed for degree in range(self.active.sh_degree)]
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Return a mask of the entries of each parameter that change an image, given the effects of each Gaussian.
+        """Return masks of the parameter entries that are used, given what each Gaussian depends on.
 
-        The masks are bool and can be broadcast to the parameters. All entries of a parameter without a mask are used.
-        `fill` sets the unused entries to constants.
+        For example, a static Gaussian does not use its parameters of motion. The masks are bool and can be broadcast to
+        the parameters. All entries of a parameter without a mask are used. `fill` sets unused entries to constants.
         """
         if effect_sets.orders is None:
             return {}
@@ -70,7 +69,7 @@ class GatedModel(GaussianModel):
 
     @torch.no_grad()
     def fill(self, effect_sets: EffectSets) -> None:
-        """Set the parameter entries that no image depends on to constants, given the effects of each Gaussian."""
+        """Set unused parameter entries, such as the motion of static Gaussians, to constants."""
         for name, mask in self.kept(effect_sets).items():
             self.splats[name].data.masked_fill_(~mask, self.constant(name))
 
@@ -93,7 +92,7 @@ class GatedModel(GaussianModel):
         return Geometry(means, factors, opacities, joined_shapes(first.shapes, rest.shapes))
 
     def pack(self) -> dict[str, Tensor]:
-        """Return the tensors for a checkpoint. Parameter entries that no image depends on are left out."""
+        """Return the tensors for a checkpoint, without unused entries such as the motion of static Gaussians."""
         state, effect_sets = super().pack(), self.effect_sets
         if effect_sets is None:
             return state
@@ -111,7 +110,7 @@ class GatedModel(GaussianModel):
         """Load the tensors that `pack` returned, for any number of Gaussians.
 
         Raises:
-            InputError: the tensors belong to another model, or the stored effects of Gaussians do not fit this model.
+            InputError: the tensors belong to another model, or are damaged.
         """
         effect_sets = effect_sets_in(state)
         super().load_state(state if effect_sets is None else self._unpacked(state, effect_sets))
@@ -120,7 +119,7 @@ class GatedModel(GaussianModel):
             self.fill(effect_sets)
 
     def _unpacked(self, state: dict[str, Any], effect_sets: EffectSets) -> dict[str, Any]:
-        """Return full parameter tensors from the entries that `pack` kept; the other entries get their constants."""
+        """Return full parameter tensors from the used entries that a checkpoint stores; other entries are constants."""
         assert effect_sets.orders is not None
         whole = {key: value for key, value in state.items() if not key.startswith(_STATE)}
         for name, mask in self.kept(effect_sets).items():
@@ -137,7 +136,7 @@ class GatedModel(GaussianModel):
 
 
 def as_gated(model: GaussianModel) -> GatedModel:
-    """Return the model as a `GatedModel`; raises InputError if gates cannot simplify it."""
+    """Return the model if its single Gaussians can be made independent of time or direction; else raise InputError."""
     if not isinstance(model, GatedModel):
         raise InputError(f"effects.gate: expected a model that gates can simplify, {type(model).__name__} is no "
                          f"GatedModel: make it one (docs/adding_a_model.md), or use effects.gate=off")  # fmt: skip
@@ -145,10 +144,10 @@ def as_gated(model: GaussianModel) -> GatedModel:
 
 
 def effect_sets_in(state: dict[str, Any]) -> EffectSets | None:
-    """Read from the tensors of a checkpoint which effects each Gaussian has; None if the checkpoint does not store it.
+    """Read from a checkpoint which Gaussians depend on time, direction and refinement; None if it is not stored.
 
     Raises:
-        InputError: the stored effects are damaged.
+        InputError: the stored tensors are damaged.
     """
     own = {key: value for key, value in state.items() if isinstance(key, str) and key.startswith(_STATE)}
     if not own:

@@ -131,17 +131,17 @@ class Gaussians4DModel(GatedModel):
         return {"static": static}
 
     def full_order(self) -> int:
-        """Return the SH degree in use with all frequencies of time, encoded as in `ColorOrder`."""
+        """Return the SH degree in use and the number of frequencies in time, as degree + 4 (frequencies - 1)."""
         return ColorOrder(self.active.sh_degree, self.time_degree + 1).packed
 
     def lower_orders(self) -> list[int]:
-        """List the reduced colours: SH degrees up to the one in use, with all frequencies of time or with none."""
+        """List the reduced colours: SH degrees up to the one in use, each constant in time or with all frequencies."""
         degrees = range(self.active.sh_degree + 1)
         orders = {ColorOrder(degree, waves).packed for waves in (1, self.time_degree + 1) for degree in degrees}
         return sorted(orders - {self.full_order()})
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Return a mask of the parameter entries that change an image, given the effects of each Gaussian.
+        """Return masks of the parameter entries that are used, given which Gaussians are static.
 
         A static Gaussian does not use its right quaternion and its scale in time. It uses its mean time only if its
         colour changes with time.
@@ -173,7 +173,7 @@ class Gaussians4DModel(GatedModel):
         self.splats["right_quats"].data[effect_sets.conditioned :] = partner(left)
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Slice by the backend's kernel if it has one and the scheme is `square_root`, else in torch."""
+        """Slice by the backend's kernel if it has one for the numerical method `scheme`, else in torch."""
         if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
         assert query.time is not None
@@ -192,7 +192,7 @@ class Gaussians4DModel(GatedModel):
         return Geometry(*geometry)
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
-        """Compute the colours of 4DGS, which change with time, by the backend's kernel if it has enough frequencies."""
+        """Compute the colours of 4DGS, which change with time, by the backend's kernel if possible, else in torch."""
         assert query.time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.active.sh_degree, self.time_degree + 1
         if waves <= MAX_WAVES and self.backend.serves(means):

@@ -1,7 +1,7 @@
-"""Simplify Gaussians: make AGR (the neural refinement), time or direction constant, or lower the SH degree of colours.
+"""Simplify Gaussians: make them independent of time, direction or AGR (neural refinement), or lower the SH degree.
 
-A constant is the mean over views, weighted by the opacity of the Gaussian in each view. A simplified Gaussian is an
-ordinary row of the model's parameters, so rendering and checkpoints need no change.
+What changes with these is replaced by its mean over views, weighted by the opacity of the Gaussian in each view. A
+simplified Gaussian is an ordinary row of the model's parameters, so rendering and checkpoints need no change.
 """
 
 import functools
@@ -24,7 +24,7 @@ FEW = 1e-6  # added to weights, so that a Gaussian which no view shows is averag
 
 @dataclass(frozen=True)
 class Simplification:
-    """Hold the parameters of all Gaussians of a model after one kind of simplification."""
+    """Hold the parameters of all Gaussians of a model after one simplification, for example independent of time."""
 
     name: str
     raw: Raw | None  # the raw parameters that change; None: the Gaussian is removed
@@ -35,13 +35,16 @@ class Simplification:
 def simplifications_of(
     model: GatedModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], by_halves: bool = True
 ) -> list[Simplification]:
-    """Return the parameters of a model's Gaussians after each kind of simplification.
+    """Return the parameters of a model's Gaussians after each possible simplification.
+
+    A simplified Gaussian is independent of AGR (the neural refinement), time, direction or all of them, or has a lower
+    SH degree, or is removed.
 
     Args:
         model: the model, which does not change.
         queries: the camera centres and times of the views over which constants are averaged.
         slices: the slices of the model for these views; their opacities are the weights of the average.
-        by_halves: whether to include Gaussians that lose time alone or direction alone.
+        by_halves: whether to include Gaussians that are independent of only one of time and direction.
     """
     weights = shares_of([one.opacities for one in slices])
     found = []
@@ -82,7 +85,7 @@ def _averages(
     model: GaussianModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], weights: Tensor,
     names: Sequence[str], fewer: Sequence[Raw],
 ) -> tuple[Raw, list[Tensor]]:  # fmt: skip
-    """Return means over views of the parameters after AGR, and of the colour [N, 3] that a lower SH degree removes.
+    """Return means over views of refined parameters (AGR), and of the colour [N, 3] that a lower SH degree removes.
 
     Args:
         model: the model, which does not change.

@@ -29,7 +29,7 @@ class Slice(NamedTuple):
 
     mean: Tensor  # [N, 3]
     factor: Tensor  # [N, 3, 3] F of cov = F F^T
-    gain: Tensor  # [N, 3, k] K: the derivative of the mean by q
+    gain: Tensor  # [N, 3, k] K: the derivative of the mean with respect to q
 
 
 class Reduced(NamedTuple):
@@ -60,7 +60,8 @@ def slice_gaussians(
             the digits and are for comparison.
 
     Returns:
-        The mean [N, 3], a factor [N, 3, 3] of the covariance, and the gain S_pq S_qq^-1 [N, 3, k].
+        The mean [N, 3], a factor [N, 3, 3] of the covariance, and the gain S_pq S_qq^-1 [N, 3, k], the derivative of
+        the mean with respect to q.
 
     Raises:
         InputError: types or shapes do not fit, or the scheme is unknown.
@@ -98,7 +99,10 @@ def slice_gaussians(
 
 
 def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
-    """Compute the gain K [N, 3, k] and the covariance S_pp - K S_pq^T [N, 3, 3], which rounding may make indefinite."""
+    """Slice by a scheme that computes S = F F^T: return K = S_pq S_qq^-1 [N, 3, k] and S_pp - K S_pq^T [N, 3, 3].
+
+    Rounding may make this covariance indefinite.
+    """
     S = factor @ factor.mT
     S_pp, S_pq, S_qq = S[:, :3, :3], S[:, :3, 3:], S[:, 3:, 3:]
     if scheme == "schur":
@@ -109,7 +113,7 @@ def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
 
 
 def check_scheme(scheme: str) -> None:
-    """Raise InputError unless `scheme` is `square_root`, `schur` or `cholesky`."""
+    """Raise InputError unless `scheme`, the numerical method of slicing, is `square_root`, `schur` or `cholesky`."""
     if scheme not in SCHEMES:
         raise InputError(f"slicing scheme '{scheme}' is not known. {did_you_mean(scheme, SCHEMES)}")
 

@@ -117,13 +117,16 @@ class TriangularModel(GatedModel):
         return Conditioned(means, factors, opacity_factor)
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return the 3D Gaussians of rows that do not depend on time or direction; L_pp is their covariance factor."""
+        """Return the 3D Gaussians of rows that do not depend on time or direction.
+
+        Their covariance factor L_pp is the position block of the Cholesky factor.
+        """
         space = self.rows["p"]
         factors = Triangle("ppp", self.triangle.form).factor(raw["log_diagonal"][:, space], raw)
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Slice by the backend's kernel for the scheme `square_root` (on a CPU also `cholesky`), else in torch."""
+        """Slice by the backend's kernel if it has one for the numerical method `scheme`, else in torch."""
         has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
         if not has_kernel or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
@@ -158,7 +161,7 @@ class TriangularModel(GatedModel):
         return self.splats["log_diagonal"].detach()[index]
 
     def log_duration(self, index: int) -> float | None:
-        """Return the logarithm of one Gaussian's diagonal entry of time; None for a model without time."""
+        """Return the log diagonal entry of time in one Gaussian's Cholesky factor; None for a model without time."""
         return float(self.log_sizes(index)[self.rows["t"][0]]) if "time" in self.observes else None
 
     def durations(self) -> Tensor | None:
@@ -166,7 +169,7 @@ class TriangularModel(GatedModel):
         return self.factors(dict(self.splats.items())).detach()[:, -1].norm(dim=-1) if "time" in self.observes else None
 
     def hold_sizes(self, least: Tensor) -> None:
-        """Raise the diagonal entries of position in the covariance factors to at least `least` [N]."""
+        """Raise the diagonal entries of position in each Cholesky factor to at least `least` [N], world units."""
         space = self.rows["p"]
         self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=least.log()[:, None])
 
@@ -199,7 +202,7 @@ class TriangularModel(GatedModel):
         return children | self.triangle.parameters(factor)
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Return a mask of the parameter entries that change an image, given the effects of each Gaussian.
+        """Return masks of the parameter entries that are used, given what each Gaussian depends on.
 
         A Gaussian that does not depend on time or direction does not use the entries of this variable.
         """
@@ -224,7 +227,7 @@ class TriangularModel(GatedModel):
         return LOG_SIZE_MAX if name == "log_diagonal" else 0.0
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
-        """Return initial covariance factors whose block of position comes from trained 3D Gaussians."""
+        """Return initial Cholesky factors whose block of position is that of trained 3D Gaussians."""
         space = torch.tensor(self.rows["p"])
         double = {name: value.double() for name, value in raw.items()}
         factor = self.triangle.factor(double["log_diagonal"], double)  # diagonal: the model starts without coupling
@@ -266,11 +269,11 @@ class TriangularModel(GatedModel):
         return changed
 
     def _without(self, blocks: Reduced, gain: Tensor, variables: list[str]) -> Tensor:
-        """Compute covariance factors [N, n, n] of Gaussians whose slices do not depend on the given variables.
+        """Compute Cholesky factors [N, n, n] of Gaussians whose slices do not depend on the given variables.
 
         Args:
-            blocks: the blocks of the present factors.
-            gain: the gain K of the present factors.
+            blocks: the blocks T_qq, T_pq and T_pp of the present factors.
+            gain: the gain K = T_pq T_qq^-1 of the present factors.
             variables: `time`, `direction` or both.
         """
         T_qq, kept = blocks.T_qq.clone(), gain.clone()
@@ -288,7 +291,7 @@ class TriangularModel(GatedModel):
         return torch.cat([p_rows, q_rows], 1)[:, self.own_order()]
 
     def factors(self, raw: Raw) -> Tensor:
-        """Compute covariance factors with rows sorted to (position, direction, time) from raw parameters, [N, n, n]."""
+        """Compute Cholesky factors from raw parameters, with rows sorted to (position, direction, time), [N, n, n]."""
         L = self.triangle.factor(raw["log_diagonal"], raw)
         return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
 
@@ -346,7 +349,7 @@ class TriangularModel(GatedModel):
 
 
 class TimedModel(TriangularModel):
-    """The base class of models whose Gaussians depend on time; 7DGS adds direction."""
+    """The base class of models whose Gaussians depend on time, such as 7DGS with or without direction."""
 
     def __init__(self, *, lambda_t: float, **options: Any) -> None:
         """Make a model without Gaussians.
@@ -363,7 +366,7 @@ class TimedModel(TriangularModel):
 
 
 class DirectionalModel(TriangularModel):
-    """The base class of models whose Gaussians depend on direction; 7DGS adds time."""
+    """The base class of models whose Gaussians depend on view direction: 6DGS, and together with time 7DGS."""
 
     def __init__(self, *, lambda_d: float, directional_half: bool = True, **options: Any) -> None:
         """Make a model without Gaussians.

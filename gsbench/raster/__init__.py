@@ -56,8 +56,8 @@ def rasterize(
         eps2d: the number that is added to the diagonal of the projected covariances, pixels^2.
         backend: `reference` (torch), `cpu` or `cuda` (kernels), or `auto` (the fastest installed one).
         antialias: whether to scale opacities for the area that `eps2d` adds, as the 2D filter of Mip-Splatting does.
-        shapes: the exponents b of the alpha profiles (1 - r^2)^b of Universal Beta Splatting, [N]; None: Gaussians. No
-            backend implements other profiles than Gaussians yet, so each raises InputError for shapes.
+        shapes: the exponents b of the alpha profiles (1 - r^2)^b of Universal Beta Splatting, [N]; None: Gaussians.
+            These profiles are not implemented yet: every backend raises InputError if `shapes` is not None.
 
     Returns:
         The images [C, H, W, D], their alpha [C, H, W, 1], and `RasterInfo` for density control.

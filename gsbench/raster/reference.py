@@ -1,4 +1,4 @@
-"""Rasterize Gaussians in torch, for any dtype and device, with gradients by all inputs.
+"""Rasterize Gaussians in torch, for any dtype and device, with gradients for all inputs.
 
 The kernels for CPU and CUDA are tested against this code. Its three steps are those of 3DGS (Kerbl et al. 2023):
 project the Gaussians (EWA splatting, Zwicker et al. 2001), sort them into tiles, and blend.
@@ -116,7 +116,7 @@ def project(
 
 @torch.no_grad()
 def bin_tiles(splats: CameraSplats, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """List the P tile intersections of an image, sorted by tile, then depth, then index.
+    """List the P tile intersections of an image, sorted by tile, then by depth, then by the index of the Gaussian.
 
     Returns:
         The tile [P] and the Gaussian [P] of each intersection.

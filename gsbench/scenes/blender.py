@@ -27,7 +27,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # as instant-ngp and nerfstu
 
 @dataclass(frozen=True)
 class _Intrinsics:
-    """Hold the intrinsics of a file, in pixels of the full image; missing values follow from the image size."""
+    """Hold the camera intrinsics of a JSON file, in pixels of the full image; missing values follow from its size."""
 
     angle_x: float | None  # horizontal field of view in radians; None if the focal length is given
     focal: tuple[float, float] | None
@@ -256,7 +256,7 @@ def _read_views(
 
 
 def _read_mask(root: Path, frame: _Frame, size: tuple[int, int], downscale: int) -> Tensor:  # [H, W] 8 bits
-    """Read the mask of an image, which has the number of the object in each pixel; raise InputError if it fails."""
+    """Read the mask of an image: a PNG with the number of the object in each pixel. Raise InputError if this fails."""
     assert frame.mask is not None
     where = f"{frame.mask} (the mask of {frame.name}; without a folder '{_MASKS}' a scene has no regions)"
     path = files.find_inside(root, frame.mask.relative_to(root).as_posix(), where)

@@ -59,7 +59,10 @@ def _parse_binary(data: bytes, path: Path) -> list[tuple[float, ...]]:
 
 
 def _parse_text(data: bytes, path: Path) -> list[tuple[float, ...]]:
-    """Parse points3D.txt, whose lines have an id, x, y, z, r, g, b, an error and a track; return x to b of each."""
+    """Parse points3D.txt and return (x, y, z, r, g, b) of each point.
+
+    A line of the file has an id, x, y, z, r, g, b, an error and a track of keypoints.
+    """
     rows = []
     for number, line in enumerate(data.decode("ascii", "replace").splitlines(), 1):
         words = line.split()

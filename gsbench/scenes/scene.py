@@ -78,7 +78,7 @@ class Points:
 
 @dataclass(frozen=True)
 class Scene:
-    """A data set of one scene: views for training, validation and test, and what belongs to all views."""
+    """A data set of one scene: training, validation and test views, background colour, extent and initial points."""
 
     name: str
     train: list[View]

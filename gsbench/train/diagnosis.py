@@ -1,4 +1,4 @@
-"""Explain why a training diverged: find the first Gaussian with a non-finite gradient and a stability case like it."""
+"""Explain why a training diverged: find a Gaussian with a non-finite gradient, and name what is unusual about it."""
 
 import math
 
@@ -14,7 +14,7 @@ LOUD = 1e3  # absolute value of a colour coefficient
 
 
 def explain(model: GaussianModel) -> str:
-    """Return one line that names the first Gaussian with a NaN or infinite gradient, and a stability case like it."""
+    """Return one line on the first Gaussian with a NaN or infinite gradient, and a numerical stress test like it."""
     for name, parameter in model.splats.items():
         if parameter.grad is None:
             continue
@@ -30,7 +30,7 @@ def explain(model: GaussianModel) -> str:
 
 @torch.no_grad()
 def resembles(model: GaussianModel, index: int) -> str | None:
-    """Return the numerical stress test (`gsbench.stability`) that the Gaussian `index` resembles, or None."""
+    """Return the name of a numerical stress test (`gsbench.stability`) that resembles a Gaussian, or None."""
     raw = {name: parameter[index].flatten() for name, parameter in model.splats.items()}
     if not all(value.isfinite().all() for value in raw.values()):
         return "learning_rates_times_30"  # the previous step was too long

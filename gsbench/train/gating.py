@@ -1,6 +1,7 @@
-"""Remove time, direction or AGR from Gaussians that do not need them: once after densification, and at the end.
+"""Make Gaussians independent of time, direction or AGR (neural refinement) where the images allow it.
 
-The first removal makes the rest of the training faster.
+This is done once after densification and once at the end of a training.
+The first simplification makes the rest of the training faster.
 """
 
 import copy
@@ -47,7 +48,7 @@ Shape = tuple[dict[str, Tensor], EffectSets | None]  # raw parameters, and the e
 
 
 def shape_of(model: GaussianModel) -> Shape:
-    """Return the parameters of a model's Gaussians and the effects of each; `become` restores them."""
+    """Return the parameters of a model's Gaussians and what each depends on; `become` restores them."""
     return {name: x.data for name, x in model.splats.items()}, model.effect_sets
 
 
@@ -59,10 +60,10 @@ def become(model: GaussianModel, shape: Shape) -> None:
 
 
 class Gating:
-    """Remove effects (time, direction, AGR) from single Gaussians during one training and after it."""
+    """Simplify Gaussians in a training: make them independent of time, direction or AGR (the neural refinement)."""
 
     def __init__(self, rows: Rows, scene: Scene, renderer: Renderer, config: Config) -> None:
-        """Choose the views on which errors are predicted and PSNR is measured.
+        """Choose the views to predict the errors of simplified Gaussians from, and the views to measure PSNR on.
 
         Args:
             rows: the model, together with the per-Gaussian state of the training, which must change with it.
@@ -90,22 +91,22 @@ class Gating:
                 self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
 
     def in_training(self, step: int) -> bool:
-        """Remove effects from Gaussians during the training, before step `step`; return whether this was done.
+        """Make Gaussians independent of time, direction or refinement before a step; return whether this was done.
 
-        Nothing is removed if the model has fewer than LEAST_IN_TRAINING Gaussians, or if it would cost too much PSNR.
+        It is not done if the model has fewer than LEAST_IN_TRAINING Gaussians, or if PSNR on val would fall too much.
         """
         if len(self.model) < LEAST_IN_TRAINING:
             self.notes.append(f"at step {step} the model has {len(self.model)} Gaussians: of fewer than "
                               f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
             return False
         most = LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING
-        # Static Gaussians do not learn their unused parameters. A Gaussian that lost only time or only direction would.
+        # Static Gaussians do not learn unused parameters. Those that are independent of only time or direction would.
         return self._gate(step, most, VIEWS_IN_TRAINING, by_halves=False)
 
     def slows_agr(self, step: int) -> float:
-        """Return the factor of AGR's learning rate at a step.
+        """Return the factor of the learning rate of AGR, the neural refinement, at a step.
 
-        The factor is 1 until effects are removed in training. Then it falls log-linearly to LAST_RATE at the end.
+        The factor is 1 until Gaussians are simplified in training. Then it falls log-linearly to LAST_RATE at the end.
         """
         if not self.gates or self.gates[0].step is None:
             return 1.0
@@ -113,27 +114,27 @@ class Gating:
         return float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))
 
     def at_end(self, by_halves: bool) -> bool:
-        """Remove effects from Gaussians of the trained model; return whether this was done.
+        """Make Gaussians of the trained model independent of time, direction or refinement; return whether it was done.
 
         The loss of PSNR is at most `effects.budget_db` dB.
 
         Args:
-            by_halves: whether a Gaussian may lose time alone or direction alone.
+            by_halves: whether a Gaussian may become independent of only one of time and direction.
         """
         return self._gate(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
 
     def now(self) -> Shape:
-        """Return the present parameters of the model's Gaussians and the effects of each, as `compare` needs them."""
+        """Return the present parameters of the model's Gaussians and what each depends on, for `compare`."""
         return shape_of(self.model)
 
     def compare(self, ungated: Shape, views: list[View]) -> None:
-        """Measure on `views` how PSNR and frame time changed by the removal of effects.
+        """Measure how PSNR and frame time changed when Gaussians were simplified at the end of the training.
 
-        The function also measures how they would change if all Gaussians lost their dependence on direction.
+        The function also measures how PSNR and frame time would change if no Gaussian depended on direction.
 
         Args:
-            ungated: the Gaussians before the removal, from `now`.
-            views: the views of the evaluated split.
+            ungated: the Gaussians before they were simplified, from `now`.
+            views: the views (test or val) on which results are measured.
         """
         if self.gates and self.gates[-1].step is None:
             before = copy.deepcopy(self.model)
@@ -155,13 +156,13 @@ class Gating:
 
     @torch.no_grad()
     def _gate(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> bool:
-        """Choose which Gaussians lose which effects, and apply this to the model; return whether it was done.
+        """Make Gaussians independent of time, direction or refinement; return whether this was done.
 
         Args:
             step: the step of the training; None at its end.
-            budget_db: the largest loss of PSNR on the checked views.
+            budget_db: the largest allowed loss of PSNR, dB.
             most: the largest number of views from which errors are predicted.
-            by_halves: whether a Gaussian may lose time alone or direction alone.
+            by_halves: whether a Gaussian may become independent of only one of time and direction.
         """
         started = time.perf_counter()
         model, at_end = as_gated(self.model), step is None
@@ -188,12 +189,12 @@ class Gating:
         self.rows.moved(found.rows, found.changed)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return for the checkpoint which removals of effects were done, and with what result."""
+        """Return for the checkpoint when Gaussians were simplified, and how PSNR and frame time changed."""
         direction = asdict(self.direction) if self.direction else None
         return {"gates": [asdict(gate) for gate in self.gates], "notes": list(self.notes), "direction": direction}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore from a checkpoint which removals of effects were done; raises InputError if the state is damaged."""
+        """Restore from a checkpoint when Gaussians were simplified; raises InputError if the state is damaged."""
         if not isinstance(state, dict):
             raise InputError(f"checkpoint: expected 'gating' as a dict, got {type(state).__name__}")
         gates, notes = state["gates"], state["notes"]

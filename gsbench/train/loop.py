@@ -36,7 +36,10 @@ from gsbench.train.thinning import blend_weights, heaviest
 
 @dataclass
 class Best:
-    """Hold the best PSNR on val, and the PSNR of the evaluated split at two iterations: best on val, best on itself."""
+    """Hold the best PSNR on val so far, and two PSNRs of the evaluated split, which is test or val.
+
+    One is its PSNR at the iteration that was best on val, the other its own best PSNR.
+    """
 
     val: float = -math.inf  # best PSNR on val so far, dB
     eval_at_best_val: float | None = None  # PSNR of the evaluated split at that iteration
@@ -47,12 +50,12 @@ class Trainer:
     """Train one model on one scene. `step` is the number of finished steps; the state can be saved after each step."""
 
     def __init__(self, model: GaussianModel, scene: Scene, views: list[View], config: Config) -> None:
-        """Prepare the training.
+        """Make the optimizer, the density control and all other parts of the training of a model.
 
         Args:
             model: the initialised model on `config.device`.
             scene: the scene, which has the training and the val views.
-            views: the views of the evaluated split.
+            views: the views (test or val) on which results are measured.
             config: the config of the run.
 
         Raises:
@@ -131,13 +134,13 @@ class Trainer:
         save(self.state_dict())
 
     def gate_at_end(self, by_halves: bool = False) -> None:
-        """Remove time, direction or AGR from Gaussians of the trained model, and measure the change of PSNR and speed.
+        """Make Gaussians of the trained model independent of time, direction or refinement; measure PSNR and speed.
 
         The measurement does not count as training time.
 
         Args:
-            by_halves: whether a Gaussian may lose time alone or direction alone. This saves bytes but no frame time,
-                and nearly doubles the time of this function (docs/effects.md).
+            by_halves: whether a Gaussian may become independent of only one of time and direction. This saves bytes but
+                no frame time, and nearly doubles the time of this function (docs/effects.md).
         """
         self.model.set_active(self.schedule.active(self.step - 1))
         ungated = self.gating.now()
@@ -186,7 +189,7 @@ class Trainer:
                     self.minimum_scale.update()
 
     def _thin(self) -> None:
-        """Keep the share `train.densify.thin_to` of Gaussians: those with the largest blend weights over all views."""
+        """Keep the Gaussians with the largest blend weights, summed over all views: a share `train.densify.thin_to`."""
         share = self.config.train.densify.thin_to
         assert share is not None
         self.rows.select(heaviest(blend_weights(self.model, self.scene.train, self.renderer.antialias), share))
@@ -214,11 +217,11 @@ class Trainer:
             self.best.eval = now
 
     def psnr(self, views: list[View]) -> float:
-        """Measure the mean PSNR over views, dB."""
+        """Return the mean PSNR of the model over views, dB."""
         return self.renderer.psnr(self.model, views)
 
     def render(self, view: View) -> Tensor:
-        """Render the image of a view, [H, W, 3]."""
+        """Render the image of the model for the camera and time of a view, [H, W, 3]."""
         return self.renderer.image(self.model, view)
 
     def state_dict(self) -> dict[str, Any]:

@@ -200,7 +200,7 @@ def adam_reference(
     parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, drawn: Tensor, rate: float, betas: list[float],
     eps: float, step: Tensor,
 ) -> None:  # fmt: skip
-    """Do in torch what the kernel `gsbench.kernels.adam.adam` does: an Adam step on the Gaussians `drawn` only."""
+    """Do an Adam step in torch on the Gaussians `drawn` [N] bool only; the kernel `adam` does the same."""
     rows = drawn.nonzero()[:, 0]
     g = gradient[rows]
     m = mean[rows].lerp(g, 1 - betas[0])

@@ -14,7 +14,10 @@ START_BINS = 16  # number of intervals of the time range, by which rows are sort
 
 
 class Follower(Protocol):
-    """An object with per-Gaussian state, such as the optimizer, which changes when Gaussians are added or removed."""
+    """An object with per-Gaussian state, such as the optimizer with its moments.
+
+    The state must be updated when Gaussians are added or removed.
+    """
 
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
         """Reorder the per-Gaussian state after Gaussians were added or removed.
@@ -26,7 +29,7 @@ class Follower(Protocol):
 
 
 class Moments(Follower, Protocol):
-    """An optimizer whose moments are per-Gaussian state, and can be cleared for a parameter."""
+    """An optimizer with moments for each Gaussian, which can be set to zero for a whole parameter."""
 
     def forget(self, parameter: Tensor) -> None:
         """Set the moments of a parameter to zero."""
@@ -66,7 +69,7 @@ class Rows:
 
         The kernels process 16 rows at once, and skip 16 rows of which none is visible. On trex after a quarter of the
         iterations, 36 % of the Gaussians of 4DGS are visible in a view; sorting reduces the processed groups of 16 from
-        96 % to 42 %. A model whose Gaussians have been sorted by their effects (time, direction, AGR) keeps that order.
+        96 % to 42 %. Simplified Gaussians are sorted by what they depend on, and keep that order.
         """
         intervals = None if self.model.effect_sets is not None else self.model.visible_intervals()
         if intervals is not None:

@@ -45,11 +45,11 @@ def fitting_threads(gaussians: int, pixels: int) -> Iterator[None]:
 
 
 def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
-    """Assign to each view of a batch a dictionary to which its gradients are added.
+    """Assign to each view of a batch the dictionary to which its gradients are added.
 
-    The two halves of a batch have a sum each, and consecutive views of one thread share the sum of their half if they
-    can. Other views get their own dictionary, which `add_up` adds later. The total has the same bits for any number
-    of threads.
+    Views share a dictionary if one thread renders them and they are in the same half of the batch. If a thread begins
+    inside a half, its views there have a dictionary each. `add_up` adds all dictionaries in the order of the views, so
+    the total has the same bits for any number of threads.
 
     Args:
         views: the number of views in the batch.
@@ -68,7 +68,7 @@ def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
 
 
 def add_up(sums: Sequence[Sums]) -> Sums:
-    """Return the sum of the gradients of all views: first within each half of the batch, then over the two halves."""
+    """Return the sum of the gradients of all views; each half of the batch is summed first, then the two halves."""
     ends = [*_parts(len(sums))[1:], len(sums)]
     return _in_order([_in_order(sums[i:end]) for i, end in zip(_parts(len(sums)), ends, strict=True)])
 
@@ -92,7 +92,7 @@ def _in_order(parts: Sequence[Sums]) -> Sums:
 
 
 class Seen(NamedTuple):
-    """Hold the loss, the rasterizer's information and the gradient of the 2D means of one view of a step."""
+    """Hold the results of one view of a training step: loss, visible Gaussians, and gradients of the 2D means."""
 
     loss: Tensor  # []
     info: RasterInfo

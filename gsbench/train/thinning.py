@@ -17,8 +17,8 @@ from gsbench.scenes import View
 def blend_weights(model: GaussianModel, views: Sequence[View], antialias: bool) -> Tensor:
     """Return for each Gaussian the sum of its blend weights over all pixels of the views, [N].
 
-    The sum is computed as a gradient: a pixel is linear in the colours, so the derivative of the sum of all pixels by
-    the colour of a Gaussian is the sum of its blend weights.
+    The sum is computed as a gradient: a pixel is linear in the colours, so the derivative of the sum of all pixels with
+    respect to the colour of a Gaussian is the sum of its blend weights.
     """
     total = torch.zeros_like(model.splats["opacities"].detach())
     for view in views:

@@ -52,7 +52,7 @@ class Densification(ABC):
 
         Args:
             drawn: which Gaussians were not culled.
-            g_means2d: the gradient of the loss, which is a mean over the batch, by the 2D means.
+            g_means2d: the gradient of the loss, a mean over the batch, with respect to the 2D means.
             width: the width of the image, pixels.
             height: the height of the image, pixels.
             views: the number of views in the batch.
@@ -76,7 +76,7 @@ class Densification(ABC):
 
     @abstractmethod
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Reorder the accumulated values after Gaussians were added or removed.
+        """Reorder the accumulated gradients and counts after Gaussians were added or removed.
 
         Args:
             rows: for each Gaussian now, its index before the change, [M].
@@ -85,8 +85,8 @@ class Densification(ABC):
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """Return the values that the rule has accumulated, for the checkpoint."""
+        """Return the gradients and counts that the rule has accumulated, for the checkpoint."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the accumulated values from a checkpoint; raises InputError if their number of Gaussians differs."""
+        """Restore the accumulated gradients from a checkpoint; raises InputError if the number of Gaussians differs."""

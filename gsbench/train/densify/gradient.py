@@ -116,7 +116,7 @@ class GradientDensification(Densification):
         return {"gradient": self.gradient, "seen": self.seen, "unseen": self.unseen}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore the sums of gradients from a checkpoint; raises InputError if their number of Gaussians differs."""
+        """Restore the sums of gradients from a checkpoint; raises InputError if the number of Gaussians differs."""
         opacities = self.model.splats["opacities"]
         self.gradient, self.seen = (
             tensor(state, name, opacities.shape, opacities.dtype) for name in ("gradient", "seen")

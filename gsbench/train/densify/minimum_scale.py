@@ -1,4 +1,4 @@
-"""Limit the scales of Gaussians from below, to 0.05 pixels in the training camera with the finest resolution there."""
+"""Keep the scale of each Gaussian above 0.05 pixels in the training camera that sees the Gaussian largest."""
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ LEAST_PIXELS = 0.05
 
 
 class MinimumScale:
-    """Compute and apply the minimum scale of each Gaussian: LEAST_PIXELS pixels in the camera that sees it largest."""
+    """Keep each Gaussian's scale above a minimum: LEAST_PIXELS pixels in the training camera that sees it largest."""
 
     def __init__(self, model: GaussianModel, cameras: list[Camera]) -> None:
         """Compute the minimum scales of the Gaussians of an initialised model for the training cameras."""
@@ -46,6 +46,6 @@ class MinimumScale:
         return {"least": self.least}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore the minimum scales from a checkpoint; raises InputError if their number of Gaussians differs."""
+        """Restore the minimum scales from a checkpoint; raises InputError if the number of Gaussians differs."""
         means = self.model.splats["means"]
         self.least = tensor(state, "least", means.shape[:1], means.dtype)
