@@ -107,7 +107,7 @@ class Schedule:
         return self.config.densify.thin_to is not None and step + 1 == max(self.scaled(THIN), self.densify_stop)
 
     def gates(self, step: int) -> bool:
-        """Return whether Gaussians are made independent of time, direction or refinement (AGR) after a step.
+        """Return whether Gaussians are made independent of time, direction or AGR (the refinement) after a step.
 
         This is done once after densification, if at least STEPS_TO_RECOVER steps are left.
         """

@@ -1,4 +1,4 @@
-"""Make as many Gaussians independent of time, direction or refinement as a given loss of PSNR allows."""
+"""Make as many Gaussians independent of time, direction or AGR (neural refinement) as a given loss of PSNR allows."""
 
 import copy
 import math
@@ -21,7 +21,10 @@ MOST_PREDICTED = 2.0  # the predicted loss of PSNR is at most this times the all
 
 @dataclass(frozen=True)
 class Gated:
-    """Hold a model with Gaussians that were made independent of time, direction or refinement, and the loss of PSNR."""
+    """Hold a model with Gaussians that were made independent of time, direction or AGR, and the loss of PSNR.
+
+    AGR is the neural refinement of Gaussians with time.
+    """
 
     model: GatedModel
     gate: Gate  # the decisions and measurements, for record.json

@@ -1,5 +1,6 @@
-"""Write messages about the test for time, and about Gaussians made independent of time, direction or refinement.
+"""Write messages about the test for change with time, and about the simplification of Gaussians.
 
+A simplified Gaussian is independent of time, direction or AGR (the neural refinement), or has a lower SH degree.
 This module does not import torch.
 """
 
@@ -56,6 +57,6 @@ def of_direction(found: Direction) -> str:
 
 
 def lines(found: OnDemand) -> list[str]:
-    """Return the messages of one run about Gaussians made independent of time, direction or refinement (AGR)."""
+    """Return the messages about Gaussians that a run made independent of time, direction or AGR (refinement)."""
     said = [of_gate(gate) for gate in found.gates]
     return said + ([of_direction(found.direction)] if found.direction else []) + found.notes

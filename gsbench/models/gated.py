@@ -1,6 +1,7 @@
-"""Define the base class of models in which single Gaussians can be made independent of time, direction or refinement.
+"""Define the base class of models in which single Gaussians can be made independent of time, direction or AGR.
 
-`gsbench.effects.gate` chooses these Gaussians. A model that does not support this derives from `GaussianModel` instead.
+AGR is the neural refinement of 7DGS. `gsbench.effects.gate` chooses these Gaussians. A model that does not support this
+derives from `GaussianModel` instead.
 """
 
 from abc import abstractmethod
@@ -21,16 +22,16 @@ _STATE = "effect_sets."  # prefix of the names of these tensors in a checkpoint
 
 
 class GatedModel(GaussianModel):
-    """The base class of models in which single Gaussians may not depend on time, direction or neural refinement (AGR).
+    """The base class of models in which single Gaussians can be made independent of time, direction or AGR.
 
-    `effect_sets` stores what each Gaussian still depends on.
+    AGR is the neural refinement of 7DGS. `effect_sets` stores what each Gaussian still depends on.
     """
 
     # ---- what a subclass provides
 
     @abstractmethod
     def static(self, raw: Raw) -> Conditioned:
-        """Return the 3D Gaussians of rows that do not depend on time or direction; their opacity factors are 1.
+        """Return the slice of Gaussians that do not depend on time or direction; their opacity factors are 1.
 
         They are the limit of `condition` for standard deviations of time and direction that go to infinity, and means
         that do not move.
@@ -64,12 +65,12 @@ class GatedModel(GaussianModel):
         return {"shN": coefficients_within(effect_sets.orders, self.sh_degree).flatten(1)[:, 1:, None]}
 
     def constant(self, name: str) -> float:
-        """Return the constant to which the unused entries of the parameter `name` are set."""
+        """Return the constant to which `fill` sets the entries of a parameter that change no image."""
         return 0.0
 
     @torch.no_grad()
     def fill(self, effect_sets: EffectSets) -> None:
-        """Set unused parameter entries, such as the motion of static Gaussians, to constants."""
+        """Set parameter entries that change no image, such as the motion of static Gaussians, to constants."""
         for name, mask in self.kept(effect_sets).items():
             self.splats[name].data.masked_fill_(~mask, self.constant(name))
 
@@ -119,7 +120,7 @@ class GatedModel(GaussianModel):
             self.fill(effect_sets)
 
     def _unpacked(self, state: dict[str, Any], effect_sets: EffectSets) -> dict[str, Any]:
-        """Return full parameter tensors from the used entries that a checkpoint stores; other entries are constants."""
+        """Restore full parameter tensors from a checkpoint, which stores only the entries that change an image."""
         assert effect_sets.orders is not None
         whole = {key: value for key, value in state.items() if not key.startswith(_STATE)}
         for name, mask in self.kept(effect_sets).items():

@@ -92,7 +92,7 @@ class Gaussians4DModel(GatedModel):
         return Conditioned(means, factors, torch.where(seen, opacity_factor, 0.0))
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return the 3D Gaussians of rows that do not depend on time; only their left quaternions and scales matter."""
+        """Return the slice of Gaussians that do not depend on time, from left quaternions and spatial scales."""
         factors = rotation(turn_of_space(raw["left_quats"])) * sizes(raw["scales"][:, :3])[:, None, :]
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
@@ -162,12 +162,15 @@ class Gaussians4DModel(GatedModel):
         return masks
 
     def constant(self, name: str) -> float:
-        """Return the constant for unused entries of a parameter: the largest log size for scales, else 0."""
+        """Return the constant for entries that change no image: the largest log size for `scales`, else 0."""
         return LOG_SIZE_MAX if name == "scales" else 0.0
 
     @torch.no_grad()
     def fill(self, effect_sets: EffectSets) -> None:
-        """Set unused entries to constants, and the right quaternions of static Gaussians so that t is not rotated."""
+        """Set parameter entries of static Gaussians that change no image to constants.
+
+        The right quaternions are set such that the 4D rotations leave the time axis fixed.
+        """
         super().fill(effect_sets)
         left = self.splats["left_quats"].data[effect_sets.conditioned :]
         self.splats["right_quats"].data[effect_sets.conditioned :] = partner(left)

@@ -117,7 +117,7 @@ class TriangularModel(GatedModel):
         return Conditioned(means, factors, opacity_factor)
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return the 3D Gaussians of rows that do not depend on time or direction.
+        """Return the slice of Gaussians that do not depend on time or direction.
 
         Their covariance factor L_pp is the position block of the Cholesky factor.
         """
@@ -223,7 +223,7 @@ class TriangularModel(GatedModel):
         return masks
 
     def constant(self, name: str) -> float:
-        """Return the constant for unused entries of a parameter: the largest log size for the diagonal, else 0."""
+        """Return the constant for entries that change no image: the largest log size for `log_diagonal`, else 0."""
         return LOG_SIZE_MAX if name == "log_diagonal" else 0.0
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:

@@ -69,7 +69,7 @@ class Gating:
             rows: the model, together with the per-Gaussian state of the training, which must change with it.
             scene: the scene with its training and val views.
             renderer: renders views with the settings of the training.
-            config: the config, which has the PSNR that a removal may cost.
+            config: the config, which has the allowed loss of PSNR.
         """
         self.rows = rows
         self.model = rows.model
@@ -91,9 +91,12 @@ class Gating:
                 self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
 
     def in_training(self, step: int) -> bool:
-        """Make Gaussians independent of time, direction or refinement before a step; return whether this was done.
+        """Make Gaussians independent of time, direction or AGR (the refinement) before a step of the training.
 
-        It is not done if the model has fewer than LEAST_IN_TRAINING Gaussians, or if PSNR on val would fall too much.
+        This is not done if the model has fewer than LEAST_IN_TRAINING Gaussians, or if PSNR on val would fall too much.
+
+        Returns:
+            Whether it was done.
         """
         if len(self.model) < LEAST_IN_TRAINING:
             self.notes.append(f"at step {step} the model has {len(self.model)} Gaussians: of fewer than "
@@ -114,12 +117,15 @@ class Gating:
         return float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))
 
     def at_end(self, by_halves: bool) -> bool:
-        """Make Gaussians of the trained model independent of time, direction or refinement; return whether it was done.
+        """Make Gaussians independent of time, direction or AGR (the refinement) after the training.
 
-        The loss of PSNR is at most `effects.budget_db` dB.
+        This is not done if PSNR would fall by more than `effects.budget_db` dB.
 
         Args:
             by_halves: whether a Gaussian may become independent of only one of time and direction.
+
+        Returns:
+            Whether it was done.
         """
         return self._gate(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
 
@@ -156,7 +162,7 @@ class Gating:
 
     @torch.no_grad()
     def _gate(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> bool:
-        """Make Gaussians independent of time, direction or refinement; return whether this was done.
+        """Make Gaussians independent of time, direction or AGR (the refinement); return whether this was done.
 
         Args:
             step: the step of the training; None at its end.

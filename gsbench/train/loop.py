@@ -134,9 +134,9 @@ class Trainer:
         save(self.state_dict())
 
     def gate_at_end(self, by_halves: bool = False) -> None:
-        """Make Gaussians of the trained model independent of time, direction or refinement; measure PSNR and speed.
+        """Make Gaussians independent of time, direction or AGR (the refinement) after the training.
 
-        The measurement does not count as training time.
+        PSNR and frame time are measured before and after. The measurement does not count as training time.
 
         Args:
             by_halves: whether a Gaussian may become independent of only one of time and direction. This saves bytes but
