@@ -46,7 +46,7 @@ class Schedule:
     """
 
     def __init__(self, config: TrainConfig, sh_degree: int, agr: bool) -> None:
-        """Scale the steps of the settings to the length of the run.
+        """Convert the steps in the settings, which are those of a run of `recipe_iterations`, to steps of this run.
 
         Args:
             config: the settings of the training.

@@ -1,9 +1,10 @@
 """Remove differences of exposure from images that were taken from the same camera position.
 
-The model of an image of a static scene is y = clip(a x + b). Here x is the mean appearance, and each image and channel
-has a gain a and an offset b. They are fitted by least absolute deviations (Schlossmacher 1973), so objects that move
-through less than half of the image are outliers and do not change the fit. x is the median of (y - b) / a over the
-images without saturated pixels, so x may exceed 1. The residuals are noise or a change of the scene.
+The model of an image of a static scene is y = clip(a x + b). The colours x are the same for all images, and each image
+and channel has a gain a and an offset b. Gains and offsets are fitted by least absolute deviations (Schlossmacher
+1973), so objects that move through less than half of the image are outliers and do not change the fit. x is the median
+of (y - b) / a over the images without saturated pixels, so x may exceed 1. The residuals are noise or a change of the
+scene.
 """
 
 import numpy as np

@@ -147,7 +147,7 @@ class GaussianModel(nn.Module, ABC):
         """
 
     def log_sizes(self, index: int) -> Tensor:
-        """Return the logarithms of the sizes of one Gaussian in its n dimensions, [n]; here only of the largest one."""
+        """Return the logarithms of the sizes of one Gaussian in its n dimensions, [n]; by default only the largest."""
         return self.scales()[index : index + 1].log()
 
     def log_duration(self, index: int) -> float | None:
@@ -255,7 +255,7 @@ class GaussianModel(nn.Module, ABC):
 
     @property
     def orders(self) -> Tensor | None:
-        """The SH degree and frequencies of each Gaussian's colour, degree + 4 (frequencies - 1), [N]; None: all."""
+        """The SH degree and frequencies in time of each colour, as degree + 4 (frequencies - 1), [N]; None: all."""
         return None if self.effect_sets is None else self.effect_sets.orders
 
     def count_by_effects(self) -> dict[str, int]:

@@ -13,7 +13,7 @@ from gsbench.scenes.scene import Camera
 
 
 class Query(NamedTuple):
-    """The camera centre and the time at which a model is sliced, refined (AGR) and coloured.
+    """The camera centre and the time for which a model returns 3D Gaussians with colours.
 
     `Query.of` makes a query from a camera, and `Query.at` from a position. These two functions check their arguments.
 

@@ -157,7 +157,7 @@ class TriangularModel(GatedModel):
         return torch.linalg.matrix_norm(T_pp, ord=2)
 
     def log_sizes(self, index: int) -> Tensor:
-        """Return the logarithms of the diagonal of the covariance factor of the Gaussian `index`."""
+        """Return the logarithms of the diagonal entries of the Cholesky factor of the Gaussian `index`."""
         return self.splats["log_diagonal"].detach()[index]
 
     def log_duration(self, index: int) -> float | None:
@@ -177,9 +177,9 @@ class TriangularModel(GatedModel):
         """Split Gaussians in time if they move and are long in time, else in space.
 
         A split in time samples the mean times of the children and moves their means along the parent's path. The
-        standard deviation in time becomes 1.6 times smaller. A split in space samples their means from the parent's
-        slice, whose scales become 1.6 times smaller. The gain K, by which the mean moves with time and direction, does
-        not change.
+        standard deviation in time becomes 1.6 times smaller. A split in space samples the means of the children from
+        the parent's slice, and the scales of the slice become 1.6 times smaller. The gain K, the derivative of the mean
+        with respect to time and direction, does not change.
         """
         factor = self.factors(raw)
         T_qq, T_pq, T_pp = reduce(factor)
@@ -241,9 +241,10 @@ class TriangularModel(GatedModel):
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
         """Return parameters of Gaussians that do not depend on time, on direction, or on both.
 
-        To remove the dependence on a variable, its columns of the gain K become zero. The average shift of the mean
-        over views is added to the mean, and the opacity is multiplied by the average opacity factor. The standard
-        deviation of the variable becomes exp(LOG_SIZE_MAX), so that the opacity factor is 1 for every view.
+        To remove the dependence on a variable, its columns of the gain K (the derivative of the mean with respect to
+        the variable) become zero. The average shift of the mean over views is added to the mean, and the opacity is
+        multiplied by the average opacity factor. The standard deviation of the variable becomes exp(LOG_SIZE_MAX), so
+        that the opacity factor is 1 for every view.
         """
         blocks = Reduced(*(block.double() for block in reduce(self.factors(raw))))
         gain = gain_of(blocks.T_pq, blocks.T_qq)
@@ -322,7 +323,7 @@ class TriangularModel(GatedModel):
         return found
 
     def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
-        """Compute -ln of the opacity factor f_dir f_temp, [N]."""
+        """Compute -ln of the product of the opacity factors f_dir and f_temp (7DGS, eq. 11 and 12), [N]."""
         return torch.stack(list(self.exponents(T_qq, delta, white).values())).sum(0)
 
     def _blocks(self, factor: Tensor) -> Reduced:

@@ -29,16 +29,16 @@ from gsbench.train.renderer import Renderer
 from gsbench.train.rows import Rows
 
 GATES = ("off", "end", "both")
-# Largest loss of PSNR on val, in dB, that a removal of effects in training may cause. Of 0.5, 0.2 and 0.1 these are the
+# Largest loss of PSNR on val, in dB, when Gaussians are simplified in training. Of 0.5, 0.2 and 0.1 these are the
 # largest losses from which the rest of the training recovers on every scene tried (docs/effects.md).
 LOSS_IN_TRAINING = 0.1
 LOSS_WITH_AGR = 0.5
-# Effects are not removed in training from a model with fewer Gaussians than this. With 300 and 600 Gaussians, models of
-# four of five scenes lost 0.2 to 0.5 dB on val by a removal in training (docs/tuning.md).
+# A model with fewer Gaussians than this is not simplified in training. With 300 and 600 Gaussians, models of four of
+# five scenes lost 0.2 to 0.5 dB on val by that (docs/tuning.md).
 LEAST_IN_TRAINING = 1_000
-VIEWS_IN_TRAINING = 30  # views from which errors are predicted; more would cost more time than the removal saves
+VIEWS_IN_TRAINING = 30  # views from which errors are predicted; more would cost more time than simplification saves
 # AGR's learning rate does not decay by itself. With fewer Gaussians the last steps are then too large: on trex a
-# training with removed effects ended 0.4 dB lower.
+# training with simplified Gaussians ended 0.4 dB lower.
 LAST_RATE = 0.1
 HELD_OUT = 8  # every 8th training view is held out to check PSNR, if the scene has no val split
 FEW = 12  # with fewer training views than this, none is held out
@@ -153,7 +153,7 @@ class Gating:
             self.direction = Direction(share_with_direction(self.model), loss, *times)
 
     def _beside(self, one: GaussianModel, other: GaussianModel, views: list[View]) -> tuple[float, list[float]]:
-        """Return the PSNR of model `one` less that of model `other`, and the median frame times of the two in ms."""
+        """Return how much lower the PSNR of `other` is than that of `one`, dB, and both median frame times, ms."""
         count = max(self.config.protocol.renders, len(views))
         frames = [lambda i, model=model: self.renderer.image(model, views[i % len(views)]) for model in (one, other)]
         times = time_in_turns(frames, count, synchroniser(self.config.device))

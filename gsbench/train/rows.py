@@ -81,10 +81,10 @@ class Rows:
         self._moments.forget(self.model.splats[name])
 
     def moved(self, rows: Tensor, fresh: Tensor | None = None) -> None:
-        """Update the per-Gaussian state after the Gaussians of the model were changed to `rows` [M].
+        """Update the per-Gaussian state after Gaussians of the model were added, removed or reordered.
 
         Args:
-            rows: for each Gaussian now, its index before the change.
+            rows: for each Gaussian now, its index before the change, [M].
             fresh: which Gaussians are new, [M] bool; by default none.
         """
         fresh = torch.zeros(len(rows), dtype=torch.bool, device=rows.device) if fresh is None else fresh

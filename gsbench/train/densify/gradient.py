@@ -107,7 +107,7 @@ class GradientDensification(Densification):
         self.rows.forget("opacities")
 
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Reorder the counts of unseen views after Gaussians were added or removed; reset the sums of gradients."""
+        """Set the sums of gradients to zero after Gaussians were added or removed, and reorder the counts of views."""
         self.unseen = self.unseen[rows]
         self.forget()
 
