@@ -1,4 +1,4 @@
-"""Measure what a dimension of a Gaussian is worth, with one rasterizer, one trainer and one protocol for all models."""
+"""Compare 3D, 4D, 6D and 7D Gaussian splatting with one rasterizer, one trainer and one protocol for all models."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -7,12 +7,12 @@ from gsbench.process.heap import keep_freed_memory
 from gsbench.process.threads import sleep_when_idle
 from gsbench.version import __version__ as __version__
 
-keep_freed_memory()  # both before anything of gsbench imports torch or the kernels
+keep_freed_memory()  # this call and the next must come before the import of torch or the kernels
 sleep_when_idle()
 
 __all__ = ["Query", "build", "load_run", "load_scene", "lpips", "psnr", "rasterize", "slice_gaussians", "ssim"]
 
-_PUBLIC = {  # names of __all__, and where each is defined
+_PUBLIC = {  # the names of __all__ with the modules that define them
     "Query": "gsbench.models.query.Query",
     "build": "gsbench.models.registry.build",
     "load_run": "gsbench.run.load.load_run",
@@ -24,7 +24,7 @@ _PUBLIC = {  # names of __all__, and where each is defined
     "ssim": "gsbench.measure.quality.ssim",
 }
 
-if TYPE_CHECKING:  # the same for type checkers and editors, which do not run what is below
+if TYPE_CHECKING:  # type checkers and editors do not run the code below, so they get imports
     from gsbench.measure.quality import lpips, psnr, ssim
     from gsbench.models.query import Query
     from gsbench.models.registry import build
@@ -35,12 +35,12 @@ if TYPE_CHECKING:  # the same for type checkers and editors, which do not run wh
 else:
 
     def __getattr__(name: str) -> Any:
-        """Import a public name when it is first asked for, so that `import gsbench` alone does without torch."""
+        """Import a public name of gsbench when it is first used, so that `import gsbench` does not import torch."""
         if name not in _PUBLIC:
             raise AttributeError(f"module 'gsbench' has no attribute '{name}'")
         module, _, attribute = _PUBLIC[name].rpartition(".")
         return getattr(importlib.import_module(module), attribute)
 
     def __dir__() -> list[str]:
-        """List the public names too, which completion would not find before they are imported."""
+        """List all names of the package for completion, including public names that are not imported yet."""
         return sorted({*globals(), *__all__})

@@ -1,4 +1,7 @@
-"""Compose configs from the command line and do their runs, without torch until the first one starts."""
+"""Run `python -m gsbench`: compose the configs of the command line and run them one after the other.
+
+torch is imported only when the first run starts, so that wrong options are reported quickly.
+"""
 
 import os
 import signal
@@ -21,13 +24,13 @@ from gsbench.sweep.finish import see_through
 from gsbench.sweep.task import Problem, do
 from gsbench.version import __version__
 
-BAD_INPUT, FAILED = 2, 1  # exit statuses: nothing could be run as asked; a run did not end well
-_problems: list[Problem] = []  # of the runs that did not end well; a Hydra sweep goes on after them
+BAD_INPUT, FAILED = 2, 1  # exit statuses: the command line or the data is wrong; a run failed
+_problems: list[Problem] = []  # problems of the runs that failed; the sweep continues after a failure
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def entry(composed: DictConfig) -> None:
-    """Do one run of the sweep; one that fails does not stop the others."""
+    """Do one run of a sweep. If the run fails, the error is stored and the sweep continues."""
     if OmegaConf.is_missing(composed, "experiment"):
         raise InputError(f"no experiment was chosen: add +exp=NAME. Valid: {', '.join(_group('exp'))}.")
     if composed.experiment == "stability":  # the only experiment that trains no model on a scene
@@ -51,7 +54,7 @@ def entry(composed: DictConfig) -> None:
 def main() -> None:
     """Run the commands `python -m gsbench` and `gsbench`; print an error as one line instead of a stack trace."""
     register_schema()
-    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and they are explained in one line below
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # makes Hydra raise its errors; they are printed in one line below
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="replace")  # type: ignore[union-attr]  # a terminal in ASCII shows ? for other letters
     signal.signal(signal.SIGTERM, stop_at_once)
@@ -80,12 +83,12 @@ def main() -> None:
 
 
 def _told(error: Exception) -> str | None:
-    """Tell in one line what is wrong with a command line; None for an error that is none of its words'."""
+    """Return one line that explains an error in the command line; None if the error has another cause."""
     if isinstance(error, InputError):
         return str(error)
     if isinstance(error, HydraException | OmegaConfBaseException):
         return explain(error)
-    if isinstance(error, OSError):  # of Hydra's own files; a run's errors end in its record
+    if isinstance(error, OSError):  # an error of Hydra's files; errors of a run are stored in its record.json
         return one_line(error)
     return one_line(error) if raised_by_library(error) else None
 
@@ -96,7 +99,7 @@ _in_two_lines = warnings.formatwarning
 def _in_one_line(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
 ) -> str:
-    """Format a warning of gsbench as its errors are, without the line of code that Python adds."""
+    """Format a Python warning of gsbench in one line, without the line of code that Python adds."""
     if not Path(filename).is_relative_to(HERE):
         return _in_two_lines(message, category, filename, lineno, line)
     return f"gsbench: warning: {message}\n"

@@ -1,19 +1,19 @@
-"""Report faults in the input: an error message says what was expected, what was given, and what to do."""
+"""Define the errors for wrong input; a message says what was expected, what was found, and what to do."""
 
 import difflib
 from collections.abc import Iterable
 
 
 class InputError(ValueError):
-    """The config, the data set or a tensor has a fault; the message is one line and is shown without a stack trace."""
+    """The config, the data set or a tensor is wrong. The message is one line, printed without a stack trace."""
 
 
 class TooLargeError(InputError, MemoryError):
-    """A request needs more memory than there is; it is refused before anything is allocated."""
+    """An operation would need more memory than is free; the error is raised before memory is allocated."""
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
-    """Return ``Did you mean 'x'? Valid: a, b, x.`` for a name that is not among `valid`."""
+    """Return a hint for an unknown name: ``Did you mean 'x'? Valid: a, b, x.``, where x is the most similar name."""
     choices = sorted(valid)
     close = difflib.get_close_matches(str(name), choices, n=1, cutoff=0.4)
     guess = f"Did you mean '{close[0]}'? " if close else ""
@@ -21,9 +21,9 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or its type if it has no message, in printable form.
+    """Return the first line of an error's message, or the name of the error's type if it has no message.
 
-    For an error of a file it is the file and what the system says: "out/x.ply: No space left on device".
+    For an OSError on a file, return the file and the reason, such as "out/x.ply: No space left on device".
     """
     if isinstance(error, OSError) and error.filename and error.strerror:
         return printable(f"{error.filename}: {error.strerror}")
@@ -31,7 +31,7 @@ def one_line(error: BaseException) -> str:
 
 
 def printable(value: object) -> str:
-    """Return a value as text on one line; control characters are written as escapes."""
+    """Convert a value to text on one line; line breaks and control characters are replaced by escapes."""
     text = str(value)
     if text.isprintable():
         return text

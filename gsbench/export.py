@@ -24,21 +24,21 @@ MOST_FRAMES = 100_000
 
 
 class ExportRequest(NamedTuple):
-    """A checked command line."""
+    """Hold the loaded run, its data set and the options of an export."""
 
     run: LoadedRun
-    scene: Scene | None  # None where nothing asks for the data set
+    scene: Scene | None  # None if the export does not need the data set
     options: argparse.Namespace
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the files that the command line asks for; return 0, or 2 with one line on stderr if that fails."""
+    """Write the PLY, the video or the images of the command line; return 0, or 2 after an error message."""
     try:
         asked = prepare(parser().parse_args(arguments))
         if asked.options.ply:
             write_ply(asked, asked.options.ply)
         if asked.options.video:
-            with closing(film.frames(asked.run, shots(asked))) as images:  # and its bar
+            with closing(film.frames(asked.run, shots(asked))) as images:  # closes the progress bar too
                 film.write_video(images, asked.options.video, asked.options.fps)
         if asked.options.images:
             with closing(film.frames(asked.run, shots(asked))) as images:
@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Describe the command line."""
+    """Return the parser of the command line of the export."""
     made = argparse.ArgumentParser(prog="python -m gsbench.export", description=__doc__)
     made.add_argument("run", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
     made.add_argument("--ply", type=Path, metavar="OUT.ply", help="write the 3D Gaussians of one slice")
@@ -76,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def prepare(options: argparse.Namespace) -> ExportRequest:
-    """Load the requested run and data; raises InputError if that is not possible."""
+    """Check the options of the export and load the run and its data set; raise InputError if this fails."""
     if not (options.ply or options.video or options.images):
         raise InputError("expected --ply OUT.ply, --video OUT.mp4 or --images FOLDER, got none of them")
     if options.time is not None and not 0 <= options.time <= 1:
@@ -97,7 +97,7 @@ def prepare(options: argparse.Namespace) -> ExportRequest:
 
 
 def write_ply(asked: ExportRequest, path: Path) -> None:
-    """Write one slice as a PLY and say what it holds."""
+    """Write the 3D Gaussians of one slice as a PLY file and print their number, time and colours."""
     run, options = asked.run, asked.options
     query, keep = slice_place(asked)
     trained = trained_of(run.model, query, keep_harmonics=keep)
@@ -111,7 +111,10 @@ def write_ply(asked: ExportRequest, path: Path) -> None:
 
 
 def slice_place(asked: ExportRequest) -> tuple[Query, bool]:
-    """Return the query of the slice, and whether its colours stay harmonics, which they do without a given place."""
+    """Return the camera centre and time of the exported slice, and whether the PLY keeps SH colours.
+
+    If a camera or direction is given, each Gaussian gets instead the one colour that is seen from there.
+    """
     run, options = asked.run, asked.options
     time = options.time
     if asked.scene is not None and options.camera is not None:
@@ -125,7 +128,7 @@ def slice_place(asked: ExportRequest) -> tuple[Query, bool]:
 
 
 def direction(text: str) -> torch.Tensor:
-    """Read a direction X,Y,Z as a unit vector [3]; raises InputError if it is none."""
+    """Parse a direction "X,Y,Z" to a unit vector [3]; raise InputError if the text is not a direction."""
     try:
         found = torch.tensor([float(word) for word in text.split(",")], dtype=torch.float64)
     except ValueError:
@@ -136,7 +139,7 @@ def direction(text: str) -> torch.Tensor:
 
 
 def shots(asked: ExportRequest) -> list[paths.Shot]:
-    """Return the cameras and the times of a video: time runs once from 0 to 1 unless it is asked to stand still."""
+    """Return the camera and the time of each frame of a video; time runs from 0 to 1, or has the value of --time."""
     options = asked.options
     count = round(options.fps * options.seconds)
     if asked.scene is not None and options.camera is not None:
@@ -153,10 +156,10 @@ def shots(asked: ExportRequest) -> list[paths.Shot]:
 
 
 def find_view(scene: Scene, name: str) -> View:
-    """Return the view of that name, such as test/r_003, or the training view of that number, from 0.
+    """Return the view whose name is `name`, such as test/r_003; if `name` is a number, the training view number `name`.
 
     Raises:
-        InputError: there is none.
+        InputError: no view has this name or number.
     """
     if name.isascii() and name.isdigit() and len(name) < 10 and int(name) < len(scene.train):
         return scene.train[int(name)]

@@ -1,6 +1,6 @@
-"""Read files that may be damaged or hostile: regular files of a limited size, and JSON without keys that appear twice.
+"""Read files that may be damaged or malicious: the size of files is limited, and JSON must not have duplicate keys.
 
-This module needs no torch.
+This module does not import torch.
 """
 
 import json
@@ -19,12 +19,12 @@ def read_file(
     where: str,  # the path, and the file and field that name it, for the message
     most: int,  # bytes
 ) -> bytes:
-    """Return the bytes of the regular file `path`, which are at most `most`.
+    """Return the content of a regular file of at most `most` bytes.
 
-    A pipe or a device is refused, because reading it could never end.
+    Pipes and devices are not read, because that may never end.
 
     Raises:
-        InputError: there is no such file, it is no regular file, is too large, or cannot be read.
+        InputError: the file is missing, is not a regular file, is too large, or cannot be read.
     """
     try:
         status = path.stat()
@@ -47,11 +47,7 @@ def parse_json(
     data: bytes,
     where: str,  # the path, for the message
 ) -> Any:
-    """Parse JSON, in which no object has two equal keys: it is not defined which of them counts.
-
-    Raises:
-        InputError: the text is not such JSON.
-    """
+    """Parse JSON, and raise InputError if it is invalid or if an object has the same key twice."""
     try:
         return json.loads(data, object_pairs_hook=_unique)
     except (ValueError, RecursionError) as error:  # also bad UTF-8 and integers of thousands of digits
@@ -59,7 +55,7 @@ def parse_json(
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Make an object of its pairs of key and value; raises ValueError if a key appears twice."""
+    """Convert the (key, value) pairs of a JSON object to a dictionary; raise ValueError if a key occurs twice."""
     unique: dict[str, Any] = {}
     for key, value in pairs:
         if key in unique:
@@ -69,6 +65,6 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _kind(mode: int) -> str:
-    """Name a kind of file that is no regular one."""
+    """Return the name of a file type that is not a regular file: a folder, a pipe, a socket or a device."""
     kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
     return kinds.get(stat.S_IFMT(mode), "a device")

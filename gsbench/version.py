@@ -1,3 +1,3 @@
-"""Say which version of gsbench this is, in the one place that all others read."""
+"""Define the version of gsbench, the only place where it is written in the code."""
 
-__version__ = "0.2.0"  # pyproject.toml reads it here, and a test holds CITATION.cff to it
+__version__ = "0.2.0"  # pyproject.toml reads this line, and a test compares CITATION.cff with it

@@ -1,1 +1,1 @@
-"""Choose what a scene and each Gaussian depend on: time, direction of view, AGR and colour harmonics."""
+"""Choose whether a scene needs time, and which Gaussians need time, direction, AGR (neural refinement) or SH."""

@@ -1,4 +1,4 @@
-"""Test without a training whether a scene needs time; remove effects from a finished run's model, or draw them.
+"""Test whether a scene needs time, or simplify the Gaussians of a trained model, or draw what its Gaussians depend on.
 
 python -m gsbench.effects SCENE_FOLDER [--json]
 python -m gsbench.effects --checkpoint RUN_FOLDER [--budget-db 0.05] [--data-root PATH]
@@ -20,7 +20,7 @@ from gsbench.models.registry import import_models
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; return 0, or 2 with one line on stderr."""
+    """Run the command line; return 0, or 2 after printing one line to stderr if an input is wrong."""
     parser = argparse.ArgumentParser(prog="python -m gsbench.effects", description=__doc__.partition("\n")[0])
     parser.add_argument("scene", type=Path, nargs="?", metavar="SCENE_FOLDER", help="of a data set that gsbench reads")
     parser.add_argument("--json", action="store_true", help="the answer as JSON")
@@ -63,7 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _whole(text: str) -> int:
-    """Read a whole number; refuse one that has more digits than int() takes."""
+    """Convert an argument of the command line to an int; only the first 40 characters are read."""
     try:
         return int(text[:40])
     except ValueError:
@@ -71,7 +71,7 @@ def _whole(text: str) -> int:
 
 
 def _gate(folder: Path, budget_db: float, data_root: str | None) -> int:
-    from gsbench.run.regate import gate_run  # a screen needs no training code
+    from gsbench.run.regate import gate_run  # imported here, because the test for time needs no training code
 
     record, new = gate_run(folder, budget_db, data_root)
     for line in messages.lines(record.on_demand) if record.on_demand else []:

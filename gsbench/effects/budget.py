@@ -1,4 +1,4 @@
-"""Remove time, direction or AGR from a model's Gaussians, as far as the measured loss of PSNR stays within a budget."""
+"""Make as many Gaussians independent of time, direction or AGR (neural refinement) as a given loss of PSNR allows."""
 
 import copy
 import math
@@ -15,18 +15,21 @@ from gsbench.models import GaussianModel
 from gsbench.models.color_order import order_of
 from gsbench.models.gated import GatedModel
 
-SHARES = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)  # of the squared error, tried from the largest
-MOST_PREDICTED = 2.0  # times the budget: on few views a loss may be measured that is smaller than it is
+SHARES = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)  # shares of the squared error, tried in this order
+MOST_PREDICTED = 2.0  # the predicted loss of PSNR is at most this times the allowed one: few views may underestimate it
 
 
 @dataclass(frozen=True)
 class Gated:
-    """A model after effects were removed from some of its Gaussians, and what this cost."""
+    """Hold a model with Gaussians that were made independent of time, direction or AGR, and the loss of PSNR.
+
+    AGR is the neural refinement of Gaussians with time.
+    """
 
     model: GatedModel
-    gate: Gate  # what was decided, for the record
-    rows: Tensor  # [M] the place that each Gaussian had before
-    changed: Tensor  # [M] bool: whether it became another simplification
+    gate: Gate  # the decisions and measurements, for record.json
+    rows: Tensor  # [M] the index of each Gaussian in the former model
+    changed: Tensor  # [M] bool: whether the Gaussian was simplified
 
 
 def gate_within(
@@ -36,18 +39,19 @@ def gate_within(
     measure: Callable[[GaussianModel], float],
     intervals: Tensor | None = None,  # [N, 2]
 ) -> Gated | None:
-    """Simplify as many Gaussians as the budget allows: try SHARES from the largest.
+    """Simplify as many Gaussians as the allowed loss of PSNR permits.
 
-    Return None if no share is within it.
-
-    Each share is that of the squared error which the simplifications may add. The model itself is not changed.
+    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+    removed. For each share in SHARES, from the largest, the function simplifies a copy of the model until the predicted
+    errors add up to this share of the model's squared error. It returns the first copy whose measured loss of PSNR is
+    allowed, or None.
 
     Args:
-        model: the model to simplify, trained or in training.
-        sensitivity: predicted errors of the model's simplifications.
-        budget_db: the most dB by which `measure` may fall.
-        measure: returns the PSNR of a model in dB, on views that were not used for `sensitivity`.
-        intervals: the times at which each Gaussian can be seen; AGR does not move a Gaussian at other times.
+        model: the model, trained or in training; it does not change.
+        sensitivity: the predicted error of each simplification of each Gaussian.
+        budget_db: the largest allowed loss of PSNR, dB.
+        measure: a function that returns the PSNR of a model in dB, on views that were not used for `sensitivity`.
+        intervals: the first and the last time at which AGR changes each Gaussian, because it is visible.
     """
     before = measure(model)
     for share in SHARES:
@@ -72,7 +76,7 @@ def gate_within(
 
 
 def orders_of(model: GaussianModel) -> dict[str, int]:
-    """Count the Gaussians by the degree of their harmonics, and in 4DGS by the frequencies of their colour in time."""
+    """Count the Gaussians by the SH degree of their colour, and in 4DGS also by its number of frequencies in time."""
     if model.effect_sets is None or model.effect_sets.orders is None:
         return {}
     values, counts = torch.unique(model.effect_sets.orders, return_counts=True)

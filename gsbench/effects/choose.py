@@ -1,13 +1,12 @@
-"""Decide before a training whether a scene changes with time.
+"""Decide before a training, by a permutation test, whether a scene changes with time.
 
-If a camera place has several images, they are compared with one another (gsbench.effects.rig). For other views a static
-3DGS is fitted in a few steps. If the scene moves, its residuals depend on time: the gradients of the squared errors of
-the training views by the Gaussians' means follow slow waves of time. The test compares their energy in those waves with
-that under random permutations of time (Freedman and Lane 1983), so it needs no threshold that depends on the scene.
-What the camera's place explains is removed from both first. If the camera moves along with time, as on an orbit,
-little of the waves is left, and the answer is undecided.
+If several images come from the same camera position, they are compared with one another (gsbench.effects.rig).
 
-Direction and AGR have no such test (docs/effects.md says why). gsbench.effects.gate keeps them where they are needed.
+For other views, a static 3DGS is fitted in a few steps. If the scene moves, the gradients of the views' squared errors
+with respect to the means of the Gaussians change slowly with time. The test measures the share of these gradients that
+follows four slow cosines of time, cos(pi k t) with k = 1 .. 4. It compares this share with the shares under random
+permutations of time (Freedman and Lane 1983). The influence of the camera position is removed by regression first. If
+the camera moves along with time, as on an orbit, the two influences cannot be separated, and the answer is undecided.
 """
 
 import math
@@ -26,15 +25,15 @@ from gsbench.errors import InputError
 from gsbench.measure.record import TimeScreen
 from gsbench.scenes import Scene, View
 
-LEVEL = 0.01  # time is on where p is at most this
-LEAST_FREE = 0.5  # share of the waves' variance that the camera must leave free
+LEVEL = 0.01  # the scene changes with time if the p-value is at most this
+LEAST_FREE = 0.5  # least share of the variance of the cosines of time that the camera position does not explain
 LEAST_VIEWS = 12
 ON, OFF, UNDECIDED = "on", "off", "undecided"
 
 
 @dataclass(frozen=True)
 class ScreenResult:
-    """The answer of one test whether the scene changes with time."""
+    """Hold the answer (on, off or undecided) of one test whether the scene changes with time, and its p-value."""
 
     decision: str
     reason: str
@@ -44,12 +43,12 @@ class ScreenResult:
 
 
 def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
-    """Decide from its training views whether a scene changes with time.
+    """Decide from its training views, reduced to a small size, whether a scene changes with time.
 
     Args:
-        scene: the scene to test; its training views are used at a small size.
-        seed: seed of the fit's points and of the random permutations.
-        backend: the backend that renders the static fit; see `gsbench.kernels.backends.resolve`.
+        scene: the scene.
+        seed: the seed of the initial points of the static fit and of the random permutations.
+        backend: the backend that renders the static fit: `reference`, `cpu`, `cuda` or `auto`.
 
     Raises:
         InputError: the scene has no training view.
@@ -63,16 +62,15 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
 
 
 def import_compiler() -> None:
-    """Make torch import its compiler before a clock starts, which its first optimizer would do.
+    """Create a torch optimizer so that torch imports its compiler now, before the time of the test is measured.
 
-    The import takes a second that would count as time of the test. A training makes its optimizer before its clock
-    starts, too.
+    The import takes a second. Otherwise the first optimizer of the test would trigger it.
     """
     torch.optim.Adam([torch.zeros(1)])
 
 
 def _answer(scene: Scene, seed: int, backend: str) -> ScreenResult:
-    """Run the tests that the scene's cameras allow, and combine their answers."""
+    """Test for change with time by views from the same camera position, by other views, or by both tests combined."""
     views = scene.train
     if not scene.has_time:
         return ScreenResult(OFF, "the views have no times")
@@ -90,7 +88,7 @@ def _answer(scene: Scene, seed: int, backend: str) -> ScreenResult:
 
 
 def _of_fixed(views: Sequence[View], places: Places, seed: int) -> ScreenResult:
-    """Compare the images of each fixed camera place."""
+    """Test for change with time by comparing the images that were taken from the same camera position."""
     found = compare_places(views, places.fixed, seed)
     count = len(places.fixed)
     where = f"each of {count} camera places" if count > 1 else "the camera's place"
@@ -110,7 +108,7 @@ def _percent(share: float) -> str:
 
 
 def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> ScreenResult:
-    """Test the residuals of a static fit to the views that no fixed camera place has."""
+    """Test for change with time by the residuals of a static 3DGS, fitted to views without a common camera position."""
     numbers = [*(v for place in places.held for v in place)] if places.held else places.other
     views = [smaller(scene.train[v]) for v in numbers]
     times = np.array([view.time for view in views], dtype=np.float64)
@@ -136,7 +134,7 @@ def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> ScreenRe
 
 
 def _dummies(places: list[list[int]]) -> Array:  # [V, P]
-    """Return a column for each camera place: 1 at the views from this place, 0 at others."""
+    """Return indicator variables [V, P] of P camera positions: 1 for a view from this position, 0 for the others."""
     columns = np.zeros((sum(map(len, places)), len(places)))
     for number, place in enumerate(places):
         columns[place, number] = 1
@@ -144,9 +142,10 @@ def _dummies(places: list[list[int]]) -> Array:  # [V, P]
 
 
 def _both(fixed: ScreenResult, loose: ScreenResult) -> ScreenResult:
-    """Combine the tests of fixed places and of other views, which share no view, by Fisher's method (1925).
+    """Combine the two tests for change with time, of repeated camera positions and of other views, by Fisher's method.
 
-    The combined p is q (1 - ln q), with q the product of both p-values.
+    The two tests have no view in common. The combined p-value is q (1 - ln q), where q is the product of the two
+    p-values.
     """
     reason = f"{fixed.reason}; of the other views, {loose.reason}"
     if OFF == fixed.decision == loose.decision:
@@ -164,5 +163,5 @@ def _both(fixed: ScreenResult, loose: ScreenResult) -> ScreenResult:
 
 
 def _is_blind(loose: ScreenResult) -> bool:
-    """Tell whether the camera moved along with time, so that p says nothing."""
+    """Return whether time and camera position are so correlated that the test for change with time says nothing."""
     return loose.free is not None and loose.free < LEAST_FREE

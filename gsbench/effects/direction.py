@@ -1,4 +1,4 @@
-"""Freeze direction in every Gaussian of a trained model, to measure how much the model uses it."""
+"""Remove the dependence on view direction from all Gaussians of a model, to measure how much the model uses it."""
 
 import copy
 from collections.abc import Sequence
@@ -17,14 +17,13 @@ from gsbench.scenes import View
 
 @torch.no_grad()
 def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianModel | None:
-    """Return a copy whose slices do not change with the direction of view.
+    """Return a copy of a model whose slices do not depend on the view direction; None for a model without direction.
 
-    Return None if the model's Gaussians never depend on direction, or if the model cannot replace it by a constant.
-    AGR, time and the harmonics of the colours stay.
+    The neural refinement (AGR), the dependence on time and the SH coefficients of the colours stay.
 
     Args:
         model: the trained model.
-        views: training views; the constant that replaces direction is the mean over them.
+        views: the training views; direction is replaced by its mean over these views.
     """
     if not isinstance(model, GatedModel) or "direction" not in model.observes:
         return None
@@ -34,7 +33,7 @@ def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianMo
     changed = copy.deepcopy(model)
     name = "direction" if "direction" in frozen else STATIC
     for key, value in frozen[name].items():
-        if key != "directions":  # AGR reads them
+        if key != "directions":  # these stay, because they are inputs of AGR
             changed.splats[key].data = value.clone()
     if name == STATIC:
         changed.effect_sets = effect_sets_of(model)._replace(refined=0, conditioned=0, intervals=None)
@@ -42,7 +41,7 @@ def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianMo
 
 
 def share_with_direction(model: GaussianModel) -> float:
-    """Return the share of Gaussians whose slices change with the direction of view."""
+    """Return the share of the Gaussians of a model whose slices depend on the view direction."""
     effect_sets = effect_sets_of(model)
     assert effect_sets.frozen is not None
     return float((effect_sets.frozen[: effect_sets.conditioned] & DIRECTION == 0).sum()) / max(1, len(model))

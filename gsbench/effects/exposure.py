@@ -1,21 +1,22 @@
-"""Remove the exposure from the images of one camera place: what is left is noise or a change.
+"""Remove differences of exposure from images that were taken from the same camera position.
 
-An image of a static scene is y = clip(a x + b) of what the place sees, x, with a gain a and an offset b for each image
-and channel. Both are fitted by least absolute deviations (iteratively reweighted: Schlossmacher 1973), so that what
-moves through less than half of the image is an outlier and does not change them. x is the median over the images of
-(y - b) / a, without saturated y, so x may exceed 1.
+The model of an image of a static scene is y = clip(a x + b). The colours x are the same for all images, and each image
+and channel has a gain a and an offset b. Gains and offsets are fitted by least absolute deviations (Schlossmacher
+1973), so objects that move through less than half of the image are outliers and do not change the fit. x is the median
+of (y - b) / a over the images without saturated pixels, so x may exceed 1. The residuals are noise or a change of the
+scene.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 LEVEL_8_BIT = 1 / 255
-ROUNDS = 3  # of the fit and of x
-REWEIGHTINGS = 8
-FIT_PIXELS = 500  # that the fit looks at
-LEAST_PIXELS = 16  # with fewer nothing is fitted
-BLACK = 0.01  # weight of a pixel that is black in all images, in parts of all: of one shade only a gain is fitted
-GAINS = (0.25, 4.0)
+ROUNDS = 3  # how often gain and offset are fitted and x is computed again
+REWEIGHTINGS = 8  # iterations of the least absolute deviations
+FIT_PIXELS = 500  # number of pixels that the fit uses
+LEAST_PIXELS = 16  # with fewer valid pixels nothing is fitted
+BLACK = 0.01  # relative weight of an added black pixel: if all other pixels are alike, only a gain is fitted
+GAINS = (0.25, 4.0)  # range of the gain
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -24,9 +25,10 @@ Mask = NDArray[np.bool_]
 def changes(
     images: Array,  # [n, H, W, 3] of one camera place, in [0, 1]
 ) -> Array:  # [n, H, W, 3]
-    """Return how each image differs from the mean of its camera place, after the image's gain and offset were removed.
+    """Return the difference of each image from the mean image, after its gain and offset of exposure were removed.
 
-    If the expected value is saturated, a difference of at most three standard deviations of noise counts as none.
+    The images come from the same camera position. A difference of at most three standard deviations of the noise is set
+    to zero if the expected value is saturated.
     """
     n, height, width, channels = images.shape
     y = np.ascontiguousarray(images.transpose(0, 3, 1, 2), np.float32).reshape(n, channels, -1)
@@ -53,7 +55,7 @@ def changes(
 def _telling(
     saturated: Mask,  # [n, 3, P]
 ) -> NDArray[np.int64]:
-    """Choose the pixels of the fit: up to FIT_PIXELS that no image saturates, and up to FIT_PIXELS of all pixels."""
+    """Choose the pixels for the fit of exposure: up to FIT_PIXELS that no image saturates, and FIT_PIXELS of all."""
     inside = np.flatnonzero((~saturated.any(0)).any(0))
     spaced = [every[:: max(1, -(-len(every) // FIT_PIXELS))] for every in (inside, np.arange(saturated.shape[2]))]
     return np.unique(np.concatenate(spaced))
@@ -64,7 +66,10 @@ def _fit(
     x: Array,  # [3, P]
     use: Mask,  # [n, 3, P]
 ) -> tuple[Array, Array]:
-    """Fit a and b, [n, 3, 1], of y = a x + b for n images to the pixels in `use` and, at small weight, to y = x = 0."""
+    """Fit gains a and offsets b, [n, 3, 1], of y = a x + b to the pixels in `use`, for n images and 3 channels.
+
+    A black pixel (x = y = 0) with a small weight is added, so that an image of one shade determines only a gain.
+    """
     number = use.sum(-1, keepdims=True)
     enough = number >= LEAST_PIXELS
     y, x = np.pad(y, ((0, 0), (0, 0), (0, 1))), np.pad(x, ((0, 0), (0, 1)))
@@ -86,7 +91,7 @@ def _shared(
     enough: Mask,  # [n, 3, 1]
     otherwise: float,
 ) -> Array:
-    """Replace a fit to too few pixels by the mean of the fits to the image's other channels."""
+    """Replace a gain or offset that has too few pixels by the mean of the other channels of the image."""
     number = enough.sum(1, keepdims=True)
     mean = (values * enough).sum(1, keepdims=True) / np.maximum(number, 1)
     return np.where(enough, values, np.where(number > 0, mean, otherwise)).astype(np.float32)
@@ -97,9 +102,10 @@ def _seen(
     saturated: Mask,  # [n, 3, P]
     full: Mask,  # [3, P] where the first image is saturated, whether it is white and not black
 ) -> Array:  # [3, P]
-    """Return each pixel's median of unsaturated values.
+    """Return for each pixel the median over n images of its unsaturated values.
 
-    If all are saturated, the least value that saturates every image.
+    A pixel that is saturated in all images gets its largest value if it is white, and its smallest value if it is
+    black.
     """
     ordered = np.sort(np.where(saturated, np.float32(np.inf), values), 0)
     number = (~saturated).sum(0)

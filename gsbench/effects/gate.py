@@ -1,8 +1,10 @@
-"""Remove effects that Gaussians do not need: choose simplifications within a budget of error, and apply them.
+"""Choose a simplification for each Gaussian of a model, and apply it.
 
-Every Gaussian takes the simplification that minimises time + lambda error. Here time is what the Gaussian costs in a
-frame, and error is what gsbench.effects.sensitivity predicts. lambda, the same for all Gaussians, is such that the
-errors add up to the budget. The same rule decides about time, direction, AGR, harmonics and removal.
+A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+removed. For each Gaussian, the rule chooses the simplification that minimises cost + lambda error. The cost is the
+rendering time of the Gaussian in a frame, and the error is the predicted growth of the images' squared error
+(gsbench.effects.sensitivity). lambda is the same for all Gaussians. It is chosen so that the errors add up to a given
+bound.
 """
 
 from dataclasses import dataclass
@@ -19,38 +21,38 @@ from gsbench.models.simplifications import CONDITIONED, LIVE, REMOVED, STATIC
 
 # Nanoseconds that a Gaussian adds to a frame, as measured on an EPYC Zen 4 (AVX-512, one thread, 5,300 Gaussians at
 # 80 x 80). They are constants, so that the same seed chooses the same Gaussians on every machine.
-REFINING = 195.0
+REFINING = 195.0  # AGR
 SLICING = 28.0
-COSTS = {CONDITIONED: SLICING, STATIC: 8.0, REMOVED: -60.0}  # beyond what a Gaussian takes in the rasterizer, 60
-COLORING = (13.0, 19.0, 23.0, 28.0)  # by degree, for each frequency of time
-LESS_TO_READ = 1.0  # a frozen variable among others saves no arithmetic, only parameters
+COSTS = {CONDITIONED: SLICING, STATIC: 8.0, REMOVED: -60.0}  # without the 60 that the rasterizer takes for a Gaussian
+COLORING = (13.0, 19.0, 23.0, 28.0)  # by SH degree, for each frequency of time
+LESS_TO_READ = 1.0  # saved if a Gaussian depends on only one of time and direction: it has fewer parameters to read
 BITS = {"time": TIME, "direction": DIRECTION}
 BISECTIONS = 32
 
 
 @dataclass(frozen=True)
 class ChosenSimplifications:
-    """The simplification of each Gaussian."""
+    """Hold the simplification that was chosen for each Gaussian, such as independent of time, and the total error."""
 
-    geometry: dict[str, Tensor]  # [N] bool by the name of a simplification: which Gaussians become it
-    orders: Tensor  # [N] int32 of colours, see EffectSets.orders
-    predicted: float  # error that the choice adds, as a share of the model's own
+    geometry: dict[str, Tensor]  # for each simplification by name: which Gaussians it is chosen for, [N] bool
+    orders: Tensor  # [N] int32: SH degree and frequencies of each colour, as in `ColorOrder`
+    predicted: float  # predicted squared error that is added, as a share of the model's squared error
 
 
 def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> ChosenSimplifications:
-    """Choose the cheapest simplifications whose predicted errors add up to at most a share of the model's own error.
+    """Choose a simplification for each Gaussian so that the predicted errors add up to at most a given bound.
 
-    Each Gaussian i takes the simplification s that minimises
+    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+    removed.
 
-        cost(i, s) + lambda error(i, s)
-
-    with its nanoseconds of a frame (COSTS, COLORING) and its predicted squared error (`Sensitivity.errors`). Bisection
-    finds the smallest lambda for which the errors add up to at most `budget` x `sensitivity.total`.
+    For Gaussian i, the simplification s minimises cost(i, s) + lambda error(i, s). The cost is its time in a frame
+    (COSTS, COLORING), and the error is the predicted squared error. Bisection finds the smallest lambda for which the
+    errors stay within the bound.
 
     Args:
-        sensitivity: predicted errors of the model's simplifications.
-        model: the model of `sensitivity`; effects may have been removed from it before.
-        budget: the share of the model's squared error that may be added, such as 0.01, which costs 0.043 dB of PSNR.
+        sensitivity: the predicted error of each simplification of each Gaussian.
+        model: the model for which the errors were predicted.
+        budget: the bound, as a share of the model's squared error. For example 0.01 is a loss of 0.043 dB of PSNR.
     """
     now = effect_sets_of(model)
     live = _live_cost(model, now)
@@ -67,13 +69,13 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     shading = _shading(orders)
 
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Choose for one lambda; return the choices of geometry and colour, and the error of each Gaussian."""
+        """Return for one weight lambda of the error the best simplification of each Gaussian, and its error."""
         shade, hue = (shading + price * hues).min(0)
         _, form = (costs + price * forms + torch.where(removes, 0.0, shade)).min(0)  # argmin takes 8 to 30 times longer
         error = forms.gather(0, form[None])[0] + hues.gather(0, hue[None])[0] * ~removes[form, 0]
         return form, hue, error
 
-    low, high = -60.0, 60.0  # of log2 of the price
+    low, high = -60.0, 60.0  # bounds of log2(lambda)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         within = float(decide(2.0**middle)[2].sum()) <= budget * sensitivity.total
@@ -86,7 +88,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
 
 
 def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
-    """Return the nanoseconds of a frame that each Gaussian takes, without its colour and rasterization, [N]."""
+    """Return the time that slicing and neural refinement (AGR) of each Gaussian take in a frame, nanoseconds, [N]."""
     like = model.splats["opacities"].detach()
     cost = torch.full_like(like, COSTS[STATIC])
     cost[: now.conditioned] = SLICING
@@ -97,25 +99,25 @@ def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
 
 
 def cost_of(model: GaussianModel) -> Tensor:
-    """Return the nanoseconds of a frame that each Gaussian takes, with its colour, without rasterization, [N]."""
+    """Return the time that slicing, refinement (AGR) and colour of each Gaussian take in a frame, nanoseconds, [N]."""
     now = effect_sets_of(model)
     assert now.orders is not None
     return _live_cost(model, now) + _shading(now.orders)
 
 
 def most_cost(model: GaussianModel) -> float:
-    """Return the nanoseconds that a Gaussian with every effect of this model adds to a frame."""
+    """Return the time that a Gaussian with slicing, refinement (AGR) and full colour takes in a frame, nanoseconds."""
     return REFINING + SLICING + float(_shading(torch.tensor(model.full_order())))
 
 
 def _shading(orders: Tensor) -> Tensor:
-    """Return the nanoseconds to evaluate each colour; `orders` pack its harmonic degree and Fourier order."""
+    """Return the time to evaluate each colour, nanoseconds; `orders` encode SH degrees and frequencies in time."""
     order = order_of(orders)
     return torch.tensor(COLORING, device=orders.device)[order.degree] * order.waves
 
 
 def effect_sets_of(model: GaussianModel) -> EffectSets:
-    """Return which effects each Gaussian of a model keeps; all that the model has if none was removed."""
+    """Return what each Gaussian of a model depends on: time, direction, AGR (neural refinement), and its SH degree."""
     if model.effect_sets is not None:
         return model.effect_sets
     rows = model.count_by_effects()
@@ -132,16 +134,19 @@ def apply(
     choice: ChosenSimplifications,
     intervals: Tensor | None = None,  # [N, 2]
 ) -> tuple[Tensor, Tensor]:
-    """Simplify each Gaussian of a model, drop the removed ones, and sort the others by the effects that they keep.
+    """Simplify each Gaussian of a model as chosen, and sort the Gaussians by what they still depend on.
+
+    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+    removed.
 
     Args:
-        model: the model to change in place.
-        sensitivity: predicted errors of the model's simplifications.
+        model: the model, which is changed in place.
+        sensitivity: the parameters of each simplified Gaussian.
         choice: the simplification of each Gaussian, from `choose`.
-        intervals: the times at which each Gaussian can be seen, see `EffectSets.intervals`.
+        intervals: the first and the last time at which AGR changes each Gaussian.
 
     Returns:
-        The former rows [M] of the Gaussians that are left, and whether each of them was changed, [M] bool.
+        The former index of each remaining Gaussian, [M], and whether it was simplified, [M] bool.
     """
     now = effect_sets_of(model)
     assert now.orders is not None
@@ -165,12 +170,12 @@ def apply(
     static = static | choice.geometry.get(STATIC, torch.zeros_like(static)) | (frozen == sum(BITS.values()))
     frozen[static] = 0
     kind = torch.where(refined, 0, torch.where(static, 2, 1))
-    # Rows of an effect set are sorted by what is frozen and by the order of their colours, and otherwise stay where
-    # they are: equal work lies together.
+    # Gaussians are sorted by the effects that remain, then by the order of their colours, so that neighbours need the
+    # same work. Otherwise their order does not change.
     rank = (kind * 4 + frozen) * (MOST_PACKED + 1) + MOST_PACKED - choice.orders
     if intervals is None:
         order = rank.argsort(stable=True)
-    else:  # those that AGR moves at the same times lie together too: a GPU's warps rest as a whole
+    else:  # Gaussians that AGR changes at the same times are neighbours too, so that whole warps of a GPU can skip
         order = intervals[:, 0].argsort(stable=True)
         order = order[rank[order].argsort(stable=True)]
     rows = order[~choice.geometry[REMOVED][order]]

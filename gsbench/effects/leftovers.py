@@ -1,4 +1,4 @@
-"""Fit 3DGS in a few steps and compute the residuals of each view: the gradients of the squared error by the means."""
+"""Fit a static 3DGS in a few steps, and compute gradients of each view's error with respect to the Gaussians' means."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,21 +20,24 @@ from gsbench.process.workers import side_by_side
 from gsbench.scenes import Camera, Points, Scene, View
 from gsbench.scenes.points import frustum_points
 
-LONG_SIDE = 40  # pixels of the images that are fitted, at least
+LONG_SIDE = 40  # least length in pixels of the longer side of a fitted image, if the image is not smaller
 POINTS = 2_000
 STEPS = 50
 BATCH = 4  # views in a step
-RATES = {"means": 2e-3, "scales": 2e-2, "quats": 1e-2, "opacities": 5e-2, "sh0": 5e-2}  # means: parts of the extent
-CAMERA_DEGREE = 2  # of the harmonics of the camera's direction that are taken out
-# A point nearest to all optical axes is the scene's centre if they pass it within this part of its depth.
+RATES = {"means": 2e-3, "scales": 2e-2, "quats": 1e-2, "opacities": 5e-2, "sh0": 5e-2}  # means: times the extent
+CAMERA_DEGREE = 2  # SH degree of the functions of camera direction that are removed from the gradients by regression
+# The point nearest to all optical axes is the scene's centre if each axis passes it within this part of its depth.
 NEAR_AXES = 0.5
-RADIUS = 0.4  # of the points around the centre, in distances of the cameras
+RADIUS = 0.4  # half width of the cube of initial points, as a part of the distance of the cameras
 
 Array = NDArray[np.float64]
 
 
 def leftovers(views: Sequence[View], scene: Scene, seed: int, backend: str) -> Array:
-    """Fit 3DGS of degree 0 for STEPS steps; return products g_v . g_w [V, V] of views' gradients."""
+    """Fit a static 3DGS to V views for STEPS steps, and return the scalar products of the views' gradients, [V, V].
+
+    The gradient of a view is that of its squared error with respect to the means of the Gaussians, after the fit.
+    """
     random = torch.Generator().manual_seed(seed)
     points = scene_points(views, scene, random)
     device = views[0].camera.viewmat.device
@@ -60,7 +63,7 @@ def leftovers(views: Sequence[View], scene: Scene, seed: int, backend: str) -> A
 
 
 def _gradients(model: Gaussians3DModel, by: list[nn.Parameter], background: Tensor, view: View) -> list[Tensor]:
-    """Compute the gradients of a view's mean squared error by some parameters."""
+    """Compute the gradients of a view's mean squared error with respect to the parameters `by` of a 3DGS model."""
     with Tape() as tape:
         gaussians = model.slice(Query.of(view.camera, None))
         image = rasterize_slice(gaussians, view.camera, background, model.backend).image
@@ -71,7 +74,7 @@ def _gradients(model: Gaussians3DModel, by: list[nn.Parameter], background: Tens
 
 
 def smaller(view: View) -> View:
-    """Return a reduced view whose longer side has LONG_SIDE pixels or a few more."""
+    """Reduce a view by an integer factor, so that its longer side has LONG_SIDE pixels or a few more."""
     camera = view.camera
     factor = max(1, max(camera.width, camera.height) // LONG_SIDE)
     height, width = camera.height // factor, camera.width // factor
@@ -86,7 +89,7 @@ def smaller(view: View) -> View:
 
 
 def scene_points(views: Sequence[View], scene: Scene, random: torch.Generator) -> Points:
-    """Choose POINTS points from which a fit starts: some of the scene's, or points where the cameras look."""
+    """Return POINTS initial points for a fit: a random subset of the scene's points, or random points at its centre."""
     if scene.points is not None:
         chosen = torch.randperm(len(scene.points.means), generator=random)[:POINTS]
         return Points(scene.points.means[chosen], scene.points.colors[chosen])
@@ -99,7 +102,7 @@ def scene_points(views: Sequence[View], scene: Scene, random: torch.Generator) -
 
 
 def center_of(views: Sequence[View]) -> Tensor | None:
-    """Return the point nearest to all optical axes, [3]; None if they do not meet before the cameras."""
+    """Return the point [3] nearest to all optical axes; None if the axes do not nearly meet in front of the cameras."""
     centers = torch.stack([view.camera.center for view in views]).cpu().double()
     axes = torch.stack([view.camera.viewmat[2, :3] for view in views]).cpu().double()
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
@@ -113,7 +116,7 @@ def center_of(views: Sequence[View]) -> Tensor | None:
 
 
 def camera_basis(views: Sequence[View]) -> Array:
-    """Compute harmonics [V, 9] of the direction of each camera from the centre of the scene."""
+    """Compute the spherical harmonics up to degree 2 of each camera's direction from the scene's centre, [V, 9]."""
     center = center_of(views)
     centers = torch.stack([view.camera.center for view in views]).cpu()
     if center is None:  # cameras side by side: seen from so far in front of them that all lie close together

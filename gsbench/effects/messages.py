@@ -1,8 +1,12 @@
-"""Write the sentences about the chosen effects of a scene and its Gaussians; this module needs no torch."""
+"""Write messages about the test for change with time, and about the simplification of Gaussians.
+
+A simplified Gaussian is independent of time, direction or AGR (the neural refinement), or has a lower SH degree.
+This module does not import torch.
+"""
 
 from gsbench.measure.record import Direction, Gate, OnDemand, TimeScreen
 
-EFFECT_SETS = {  # of Gaussians: the names of gsbench.models.effect_sets, in its order, and what they are called
+EFFECT_SETS = {  # the names of gsbench.models.effect_sets, in the same order, and their names in the legend
     "refined": "refined by AGR",
     "conditioned": "conditioned",
     "time": "time frozen",
@@ -19,17 +23,17 @@ _KEEP = {
 
 
 def of_decision(screen: TimeScreen) -> str:
-    """Say whether the model depends on time."""
+    """Return a message that says whether the test found that the scene changes with time."""
     return f"time is {screen.decision}{', so it is simulated' if screen.decision == 'undecided' else ''}"
 
 
 def of_screen(screen: TimeScreen) -> str:
-    """Say whether the model depends on time, and why."""
+    """Return a message with the answer of the test whether the scene changes with time, and its reason."""
     return f"{of_decision(screen)}: {screen.reason}"
 
 
 def of_gate(gate: Gate) -> str:
-    """Say how many Gaussians and effects are left after a removal of effects, and how many dB this cost."""
+    """Return a message on a simplification of a model: what its Gaussians still depend on, PSNR, frame time, bytes."""
     left = sum(number for name, number in gate.rows.items() if name != "removed")
     when = "at the end" if gate.step is None else f"after step {gate.step}"
     kept = ", ".join(f"{gate.rows[name]} {words}" for name, words in _KEEP.items() if gate.rows.get(name))
@@ -46,13 +50,13 @@ def of_gate(gate: Gate) -> str:
 
 
 def of_direction(found: Direction) -> str:
-    """Say how many Gaussians depend on direction, and what freezing it in all of them would change."""
+    """Return a message: how many Gaussians depend on direction, and what would change if none did."""
     return (f"direction: {found.kept:.0%} of the Gaussians keep it; freezing it in all would change PSNR by "
             f"{-found.loss_db:+.2f} dB and a frame from {found.frame_ms:.2f} to "
             f"{found.frame_ms_without:.2f} ms")  # fmt: skip
 
 
 def lines(found: OnDemand) -> list[str]:
-    """Return a sentence on each line about the effects that were removed; `of_screen` has the test for time."""
+    """Return the messages about Gaussians that a run made independent of time, direction or AGR (refinement)."""
     said = [of_gate(gate) for gate in found.gates]
     return said + ([of_direction(found.direction)] if found.direction else []) + found.notes

@@ -1,7 +1,8 @@
-"""Draw a model's image, the same Gaussians in the colours of their effect sets, and the cost of each pixel.
+"""Draw three panels: a rendered image, what each Gaussian depends on, and the rendering cost of each pixel.
 
-The third panel is the cost of the Gaussians that a pixel shows, weighted as their colours are: nanoseconds of a frame
-by the constants of gsbench.effects.gate, black for none, bright yellow for a Gaussian with AGR and all harmonics.
+In the second panel, the colour of a Gaussian shows whether it depends on time, direction and AGR (the neural
+refinement). In the third, the time that each Gaussian takes in a frame (constants of gsbench.effects.gate) is
+alpha-composited like a colour. Bright yellow is a Gaussian with AGR and the full SH degree, black is no cost.
 """
 
 import cv2
@@ -17,7 +18,7 @@ from gsbench.models.effect_sets import NAMES
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes import Camera
 
-# RGB, those of the report's page on white: a Gaussian has the colour of the model whose effects it still has.
+# RGB colours, as on the report's page: a Gaussian has the colour of the model with the same effects.
 COLOURS = {
     "refined": (0xB3, 0x47, 0x00),
     "conditioned": (0x9C, 0x3D, 0x82),
@@ -25,7 +26,7 @@ COLOURS = {
     "direction": (0x00, 0x69, 0xA8),
     "static": (0x5C, 0x60, 0x66),
 }
-LEAST_WIDTH, MOST_WIDTH = 300, 640  # pixels of a panel: smaller images are enlarged by an integer factor, larger shrunk
+LEAST_WIDTH, MOST_WIDTH = 300, 640  # pixels; smaller images are enlarged by an integer factor, larger ones reduced
 GAP = 4  # pixels
 GREY = 200
 LINE = 22  # pixels of a line of text
@@ -36,14 +37,17 @@ COLUMNS = 3
 def draw(
     model: GaussianModel, camera: Camera, time: float | None, background: Tensor, antialias: bool = False
 ) -> Pixels:
-    """Draw the three panels with their titles and a legend: uint8 [H', W', 3] RGB.
+    """Draw three panels with a legend: an image, what each Gaussian depends on, and the rendering cost of each pixel.
 
     Args:
-        model: an initialised model; if no effects were removed, all its Gaussians have the same colour.
+        model: the model; if its Gaussians were not simplified, all have the same colour in the second panel.
         camera: the camera of the image.
         time: the time of the image in [0, 1]; None if the scene has no time.
-        background: background colour [3] of the first panel; that of the second is white.
-        antialias: see `gsbench.raster.rasterize`.
+        background: the background colour of the first panel, [3].
+        antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
+
+    Returns:
+        The picture, uint8 RGB.
 
     Raises:
         InputError: the model depends on time and `time` is None.
@@ -64,17 +68,17 @@ def draw(
 
 
 def effect_set_colors(model: GaussianModel) -> Tensor:
-    """Return the colour of each Gaussian's effect set, [N, 3] in [0, 1]."""
+    """Return a colour for each Gaussian that shows whether it depends on time, direction and refinement, [N, 3]."""
     return torch.tensor([COLOURS[name] for name in NAMES]).to(model.splats["means"])[kinds_of(model)] / 255
 
 
 def cost_colors(model: GaussianModel, most: float) -> Tensor:
-    """Return the cost of each Gaussian as a grey level, [N, 3]: 1 stands for `most` nanoseconds of a frame."""
+    """Return the rendering time of each Gaussian as a grey level, [N, 3]; 1 stands for `most` nanoseconds."""
     return (cost_of(model).to(model.splats["means"]) / most)[:, None].repeat(1, 3)
 
 
 def kinds_of(model: GaussianModel) -> Tensor:
-    """Return the effect set (the effects that it keeps) of each Gaussian as an index into NAMES, [N] int64."""
+    """Return what each Gaussian depends on (refinement, time, direction, nothing) as an index into NAMES, [N]."""
     effect_sets = effect_sets_of(model)
     assert effect_sets.frozen is not None
     place = torch.arange(len(model), device=effect_sets.frozen.device)
@@ -88,7 +92,7 @@ def kinds_of(model: GaussianModel) -> Tensor:
 
 
 def _arranged(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixels:
-    """Put panels side by side, with titles above and the legend below."""
+    """Put the three panels side by side, with titles above and the legend of the Gaussians' colours below."""
     height, width = panels[0].shape[:2]
     factor = max(1, -(-LEAST_WIDTH // width))
     if width > MOST_WIDTH:

@@ -1,4 +1,4 @@
-"""Find the views from each camera place, by how far the image moves between two views."""
+"""Group views that were taken from the same camera position, by the shift of the image between two views."""
 
 import math
 from collections.abc import Sequence
@@ -10,34 +10,34 @@ from numpy.typing import NDArray
 from gsbench.effects.leftovers import center_of
 from gsbench.scenes import View
 
-SAME = 1e-4  # of the image's longer side: less than a tenth of a pixel of 800
-NEAR = 0.05  # the same for a camera that is held, or stands on soft ground
-LEAST_HELD = 3  # views of a held camera
-LEAST_SPAN = 0.5  # of the film that its views span: a camera that wanders is at each place for a moment only
+SAME = 1e-4  # largest shift within a position, in units of the longer side: less than a tenth of a pixel of 800
+NEAR = 0.05  # largest shift for a camera that is held in the hand, or stands on soft ground
+LEAST_HELD = 3  # least number of views of a held camera
+LEAST_SPAN = 0.5  # least part of the scene's length that these views span; a moving camera stays for a moment only
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Places:
-    """The views from each camera place, as indices into a list of views."""
+    """Hold the views from each camera position, as indices into a list of views."""
 
-    fixed: list[list[int]]  # at least two of each place
-    held: list[list[int]]  # places of cameras that move a little; empty, or most of the views that no fixed place has
-    other: list[int]  # views of neither
+    fixed: list[list[int]]  # groups of at least two views from exactly the same position
+    held: list[list[int]]  # groups of views from a camera that moves a little; empty if these are a minority
+    other: list[int]  # the views of no group
 
     @property
     def loose(self) -> list[int]:
-        """Return the views that no fixed place has."""
+        """The views that share their exact camera position with no other view, sorted."""
         return sorted([v for place in self.held for v in place] + self.other)
 
 
 def find_places(views: Sequence[View], extent: float) -> Places:
-    """Group the views by camera place.
+    """Group views by the camera position from which they were taken.
 
     Args:
-        views: with times.
-        extent: the scene's extent, taken as the distance to the scene if the cameras look at no common point.
+        views: the views, which have times.
+        extent: the radius of the scene; it replaces the distance to the scene if the cameras look at no common point.
     """
     poses = _poses(views, extent)
     exact = _groups(list(range(len(views))), poses, SAME)
@@ -53,7 +53,10 @@ def find_places(views: Sequence[View], extent: float) -> Places:
 
 
 def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
-    """Return a vector for each camera; the distance of two vectors is about the shift of the image, in longer sides."""
+    """Return a vector for each camera, such that the distance of two vectors approximates the shift of their images.
+
+    The unit of the shift is the longer side of the image.
+    """
     center = center_of(views)
     rows = []
     for view in views:
@@ -75,7 +78,7 @@ def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
 
 
 def _groups(numbers: list[int], poses: Array, tolerance: float) -> list[list[int]]:
-    """Group views so that no view is farther than the tolerance from the first view of its group."""
+    """Group views so that the distance of each pose vector to the first one of its group is at most `tolerance`."""
     groups: list[list[int]] = []
     left = np.array(numbers, dtype=np.int64)
     while len(left):

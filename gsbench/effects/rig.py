@@ -1,15 +1,14 @@
-"""Test whether the images of one camera place change with time, without a fitted model.
+"""Test whether images that were taken from the same camera position change with time.
 
-Two questions are asked of all places together, after each image's exposure is taken out (gsbench.effects.exposure).
+Differences of exposure are removed first (gsbench.effects.exposure). Then there are two tests:
 
-- Does anything change? Noise is white over pixels, a change is not. The pixels of a block form two halves like the
-  squares of a chess board. The product of the means of the halves is zero on average for noise of any size, and the
-  energy of a change otherwise. One block in which it is far above the noise is enough.
-- Does it change slowly? The share of the energy of each place's block means that follows slow waves of time,
-  |W^T M|^2 / |M|^2, is summed over places. It is compared with that of images permuted within their places (a kernel
-  test of independence, Gretton et al. 2005, with permutations within strata), so differences between places do not
-  count. Each moment has a random number, and a place's images are permuted in the order of these numbers. So the images
-  of one moment stay together, and the level holds for a light that flickers for all cameras.
+- Does anything change? Each block of pixels is divided into two halves by a chess-board pattern. Noise is independent
+  in the two halves, so the product of their means is zero on average. For a change of the scene it is positive. The
+  scene changes if this product is far above the noise in at least one block.
+- Does it change slowly with time? Let M hold the block means of the images from one position, and W four slow cosines
+  of time. The statistic is |W^T M|^2 / |M|^2, summed over positions. It is compared with its values after random
+  permutations of the images within each position (Gretton et al. 2005). Images of the same time are permuted together,
+  so that a light which flickers for all cameras does not count as slow change.
 """
 
 from collections.abc import Sequence
@@ -23,31 +22,31 @@ from gsbench.effects.exposure import LEVEL_8_BIT, changes
 from gsbench.effects.waves import PERMUTATIONS, compare, slow_waves
 from gsbench.scenes import View
 
-LONG_SIDE = 100  # pixels of the images that are compared; every k-th is taken, as neighbours' noise may be alike
-BLOCKS = 20  # along the longer side
-FAR_ABOVE = 20.0  # times the energy of noise
-MOST_VIEWS = 240  # of all places together; more are taken evenly spaced from each
-LEAST_AT_A_PLACE = 3  # two images have no order: a film and its reverse are one to slow waves
+LONG_SIDE = 100  # size of the compared images; every k-th pixel is taken, since noise of neighbours may be correlated
+BLOCKS = 20  # number of blocks along the longer side
+FAR_ABOVE = 20.0  # a block changes if its energy is above this times that of noise
+MOST_VIEWS = 240  # largest number of images of all positions; of more images, evenly spaced ones are used
+LEAST_AT_A_PLACE = 3  # least number of images from a position; the statistic is the same for two images in any order
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class PlaceComparison:
-    """The result of comparing the images of each camera place with one another."""
+    """Hold the result of comparing the images from the same camera position with one another."""
 
-    changed: float  # share of the blocks, over all places
-    p: float | None  # of slow waves; None: nothing changes, or no place has images enough
-    z: float | None
+    changed: float  # share of the blocks of pixels that change, over all positions
+    p: float | None  # p-value of slow change with time; None: nothing changes, or no position has enough images
+    z: float | None  # z-score of slow change with time
 
 
 def compare_places(views: Sequence[View], places: Sequence[Sequence[int]], seed: int) -> PlaceComparison:
-    """Compare the images of each camera place with one another, to find changes with time.
+    """Test whether images from the same camera position differ, and whether they change slowly with time.
 
     Args:
-        views: with times.
-        places: for each camera place the indices of its views, at least two.
-        seed: seed of the random permutations.
+        views: the views, which have times.
+        places: for each camera position the indices of its views, at least two.
+        seed: the seed of the random permutations.
     """
     most = max(4, MOST_VIEWS // len(places))
     blocks, changed, means, times = 0, 0, [], []
@@ -66,9 +65,9 @@ def compare_places(views: Sequence[View], places: Sequence[Sequence[int]], seed:
 
 
 def _spread(ordered: list[int], most: int, start: float) -> list[int]:
-    """Choose at most `most` views, evenly spaced.
+    """Choose at most `most` evenly spaced views of a sorted list.
 
-    `start` in [0, 1) shifts them, so that camera places differ in time.
+    A different `start` in [0, 1) for each camera position makes the chosen times different.
     """
     if len(ordered) <= most:
         return ordered
@@ -76,7 +75,7 @@ def _spread(ordered: list[int], most: int, start: float) -> list[int]:
 
 
 def _pixels(view: View) -> NDArray[np.float32]:
-    """Return every k-th pixel of a view's image, at most LONG_SIDE along its longer side."""
+    """Return every k-th pixel of a view's image, so that its longer side has at most LONG_SIDE pixels."""
     step = -(-max(view.pixels.shape[:2]) // LONG_SIDE)
     pixels = view.pixels[step // 2 :: step, step // 2 :: step]
     return np.asarray((pixels if pixels.is_floating_point() else pixels.float() / 255).to("cpu", torch.float32).numpy())
@@ -85,7 +84,7 @@ def _pixels(view: View) -> NDArray[np.float32]:
 def _halves(
     images: NDArray[np.float32],  # [n, H, W, 3]
 ) -> NDArray[np.float32]:  # [2, n, B, 3]
-    """Average the two halves of the pixels of each block, which are like the squares of a chess board."""
+    """Divide each block of pixels into two halves by a chess-board pattern, and return the mean of each half."""
     n, height, width, channels = images.shape
     side = min(max(2, max(height, width) // BLOCKS), height, width)
     rows, columns = height // side, width // side
@@ -99,7 +98,11 @@ def _halves(
 def _is_changed(
     halves: NDArray[np.float32],  # [2, n, B, 3], of mean zero over the n images
 ) -> NDArray[np.bool_]:  # [B]
-    """Tell which blocks change by more than a level of 8 bits, and by far more than the noise of their pixels."""
+    """Return which blocks of pixels change over the images by more than 1/255 and by far more than their noise.
+
+    Args:
+        halves: the means of the two halves of each block, from `_halves`.
+    """
     first, second = halves
     degrees = first.shape[2] * (len(first) - 1)
     energy = (first * second).sum((0, 2)) / degrees
@@ -109,7 +112,13 @@ def _is_changed(
 
 
 def _slow(means: list[Array], times: list[Array], seed: int) -> tuple[float, float]:
-    """Return p-value and z-score of the share of energy that follows slow waves of time, summed over camera places."""
+    """Return the p-value and z-score of the test whether block means follow slow cosines of time.
+
+    Args:
+        means: the block means of the images from each camera position, [n, ..] each.
+        times: the times of these images, [n] for each position.
+        seed: the seed of the random permutations.
+    """
     moments = np.unique(np.concatenate(times))
     keys = np.random.default_rng(seed).random((PERMUTATIONS, len(moments)))
     total = np.zeros(1 + PERMUTATIONS)

@@ -1,22 +1,22 @@
-"""Predict the error of every simplification of every Gaussian, all at once, from a few renders.
+"""Predict how much the squared error of the images grows if a Gaussian is simplified, for all Gaussians at once.
 
-A simplification of a Gaussian (AGR baked in, time or direction frozen, fewer harmonics, removed) changes its slice in
-view v by delta_v, and the image by x_v. With r the image minus the truth, the squared error of all views grows by
+A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+removed. This changes the image of view v by x_v. Let r_v be the present image less the true one. The predicted error is
 
-    E = sum over v of max(0, 2 <r, x_v>) + <g, x_v>^2,
+    E = sum over v of max(0, 2 <r_v, x_v>) + <g_v, x_v>^2,
 
-with random signs g, because <g, x>^2 is |x|^2 on average. The maximum ignores improvements of the training
-views. Products of r and g with J, the derivative of the image by slices, have <r, x> and <g, x> for all Gaussians at
-once:
+where g_v has random signs, so that <g, x>^2 is |x|^2 on average. The maximum ignores improvements on training views.
+One backward pass with r and one with g give the scalar products of all Gaussians. Let J be the derivative of the image
+with respect to the parameters of a sliced Gaussian, and delta the change of these parameters.
 
-- The image is linear in a Gaussian's colour and in its opacity, so x = J delta for fewer harmonics and for a removal.
-- If a simplification moves a Gaussian by less than its size, x = (J + J') delta / 2, with J' at the simplification. To
-  compute J' the simplified Gaussians are rendered beside the model's own, so thin that they do not hide each other.
-  What the own Gaussian hides of its simplification is added.
-- If it moves the Gaussian farther, |x|^2 is the sum of the squares at both places.
+- An image is linear in colour and opacity, so x = J delta for a lower SH degree and for a removal.
+- If a Gaussian moves by less than its size, x = (J + J') delta / 2, where J' is the derivative at the simplified
+  Gaussian. For J', the simplified Gaussians are rendered together with the present ones, with small opacities.
+- If a Gaussian moves farther, the image changes at the old and at the new position, and the squares of the two changes
+  are added.
 
-Two equal Gaussians that are d standard deviations apart overlap by exp(-d^2 / 4). This is the weight of the second
-case, and the rest is that of the third.
+The last two cases are mixed with the weights w and 1 - w. Here w = exp(-d^2 / 4) is the overlap of two equal Gaussians
+at a distance of d standard deviations.
 """
 
 import math
@@ -38,21 +38,25 @@ from gsbench.models.simplifications import REMOVED, Simplification, simplificati
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import Camera, View
 
-MOST_VIEWS = 60  # evenly spaced ones stand for more
-THIN = 0.02  # the opacity of Gaussians that are tried out beside the others
-# The share of a thin Gaussian's motion that an opaque one in its place hides or outshines: the root of the integral of
-# r^2 g^2 (1 - g)^2 over that of r^2 g^2 is 0.6 for g = exp(-r^2 / 2).
+MOST_VIEWS = 60  # largest number of views; of more views, evenly spaced ones are used
+THIN = 0.02  # largest opacity of the simplified Gaussians that are rendered together with the present ones
+# The share of a transparent Gaussian's change that an opaque Gaussian at the same position hides. The root of the
+# integral of r^2 g^2 (1 - g)^2 over that of r^2 g^2 is 0.6 = 1 - HIDDEN for g = exp(-r^2 / 2).
 HIDDEN = 0.4
 OPACITY, COLOR = 12, slice(13, 16)  # columns of `_rows_of`
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What each simplification of each Gaussian would add to the squared error of the training views."""
+    """Hold the predicted growth of the images' squared error if a Gaussian is simplified, for each Gaussian.
+
+    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+    removed.
+    """
 
     simplifications: list[Simplification]
-    errors: dict[str, Tensor]  # [N] by the name of the simplification, summed over pixels, channels and views
-    total: float  # the squared error of the model as it is, in the same units
+    errors: dict[str, Tensor]  # for each simplification by name: [N], summed over pixels, channels and views
+    total: float  # the present squared error of the model, in the same units
 
 
 @torch.no_grad()
@@ -68,18 +72,21 @@ def probe(
     by_halves: bool = True,
     hidden: Tensor | None = None,  # [N] bool
 ) -> Sensitivity:
-    """Predict the error of every simplification of every Gaussian.
+    """Predict how much the squared error of training views grows if a Gaussian is simplified, for each Gaussian.
+
+    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+    removed.
 
     Args:
         model: the model, trained or in training.
-        views: training views.
-        background: background colour [3].
-        seed: seed of the random signs g.
+        views: the training views.
+        background: the background colour, [3].
+        seed: the seed of the random signs g (formula in the module).
         most: the largest number of views that are used, evenly spaced.
-        draws: random g for each view; one draw says little about a Gaussian that few views show.
-        antialias: see `gsbench.raster.rasterize`.
-        by_halves: whether time alone or direction alone may be frozen, not only both.
-        hidden: mask of Gaussians that no view shows.
+        draws: the number of random images g for each view; more draws reduce the variance.
+        antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
+        by_halves: whether to include Gaussians that are independent of only one of time and direction.
+        hidden: which Gaussians no training view shows.
     """
     looked_at = evenly(views, most)
     queries = [Query.of(view.camera, view.time) for view in looked_at]
@@ -90,7 +97,7 @@ def probe(
     seeds = torch.randint(2**62, (len(looked_at),), generator=random).tolist()
 
     def errors_in(v: int) -> tuple[float, list[Tensor]]:
-        """Return the squared error of a view's image, and what each simplification would add to this error."""
+        """Return the squared error of view `v`, and how much it grows if each Gaussian is simplified, in each way."""
         view = looked_at[v]
         drawing = ViewRasterizer(model, view.camera, background, antialias)
         here = drawing(seen[v])
@@ -108,28 +115,28 @@ def probe(
         total += squared
         for simplification, error in zip(simplifications, added, strict=True):
             errors[simplification.name] += error
-    if len(looked_at) < len(views):  # of a Gaussian in none of these views nothing is known, so nothing is taken
+    if len(looked_at) < len(views):  # a Gaussian that none of these views shows must not be simplified
         unknown = (errors[REMOVED] == 0) if hidden is None else (errors[REMOVED] == 0) & ~hidden
         errors = {name: torch.where(unknown, math.inf, error) for name, error in errors.items()}
     return Sensitivity(simplifications, errors, total)
 
 
 class Drawn(NamedTuple):
-    """The image of a model at one view, with the derivative by the Gaussians."""
+    """Hold a rendered image, its 3D Gaussians, and the recorded operations (tape) for backward passes."""
 
-    at: Gaussians3D
-    tape: Tape  # how
+    at: Gaussians3D  # the 3D Gaussians
+    tape: Tape  # the operations of the rendering, for the backward pass
     images: Tensor  # [1, H, W, 3]
     means2d: Tensor  # [N, 2] pixels
-    radii: Tensor  # [N] pixels, three standard deviations; 0 where it is culled
+    radii: Tensor  # [N] pixels, three standard deviations; 0 for a culled Gaussian
 
     @property
     def image(self) -> Tensor:
-        """Return the image [H, W, 3]."""
+        """The rendered image [H, W, 3], without a gradient."""
         return self.images[0].detach()
 
     def products(self, vectors: list[Tensor]) -> Tensor:
-        """Return the gradients [K, N, 16], by the Gaussians' rows, of the image's scalar products with K `vectors`."""
+        """Return gradients of K scalar products <image, vector> with respect to the Gaussians' numbers, [K, N, 16]."""
         found = []
         for vector in vectors:
             sums: dict[int, Tensor] = {}
@@ -139,7 +146,7 @@ class Drawn(NamedTuple):
 
 
 class ViewRasterizer(NamedTuple):
-    """The rasterizer of one view."""
+    """Rasterize 3D Gaussians for one camera, and record the operations for derivatives."""
 
     model: GaussianModel
     camera: Camera
@@ -148,7 +155,7 @@ class ViewRasterizer(NamedTuple):
 
     @torch.enable_grad()
     def __call__(self, gaussians: Gaussians3D) -> Drawn:
-        """Rasterize the 3D Gaussians of the view."""
+        """Rasterize 3D Gaussians for the camera; return the image and the recorded operations for backward passes."""
         at = Gaussians3D(*(x.detach().requires_grad_() for x in tensors_of(gaussians)))
         with Tape() as tape:
             output = rasterize_slice(at, self.camera, self.background, self.model.backend, self.antialias)
@@ -156,20 +163,26 @@ class ViewRasterizer(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A model at one view, with the camera and time of the view."""
+    """Hold the slice of a model in one view, its image, and the derivatives from which errors are predicted."""
 
     model: GaussianModel
     query: Query
-    live: Gaussians3D
-    rows: Tensor  # [N, 16], of `live`
-    drawn: Drawn
-    products: Tensor  # [K, N, 16] of `vectors` with the derivative of the image
-    vectors: list[Tensor]  # K of [H, W, 3]: the residual, then random signs
-    removed: Tensor  # [K, N] what each Gaussian's removal changes, times each of the vectors
+    live: Gaussians3D  # the present slice
+    rows: Tensor  # [N, 16], `live` as one matrix
+    drawn: Drawn  # the image of `live`
+    products: Tensor  # [K, N, 16] gradients of <image, vector>
+    vectors: list[Tensor]  # K images [H, W, 3]: the residual r, then random signs g
+    removed: Tensor  # [K, N] <x, vector> for the change x of the image by the removal of a Gaussian
 
 
 def _error(simplification: Simplification, here: Place, draw: ViewRasterizer) -> Tensor:
-    """Compute the error E [N] that a simplification of each Gaussian adds in one view (formula in the module)."""
+    """Predict how much the squared error of one view grows if each Gaussian is simplified in this way, [N].
+
+    Args:
+        simplification: the parameters of the simplified Gaussians.
+        here: the present slice and image of the view.
+        draw: the rasterizer of the view.
+    """
     model, live = here.model, here.live
     if simplification.raw is None:
         return _grown(here.removed)
@@ -187,7 +200,7 @@ def _error(simplification: Simplification, here: Place, draw: ViewRasterizer) ->
     distance = (both.means2d[N:] - here.drawn.means2d[:n]) / (2 * size[:, None])
     overlap = torch.exp(-distance.square().sum(-1))
     shown = 1 - HIDDEN * live.opacities[:n] * overlap
-    scale = changed.opacities / (thin.opacities.clamp(min=1e-12) * shown)  # an image is linear in an opacity
+    scale = changed.opacities / (thin.opacities.clamp(min=1e-12) * shown)  # the image is linear in each opacity
     thin_products = both.products(here.vectors)[:, N:]
     there = thin_products * scale[:, None]
     there[..., OPACITY] = thin_products[..., OPACITY] / shown
@@ -198,11 +211,15 @@ def _error(simplification: Simplification, here: Place, draw: ViewRasterizer) ->
 
 
 def _rows_of(gaussians: Gaussians3D) -> Tensor:
-    """Put the mean, the factor, the opacity and the colour of each Gaussian in a row, [N, 16]; then its shape."""
+    """Concatenate mean, covariance factor, opacity and colour of each Gaussian to a matrix [N, 16]."""
     return torch.cat([x[:, None].flatten(1) for x in tensors_of(gaussians)], 1)
 
 
 def _grown(*changes: Tensor) -> Tensor:
-    """Compute max(0, 2 <r, x>) + |x|^2 [N] of changes x that do not overlap, [K, N] each: <r, x>, then some <g, x>."""
+    """Compute the growth of the squared error, max(0, 2 <r, x>) + |x|^2, [N].
+
+    The change x of the image is a sum of changes that do not overlap. Each argument [K, N] has the scalar products of
+    one of them: first with the residual r, then with K - 1 images of random signs g, which estimate |x|^2.
+    """
     products = torch.stack(changes)
     return (2 * products[:, 0].sum(0)).clamp(min=0) + products[:, 1:].square().mean(1).sum(0)

@@ -1,4 +1,4 @@
-"""Find the times at which each Gaussian can be seen; at other times AGR need not move the Gaussian."""
+"""Find the interval of time in which each Gaussian is visible; AGR (neural refinement) skips it at other times."""
 
 import itertools
 import math
@@ -15,14 +15,15 @@ from gsbench.scenes import View
 
 @torch.no_grad()
 def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
-    """Return the first and last time at which a view can show each Gaussian, in [0, 1]; (inf, -inf) if no view can.
+    """Return the first and the last time at which each Gaussian is visible in a training view, in [0, 1].
 
-    A view can show a Gaussian if its opacity in the slice, with or without AGR, reaches ALPHA_MIN. The interval is
-    extended on both sides by the largest gap between the times of neighbouring views.
+    A Gaussian is visible in a view if its opacity in the slice is at least ALPHA_MIN, with or without AGR (the neural
+    refinement). The interval is extended on both sides by the largest gap between the times of neighbouring views. It
+    is (inf, -inf) for a Gaussian that is never visible.
 
     Args:
         model: the trained model.
-        views: training views.
+        views: the training views.
     """
     own = dict(model.splats.items())
 
@@ -47,7 +48,10 @@ def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
 
 
 def share_asleep(model: GaussianModel, views: Sequence[View]) -> float | None:
-    """Return the share of AGR's work that is saved at times when a Gaussian is invisible; None if these are unknown."""
+    """Return the share of neural refinement (AGR) that is skipped, because a Gaussian is invisible at a view's time.
+
+    Return None if the times at which Gaussians are visible are unknown.
+    """
     intervals = None if model.effect_sets is None else model.effect_sets.intervals
     if intervals is None or not len(intervals):
         return None

@@ -1,4 +1,4 @@
-"""Test whether a share of energy follows slow waves of time more than after random permutations of time."""
+"""Test by random permutations of time whether data follow slow cosines of time, cos(pi k t)."""
 
 import math
 from collections.abc import Sequence
@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 
 WAVES = 4  # cos(pi k t), k = 1 .. WAVES
 PERMUTATIONS = 999
-TIE = 1e-9  # relative; a deal that is the actual order again may differ from it by rounding
+TIE = 1e-9  # relative tolerance: a permutation that happens to be the actual order may differ by rounding
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The result of the permutation test: whether residuals follow slow waves of time."""
+    """Hold the p-value and z-score of the test whether residuals follow slow cosines of time."""
 
     p: float
     z: float
-    free: float
+    free: float  # share of the variance of the cosines that the camera does not explain
 
 
 def evidence(
@@ -30,13 +30,13 @@ def evidence(
     seed: int,
     places: Sequence[Sequence[int]] | None = None,
 ) -> Evidence:
-    """Test whether gradients follow slow waves of time, given what the camera explains (Freedman and Lane 1983).
+    """Test whether the gradients of V views follow slow cosines of time (Freedman and Lane 1983).
 
     Args:
-        leftovers: the scalar products g_v . g_w of the gradients of all pairs of views.
+        leftovers: the scalar products of the gradients of all pairs of views.
         times: the times of the views.
-        camera: functions of the camera; their span is removed from gradients and waves.
-        seed: seed of the random permutations.
+        camera: functions of the camera; their effect is removed from gradients and cosines by linear regression.
+        seed: the seed of the random permutations.
         places: groups of views within which times are permuted; by default all views are one group.
     """
     waves = slow_waves(times)
@@ -50,7 +50,7 @@ def evidence(
     random = np.random.default_rng(seed)
 
     def share(rows: NDArray[np.int64]) -> float:
-        """Return the share of energy in the slow waves, after the camera is removed from the permuted residuals too."""
+        """Return the share of gradients, permuted by `rows`, that follows the cosines and not the camera."""
         turned = np.concatenate([slow, known], 1)[rows]
         energies = np.einsum("vk,vk->k", turned, gram @ turned)
         left = total - energies[slow.shape[1] :].sum()
@@ -64,23 +64,26 @@ def evidence(
 def slow_waves(
     times: Array,  # [V] in [0, 1]
 ) -> Array:  # [V, WAVES]
-    """Return slow waves of time, cosines with the mean removed from each."""
+    """Return the cosines cos(pi k t), k = 1 .. WAVES, of times t, less the mean of each, [V, WAVES]."""
     waves = np.cos(math.pi * np.outer(times, np.arange(1, WAVES + 1)))
     return np.asarray(waves - waves.mean(0))
 
 
 def compare(
     actual: float,
-    null: Array,  # [PERMUTATIONS] the same of times that were dealt at random
+    null: Array,  # [PERMUTATIONS] the values after random permutations of time
 ) -> tuple[float, float]:
-    """Return the p-value (share of random orders and the actual one that reach the actual value) and the z-score."""
+    """Return the p-value and the z-score of a permutation test.
+
+    The p-value is (1 + number of permutations that reach the actual value) / (1 + number of permutations).
+    """
     p = (1 + int((null >= actual - TIE * abs(actual)).sum())) / (1 + len(null))
     spread = float(null.std())
     return p, (actual - float(null.mean())) / spread if spread > TIE * abs(actual) else 0.0
 
 
 def _deal(views: int, places: Sequence[Sequence[int]] | None, random: np.random.Generator) -> NDArray[np.int64]:
-    """Draw a random permutation of the views within each camera place."""
+    """Draw a random permutation of views; with `places`, views are permuted only within each group."""
     if places is None:
         return random.permutation(views)
     dealt = np.arange(views)
@@ -90,6 +93,6 @@ def _deal(views: int, places: Sequence[Sequence[int]] | None, random: np.random.
 
 
 def _range(columns: Array) -> Array:
-    """Return an orthonormal basis [V, R] of what columns [V, B] span."""
+    """Return an orthonormal basis [V, R] of the column space of a matrix [V, B]."""
     left, values, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(left[:, values > 1e-6 * max(values.max(initial=0.0), 1e-300)])

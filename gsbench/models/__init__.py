@@ -1,4 +1,4 @@
-"""Model scenes by Gaussians of three to seven dimensions; every model returns its 3D slice at a query."""
+"""Model scenes by Gaussians of 3 to 7 dimensions. Each model returns 3D Gaussians for a camera centre and a time."""
 
 from gsbench.models.base import GaussianModel, Gaussians3D
 from gsbench.models.query import Query

@@ -1,4 +1,4 @@
-"""Compute colours: spherical harmonics of the direction (3DGS), times a Fourier series of time (4DGS)."""
+"""Compute colours of Gaussians: by spherical harmonics (3DGS), or by these times a Fourier series of time (4DGS)."""
 
 import math
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from gsbench.models.color_order import coefficients_within, order_of
 from gsbench.scenes.points import SH_C0  # Y_00
 
-# Constants of the real spherical harmonics of degree 1 to 3, in 3DGS' order and signs.
+# Constants of the real spherical harmonics of degrees 1 to 3, with the order and the signs of 3DGS.
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
 _C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
@@ -16,7 +16,7 @@ _C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Compute real spherical harmonics up to `degree` (at most 3) of unit directions, [N, 3] -> [N, (degree + 1)^2]."""
+    """Evaluate the real spherical harmonics up to `degree` (0 to 3) at unit vectors, [N, 3] -> [N, (degree + 1)^2]."""
     x, y, z = directions.unbind(-1)
     basis = [torch.full_like(x, SH_C0)]
     if degree > 0:
@@ -34,9 +34,16 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def sh_colors(coefficients: Tensor, directions: Tensor, degree: int, orders: Tensor | None = None) -> Tensor:
-    """Compute colours max(0, sum beta_lm Y_lm + 0.5), [N, K, 3] and [N, 3] -> [N, 3] (3DGS; 7DGS eq. 2).
+    """Compute SH colours max(0, sum_lm beta_lm Y_lm(d) + 0.5), as in 3DGS and 7DGS eq. 2.
 
-    Orders [N] int32 leave out coefficients above the degree of a row, see `gsbench.models.effect_sets.EffectSets`.
+    Args:
+        coefficients: SH coefficients beta of each Gaussian, [N, K, 3].
+        directions: unit vectors d from the camera to the Gaussians, [N, 3].
+        degree: the SH degree in use, 0 to 3.
+        orders: the SH degree of each Gaussian if it is lower, [N] int32; None: `degree` for all.
+
+    Returns:
+        The colours, [N, 3].
     """
     basis = _basis_within(directions, degree, orders)
     used = coefficients[:, : basis.shape[-1]]
@@ -46,14 +53,15 @@ def sh_colors(coefficients: Tensor, directions: Tensor, degree: int, orders: Ten
 def sh_time_colors(
     coefficients: Tensor, directions: Tensor, degree: int, time_offset: Tensor, orders: Tensor | None = None
 ) -> Tensor:
-    """Compute colours by 4DSH: Y_lm(d) cos(2 pi n (t - mu_t) / T), T = 1 (4DGS, eq. 12).
+    """Compute the colours [N, 3] of 4DGS, whose basis functions are Y_lm(d) cos(2 pi n (t - mu_t)) (4DGS, eq. 12).
 
     Args:
-        coefficients: [N, M, K, 3], one set of K spherical harmonics for each frequency n = 0 .. M-1.
-        directions: [N, 3] unit vectors.
-        degree: of the spherical harmonics in use.
-        time_offset: [N] t - mu_t.
-        orders: [N] int32, the order of each row, packed as by `ColorOrder`.
+        coefficients: K SH coefficients for each frequency n = 0 .. M-1, [N, M, K, 3].
+        directions: unit vectors d from the camera to the Gaussians, [N, 3].
+        degree: the SH degree in use, 0 to 3.
+        time_offset: the time less the mean time of each Gaussian, t - mu_t, [N].
+        orders: the SH degree and number of frequencies of each Gaussian if these are lower, encoded in one number
+            degree + 4 (frequencies - 1), [N] int32; None: all coefficients are used.
     """
     frequencies = torch.arange(coefficients.shape[1], device=time_offset.device, dtype=time_offset.dtype)
     waves = torch.cos(2 * math.pi * frequencies * time_offset[:, None])  # [N, M]
@@ -65,7 +73,7 @@ def sh_time_colors(
 
 
 def _basis_within(directions: Tensor, degree: int, orders: Tensor | None) -> Tensor:
-    """Compute `sh_basis`, zero above the degree of each row's order."""
+    """Evaluate the spherical harmonics at unit vectors, and set those above each Gaussian's own SH degree to zero."""
     basis = sh_basis(directions, degree)
     if orders is None:
         return basis

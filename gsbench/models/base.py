@@ -1,6 +1,7 @@
-"""Define what every model must have: N Gaussians with raw parameters, their slice, and edits of their rows.
+"""Define the base class of all models: N Gaussians with parameters, their slices, and the edits of density control.
 
-What a model may have beside that, so that gates can simplify its Gaussians, is `gsbench.models.gated`.
+`gsbench.models.gated` adds optional methods that make single Gaussians independent of time, direction or AGR (the
+neural refinement).
 """
 
 import math
@@ -25,24 +26,24 @@ from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
 from gsbench.schedule import ActiveComponents
 
-Raw = dict[str, Tensor]  # raw parameters by name, N rows each
-CHILDREN = 2  # a split leaves two Gaussians ..
+Raw = dict[str, Tensor]  # raw parameters (before exp, sigmoid and normalisation) by name, N rows each
+CHILDREN = 2  # a split replaces a Gaussian by two ..
 SHRINK = 0.8 * CHILDREN  # .. that are 1.6 times smaller (3DGS, gaussian_model.py)
 INITIAL_OPACITY = 0.1
 
 
 class Gaussians3D(NamedTuple):
-    """One slice of a model: the 3D Gaussians that the rasterizer renders."""
+    """Hold the 3D Gaussians that the rasterizer renders: the slice of a model for one camera centre and time."""
 
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
     opacities: Tensor  # [N]
     colors: Tensor  # [N, 3]
-    shapes: Tensor | None = None  # [N] b of the profile (see `gsbench.raster.rasterize`); None: every one is a Gaussian
+    shapes: Tensor | None = None  # [N] b of the alpha profile (1 - r^2)^b; None: the profile is a Gaussian
 
 
 class Conditioned(NamedTuple):
-    """The geometry of one slice, with the part of the opacities that is left."""
+    """Hold the geometry of a slice, and the factors in [0, 1] by which slicing multiplies the opacities."""
 
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
@@ -51,7 +52,7 @@ class Conditioned(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """One slice without its colours."""
+    """Hold the geometry and the opacities of a slice, without its colours."""
 
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
@@ -60,15 +61,15 @@ class Geometry(NamedTuple):
 
 
 def tensors_of(parts: Iterable[Tensor | None]) -> list[Tensor]:
-    """Return the tensors of a slice or of its geometry in their order, without shapes that are None."""
+    """Return the tensors of a slice in their order, without fields that are None."""
     return [part for part in parts if part is not None]
 
 
 def joined_shapes(first: Tensor | None, second: Tensor | None) -> Tensor | None:
-    """Return the shapes of some rows and then those of others; None where neither have any.
+    """Concatenate the exponents b of the alpha profiles (1 - r^2)^b of two groups of Gaussians; None if both are None.
 
     Raises:
-        InputError: only one of them has shapes.
+        InputError: only one of the groups has exponents.
     """
     if first is None and second is None:
         return None
@@ -79,12 +80,12 @@ def joined_shapes(first: Tensor | None, second: Tensor | None) -> Tensor | None:
 
 
 class GaussianModel(nn.Module, ABC):
-    """N Gaussians. A subclass provides its raw geometry, how that is sliced, and how a Gaussian is split."""
+    """The base class of models. A subclass defines its parameters, and how its Gaussians are sliced and split."""
 
     observes: ClassVar[tuple[str, ...]] = ()  # of "time", "direction"
-    centers: ClassVar[tuple[str, ...]] = ("means",)  # the raw parameters that are means: AGR reads and moves them ..
-    geometry: ClassVar[tuple[str, ...]]  # .. and moves these, which form the factor
-    lengths: ClassVar[tuple[str, ...]] = ("means",)  # those of both in world units; logarithms of sizes are not
+    centers: ClassVar[tuple[str, ...]] = ("means",)  # the raw parameters that are means: AGR reads and changes them
+    geometry: ClassVar[tuple[str, ...]]  # the raw parameters of the covariance: AGR changes them
+    lengths: ClassVar[tuple[str, ...]] = ("means",)  # the raw parameters of both kinds that are in world units
 
     def __init__(
         self, *, agr: bool = False, agr_octaves: int = OCTAVES, sh_degree: int = 3, backend: Backend = AUTO
@@ -92,10 +93,10 @@ class GaussianModel(nn.Module, ABC):
         """Make a model without Gaussians; `initialise` or `load_state` adds them.
 
         Args:
-            agr: whether AGR, the adaptive Gaussian refinement, moves the Gaussians.
-            agr_octaves: K of AGR's time encoding.
-            sh_degree: of the spherical harmonics, 0 to 3.
-            backend: computes the slices, the colours and AGR.
+            agr: whether AGR, the adaptive Gaussian refinement of 7DGS, changes the Gaussians with time.
+            agr_octaves: the number of frequencies of AGR's time encoding.
+            sh_degree: the SH degree of the colours, 0 to 3.
+            backend: the implementation that computes slices, colours and AGR.
 
         Raises:
             InputError: an option is out of its range.
@@ -120,62 +121,81 @@ class GaussianModel(nn.Module, ABC):
 
     @abstractmethod
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Initialise the parameters of `centers` and `geometry` except `means`, from distances to neighbours [N]."""
+        """Return the initial raw parameters of the covariances, and of the means in time and direction.
+
+        Args:
+            points: the points at which the Gaussians start.
+            distances: the distance of each point to its neighbours, [N] world units.
+            generator: the source of all random numbers.
+        """
 
     @abstractmethod
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Slice Gaussians with raw parameters `raw` at a query."""
+        """Slice Gaussians with the raw parameters `raw` (before exp and sigmoid) at a camera centre and time."""
 
     @abstractmethod
     def scales(self) -> Tensor:
-        """Return the largest standard deviation of each Gaussian in space, [N], world units."""
+        """Return the largest spatial standard deviation of each Gaussian, [N], world units."""
 
     @abstractmethod
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Return the raw geometry of children; `raw` holds CHILDREN copies of each parent, one after the other."""
+        """Return means and covariance parameters of the two children of each split Gaussian.
+
+        Args:
+            raw: the raw parameters of the parents, of which each has two copies, one after the other.
+            generator: the source of all random numbers.
+        """
 
     def log_sizes(self, index: int) -> Tensor:
-        """Return the log sizes of a Gaussian in all its dimensions, [n]; by default its largest one in space, [1]."""
+        """Return the logarithms of the sizes of one Gaussian in its n dimensions, [n]; by default only the largest."""
         return self.scales()[index : index + 1].log()
 
     def log_duration(self, index: int) -> float | None:
-        """Return the log size of a Gaussian in time, clips; None for a model that has none or does not say."""
+        """Return the logarithm of a Gaussian's size in time (1 = the length of the scene); None if it has none."""
         return None
 
     def durations(self) -> Tensor | None:
-        """Return each Gaussian's standard deviation in time, [N] clips; None unless it has `times` and lambda_t."""
+        """Return each Gaussian's standard deviation in time, [N] (1 = the length of the scene); None without time."""
         return None
 
     def hold_sizes(self, least: Tensor) -> None:
-        """Raise raw sizes in space to at least `least` [N], world units; a model without such sizes does nothing."""
+        """Raise the spatial sizes of each Gaussian to at least `least` [N], world units; by default do nothing."""
         return
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
-        """Return the raw geometry that has the shape of trained 3D Gaussians in space, given its initial one.
+        """Return covariance parameters of the model for which the spatial covariance is that of trained 3D Gaussians.
 
-        A model that does not say how starts with spheres of the same volume.
+        By default the Gaussians become spheres of the same volume.
+
+        Args:
+            trained: the 3D Gaussians.
+            raw: the initial raw parameters of the model.
         """
         points, radii = Points(trained.means, trained.means), trained.log_scales.mean(1).exp()
         spheres = self.initial_geometry(points, radii, torch.Generator().manual_seed(0))
         return {name: spheres[name] for name in self.geometry}
 
     def long_in_time(self) -> Tensor:
-        """Tell which Gaussians are split because of their extent in time, [N] bool (7DGS, section 4.4)."""
+        """Return which Gaussians must be split because they are long in time, [N] bool (7DGS, section 4.4)."""
         return torch.zeros(len(self), dtype=torch.bool, device=self.splats["means"].device)
 
     def initial_colors(self, dc: Tensor) -> Raw:
-        """Return the raw appearance that has the colour dc [N, 3] (degree 0) in every direction and at every time."""
+        """Return SH coefficients that give each Gaussian one colour for all directions and times.
+
+        Args:
+            dc: the coefficient of degree 0, [N, 3].
+        """
         rest = dc.new_zeros(len(dc), (self.sh_degree + 1) ** 2 - 1, 3)
         return {"sh0": dc[:, None], "shN": rest}
 
     def full_order(self) -> int:
-        """Return the order of colour in use, packed as by `ColorOrder`."""
+        """Return the SH degree in use and the number of frequencies in time, as degree + 4 (frequencies - 1)."""
         return ColorOrder(self.active.sh_degree, 1).packed
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
-        """Compute the colours [N, 3] of a slice; a model whose colours are not these harmonics overrides it.
+        """Compute the SH colours [N, 3] of a slice as seen from the camera centre of `query`.
 
-        The kernel skips Gaussians that are culled by their opacity.
+        The kernel skips Gaussians that are culled because of their opacity. A model with other colours overrides this.
         """
         degree = self.active.sh_degree
         if self.backend.serves(means):
@@ -189,11 +209,13 @@ class GaussianModel(nn.Module, ABC):
 
     @torch.no_grad()
     def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
-        """Start at points: isotropic in space, as large as the distance to three neighbours, opacity 0.1 (3DGS, 5.1).
+        """Place an isotropic Gaussian of opacity 0.1 at each point (3DGS, section 5.1).
+
+        The standard deviation of a Gaussian is the root mean square distance to its three nearest neighbours.
 
         Args:
             points: the means and colours of the Gaussians.
-            extent: of the scene, world units; density control and learning rates are relative to it.
+            extent: the radius of the scene, world units; density control and learning rates are relative to it.
             generator: the source of all random numbers.
         """
         self.extent = extent
@@ -211,10 +233,10 @@ class GaussianModel(nn.Module, ABC):
         self.set_active(self.active)
 
     def slice(self, query: Query) -> Gaussians3D:
-        """Slice the model at a query: return 3D Gaussians for the rasterizer.
+        """Slice the model at the camera centre and time of `query`: return 3D Gaussians for the rasterizer.
 
         Raises:
-            InputError: the model observes time and the query has none.
+            InputError: the model depends on time and the query has none.
         """
         if query.time is None and ("time" in self.observes or self.agr):
             raise InputError(f"{type(self).__name__}: expected a time in [0, 1], got none: this model observes time")
@@ -222,22 +244,22 @@ class GaussianModel(nn.Module, ABC):
         return self.colored(self.slice_geometry(raw, query), raw, query)
 
     def colored(self, geometry: Geometry, raw: Raw, query: Query) -> Gaussians3D:
-        """Add the colours to the geometry of a slice."""
+        """Compute the colours of a slice and return them together with its geometry."""
         means, factors, opacities, shapes = geometry
         return Gaussians3D(means, factors, opacities, self.shade(raw, means, opacities, query), shapes)
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Compute the geometry of a slice; models that have a kernel for it call the kernel."""
+        """Compute the geometry and the opacities of a slice. A subclass that has a kernel for this overrides it."""
         means, factors, opacity_factor, shapes = self.condition(raw, query)
         return Geometry(means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor, shapes)
 
     @property
     def orders(self) -> Tensor | None:
-        """The harmonics of each row's colours, [N] int32 as in `EffectSets`; None: all of them."""
+        """The SH degree and frequencies in time of each colour, as degree + 4 (frequencies - 1), [N]; None: all."""
         return None if self.effect_sets is None else self.effect_sets.orders
 
     def count_by_effects(self) -> dict[str, int]:
-        """Count the Gaussians of each effect set, by the names of `gsbench.models.effect_sets.NAMES`."""
+        """Count Gaussians by what they depend on: neural refinement, time and direction, one of the two, or nothing."""
         N, effect_sets = len(self), self.effect_sets
         if effect_sets is not None:
             return effect_sets.by_name(N)
@@ -247,11 +269,11 @@ class GaussianModel(nn.Module, ABC):
 
     @property
     def refines(self) -> bool:
-        """Whether AGR is there and is active."""
+        """Whether the model has AGR, the neural refinement, and it is switched on."""
         return self.refinement is not None and self.active.refine
 
     def refined(self, query: Query) -> Raw:
-        """Apply AGR to the raw parameters: raw + phi(f) (7DGS eq. 15), to log-diagonals before the exp."""
+        """Return the raw parameters after AGR, the neural refinement, has added its output (7DGS eq. 15)."""
         raw: Raw = dict(self.splats.items())
         rows = None if self.effect_sets is None else self.effect_sets.refined
         if self.refinement is None or not self.active.refine or query.time is None or rows == 0:
@@ -264,7 +286,11 @@ class GaussianModel(nn.Module, ABC):
         return raw | dict(zip(names, moved, strict=True))
 
     def add_lambda(self, name: str, value: float) -> None:
-        """Give the model lambda_t (`time`) or lambda_d (`direction`), initially `value`.
+        """Add the parameter lambda_t or lambda_d, the coefficient in the exponent of the opacity factor (7DGS, eq. 11).
+
+        Args:
+            name: `time` or `direction`.
+            value: the initial value.
 
         Raises:
             InputError: `value` is not a positive number.
@@ -274,11 +300,11 @@ class GaussianModel(nn.Module, ABC):
         self.log_lambda[name] = nn.Parameter(torch.tensor(math.log(value)))
 
     def lambda_of(self, name: str) -> Tensor:
-        """Return lambda_t or lambda_d, [], positive as the exp of `log_lambda`."""
+        """Return lambda_t (for `time`) or lambda_d (for `direction`), a tensor []; the model stores its logarithm."""
         return self.log_lambda[name].exp()
 
     def set_active(self, active: ActiveComponents) -> None:
-        """Switch parts of the model on or off; a part that is off neither acts nor learns."""
+        """Set which parts of the model are active: SH degree, neural refinement (AGR), and learning of the lambdas."""
         self.active = active
         for parameter in self.log_lambda.parameters():
             parameter.requires_grad_(active.tunes_lambda)
@@ -286,7 +312,7 @@ class GaussianModel(nn.Module, ABC):
             self.refinement.requires_grad_(active.refine)
 
     def groups(self) -> dict[str, list[nn.Parameter]]:
-        """Return the parameters by group; a group has a name and a learning rate."""
+        """Return the parameters of the model by the name of their group; each group has its own learning rate."""
         groups = {name: [parameter] for name, parameter in self.splats.items()}
         if self.refinement is not None:
             groups["refinement"] = list(self.refinement.parameters())
@@ -298,10 +324,11 @@ class GaussianModel(nn.Module, ABC):
 
     @torch.no_grad()
     def visible_intervals(self) -> Tensor | None:
-        """Return the first and the last time at which each Gaussian can be visible, [N, 2] clips; None without time.
+        """Return the first and the last time at which each Gaussian can be visible, [N, 2]; None without time.
 
-        The opacity in a slice, o exp(-lambda_t (t - mu_t)^2 / (2 S_t)) at most, is then at least ALPHA_MIN. AGR may
-        move a Gaussian out of its interval, so this is for the order of rows only. (inf, inf) is never.
+        A Gaussian with opacity o, mean time mu_t and variance S_t in time is visible at time t if
+        o exp(-lambda_t (t - mu_t)^2 / (2 S_t)) is at least ALPHA_MIN. Times are in [0, 1]; (inf, inf) marks a Gaussian
+        that is never visible. The intervals only serve to sort the Gaussians: they ignore AGR, the neural refinement.
         """
         deviations = self.durations()
         if deviations is None:
@@ -314,14 +341,19 @@ class GaussianModel(nn.Module, ABC):
 
     @torch.no_grad()
     def select(self, rows: Tensor) -> None:
-        """Keep the given rows in the given order; a row may be repeated. Parameters stay the same objects."""
+        """Keep the Gaussians with the indices `rows`, in this order; an index that occurs twice copies a Gaussian."""
         for parameter in self.splats.values():
             parameter.data = parameter.data[rows]
             parameter.grad = None
 
     @torch.no_grad()
     def split_rows(self, rows: Tensor, generator: torch.Generator) -> None:
-        """Turn rows [M], CHILDREN copies of each parent one after the other, into its children."""
+        """Replace copies of split Gaussians by their children.
+
+        Args:
+            rows: the indices of the copies, [M]; the two copies of a Gaussian follow each other.
+            generator: the source of all random numbers.
+        """
         raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.geometry)}
         for name, value in self.split(raw, generator).items():
             self.splats[name].data[rows] = value
@@ -334,20 +366,20 @@ class GaussianModel(nn.Module, ABC):
     # ---- what a checkpoint holds
 
     def pack(self) -> dict[str, Tensor]:
-        """Return the state of the model for a checkpoint."""
+        """Return the tensors of the model for a checkpoint, by name."""
         state: dict[str, Tensor] = self.state_dict()
         return state
 
     def stored_bytes(self) -> int:
-        """Return the bytes of the parameters, as a checkpoint holds them."""
+        """Return the number of bytes that the parameters need in a checkpoint."""
         constants = {name for name, _ in self.named_buffers()}
         return sum(x.numel() * x.element_size() for name, x in self.pack().items() if name not in constants)
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Load what `pack` returned, of any number of Gaussians.
+        """Load the tensors that `pack` returned, for any number of Gaussians.
 
         Raises:
-            InputError: the state is that of another model.
+            InputError: the tensors belong to another model.
         """
         means = state.get("splats.means")
         N = len(means) if isinstance(means, Tensor) and means.dim() else 0

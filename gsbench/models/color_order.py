@@ -1,6 +1,6 @@
-"""Define the order of a colour: the degree of its spherical harmonics and its number of frequencies of time.
+"""Define the order of a colour: its SH degree and its number of frequencies in time (`waves`, 1 = constant in time).
 
-Kernels, checkpoints and `EffectSets` store an order as one number, degree + 4 (waves - 1) (math/harmonics.h).
+Kernels and checkpoints store the order of a Gaussian's colour as one number, degree + 4 (waves - 1).
 """
 
 import math
@@ -18,24 +18,27 @@ Number = TypeVar("Number", int, Tensor)
 
 @dataclass(frozen=True)
 class ColorOrder(Generic[Number]):
-    """The order of one colour (ints), or of each Gaussian's colour (tensors [N])."""
+    """Hold the SH degree and the number of frequencies in time of a colour (ints), or of N colours (tensors [N])."""
 
     degree: Number  # of the spherical harmonics (3DGS, section 4)
     waves: Number  # frequencies n = 0 .. waves - 1 of cos(2 pi n (t - mu_t) / T) (4DGS, eq. 12); 1: constant in time
 
     @property
     def packed(self) -> Number:
-        """Return the number degree + 4 (waves - 1)."""
+        """The SH degree and the number of frequencies in one number: degree + 4 (waves - 1)."""
         return self.degree + _DEGREES * (self.waves - 1)
 
 
 def order_of(packed: Number) -> ColorOrder[Number]:
-    """Read an order from its number."""
+    """Decode the SH degree and the number of frequencies (waves) from the number degree + 4 (waves - 1)."""
     return ColorOrder(packed % _DEGREES, packed // _DEGREES + 1)
 
 
 def at_most(packed: Tensor, limit: int) -> Tensor:
-    """Limit each packed order [N] to the degree and the waves of another one."""
+    """Limit the SH degree and the number of frequencies of each colour [N] to those of `limit`.
+
+    All are encoded as degree + 4 (waves - 1).
+    """
     own, most = order_of(packed), order_of(limit)
     return ColorOrder(own.degree.clamp(max=most.degree), own.waves.clamp(max=most.waves)).packed
 
@@ -45,12 +48,12 @@ def coefficients_within(
     degree: int,
     waves: int = 1,
 ) -> Tensor:  # [N, waves, (degree + 1)^2] bool
-    """Tell which of the stored coefficients are within each Gaussian's order.
+    """Return a mask of the colour coefficients that each Gaussian uses, given its SH degree and frequencies in time.
 
     Args:
-        packed: the harmonic degree and Fourier order of each Gaussian, packed in one number.
-        degree: the harmonic degree of the coefficients that are stored for each frequency.
-        waves: the number of frequencies that are stored.
+        packed: the SH degree and the number of frequencies of each Gaussian, as degree + 4 (waves - 1).
+        degree: the SH degree of the stored coefficients.
+        waves: the number of frequencies of the stored coefficients.
     """
     own = order_of(packed)
     degrees = packed.new_tensor([math.isqrt(k) for k in range((degree + 1) ** 2)])

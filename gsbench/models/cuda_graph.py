@@ -1,4 +1,4 @@
-"""Record the renders of a model as a CUDA graph, and replay it for other cameras and times."""
+"""Record the rendering of a model as a CUDA graph, and replay the graph for other cameras and times."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
@@ -21,29 +21,34 @@ T = TypeVar("T")
 
 
 class _Recording(NamedTuple):
-    """A recorded render of one image size. Its camera and time are overwritten before each replay."""
+    """Hold a CUDA graph that renders images of one size. The camera and time are overwritten before each replay."""
 
     camera: Camera
     time: Tensor | None  # []
     play: Callable[[], None]
     image: Tensor  # [H, W, 3]
     needed: Tensor  # [2] int64: intersections, and whether a value was out of range
-    room: int  # for intersections
+    room: int  # the number of intersections that fit into the graph's memory
 
 
 class GraphedFrames:
-    """Renders a model on a GPU like `render`, but replays its kernels and waits only at the end of an image.
+    """Render images of a model on a GPU by replaying a CUDA graph.
 
-    The first call for an image size records a graph, which fixes the numbers of Gaussians and of pixels. `render` waits
-    for the number of intersections in the middle of an image. A graph has memory for a fixed number, MARGIN times that
-    of the first image. The number is checked at the end; if it is larger, the graph is recorded again.
+    The first call for an image size records the graph. The graph has memory for MARGIN times as many tile
+    intersections as the first image has, so rendering needs no synchronisation before the end of an image. If an image
+    has more intersections, the graph is recorded again. The number of Gaussians must not change.
     """
 
     def __init__(self, model: GaussianModel, background: Tensor, antialias: bool = False) -> None:
-        """Render `model`, whose parameters may change in value but not in number, with a background colour [3].
+        """Prepare to render a model. The values of its parameters may change between images, their number may not.
+
+        Args:
+            model: the model, on a GPU.
+            background: the background colour, [3].
+            antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
 
         Raises:
-            InputError: this model is not rendered by the CUDA backend.
+            InputError: the model does not use the CUDA backend.
         """
         backend = resolve(model.backend.name, model.splats["means"].device.type)
         if backend.name != "cuda":
@@ -56,10 +61,10 @@ class GraphedFrames:
 
     @torch.no_grad()
     def __call__(self, camera: Camera, time: float | None) -> Tensor:  # [H, W, 3]
-        """Render the model for a camera at a time; the next call overwrites the image.
+        """Return the image of the model for a camera and a time. The next call overwrites this image.
 
         Raises:
-            InputError: the model observes time and `time` is None, or a value is out of range.
+            InputError: the model depends on time and `time` is None, or a value is out of range.
             RuntimeError: CUDA cannot record this model.
         """
         size = camera.width, camera.height, time is None
@@ -86,7 +91,7 @@ class GraphedFrames:
         view = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, self.antialias)
 
         def frame() -> tuple[Tensor, Tensor]:
-            # The first image was refused if the model has shapes.
+            # A model with other alpha profiles than Gaussians never comes here: its first image raised an error.
             means, factors, opacities, colors, _ = self.model.slice(Query.of(own, own_time))
             return draw_within(means, factors, opacities, colors[None], own.viewmat[None], own.K[None],
                                 self.background, view, room)  # fmt: skip
@@ -97,7 +102,7 @@ class GraphedFrames:
 
 
 def capture(call: Callable[[], T]) -> tuple[Callable[[], None], T]:
-    """Record a call on the current GPU; return the function that replays it, and the results that it overwrites."""
+    """Record a call as a CUDA graph. Return a function that replays it, and the result, which a replay overwrites."""
     call()  # the first call loads modules, which cannot be recorded
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):

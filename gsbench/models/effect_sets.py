@@ -1,7 +1,7 @@
-"""Sort the Gaussians of a model into effect sets: the effects that each of them has.
+"""Record what each Gaussian of a model depends on: time, direction and AGR (the neural refinement).
 
-If a Gaussian lacks an effect, some of its parameters change no image: the motion of a static one, the harmonics above
-its order. They are constant, do not learn, and are not stored.
+If a Gaussian does not depend on time, for example, its parameters of motion change no image. Such parameters are
+constant, do not learn, and are not stored.
 """
 
 from typing import NamedTuple
@@ -9,20 +9,28 @@ from typing import NamedTuple
 from torch import Tensor
 
 TIME, DIRECTION = 1, 2  # in EffectSets.frozen
-NAMES = ("refined", "conditioned", "time", "direction", "static")  # by what AGR, slicing or freezing does to them
+NAMES = ("refined", "conditioned", "time", "direction", "static")  # groups; "time" are Gaussians independent of time
 
 
 class EffectSets(NamedTuple):
-    """The effects of each row of a model; rows are ordered refined (AGR) | conditioned | static."""
+    """Record what each Gaussian depends on.
 
-    refined: int  # this many first rows are moved by AGR
-    conditioned: int  # this many first rows (refined <= conditioned) change with the query; the others are static
-    orders: Tensor | None  # [N] int32: the order of a row's colours, packed as by `ColorOrder`; None: the whole
-    frozen: Tensor | None = None  # [N] uint8: TIME + DIRECTION, what a row does not change with; None: nothing
-    intervals: Tensor | None = None  # [refined, 2] clips: AGR moves a row from a first to a last time; None: always
+    Gaussians are sorted: first those that AGR, the neural refinement, changes (refined), then those that change with
+    time or direction but not through AGR (conditioned), then the static ones.
+    """
+
+    refined: int  # AGR changes the first `refined` Gaussians
+    conditioned: int  # the first `conditioned` >= `refined` Gaussians change with time or direction
+    orders: Tensor | None  # [N] int32: SH degree and frequencies of each colour, as in `ColorOrder`; None: all
+    frozen: Tensor | None = None  # [N] uint8: TIME + DIRECTION, variables that a row does not depend on; None: nothing
+    intervals: Tensor | None = None  # [refined, 2]: the first and last time at which AGR changes a row; None: always
 
     def by_name(self, rows: int) -> dict[str, int]:
-        """Count by NAMES how many of the given number of Gaussians keep which effects."""
+        """Return the number of Gaussians in each group of NAMES, for a model of `rows` Gaussians.
+
+        The groups are: refined by AGR; sliced by time and direction; independent of time; independent of direction;
+        static.
+        """
         frozen = [0, 0] if self.frozen is None else [int((self.frozen == bit).sum()) for bit in (TIME, DIRECTION)]
         conditioned = self.conditioned - self.refined - sum(frozen)
         return dict(zip(NAMES, (self.refined, conditioned, *frozen, rows - self.conditioned), strict=True))

@@ -1,4 +1,4 @@
-"""Compute factors F of covariances S = F F^T from raw parameters: triangular (6DGS, 7DGS) or rotated (3DGS, 4DGS)."""
+"""Compute factors F of covariances S = F F^T: a Cholesky factor (6DGS, 7DGS), or rotation times scale (3DGS, 4DGS)."""
 
 import torch
 import torch.nn.functional as F
@@ -9,32 +9,33 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models.slicing import triangularise
 
-OFF_DIAGONALS = ("relative", "raw", "row_scaled")  # forms of `Triangle`; math/off_diagonal.h has them in this order
-KINDS = ("shape", "motion", "coupling")  # kinds of entries below the diagonal
+OFF_DIAGONALS = ("relative", "raw", "row_scaled")  # values of `form` of `Triangle`, in the order of math/off_diagonal.h
+KINDS = ("shape", "motion", "coupling")  # kinds of entries below the diagonal, see `Triangle`
 
 
 def sizes(logs: Tensor) -> Tensor:
-    """Compute exp of log sizes of any shape, clamped to +-LOG_SIZE_MAX; a clamped one has a gradient of zero."""
+    """Compute exp of log sizes after clamping them to +-LOG_SIZE_MAX; a clamped log size has a gradient of zero."""
     return logs.clamp(-LOG_SIZE_MAX, LOG_SIZE_MAX).exp()
 
 
 class Triangle:
-    """The layout of a triangular factor over p, t and d: which entries are shape, motion and coupling.
+    """Describe the Cholesky factor of a covariance over position p, time t and direction d.
 
-    Below the diagonal of L there are three kinds of entries. Each has its own unit and so its own learning rate.
-    `shape`, in the rows and columns of p, is the skew of a slice relative to the Gaussian's size. `motion`, in the rows
-    of p and the columns of t and d, is how far a slice moves for one standard deviation of t or d, in world units; in a
-    factor over (p, t, d) it is how far t and d move for one of p. `coupling` is the rest, among t and d.
+    The entries below the diagonal are of three kinds, each with its own learning rate:
+
+    - `shape`: the row and the column are both of p;
+    - `motion`: one of them is of p, the other of t or d; these entries move the slice with time and direction;
+    - `coupling`: the row and the column are both of t or d.
     """
 
     def __init__(self, letters: str, form: str = "relative") -> None:
-        """Lay out the factor whose rows are `letters`, such as "dddtppp".
+        """Describe a factor by the variables of its rows.
 
         Args:
-            letters: the variable of each row: "p", "t" or "d".
-            form: `relative`: entries of shape are in units of their row's diagonal, so that they mean the same for a
-                Gaussian of any size; `raw`: a parameter is the entry itself, as in the 7DGS paper; `row_scaled`: an
-                entry is (2 sigmoid(x) - 1) times its row's diagonal, as in the authors' later code.
+            letters: the variable of each row, "p", "t" or "d"; for example "dddtppp".
+            form: how a parameter x gives an entry below the diagonal. `raw`: the entry is x, as in the 7DGS paper.
+                `row_scaled`: it is (2 sigmoid(x) - 1) times the diagonal entry of its row, as in the authors' later
+                code. `relative`: it is x times the diagonal entry of its row if row and column are "p", else x.
 
         Raises:
             InputError: the form is unknown.
@@ -48,25 +49,27 @@ class Triangle:
         for place, (i, j) in enumerate(below):
             in_space = (letters[i] + letters[j]).count("p")
             places[("coupling", "motion", "shape")[in_space]].append(place)
-        self.places = places  # by kind, the places of its entries among all
+        self.places = places  # the indices of the entries of each kind among all entries below the diagonal
         self.kinds = tuple(kind for kind in KINDS if places[kind])  # a factor over (t, p) has no coupling
         self.rows = [i for i, _ in below]
         order = [place for kind in KINDS for place in places[kind]]
-        self.columns = sorted(range(len(order)), key=order.__getitem__)  # of (shape, motion, coupling), for each place
+        # Entry i below the diagonal is column self.columns[i] of the concatenation (shape, motion, coupling).
+        self.columns = sorted(range(len(order)), key=order.__getitem__)
         relative = {"relative": places["shape"], "raw": [], "row_scaled": range(len(below))}[form]
         self.is_relative = torch.tensor([place in relative for place in range(len(below))])
 
     def pair(self, place: int) -> tuple[str, str]:
-        """Return the variables of the row and the column of an entry below the diagonal."""
+        """Return the variables ("p", "t" or "d") of the row and the column of entry `place` below the diagonal."""
         row = self.rows[place]
         return self.letters[row], self.letters[place - row * (row - 1) // 2]
 
     def factor(self, log_diagonal: Tensor, kinds: dict[str, Tensor]) -> Tensor:
-        """Compute the lower triangular L, whose diagonal is positive by exp (7DGS, section 4.1).
+        """Compute the lower triangular factors L [N, n, n] from their parameters (7DGS, section 4.1).
 
         Args:
-            log_diagonal: [N, n] logarithms of the diagonal.
-            kinds: the parameters of `self.kinds`, [N, 3], [N, 3 k] and [N, k (k - 1) / 2] for n = k + 3.
+            log_diagonal: the logarithms of the diagonal, [N, n] with n = 3 + k.
+            kinds: the parameters below the diagonal: `shape` (within position) [N, 3], `motion` (position with time or
+                direction) [N, 3 k], `coupling` (within time and direction) [N, k (k - 1) / 2].
         """  # [N, n, n]
         n = log_diagonal.shape[-1]
         diagonal = sizes(log_diagonal)
@@ -78,9 +81,10 @@ class Triangle:
         return torch.stack([F.pad(torch.cat(row, -1), (0, n - 1 - i)) for i, row in enumerate(rows)], 1)
 
     def parameters(self, factor: Tensor) -> dict[str, Tensor]:
-        """Invert `factor`: compute log_diagonal, shape, motion and coupling of any square factor [N, n, n] of S.
+        """Compute the parameters of the triangular factors L with L L^T = F F^T, for any square F [N, n, n].
 
-        The form `row_scaled` cannot express entries as large as their row's diagonal; they are cut to 99.9 % of it.
+        The form `row_scaled` cannot express an entry as large as the diagonal entry of its row. Such an entry is cut to
+        99.9 % of the diagonal entry.
         """
         n = factor.shape[-1]
         L, _ = triangularise(factor, n)
@@ -94,16 +98,20 @@ class Triangle:
         return {"log_diagonal": diagonal.log()} | self.split(x)
 
     def split(self, below: Tensor) -> dict[str, Tensor]:
-        """Sort the parameters below the diagonal, [N, n (n - 1) / 2] row by row, by their kind."""
+        """Split the factor's parameters below the diagonal, [N, n (n - 1) / 2], into three kinds.
+
+        These are `shape` (within position), `motion` (position with time or direction) and `coupling` (within time and
+        direction).
+        """
         return {kind: below[:, self.places[kind]] for kind in self.kinds}
 
     def join(self, kinds: dict[str, Tensor]) -> Tensor:
-        """Invert `split`."""
+        """Concatenate the three kinds of parameters from `split` to all parameters below the diagonal, row by row."""
         return torch.cat([kinds[kind] for kind in self.kinds], -1)[:, self.columns]
 
 
 def rotation(quaternions: Tensor) -> Tensor:
-    """Compute the rotation matrices of quaternions wxyz of any length but zero, [N, 4] -> [N, 3, 3]."""
+    """Compute the rotation matrices of quaternions wxyz, which need not be normalised, [N, 4] -> [N, 3, 3]."""
     w, x, y, z = F.normalize(quaternions, dim=-1).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -114,29 +122,29 @@ def rotation(quaternions: Tensor) -> Tensor:
 
 
 def turn_of_space(quaternions: Tensor) -> Tensor:
-    """Compute the quaternion of the rotation of space that a left one makes with its partner, [N, 4] -> [N, 4].
+    """Convert the left quaternions l of 4D rotations that leave the time axis fixed to 3D quaternions, [N, 4].
 
-    M_left(l) M_right(r) keeps the axis of t only for r = (l0, -l1, -l2, l3), up to its length. It then rotates space as
-    `rotation` does by (l0, l3, -l2, l1), because x comes first and t last in these matrices. The function is its own
-    inverse, so it also computes the left quaternion of a rotation of space.
+    A 4D rotation M_left(l) M_right(r) of 4DGS leaves the time axis fixed only for r = (l0, -l1, -l2, l3), up to its
+    length. It is then the 3D rotation with the quaternion wxyz = (l0, l3, -l2, l1). This function is its own inverse,
+    so it also converts a 3D quaternion to l.
     """
     w, x, y, z = quaternions.unbind(-1)
     return torch.stack([w, z, -y, x], -1)
 
 
 def partner(left: Tensor) -> Tensor:
-    """Return the right quaternions with which left ones rotate space only, [N, 4]; see `turn_of_space`."""
+    """Return the right quaternions r for which M_left(l) M_right(r) leaves the time axis fixed, [N, 4] -> [N, 4]."""
     return left * left.new_tensor([1, -1, -1, 1])
 
 
 def quaternion(rotations: Tensor) -> Tensor:
-    """Compute the quaternions wxyz of rotation matrices [N, 3, 3], [N, 4], by scipy."""
+    """Convert rotation matrices to quaternions wxyz, [N, 3, 3] -> [N, 4]."""
     xyzw = Rotation.from_matrix(rotations.double().cpu().numpy()).as_quat()
     return torch.from_numpy(xyzw).roll(1, -1).to(rotations)
 
 
 def rotation4d(left: Tensor, right: Tensor) -> Tensor:
-    """Compute the 4D rotation M_left(l) M_right(r) of two quaternions, [N, 4] and [N, 4] -> [N, 4, 4] (4DGS, eq. 7)."""
+    """Compute 4D rotations M_left(l) M_right(r) of two quaternions, [N, 4] and [N, 4] -> [N, 4, 4] (4DGS, eq. 7)."""
     a, b, c, d = F.normalize(left, dim=-1).unbind(-1)
     p, q, r, s = F.normalize(right, dim=-1).unbind(-1)
     M_left = torch.stack([a, -b, -c, -d, b, a, -d, c, c, d, a, -b, d, -c, b, a], -1).unflatten(-1, (4, 4))
@@ -145,10 +153,10 @@ def rotation4d(left: Tensor, right: Tensor) -> Tensor:
 
 
 def quaternions_in_space(quats: Tensor) -> tuple[Tensor, Tensor]:  # [N, 4] wxyz
-    """Return the two quaternions of `rotation4d` that turn (x, y, z) by a quaternion wxyz and leave t as it is.
+    """Return the left and right quaternions of the 4D rotation that rotates space by a quaternion wxyz and fixes t.
 
-    `rotation4d(l, r)` maps v = x + y i + z j + t k to l v r*. It leaves k as it is where r = k* l k, and then turns
-    v k* = t - z i + y j - x k by l: the axis (x, y, z) is (z, -y, x) there.
+    Derivation: `rotation4d(l, r)` maps v = x + y i + z j + t k to l v r*. It fixes k if r = k* l k. It then maps
+    u = v k* = t - z i + y j - x k to l u l*, a 3D rotation in which (z, -y, x) stands for the axis (x, y, z).
     """
     w, x, y, z = quats.unbind(-1)
     return torch.stack([w, z, -y, x], -1), torch.stack([w, -z, y, x], -1)

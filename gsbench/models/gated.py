@@ -1,6 +1,7 @@
-"""Define the methods that a model needs for gates to simplify its Gaussians: frozen effects, fewer harmonics.
+"""Define the base class of models in which single Gaussians can be made independent of time, direction or AGR.
 
-A model without gates derives from `GaussianModel` instead, and needs none of these methods.
+AGR is the neural refinement of 7DGS. `gsbench.effects.gate` chooses these Gaussians. A model that does not support this
+derives from `GaussianModel` instead.
 """
 
 from abc import abstractmethod
@@ -16,54 +17,60 @@ from gsbench.models.color_order import MOST_PACKED, ColorOrder, coefficients_wit
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
 from gsbench.models.query import Query
 
-OPACITY_MARGIN = 1e-6  # between a frozen Gaussian's opacity and 0 or 1, whose logits are infinite
-_STATE = "effect_sets."  # in front of a name in a checkpoint
+OPACITY_MARGIN = 1e-6  # least distance of a frozen Gaussian's opacity from 0 and 1, whose logits are infinite
+_STATE = "effect_sets."  # prefix of the names of these tensors in a checkpoint
 
 
 class GatedModel(GaussianModel):
-    """N Gaussians, each of which may have only some effects; `effect_sets` says which."""
+    """The base class of models in which single Gaussians can be made independent of time, direction or AGR.
+
+    AGR is the neural refinement of 7DGS. `effect_sets` stores what each Gaussian still depends on.
+    """
 
     # ---- what a subclass provides
 
     @abstractmethod
     def static(self, raw: Raw) -> Conditioned:
-        """Return Gaussians that no query changes, with an opacity factor of one.
+        """Return the slice of Gaussians that do not depend on time or direction; their opacity factors are 1.
 
-        They are the limit of `condition` for Gaussians that are long in all observed variables and move with none.
+        They are the limit of `condition` for standard deviations of time and direction that go to infinity, and means
+        that do not move.
         """
 
     @abstractmethod
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Freeze effects at their weighted mean over queries; return the raw parameters that each changes.
+        """Return raw parameters of Gaussians in which time, direction or both are replaced by a mean over views.
 
-        The last one, `static`, does not change with the query. A model whose slice never changes has nothing to freeze.
+        The result has a dictionary of changed raw parameters for each variable that is replaced, and as the last one
+        `static`, where all variables are replaced. It is empty if the model depends on neither time nor direction.
 
         Args:
-            raw: parameters without AGR.
-            queries: V of them.
-            weights: [V, N]; those of each Gaussian sum to 1.
+            raw: the raw parameters, without AGR.
+            queries: the camera centres and times of V views.
+            weights: the weight of each view in the mean of each Gaussian, [V, N]; the sum over views is 1.
         """
 
     def lower_orders(self) -> list[int]:
-        """List the packed orders of colour below the one in use."""
+        """List the lower SH degrees to which colours can be reduced, as degree + 4 (frequencies in time - 1)."""
         return [ColorOrder(degree, 1).packed for degree in range(self.active.sh_degree)]
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Tell which entries of parameters matter to rows of these effect sets; parameters without a mask matter fully.
+        """Return masks of the parameter entries that are used, given what each Gaussian depends on.
 
-        The masks are bool, broadcastable to the parameters. Entries that do not matter have the constants of `fill`.
+        For example, a static Gaussian does not use its parameters of motion. The masks are bool and can be broadcast to
+        the parameters. All entries of a parameter without a mask are used. `fill` sets unused entries to constants.
         """
         if effect_sets.orders is None:
             return {}
         return {"shN": coefficients_within(effect_sets.orders, self.sh_degree).flatten(1)[:, 1:, None]}
 
     def constant(self, name: str) -> float:
-        """Return the constant of a parameter's entries that do not matter."""
+        """Return the constant to which `fill` sets the entries of a parameter that change no image."""
         return 0.0
 
     @torch.no_grad()
     def fill(self, effect_sets: EffectSets) -> None:
-        """Set the entries that do not matter to rows of these effect sets to constants."""
+        """Set parameter entries that change no image, such as the motion of static Gaussians, to constants."""
         for name, mask in self.kept(effect_sets).items():
             self.splats[name].data.masked_fill_(~mask, self.constant(name))
 
@@ -71,11 +78,11 @@ class GatedModel(GaussianModel):
 
     @property
     def conditioned(self) -> int | None:
-        """Return how many of the first rows change with the query; None: all rows of the slice."""
+        """The number of Gaussians, from the first row on, that change with time or direction; None: all of them."""
         return None if self.effect_sets is None or not self.observes else self.effect_sets.conditioned
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Slice the rows that change with the query, and leave the others as they are."""
+        """Compute the geometry of a slice; static Gaussians are not sliced but copied."""
         if self.conditioned is None:
             return super().slice_geometry(raw, query)
         changing = {name: x[: self.conditioned] for name, x in raw.items()}
@@ -86,7 +93,7 @@ class GatedModel(GaussianModel):
         return Geometry(means, factors, opacities, joined_shapes(first.shapes, rest.shapes))
 
     def pack(self) -> dict[str, Tensor]:
-        """Return the state for a checkpoint; with effect sets it has only the entries that matter, as [entries]."""
+        """Return the tensors for a checkpoint, without unused entries such as the motion of static Gaussians."""
         state, effect_sets = super().pack(), self.effect_sets
         if effect_sets is None:
             return state
@@ -101,10 +108,10 @@ class GatedModel(GaussianModel):
                                 f"{_STATE}frozen": effect_sets.frozen}  # fmt: skip
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Load what `pack` returned, of any number of Gaussians.
+        """Load the tensors that `pack` returned, for any number of Gaussians.
 
         Raises:
-            InputError: the state is of another model, or its effect sets do not fit this model.
+            InputError: the tensors belong to another model, or are damaged.
         """
         effect_sets = effect_sets_in(state)
         super().load_state(state if effect_sets is None else self._unpacked(state, effect_sets))
@@ -113,7 +120,7 @@ class GatedModel(GaussianModel):
             self.fill(effect_sets)
 
     def _unpacked(self, state: dict[str, Any], effect_sets: EffectSets) -> dict[str, Any]:
-        """Return the whole state from the entries that `pack` kept."""
+        """Restore full parameter tensors from a checkpoint, which stores only the entries that change an image."""
         assert effect_sets.orders is not None
         whole = {key: value for key, value in state.items() if not key.startswith(_STATE)}
         for name, mask in self.kept(effect_sets).items():
@@ -130,7 +137,7 @@ class GatedModel(GaussianModel):
 
 
 def as_gated(model: GaussianModel) -> GatedModel:
-    """Return the model as a `GatedModel`; raises InputError if gates cannot simplify it."""
+    """Return the model if its single Gaussians can be made independent of time or direction; else raise InputError."""
     if not isinstance(model, GatedModel):
         raise InputError(f"effects.gate: expected a model that gates can simplify, {type(model).__name__} is no "
                          f"GatedModel: make it one (docs/adding_a_model.md), or use effects.gate=off")  # fmt: skip
@@ -138,10 +145,10 @@ def as_gated(model: GaussianModel) -> GatedModel:
 
 
 def effect_sets_in(state: dict[str, Any]) -> EffectSets | None:
-    """Return the effect sets of the rows in a checkpoint's state; None if it has none.
+    """Read from a checkpoint which Gaussians depend on time, direction and refinement; None if it is not stored.
 
     Raises:
-        InputError: they are damaged.
+        InputError: the stored tensors are damaged.
     """
     own = {key: value for key, value in state.items() if isinstance(key, str) and key.startswith(_STATE)}
     if not own:

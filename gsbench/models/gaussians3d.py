@@ -19,61 +19,61 @@ from gsbench.scenes.trained import TrainedGaussians
 
 @register("3dgs")
 class Gaussians3DModel(GatedModel):
-    """Means, log scales and quaternions: F = R S, cov = R S S R^T (3DGS eq. 6)."""
+    """3DGS: the covariance of a Gaussian is R S S^T R^T, with rotation R and scales S (3DGS, eq. 6)."""
 
     geometry = ("scales", "quats")
 
     def __init__(self, **options: Any) -> None:
-        """Make an empty model, with the options of `GatedModel`."""
+        """Make a model without Gaussians. Options are those of `GatedModel`."""
         super().__init__(**options)
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Start with spheres."""
+        """Return spheres whose radii are the distances [N] of the points to their neighbours."""
         quats = torch.zeros(len(distances), 4)
         quats[:, 0] = 1
         return {"scales": distances.log()[:, None].repeat(1, 3), "quats": quats}
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Return the Gaussian itself."""
+        """Return the Gaussians themselves, because 3DGS depends on neither time nor direction."""
         return self.static(raw)
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
-        """Return the trained Gaussians' own scales and quaternions."""
+        """Return the scales and quaternions of the trained 3D Gaussians."""
         return {"scales": trained.log_scales, "quats": trained.quats}
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return the Gaussian itself, which no query changes."""
+        """Return the Gaussians themselves, with factors R S and an opacity factor of 1."""
         return Conditioned(raw["means"], self.factors(raw), torch.ones_like(raw["opacities"]))
 
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Return nothing: there is no effect to freeze."""
+        """Return an empty dictionary, because 3DGS has no dependence on time or direction that could be removed."""
         return {}
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Slice by the kernel where the backend has one."""
+        """Compute factors and opacities by the backend's kernel if it has one, else in torch."""
         if not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
         return Geometry(raw["means"], *slice_static(raw["scales"], raw["quats"], raw["opacities"]))
 
     def scales(self) -> Tensor:
-        """Return the largest of the three scales."""
+        """Return the largest of the three scales of each Gaussian, [N]."""
         return self.splats["scales"].detach().amax(-1).exp()
 
     def log_sizes(self, index: int) -> Tensor:
-        """Return the three log scales."""
+        """Return the three log scales of the Gaussian `index`, [3]."""
         return self.splats["scales"].detach()[index]
 
     def hold_sizes(self, least: Tensor) -> None:
-        """Raise all three scales."""
+        """Raise all three scales of each Gaussian to at least `least` [N]."""
         self.splats["scales"].data.clamp_(min=least.log()[:, None])
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Sample children from the parent's distribution, 1.6 times smaller (3DGS, section 5.2)."""
+        """Sample the means of children from the parent Gaussian, with scales 1.6 times smaller (3DGS, section 5.2)."""
         z = torch.randn(raw["means"].shape, generator=generator).to(raw["means"])
         means = raw["means"] + (self.factors(raw) @ z[..., None])[..., 0]
         return {"means": means, "scales": raw["scales"] - math.log(SHRINK)}
 
     @staticmethod
     def factors(raw: Raw) -> Tensor:
-        """Compute the factors R S, [N, 3, 3]."""
+        """Compute the factors R S of the covariances, rotation times scale, [N, 3, 3]."""
         return rotation(raw["quats"]) * sizes(raw["scales"])[:, None, :]

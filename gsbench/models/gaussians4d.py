@@ -24,19 +24,19 @@ from gsbench.scenes.points import size_of
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
 
-MAX_DEGREE = 32  # of the Fourier series; above it are only frequencies that no clip resolves
+MAX_DEGREE = 32  # largest degree of the Fourier series; the frames of a scene do not resolve higher frequencies
 
 
 @register("4dgs")
 class Gaussians4DModel(GatedModel):
-    """Means and times, four log scales and two quaternions: F = M_left(l) M_right(r) S over (x, y, z, t).
+    """4DGS: the factor of the covariance over (x, y, z, t) is a 4D rotation M_left(l) M_right(r) times four scales.
 
-    A rotation of space and time needs one unit for both. With `clock` the clip is as long as the scene is large, so
-    training does not depend on the scene's unit of length. The fourth scale is in that unit; `times` are
-    in clips.
+    A 4D rotation needs the same unit for space and time. The model uses the size of the scene as the length of its time
+    range, so that training does not depend on the scene's unit of length. The fourth scale, that of time, is in this
+    unit. The parameter `times` is in [0, 1].
     """
 
-    clock: Tensor  # [] world units a clip
+    clock: Tensor  # [] world units that correspond to the time range [0, 1]
 
     observes = ("time",)
     centers = ("means", "times")
@@ -45,13 +45,13 @@ class Gaussians4DModel(GatedModel):
     def __init__(
         self, *, time_degree: int = 2, scheme: str = "square_root", lambda_t: float = 1.0, **options: Any
     ) -> None:
-        """Make an empty model.
+        """Make a model without Gaussians.
 
         Args:
-            time_degree: frequencies of the colour's Fourier series besides the constant one; 0: constant colours.
-            scheme: of `slice_gaussians`.
-            lambda_t: coefficient of f_temp.
-            options: as `GatedModel`.
+            time_degree: the number of frequencies of the colours in time, without the constant; 0: constant colours.
+            scheme: the numerical method of slicing, see `slice_gaussians`.
+            lambda_t: the coefficient in the exponent of f_temp, the factor of the opacity at a time.
+            options: the options of `GatedModel`.
 
         Raises:
             InputError: an option is out of its range.
@@ -66,7 +66,7 @@ class Gaussians4DModel(GatedModel):
         self.register_buffer("clock", torch.ones(()))
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Start with spheres, times uniform from -0.1 to 1.1 clips, and a time scale of sqrt(T / 5)."""
+        """Return spheres with mean times uniform in [-0.1, 1.1] and a standard deviation in time of sqrt(1/5)."""
         N = len(distances)
         self.clock.fill_(size_of(points))
         duration = self.clock.log() + 0.5 * math.log(1 / 5)
@@ -77,12 +77,12 @@ class Gaussians4DModel(GatedModel):
         return {"times": times, "scales": scales, "left_quats": quats, "right_quats": quats.clone()}
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Slice at t; f_temp = exp(-1/2 lambda_t (t - mu_t)^2 / S_t)."""
+        """Slice the Gaussians at time t; the opacity factor is f_temp = exp(-1/2 lambda_t (t - mu_t)^2 / S_t)."""
         time = query.time
         assert time is not None
         factor, delta = _leading_first(self.factors(raw)), time - raw["times"]
-        # A Gaussian that is culled at this time is sliced at its own time and so stays at mu_p. Otherwise the huge
-        # numbers of a Gaussian that is thin in time would reach its gradient as 0 x inf.
+        # A Gaussian that is culled at this time is sliced at its own mean time instead, so its mean does not move.
+        # Otherwise the huge numbers of a Gaussian that is thin in time would give gradients of 0 x inf.
         with torch.no_grad():
             seen = self.opacity_factor(factor, delta) > TIME_OPACITY_FACTOR_MIN
         mean = torch.cat([raw["means"], raw["times"]], -1)
@@ -92,19 +92,22 @@ class Gaussians4DModel(GatedModel):
         return Conditioned(means, factors, torch.where(seen, opacity_factor, 0.0))
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return Gaussians that the left quaternion rotates in space only; times and sizes in time do not matter."""
+        """Return the slice of Gaussians that do not depend on time, from left quaternions and spatial scales."""
         factors = rotation(turn_of_space(raw["left_quats"])) * sizes(raw["scales"][:, :3])[:, None, :]
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
-        """Return the trained shape in space and the initial size in time."""
+        """Return the spatial scales and rotations of trained 3D Gaussians, with the initial size in time."""
         left, right = quaternions_in_space(trained.quats)
         scales = torch.cat([trained.log_scales, raw["scales"][:, 3:]], 1)
         return {"scales": scales, "left_quats": left, "right_quats": right}
 
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Freeze t: mean and f_temp become their averages, and the factor becomes that of the slice."""
+        """Remove the dependence on time: replace means and opacities by their weighted averages over views.
+
+        The covariance becomes that of the slice, which is the same at all times.
+        """
         factor = self.factors(raw).double()
         blocks = reduce(factor)
         shift, opacity = torch.zeros_like(factor[:, 3:, 0]), torch.zeros_like(factor[:, 0, 0])
@@ -128,21 +131,25 @@ class Gaussians4DModel(GatedModel):
         return {"static": static}
 
     def full_order(self) -> int:
-        """Return the degree in use with all waves."""
+        """Return the SH degree in use and the number of frequencies in time, as degree + 4 (frequencies - 1)."""
         return ColorOrder(self.active.sh_degree, self.time_degree + 1).packed
 
     def lower_orders(self) -> list[int]:
-        """List every degree up to the one in use, with all waves and with the constant one alone."""
+        """List the reduced colours: SH degrees up to the one in use, each constant in time or with all frequencies."""
         degrees = range(self.active.sh_degree + 1)
         orders = {ColorOrder(degree, waves).packed for waves in (1, self.time_degree + 1) for degree in degrees}
         return sorted(orders - {self.full_order()})
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Tell which entries matter: a static row has no right quaternion, and a time only if its colour has waves."""
+        """Return masks of the parameter entries that are used, given which Gaussians are static.
+
+        A static Gaussian does not use its right quaternion and its scale in time. It uses its mean time only if its
+        colour changes with time.
+        """
         masks = {}
         if effect_sets.orders is not None:
             stored = coefficients_within(effect_sets.orders, self.sh_degree, self.time_degree + 1)
-            masks["shN"] = stored.flatten(1)[:, 1:, None]  # the constant coefficient is sh0's
+            masks["shN"] = stored.flatten(1)[:, 1:, None]  # the constant coefficient is stored in sh0
         if effect_sets.frozen is not None:
             changes = (
                 torch.arange(len(effect_sets.frozen), device=effect_sets.frozen.device)[:, None]
@@ -155,18 +162,21 @@ class Gaussians4DModel(GatedModel):
         return masks
 
     def constant(self, name: str) -> float:
-        """Return the largest size in time for a static row."""
+        """Return the constant for entries that change no image: the largest log size for `scales`, else 0."""
         return LOG_SIZE_MAX if name == "scales" else 0.0
 
     @torch.no_grad()
     def fill(self, effect_sets: EffectSets) -> None:
-        """Give each left quaternion of a static row the right one that leaves the axis of t alone."""
+        """Set parameter entries of static Gaussians that change no image to constants.
+
+        The right quaternions are set such that the 4D rotations leave the time axis fixed.
+        """
         super().fill(effect_sets)
         left = self.splats["left_quats"].data[effect_sets.conditioned :]
         self.splats["right_quats"].data[effect_sets.conditioned :] = partner(left)
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Slice by the kernel where the backend has one, in the square-root scheme."""
+        """Slice by the backend's kernel if it has one for the numerical method `scheme`, else in torch."""
         if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
         assert query.time is not None
@@ -185,7 +195,7 @@ class Gaussians4DModel(GatedModel):
         return Geometry(*geometry)
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
-        """Compute 4DSH, by the kernel if the backend has one for so many waves."""
+        """Compute the colours of 4DGS, which change with time, by the backend's kernel if possible, else in torch."""
         assert query.time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.active.sh_degree, self.time_degree + 1
         if waves <= MAX_WAVES and self.backend.serves(means):
@@ -196,33 +206,33 @@ class Gaussians4DModel(GatedModel):
         return sh_time_colors(coefficients, directions, degree, query.time - raw["times"][:, 0], self.orders)
 
     def initial_colors(self, dc: Tensor) -> Raw:
-        """Return 4DSH coefficients [N, time_degree + 1, K, 3]; all but the constant one are zero."""
+        """Return SH coefficients for all frequencies of time; all are zero except the constant colour `dc` [N, 3]."""
         K = (self.sh_degree + 1) ** 2
         waves = dc.new_zeros(len(dc), self.time_degree + 1, K, 3)
         return {"sh0": dc[:, None, None], "shN": waves.flatten(1, 2)[:, 1:]}
 
     def scales(self) -> Tensor:
-        """Return the largest of the three spatial scales, as density control in 4DGS does."""
+        """Return the largest of the three spatial scales of each Gaussian, [N], as 4DGS uses it in density control."""
         return self.splats["scales"].detach()[:, :3].amax(-1).exp()
 
     def log_sizes(self, index: int) -> Tensor:
-        """Return the four log scales."""
+        """Return the four log scales of the Gaussian `index`, [4]."""
         return self.splats["scales"].detach()[index]
 
     def log_duration(self, index: int) -> float | None:
-        """Return the fourth log scale in clips."""
+        """Return the log scale in time of the Gaussian `index`, in units of the length of the scene."""
         return float(self.splats["scales"].detach()[index, 3] - self.clock.log())
 
     def durations(self) -> Tensor:
-        """Return sqrt(S_t), the norm of the factor's row of t."""
+        """Return the standard deviation in time of each Gaussian, [N]: the norm of the row of t of its factor."""
         return self.factors(dict(self.splats.items())).detach()[:, 3].norm(dim=-1)
 
     def hold_sizes(self, least: Tensor) -> None:
-        """Raise the three spatial scales."""
+        """Raise the three spatial scales of each Gaussian to at least `least` [N]."""
         self.splats["scales"].data[:, :3].clamp_(min=least.log()[:, None])
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Sample children from the parent's distribution in space and time, with all scales 1.6 times smaller."""
+        """Sample means and times of children from the parent Gaussian; all four scales are 1.6 times smaller."""
         z = torch.randn(len(raw["means"]), 4, generator=generator).to(raw["means"])
         offset = (self.factors(raw) @ z[..., None])[..., 0]
         return {
@@ -232,20 +242,20 @@ class Gaussians4DModel(GatedModel):
         }
 
     def opacity_factor(self, factor: Tensor, delta: Tensor) -> Tensor:
-        """Compute f_temp [N] of factors [N, 4, 4] at a distance delta [N, 1] in time."""
+        """Compute the opacity factors f_temp [N] from factors [N, 4, 4] and time offsets delta = t - mu_t [N, 1]."""
         return torch.exp(-0.5 * self.lambda_of("time") * mahalanobis(factor[:, 3:], delta))
 
     def factors(self, raw: Raw) -> Tensor:
-        """Compute the factors R S with rows (x, y, z, t), [N, 4, 4]; the unit of t is the length of the sequence."""
+        """Compute the factors R S of the covariances over (x, y, z, t), [N, 4, 4]; t is in [0, 1] for the scene."""
         factor = rotation4d(raw["left_quats"], raw["right_quats"]) * sizes(raw["scales"])[:, None, :]
         return torch.cat([factor[:, :3], factor[:, 3:] / self.clock], 1)
 
 
 def _leading_first(factor: Tensor) -> Tensor:
-    """Swap columns of [N, 4, 4] so that the first one is the largest in the row of t; F F^T does not change.
+    """Swap two columns of each factor F [N, 4, 4] so that the largest entry of the row of t comes first.
 
-    In a Gaussian that is long in time, columns differ by factors of 10^7. With this order a reflection is accurate in
-    every column and not only in the largest (Powell and Reid 1969; Cox and Higham 1998).
+    F F^T does not change. In a Gaussian that is long in time, columns differ by factors of 10^7. With this order the
+    Householder reflection is accurate in all columns (Powell and Reid 1969; Cox and Higham 1998).
     """
     largest = factor[:, 3].detach().abs().argmax(-1, keepdim=True)
     columns = torch.arange(4, device=factor.device).repeat(len(factor), 1)

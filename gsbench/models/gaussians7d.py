@@ -6,7 +6,7 @@ from gsbench.models.triangular import DirectionalModel, TimedModel
 
 @register("7dgs")
 class Gaussians7DModel(TimedModel, DirectionalModel):
-    """Gaussians conditioned on q = {t, d}."""
+    """7DGS: Gaussians over position, time and direction, sliced at a time and the direction from the camera."""
 
     observes = ("time", "direction")
     centers = ("means", "times", "directions")

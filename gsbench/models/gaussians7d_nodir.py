@@ -1,7 +1,7 @@
-"""Model a moving scene by 7DGS less direction: Gaussians over position and time, to measure what direction is worth.
+"""Model a moving scene by 7DGS without direction: Gaussians over position and time, to measure the gain by direction.
 
-4DGS has the same variables, but another factor, colours that change with time, and other rates. This model differs from
-7DGS only in direction.
+4DGS also has position and time, but another covariance factor, colours that change with time, and other learning rates.
+This model differs from 7DGS only in direction.
 """
 
 from gsbench.models.registry import register
@@ -10,7 +10,7 @@ from gsbench.models.triangular import TimedModel
 
 @register("7dgs_nodir")
 class Gaussians7DWithoutDirectionModel(TimedModel):
-    """Gaussians over position and time, which are sliced at a time, for any direction of view."""
+    """7DGS without direction: Gaussians over position and time, sliced at a time."""
 
     observes = ("time",)
     centers = ("means", "times")

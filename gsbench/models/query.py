@@ -1,4 +1,4 @@
-"""Define the query at which a model is sliced: a camera's centre and a time."""
+"""Define `Query`: the camera centre and the time at which a model is sliced."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from gsbench.scenes.scene import Camera
 
 
 class Query(NamedTuple):
-    """The place and the time at which slicing, colours and AGR are evaluated.
+    """The camera centre and the time for which a model returns 3D Gaussians with colours.
 
-    `Query.of` takes a camera and `Query.at` a place; both check their arguments.
+    `Query.of` makes a query from a camera, and `Query.at` from a position. These two functions check their arguments.
 
     Args:
-        center: the camera's position [3], world units.
+        center: the position of the camera [3], world units.
         time: the time in [0, 1], a tensor []; None if the scene has no time.
 
     Example:
@@ -32,24 +32,24 @@ class Query(NamedTuple):
         gsbench.errors.InputError: query: center: expected shape [3], got [2]
     """
 
-    center: Tensor  # [3] where the camera is, world units
-    time: Tensor | None = None  # [] in [0, 1], clips; None: the scene has no time
+    center: Tensor  # [3] position of the camera, world units
+    time: Tensor | None = None  # [] in [0, 1]; None: the scene has no time
 
     @classmethod
     def of(cls, camera: Camera, time: float | Tensor | None) -> Query:
-        """Make the query of a camera at a time; raises InputError as `at` does."""
+        """Make a query from a camera and a time in [0, 1]; raises InputError if the time is not a finite number."""
         return cls.at(camera.center, time)
 
     @classmethod
     def at(cls, center: Tensor, time: float | Tensor | None) -> Query:
-        """Make the query of a place at a time. If the time is a tensor, it stays one, so that a CUDA graph can read it.
+        """Make a query from a camera position and a time.
 
         Args:
-            center: the place [3], world units.
-            time: in [0, 1], clips; None: the scene has no time.
+            center: the position [3], world units.
+            time: the time in [0, 1]; a tensor [] is kept, so that a CUDA graph can read it; None: no time.
 
         Raises:
-            InputError: the place is not a tensor [3], or the time is not a finite number.
+            InputError: the position is not a tensor [3], or the time is not a finite number.
         """
         check_tensor(center, "query: center")
         if center.shape != (3,):
@@ -66,7 +66,7 @@ class Query(NamedTuple):
 
 
 def unit(vectors: Tensor) -> Tensor:
-    """Normalise vectors [N, 3]; a vector too short to have a direction becomes zero, and so does its gradient."""
+    """Normalise vectors [N, 3]. A vector shorter than 1e-10 becomes zero, with a gradient of zero."""
     square = vectors.square().sum(-1, keepdim=True)
     defined = square > 1e-20
     return torch.where(defined, vectors * torch.where(defined, square, 1.0).rsqrt(), 0.0)

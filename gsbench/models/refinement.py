@@ -1,4 +1,4 @@
-"""Move the raw parameters of Gaussians with time by AGR, the adaptive Gaussian refinement (7DGS, section 4.3)."""
+"""Change the parameters of Gaussians with time by AGR, the adaptive Gaussian refinement of 7DGS (section 4.3)."""
 
 import functools
 import math
@@ -14,22 +14,23 @@ OCTAVES = 10  # K of the time encoding in the 7DGS paper
 
 
 def encode_time(time: Tensor, octaves: int = OCTAVES) -> Tensor:
-    """Return gamma(t) = (sin 2^0 pi t, cos 2^0 pi t, .., sin 2^(K-1) pi t, cos 2^(K-1) pi t), [] -> [2 K]."""
+    """Return the positional encoding of a time, (sin 2^k pi t, cos 2^k pi t) for k = 0 .. octaves-1, [2 octaves]."""
     angles = time * _frequencies(octaves, time.device, time.dtype)
     return torch.stack([angles.sin(), angles.cos()], -1).flatten()
 
 
 @functools.cache
 def _frequencies(octaves: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Return the frequencies 2^k pi of K octaves, [K]; they are cached, because each operation on a GPU takes time."""
+    """Return the frequencies 2^k pi of the time encoding, [octaves]; they are cached to save GPU operations."""
     return math.pi * 2.0 ** torch.arange(octaves, device=device, dtype=dtype)
 
 
 class Refinement(nn.Module):
-    """Perceptrons f x 64 x c that read f = (means, gamma(t)): one for each mean, one for all other parameters.
+    """The networks of AGR, the adaptive Gaussian refinement (7DGS, eq. 14 and 15).
 
-    See 7DGS eq. 14 and 15. The output layers start at zero, so that switching AGR on changes nothing. f does not depend
-    on the view.
+    Each network has one hidden layer of 64 units. Its input is the means of a Gaussian and an encoding of the time, its
+    output is added to raw parameters. One network changes each mean (position, time, direction), one more changes all
+    parameters of the covariance. Output layers start at zero, so AGR changes nothing at first.
     """
 
     units: Tensor  # [sum of outputs]
@@ -37,14 +38,15 @@ class Refinement(nn.Module):
     def __init__(
         self, outputs: list[int], generator: torch.Generator, octaves: int = OCTAVES, units: Tensor | None = None
     ) -> None:
-        """Make the networks with output layers of zero.
+        """Make the networks, with output layers of zero.
 
         Args:
-            outputs: the width of each network; the last one moves all that is not a mean.
-            generator: samples the first layers.
-            octaves: K of gamma(t). With many octaves and few frames the networks memorise each frame.
-            units: [sum of outputs], the unit of each number for the networks, so that the size of the scene does not
-                matter; by default ones.
+            outputs: the number of outputs of each network. The last network changes the parameters of the covariance,
+                the others change one mean each.
+            generator: the source of the random weights of the first layers.
+            octaves: the number of frequencies of the time encoding. Many frequencies overfit a scene of few frames.
+            units: the unit of each parameter, [sum of outputs], by which inputs are divided and outputs multiplied, so
+                that the size of the scene does not matter; by default ones.
         """
         super().__init__()
         self.features = sum(outputs[:-1])
@@ -52,8 +54,8 @@ class Refinement(nn.Module):
         self.register_buffer("units", torch.ones(sum(outputs)) if units is None else units)
         width = self.features + 2 * octaves
         self.widths = outputs
-        # The first layers of all networks read the same f: they are one matrix, 64 rows for each. So are the second
-        # layers, a row for each number that is moved.
+        # The first layers of all networks have the same input, so they are one matrix with 64 rows for each network.
+        # The second layers are one matrix with a row for each output.
         self.weight_in = nn.Parameter(torch.empty(HIDDEN * len(outputs), width))
         self.bias_in = nn.Parameter(torch.empty(HIDDEN * len(outputs)))
         bound = 1 / math.sqrt(width)  # torch.nn.Linear's own initialisation, drawn from the run's seed
@@ -66,10 +68,14 @@ class Refinement(nn.Module):
         self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False, rows: int | None = None,
         intervals: Tensor | None = None,
     ) -> list[Tensor]:  # fmt: skip
-        """Move raw parameters [N, c] to a time []; the parameters that are read come first.
+        """Return the raw parameters plus the outputs of the networks at a time.
 
-        The kernel (float32) writes no hidden layer to memory. With `rows` only the first Gaussians are
-        moved, with `intervals` [rows, 2] each of them only from a first to a last time.
+        Args:
+            values: raw parameters, [N, c] each: first the means, which are the input, then those of the covariance.
+            time: the time in [0, 1], [].
+            by_kernel: whether the backend's kernel (float32) computes it, which stores no hidden layer in memory.
+            rows: only the first `rows` Gaussians change; None: all.
+            intervals: the first and the last time at which each of these Gaussians changes, [rows, 2]; None: always.
         """
         if by_kernel:
             gamma = encode_time(time, self.octaves)
@@ -93,5 +99,5 @@ class Refinement(nn.Module):
         return [x + residual for x, residual in zip(values, residuals, strict=True)]
 
     def at_time(self, time: Tensor) -> Tensor:
-        """Compute what gamma(t) adds to the hidden units; all Gaussians share it, so it is one vector."""
+        """Return the contribution of the encoded time to the hidden layer, a vector that all Gaussians share."""
         return F.linear(encode_time(time, self.octaves), self.weight_in[:, self.features :], self.bias_in)

@@ -1,4 +1,4 @@
-"""Register models by name, also those of other packages, and build them."""
+"""Register model classes by name, also those of other packages, and build models."""
 
 import importlib
 import inspect
@@ -18,7 +18,7 @@ M = TypeVar("M", bound=type[GaussianModel])
 
 
 def register(name: str) -> Callable[[M], M]:
-    """Decorate a class so that `build` finds it by this name; raises InputError if another class has the name."""
+    """Return a class decorator that registers a model as `name`; raises InputError if another class has the name."""
 
     def enter(model: M) -> M:
         other = _REGISTRY.get(name, model)
@@ -31,14 +31,15 @@ def register(name: str) -> Callable[[M], M]:
 
 
 def find(name: str, module: str | None = None) -> type[GaussianModel]:
-    """Return the class registered as `name`.
+    """Return the model class registered as `name`.
 
-    Every module of `gsbench.models` is imported, so that a new model is one new file in that folder, and every entry
-    point of the group `gsbench.models` of an installed package.
+    The function first imports every module of `gsbench.models`, and every module that an installed package lists as an
+    entry point of the group `gsbench.models`.
 
     Args:
-        name: of the model.
-        module: a Python module that registers it, imported first; the user names it, never a file.
+        name: the name of the model.
+        module: a Python module that registers the model, to be imported as well. It must come from the user, never from
+            a checkpoint, because an import runs code.
 
     Raises:
         InputError: the model is unknown, or a module cannot be imported.
@@ -51,7 +52,7 @@ def find(name: str, module: str | None = None) -> type[GaussianModel]:
 
 
 def is_registered(name: str) -> bool:
-    """Tell whether gsbench, an installed package or an imported module has a model of this name.
+    """Return whether gsbench, an installed package or an imported module has registered a model as `name`.
 
     Raises:
         InputError: the models of an installed package cannot be imported.
@@ -61,7 +62,7 @@ def is_registered(name: str) -> bool:
 
 
 def _import_all() -> None:
-    """Import every module of `gsbench.models` and every entry point, if that was not done before."""
+    """Import every module of `gsbench.models`, and those that installed packages list as entry points."""
     package = importlib.import_module("gsbench.models")
     for own in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"gsbench.models.{own.name}")
@@ -70,11 +71,11 @@ def _import_all() -> None:
 
 
 def import_models(module: str | None, named_by: str = "--model-module") -> None:
-    """Import a module that registers models; raises InputError with one line that says where it fails.
+    """Import a Python module that registers models; raises InputError with the file and line if the import fails.
 
     Args:
-        module: its name, such as package.module; None for nothing.
-        named_by: the option that named it, for the message.
+        module: the name of the module, such as package.module; None: do nothing.
+        named_by: the option that gave the name, for the error message.
     """
     if module is None:
         return
@@ -90,19 +91,18 @@ def import_models(module: str | None, named_by: str = "--model-module") -> None:
 
 
 def build(name: str, *, module: str | None = None, **options: Any) -> GaussianModel:
-    """Build the model registered as `name`, without Gaussians yet.
+    """Build the model registered as `name`, without Gaussians.
 
     Args:
-        name: such as `3dgs`, `4dgs`, `6dgs`, `7dgs`.
-        module: a Python module that registers it, as in `find`.
-        options: of the model's class and of `GaussianModel`, such as `agr`, `sh_degree`, `lambda_t`.
+        name: the name of the model, such as `3dgs`, `4dgs`, `6dgs`, `7dgs`.
+        module: a Python module that registers the model, as in `find`.
+        options: options of the model class and of `GaussianModel`, such as `agr`, `sh_degree`, `lambda_t`.
 
     Returns:
-        The model. `initialise` or `load_state` gives it Gaussians. `load_run` builds and loads a trained one.
+        The model. `initialise` or `load_state` gives it Gaussians. To load a trained model, use `load_run`.
 
     Raises:
-        InputError: the model is unknown, does not have an option, needs an option that is missing, or the option has
-            another type.
+        InputError: the model is unknown, an option is unknown or of the wrong type, or a required option is missing.
 
     Example:
         >>> from gsbench import build
@@ -136,7 +136,7 @@ def build(name: str, *, module: str | None = None, **options: Any) -> GaussianMo
 
 
 def _is_a(value: object, kind: Any) -> bool:
-    """Tell whether an option's value has the type of the constructor's argument; a number may be whole."""
+    """Return whether `value` has the type `kind` of a constructor's argument; an int is accepted as a float."""
     if kind is float:
         return type(value) in (int, float)
     if kind in (bool, int, str):

@@ -1,4 +1,4 @@
-"""Render an image of a model: slice it at a query and rasterize the slice."""
+"""Render an image of a model: slice the model at a camera centre and time, then rasterize the slice."""
 
 from torch import Tensor
 
@@ -12,14 +12,14 @@ from gsbench.scenes.scene import Camera
 def rasterize_slice(
     gaussians: Gaussians3D, camera: Camera, background: Tensor, backend: Backend, antialias: bool = False
 ) -> RasterOutput:
-    """Rasterize one slice for one camera.
+    """Rasterize the slice of a model (3D Gaussians with colours) for one camera.
 
     Args:
         gaussians: the slice.
-        camera: sees it.
-        background: colour [3].
-        backend: of the rasterizer.
-        antialias: see `gsbench.raster.rasterize`.
+        camera: the camera that sees the slice.
+        background: the background colour, [3].
+        backend: the implementation of the rasterizer.
+        antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
     """
     return rasterize(
         gaussians.means,
@@ -40,14 +40,14 @@ def rasterize_slice(
 def render(
     model: GaussianModel, camera: Camera, time: float | None, background: Tensor, antialias: bool = False
 ) -> Tensor:
-    """Render the image [H, W, 3] of a model by the model's own backend.
+    """Render the image [H, W, 3] of a model for a camera and a time.
 
     Args:
-        model: initialised.
-        camera: sees it.
-        time: in [0, 1]; None if the scene has no time.
-        background: colour [3].
-        antialias: see `gsbench.raster.rasterize`.
+        model: a model with Gaussians; its backend renders.
+        camera: the camera.
+        time: the time in [0, 1]; None if the scene has no time.
+        background: the background colour, [3].
+        antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
     """
     seen = model.slice(Query.of(camera, time))
     return rasterize_slice(seen, camera, background, model.backend, antialias).image[0]

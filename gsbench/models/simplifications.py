@@ -1,7 +1,7 @@
-"""Simplify the Gaussians of a model: bake AGR in, freeze time or direction, remove harmonics.
+"""Simplify Gaussians: make them independent of time, direction or AGR (neural refinement), or lower the SH degree.
 
-A simplified Gaussian is an ordinary row of the model's parameters, so every model, backend and checkpoint can use it.
-A frozen value is the mean over given queries, weighted by the Gaussian's opacity at each of them.
+What changes with these is replaced by its mean over views, weighted by the opacity of the Gaussian in each view. A
+simplified Gaussian is an ordinary row of the model's parameters, so rendering and checkpoints need no change.
 """
 
 import functools
@@ -19,29 +19,32 @@ from gsbench.process.workers import side_by_side
 from gsbench.scenes.points import SH_C0
 
 LIVE, CONDITIONED, STATIC, REMOVED = "live", "conditioned", "static", "removed"
-FEW = 1e-6  # added to weights: a Gaussian that no query sees is averaged over all
+FEW = 1e-6  # added to weights, so that a Gaussian which no view shows is averaged over all views
 
 
 @dataclass(frozen=True)
 class Simplification:
-    """All Gaussians of a model, simplified in one way."""
+    """Hold the parameters of all Gaussians of a model after one simplification, for example independent of time."""
 
     name: str
     raw: Raw | None  # the raw parameters that change; None: the Gaussian is removed
-    rows: int  # only this many first rows change: effect sets that are behind them have nothing of this to lose
-    order: int | None = None  # of the harmonics that are left (see EffectSets.orders), where only the colour changes
+    rows: int  # only the first `rows` Gaussians change; the others do not have the effect that is removed
+    order: int | None = None  # if only colours change: the remaining SH degree and frequencies, as in `ColorOrder`
 
 
 def simplifications_of(
     model: GatedModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], by_halves: bool = True
 ) -> list[Simplification]:
-    """List the ways to simplify the Gaussians of a model.
+    """Return the parameters of a model's Gaussians after each possible simplification.
+
+    A simplified Gaussian is independent of AGR (the neural refinement), time, direction or all of them, or has a lower
+    SH degree, or is removed.
 
     Args:
-        model: as it is.
-        queries: of the views over which frozen values are averaged.
-        slices: of the model at the queries; their opacities are the weights.
-        by_halves: whether time or direction alone may be frozen.
+        model: the model, which does not change.
+        queries: the camera centres and times of the views over which constants are averaged.
+        slices: the slices of the model for these views; their opacities are the weights of the average.
+        by_halves: whether to include Gaussians that are independent of only one of time and direction.
     """
     weights = shares_of([one.opacities for one in slices])
     found = []
@@ -68,13 +71,13 @@ def simplifications_of(
 
 
 def shares_of(opacities: Sequence[Tensor]) -> Tensor:
-    """Return the weights [V, N] of queries, from the opacities of their slices; each Gaussian's sum to 1."""
+    """Return the weights of V views for N Gaussians, [V, N]: opacities [N] in each view, normalised to a sum of 1."""
     weights = torch.stack(list(opacities)) + FEW
     return weights / weights.sum(0)
 
 
 def _all(model: GaussianModel, order: int) -> Tensor:
-    """Return one order of colour for all Gaussians, [N]."""
+    """Return `order`, an encoded SH degree and number of frequencies, for all Gaussians of a model, [N]."""
     return torch.full((len(model),), order, dtype=torch.int32, device=model.splats["means"].device)
 
 
@@ -82,15 +85,15 @@ def _averages(
     model: GaussianModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], weights: Tensor,
     names: Sequence[str], fewer: Sequence[Raw],
 ) -> tuple[Raw, list[Tensor]]:  # fmt: skip
-    """Average over the queries the raw parameters after AGR, and the colour [N, 3] that fewer harmonics lose.
+    """Return means over views of refined parameters (AGR), and of the colour [N, 3] that a lower SH degree removes.
 
     Args:
-        model: as it is.
-        queries: V of them.
-        slices: at the queries.
-        weights: [V, N].
-        names: of the raw parameters that AGR moves; none without AGR.
-        fewer: raw parameters with fewer harmonics.
+        model: the model, which does not change.
+        queries: the camera centres and times of V views.
+        slices: the slices of the model for these views.
+        weights: the weight of each view for each Gaussian, [V, N].
+        names: the names of the raw parameters that AGR changes; empty without AGR.
+        fewer: raw parameters with lower SH degrees, one dictionary for each degree.
     """
 
     def at(v: int) -> list[Tensor]:

@@ -1,14 +1,16 @@
-"""Slice joint Gaussians over (p, q) at an observed q into conditional 3D Gaussians over p (7DGS, section 4.2).
+"""Slice Gaussians: compute the conditional 3D Gaussians over position p, given q (time, direction) (7DGS, section 4.2).
+
+The joint covariance of p and q is S = F F^T, where the rows of F are ordered (p, q). The conditional Gaussian has
 
     K = S_pq S_qq^-1        mean = mu_p + K (q - mu_q)        cov = S_pp - K S_pq^T
 
-A factor F of S = F F^T, with rows ordered (p, q), gives a Gaussian. Forming S squares the condition number,
-so the default scheme never forms it. It turns the rows of F by reflections until
-F = [T_pq T_pp; T_qq 0] with T_qq lower triangular (square-root Kalman filters: Kailath, Sayed, Hassibi, chapter 12),
+The default method does not compute S, because that squares the condition number. It multiplies F from the right by
+Householder reflections until F = [T_pq T_pp; T_qq 0] with T_qq lower triangular. This is the method of square-root
+Kalman filters (Kailath, Sayed, Hassibi, chapter 12). Then
 
     K = T_pq T_qq^-1        cov = T_pp T_pp^T
 
-and passes T_pp itself to the rasterizer. This covariance is semi-definite by construction; nothing is subtracted.
+The rasterizer takes the factor T_pp, so the covariance is always semi-definite.
 """
 
 from typing import NamedTuple
@@ -23,15 +25,15 @@ SCHEMES = ("square_root", "schur", "cholesky")
 
 
 class Slice(NamedTuple):
-    """The conditional Gaussian of a joint one, given q."""
+    """Hold the conditional 3D Gaussians over position, given time or direction q."""
 
     mean: Tensor  # [N, 3]
     factor: Tensor  # [N, 3, 3] F of cov = F F^T
-    gain: Tensor  # [N, 3, k] K: how the mean moves with q
+    gain: Tensor  # [N, 3, k] K: the derivative of the mean with respect to q
 
 
 class Reduced(NamedTuple):
-    """A factor in the form [T_qq 0; T_pq T_pp]: conditioned variables first, T_qq lower triangular."""
+    """Hold the blocks of the factor [T_qq 0; T_pq T_pp] of a covariance over (q, p), with T_qq lower triangular."""
 
     T_qq: Tensor  # [N, k, k]
     T_pq: Tensor  # [N, 3, k]
@@ -45,29 +47,27 @@ def slice_gaussians(
     *,
     scheme: str = "square_root",
 ) -> Slice:
-    """Slice N joint Gaussians: condition them on q = query (7DGS eq. 9 and 10).
+    """Compute the conditional 3D Gaussians over position p of N joint Gaussians over (p, q), given q (7DGS eq. 9, 10).
 
         mean = mu_p + S_pq S_qq^-1 (q - mu_q)        cov = S_pp - S_pq S_qq^-1 S_qp
 
-    with S = F F^T and p = (x, y, z). By `square_root` no covariance is formed: an orthogonal matrix turns F into
-    [T_pp T_pq; 0 T_qq], and then gain = T_pq T_qq^-1 and cov = T_pp T_pp^T.
-
     Args:
-        mean: (mu_p, mu_q), [N, 3+k].
-        factor: a square F with S = F F^T, rows ordered (p, q), [N, 3+k, 3+k].
-        query: the observed q in the units of mu_q, the same for all Gaussians [k] or one for each [N, k].
-        scheme: `square_root` works on F; `schur` inverts S_qq and subtracts, as published code does; `cholesky` solves
-            with a Cholesky factor of S_qq and subtracts. The last two are for comparison: they lose half the digits.
+        mean: the means (mu_p, mu_q), [N, 3+k].
+        factor: a square factor F of the covariance S = F F^T, with rows ordered (p, q), [N, 3+k, 3+k].
+        query: the value of q, [k] for all Gaussians or [N, k].
+        scheme: the numerical method. `square_root` applies reflections to F and does not compute S. `schur` inverts
+            S_qq, as published code does. `cholesky` solves with a Cholesky factor of S_qq. The last two lose half of
+            the digits and are for comparison.
 
     Returns:
-        Slice(mean, factor, gain): mean [N, 3] and factor [N, 3, 3] of the conditional Gaussians in the units of p, with
-        cov = factor factor^T; gain = S_pq S_qq^-1 [N, 3, k], the motion of the mean with q.
+        The mean [N, 3], a factor [N, 3, 3] of the covariance, and the gain S_pq S_qq^-1 [N, 3, k], the derivative of
+        the mean with respect to q.
 
     Raises:
         InputError: types or shapes do not fit, or the scheme is unknown.
 
     Example:
-        A Gaussian over (x, y, z, t) that moves along x: its covariance of x and t is 0.5.
+        A Gaussian over (x, y, z, t) moves along x, because the covariance of x and t is 0.5.
 
         >>> import torch
         >>> from gsbench import slice_gaussians
@@ -99,7 +99,10 @@ def slice_gaussians(
 
 
 def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
-    """Compute K [N, 3, k] and S_pp - K S_pq^T [N, 3, 3] by a scheme that forms S; the result may be indefinite."""
+    """Slice by a scheme that computes S = F F^T: return K = S_pq S_qq^-1 [N, 3, k] and S_pp - K S_pq^T [N, 3, 3].
+
+    Rounding may make this covariance indefinite.
+    """
     S = factor @ factor.mT
     S_pp, S_pq, S_qq = S[:, :3, :3], S[:, :3, 3:], S[:, 3:, 3:]
     if scheme == "schur":
@@ -110,38 +113,41 @@ def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
 
 
 def check_scheme(scheme: str) -> None:
-    """Raise InputError unless `scheme` is one of SCHEMES."""
+    """Raise InputError unless `scheme`, the numerical method of slicing, is `square_root`, `schur` or `cholesky`."""
     if scheme not in SCHEMES:
         raise InputError(f"slicing scheme '{scheme}' is not known. {did_you_mean(scheme, SCHEMES)}")
 
 
 def slice_reduced(mean: Tensor, reduced: Reduced, query: Tensor) -> Slice:
-    """Slice factors that are already [T_qq 0; T_pq T_pp]: mean = mu_p + T_pq (T_qq^-1 (q - mu_q))."""
+    """Slice Gaussians whose covariance factor over (q, p) has the form [T_qq 0; T_pq T_pp], at the value `query` of q.
+
+    The slice has the mean mu_p + T_pq T_qq^-1 (q - mu_q) and the covariance factor T_pp.
+    """
     white = whiten(reduced.T_qq, query - mean[:, 3:])
     moved = mean[:, :3] + (reduced.T_pq * white[:, None]).sum(-1)
     return Slice(moved, reduced.T_pp, gain_of(reduced.T_pq, reduced.T_qq))
 
 
 def reduce(factor: Tensor) -> Reduced:
-    """Turn a factor with rows (p, q), [N, 3+k, n], to [T_qq 0; T_pq T_pp] by reflections from the right."""
+    """Transform covariance factors with rows (p, q), [N, 3+k, n], to [T_qq 0; T_pq T_pp] by Householder reflections."""
     k = factor.shape[1] - 3
     T, rest = triangularise(torch.cat([factor[:, 3:], factor[:, :3]], 1), k)
     return Reduced(T[:, :k], T[:, k:], rest[:, k:])
 
 
 def mahalanobis(rows: Tensor, delta: Tensor) -> Tensor:
-    """Compute delta^T (R R^T)^-1 delta of rows R of a factor without an inverse, [N, m, n] and [N, m] -> [N].
+    """Compute squared Mahalanobis distances delta^T (R R^T)^-1 delta without an inverse, [N, m, n] and [N, m] -> [N].
 
-    This is the exponent of f_temp and f_dir (7DGS eq. 11 and 12): R R^T is the marginal block S_t or S_d.
+    `rows` is R, the rows of a factor for some variables, so R R^T is the marginal covariance of these variables.
     """
     T, _ = triangularise(rows, rows.shape[1])
     return whiten(T, delta).square().sum(-1)
 
 
 def whiten(T: Tensor, delta: Tensor) -> Tensor:
-    """Compute T^-1 delta for lower triangular T, [N, m, m] and [N, m] -> [N, m], by forward substitution.
+    """Compute T^-1 delta for lower triangular T by forward substitution, [N, m, m] and [N, m] -> [N, m].
 
-    The squares of its first i entries add up to the Mahalanobis distance of the first i variables alone.
+    The sum of squares of the first i entries is the squared Mahalanobis distance of the first i variables.
     """
     rows = T.unbind(1)
     white: list[Tensor] = []
@@ -153,10 +159,13 @@ def whiten(T: Tensor, delta: Tensor) -> Tensor:
 
 
 def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Reflect [N, r, n] rows from the right until the first k are lower triangular: [N, r, k] and the rest [N, r, n-k].
+    """Multiply matrices R [N, r, n] from the right by k Householder reflections that make the first k rows triangular.
 
-    R H H^T R^T = R R^T, so no covariance changes. These are Householder reflections, with the sign that avoids
-    cancellation (Golub and Van Loan, section 5.1).
+    R R^T, the covariance, does not change. The reflections have the sign that avoids cancellation (Golub and Van Loan,
+    section 5.1).
+
+    Returns:
+        The first k columns [N, r, k], which are lower triangular in their first k rows, and the others [N, r, n-k].
     """
     rest, columns = rows, []
     for i in range(k):
@@ -168,7 +177,7 @@ def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
         vv = (v * v).sum(-1, keepdim=True)
         step = v * (2 / torch.where(vv > 0, vv, 1.0))  # zero for a row of zeros, which does not change
         rest = rest - (rest * v[:, None]).sum(-1, keepdim=True) * step[:, None]
-        # Row i is now (-+|x|, 0, ..). It is written as such, so that T is exactly triangular.
+        # Row i is now (+-|x|, 0, ..) up to rounding. The zeros are written, so that T is exactly triangular.
         columns.append(torch.cat([torch.zeros_like(rest[:, :i, 0]), -signed, rest[:, i + 1 :, 0]], -1))
         rest = rest[..., 1:]
     T = torch.stack(columns, -1) if columns else rows[..., :0]
@@ -176,7 +185,7 @@ def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 def gain_of(T_pq: Tensor, T_qq: Tensor) -> Tensor:
-    """Compute K = T_pq T_qq^-1 by back substitution, [N, 3, k] and [N, k, k] lower triangular -> [N, 3, k]."""
+    """Compute the gain K = T_pq T_qq^-1 for lower triangular T_qq, [N, 3, k] and [N, k, k] -> [N, 3, k]."""
     k = T_qq.shape[-1]
     solved: list[Tensor] = []  # columns k-1, k-2, ..
     for j in reversed(range(k)):
@@ -188,7 +197,7 @@ def gain_of(T_pq: Tensor, T_qq: Tensor) -> Tensor:
 
 
 def _cholesky3(S: Tensor) -> Tensor:
-    """Compute a lower triangular factor of S [N, 3, 3]; if S is indefinite, negative pivots become zero."""
+    """Compute the Cholesky factor of S [N, 3, 3]; if S is indefinite, negative pivots are replaced by zero."""
 
     def root(x: Tensor) -> Tensor:
         return torch.where(x > 0, torch.where(x > 0, x, 1.0).sqrt(), 0.0)

@@ -1,4 +1,4 @@
-"""Slice Gaussians over position and direction, time or both, by their triangular factor (6DGS and 7DGS)."""
+"""Define 6DGS and 7DGS: Gaussians over position and direction, time or both, with the Cholesky factor as parameter."""
 
 import math
 from collections.abc import Sequence
@@ -23,18 +23,18 @@ from gsbench.scenes.trained import TrainedGaussians
 # The order of position, time and direction among the rows of the triangular factor.
 FACTOR_ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
 WIDTH = {"p": 3, "t": 1, "d": 3}
-CENTERS = {"time": "times", "direction": "directions"}  # the raw parameters that are means of variables
+CENTERS = {"time": "times", "direction": "directions"}  # the raw parameters that are the means of time and direction
 LETTERS = {"time": "t", "direction": "d"}
-FLATTEST = 1e-9  # thinnest side of a trained Gaussian in units of its widest
-TIME_CORRELATION = 0.05  # split in time where |S_pt| is above this part of the scene's extent ..
-TIME_SCALE = 0.25  # .. and sqrt(S_t) above this part of the clip (7DGS, section 4.4)
+FLATTEST = 1e-9  # least ratio of the smallest to the largest scale of a trained Gaussian
+TIME_CORRELATION = 0.05  # a Gaussian is split in time if |S_pt| is above this part of the scene's extent ..
+TIME_SCALE = 0.25  # .. and sqrt(S_t) is above this part of the scene's length (7DGS, section 4.4)
 
 
 class TriangularModel(GatedModel):
-    """Gaussians over p and d, t or both, with a lower triangular factor of their covariance.
+    """The base class of 6DGS and 7DGS: Gaussians over position p and direction d, time t or both.
 
-    For slicing, the rows of a factor are ordered (p, d, t): with d before t, the leading block of the reduced factor is
-    the marginal of d.
+    The parameters are those of a lower triangular factor of the covariance. For slicing, its rows are sorted to
+    (p, d, t).
     """
 
     geometry: ClassVar[tuple[str, ...]] = ("log_diagonal", *KINDS)
@@ -50,14 +50,15 @@ class TriangularModel(GatedModel):
         split_in_time: bool = True,
         **options: Any,
     ) -> None:
-        """Make an empty model.
+        """Make a model without Gaussians.
 
         Args:
-            factor_order: `paper`, the factor triangular over (p, t, d), or `conditioned_first`, over (d, t, p).
-            scheme: of `slice_gaussians`.
-            off_diagonal: the `form` of `Triangle`, which says what the parameters below the diagonal mean.
-            split_in_time: whether Gaussians that move are also split because of their extent in time.
-            options: as `GatedModel`.
+            factor_order: the order of variables in the triangular factor: `paper` is (position, time, direction),
+                `conditioned_first` is (direction, time, position).
+            scheme: the numerical method of slicing, see `slice_gaussians`.
+            off_diagonal: how a parameter gives an entry below the diagonal, see `form` of `Triangle`.
+            split_in_time: whether moving Gaussians are also split if they are long in time (7DGS, section 4.4).
+            options: the options of `GatedModel`.
 
         Raises:
             InputError: an option is out of its range.
@@ -69,7 +70,7 @@ class TriangularModel(GatedModel):
         self.factor_order = factor_order
         self.scheme = scheme
         self.split_in_time = split_in_time
-        # Row numbers of p, d and t in the triangular factor; and of t and d in q, which is ordered (d, t).
+        # The row numbers of p, d and t in the triangular factor, then the indices of d and t in q, ordered (d, t).
         there = "p" + "".join(LETTERS[x] for x in self.observes)
         letters = "".join(x * WIDTH[x] for x in FACTOR_ORDERS[factor_order] if x in there)
         self.rows = {x: [i for i, letter in enumerate(letters) if letter == x] for x in "pdt"}
@@ -79,7 +80,11 @@ class TriangularModel(GatedModel):
         self.is_reduced = factor_order == "conditioned_first" and scheme == "square_root"
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Start with spheres, directions uniform on the unit sphere of scale 1, and a time scale of sqrt(T / 10)."""
+        """Return spheres with random mean times and directions.
+
+        The standard deviation is sqrt(1/10) in time and 1 in direction. Mean times are uniform in [-0.1, 1.1], mean
+        directions uniform on the unit sphere.
+        """
         N = len(distances)
         log_diagonal = torch.zeros(N, sum(map(len, self.rows.values())))
         log_diagonal[:, self.rows["p"]] = distances.log()[:, None]
@@ -93,11 +98,11 @@ class TriangularModel(GatedModel):
         return raw
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Slice at d = the unit vector from the camera to mu_p, and t (7DGS, algorithm 1)."""
+        """Slice the Gaussians at time t and at the unit vector d from the camera to their means (7DGS, algorithm 1)."""
         factor, offset = self.factors(raw), self.offset(raw, query)
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
-        # A Gaussian so far from the query that its opacity is zero is replaced by a unit Gaussian at the query, and its
-        # opacity factor is zero. Otherwise its huge numbers would reach a gradient as 0 x inf.
+        # If q is so far from mu_q that the opacity is zero, T_qq is replaced by the identity and q by mu_q, and the
+        # opacity factor is zero. Otherwise the huge numbers would give gradients of 0 x inf.
         with torch.no_grad():
             seen = self._exponent(reduced.T_qq, offset, whiten(reduced.T_qq, offset)) < EXPONENT_MAX
         delta = torch.where(seen[:, None], offset, 0.0)
@@ -112,13 +117,16 @@ class TriangularModel(GatedModel):
         return Conditioned(means, factors, opacity_factor)
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return Gaussians of the block L_pp alone."""
+        """Return the slice of Gaussians that do not depend on time or direction.
+
+        Their covariance factor L_pp is the position block of the Cholesky factor.
+        """
         space = self.rows["p"]
         factors = Triangle("ppp", self.triangle.form).factor(raw["log_diagonal"][:, space], raw)
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Slice by the kernel where there is one: in the square-root scheme, and on the CPU also for `cholesky`."""
+        """Slice by the backend's kernel if it has one for the numerical method `scheme`, else in torch."""
         has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
         if not has_kernel or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
@@ -144,32 +152,34 @@ class TriangularModel(GatedModel):
         return Geometry(*geometry)
 
     def scales(self) -> Tensor:
-        """Return the largest standard deviation of the slice, which is the same at every t and d."""
+        """Return the largest standard deviation of each slice, [N]; it does not depend on time and direction."""
         T_pp = reduce(self.factors(dict(self.splats.items())).detach()).T_pp
         return torch.linalg.matrix_norm(T_pp, ord=2)
 
     def log_sizes(self, index: int) -> Tensor:
-        """Return the log diagonal of the factor."""
+        """Return the logarithms of the diagonal entries of the Cholesky factor of the Gaussian `index`."""
         return self.splats["log_diagonal"].detach()[index]
 
     def log_duration(self, index: int) -> float | None:
-        """Return the log diagonal at t, for a model that has time."""
+        """Return the log diagonal entry of time in one Gaussian's Cholesky factor; None for a model without time."""
         return float(self.log_sizes(index)[self.rows["t"][0]]) if "time" in self.observes else None
 
     def durations(self) -> Tensor | None:
-        """Return sqrt(S_t), the norm of the factor's row of t."""
+        """Return the standard deviation in time of each Gaussian, [N]; None for a model without time."""
         return self.factors(dict(self.splats.items())).detach()[:, -1].norm(dim=-1) if "time" in self.observes else None
 
     def hold_sizes(self, least: Tensor) -> None:
-        """Raise the diagonal of L_pp."""
+        """Raise the diagonal entries of position in each Cholesky factor to at least `least` [N], world units."""
         space = self.rows["p"]
         self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=least.log()[:, None])
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Sample children along the parent's path if the parent is long in time, else from its 3D Gaussian.
+        """Split Gaussians in time if they move and are long in time, else in space.
 
-        In the reduced factor [T_qq 0; K T_qq T_pp] a child's shape is T_pp / 1.6 (space), or T_qq with its last row,
-        that of t, divided by 1.6 (time). K does not change: a child moves as its parent did.
+        A split in time samples the mean times of the children and moves their means along the parent's path. The
+        standard deviation in time becomes 1.6 times smaller. A split in space samples the means of the children from
+        the parent's slice, and the scales of the slice become 1.6 times smaller. The gain K, the derivative of the mean
+        with respect to time and direction, does not change.
         """
         factor = self.factors(raw)
         T_qq, T_pq, T_pp = reduce(factor)
@@ -179,8 +189,8 @@ class TriangularModel(GatedModel):
         children = {"means": raw["means"] + torch.where(in_time, 0, (T_pp @ z[..., None])[..., 0])}
         T_pp = torch.where(in_time[..., None], T_pp, T_pp / SHRINK)
         if "time" in self.observes:
-            # A child is z standard deviations along t from its parent, at most z clips. At any (t, d) it is where its
-            # parent was, since K (q - mu_q) loses K_t dt and mu_p gains it.
+            # The mean time of a child differs by dt = z sigma from its parent's. At any (t, d) its slice has the mean
+            # of the parent's slice, since K (q - mu_q) changes by -K_t dt and mu_p by K_t dt.
             sigma = factor[:, -1].norm(dim=-1, keepdim=True).clamp(max=1)
             dt = torch.where(in_time, z[:, :1] * sigma, 0)
             children["means"] = children["means"] + gain[..., -1] * dt
@@ -192,7 +202,10 @@ class TriangularModel(GatedModel):
         return children | self.triangle.parameters(factor)
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Tell which entries matter: none of a frozen variable, and none of t and d in a static row."""
+        """Return masks of the parameter entries that are used, given what each Gaussian depends on.
+
+        A Gaussian that does not depend on time or direction does not use the entries of this variable.
+        """
         masks = super().kept(effect_sets)
         if effect_sets.frozen is None:
             return masks
@@ -210,15 +223,15 @@ class TriangularModel(GatedModel):
         return masks
 
     def constant(self, name: str) -> float:
-        """Return constants of a frozen variable: the largest size, and no motion."""
+        """Return the constant for entries that change no image: the largest log size for `log_diagonal`, else 0."""
         return LOG_SIZE_MAX if name == "log_diagonal" else 0.0
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
-        """Return the initial factor with the block of position replaced by the trained one."""
+        """Return initial Cholesky factors whose block of position is that of trained 3D Gaussians."""
         space = torch.tensor(self.rows["p"])
         double = {name: value.double() for name, value in raw.items()}
         factor = self.triangle.factor(double["log_diagonal"], double)  # diagonal: the model starts without coupling
-        # The thinnest side of a flat Gaussian becomes a difference of numbers as large as its widest side.
+        # The smallest scale of a flat Gaussian is computed as a difference of numbers as large as its largest scale.
         log_scales = trained.log_scales.double()
         log_scales = log_scales.clamp(min=log_scales.amax(1, keepdim=True) + math.log(FLATTEST))
         factor[:, space[:, None], space] = rotation(trained.quats.double()) * sizes(log_scales)[:, None, :]
@@ -226,11 +239,12 @@ class TriangularModel(GatedModel):
 
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Freeze t, d and both, if they are observed, at their weighted means over queries.
+        """Return parameters of Gaussians that do not depend on time, on direction, or on both.
 
-        The slice of (T_qq, K, T_pp) is mu_p + K (q - mu_q) with the factor T_pp. Freezing a variable zeroes its column
-        of K; the mean keeps what the column did to it on average, and the opacity what f_temp or f_dir did. Its
-        standard deviation becomes exp(LOG_SIZE_MAX), so that no query is far from its mean.
+        To remove the dependence on a variable, its columns of the gain K (the derivative of the mean with respect to
+        the variable) become zero. The average shift of the mean over views is added to the mean, and the opacity is
+        multiplied by the average opacity factor. The standard deviation of the variable becomes exp(LOG_SIZE_MAX), so
+        that the opacity factor is 1 for every view.
         """
         blocks = Reduced(*(block.double() for block in reduce(self.factors(raw))))
         gain = gain_of(blocks.T_pq, blocks.T_qq)
@@ -256,10 +270,16 @@ class TriangularModel(GatedModel):
         return changed
 
     def _without(self, blocks: Reduced, gain: Tensor, variables: list[str]) -> Tensor:
-        """Compute the factor [N, n, n] in the model's own order whose slices depend on no frozen variable."""
+        """Compute Cholesky factors [N, n, n] of Gaussians whose slices do not depend on the given variables.
+
+        Args:
+            blocks: the blocks T_qq, T_pq and T_pp of the present factors.
+            gain: the gain K = T_pq T_qq^-1 of the present factors.
+            variables: `time`, `direction` or both.
+        """
         T_qq, kept = blocks.T_qq.clone(), gain.clone()
         if "direction" in variables and "time" in self.observes:
-            # t is no longer measured by d: its own deviation becomes its whole one
+            # Without d, the row of t has its whole standard deviation on the diagonal.
             deviation = T_qq[:, -1].norm(dim=-1)
             T_qq[:, -1] = 0
             T_qq[:, -1, -1] = deviation
@@ -272,12 +292,12 @@ class TriangularModel(GatedModel):
         return torch.cat([p_rows, q_rows], 1)[:, self.own_order()]
 
     def factors(self, raw: Raw) -> Tensor:
-        """Compute the triangular factor with its rows sorted to (p, d, t), [N, n, n]."""
+        """Compute Cholesky factors from raw parameters, with rows sorted to (position, direction, time), [N, n, n]."""
         L = self.triangle.factor(raw["log_diagonal"], raw)
         return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
 
     def offset(self, raw: Raw, query: Query) -> Tensor:
-        """Compute q - mu_q, [N, k], ordered (d, t)."""
+        """Compute the offset q - mu_q of direction and time from their means, [N, k], ordered (direction, time)."""
         parts = []
         if "direction" in self.observes:
             parts.append(unit(raw["means"] - query.center) - raw["directions"])
@@ -286,9 +306,12 @@ class TriangularModel(GatedModel):
         return torch.cat(parts, -1)
 
     def exponents(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> dict[str, Tensor]:
-        """Compute lambda_d |white_d|^2 / 2 = -ln f_dir and lambda_t (t - mu_t)^2 / (2 S_t) = -ln f_temp, [N] each.
+        """Compute -ln of the opacity factors f_dir and f_temp (7DGS, eq. 11 and 12), [N] for each variable.
 
-        The keys are the names of the variables (7DGS eq. 11 and 12); delta = q - mu_q and white = T_qq^-1 delta.
+        Args:
+            T_qq: the triangular factor of the covariance of direction and time.
+            delta: the offset of direction and time from their means, q - mu_q.
+            white: T_qq^-1 delta.
         """
         found = {}
         if "direction" in self.observes:
@@ -300,21 +323,21 @@ class TriangularModel(GatedModel):
         return found
 
     def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
-        """Compute -ln(f_dir f_temp), [N]."""
+        """Compute -ln of the product of the opacity factors f_dir and f_temp (7DGS, eq. 11 and 12), [N]."""
         return torch.stack(list(self.exponents(T_qq, delta, white).values())).sum(0)
 
     def _blocks(self, factor: Tensor) -> Reduced:
-        """Split a factor of `conditioned_first` into its blocks; it is already reduced, with the columns of q first."""
+        """Split factors that are triangular over (direction, time, position) into the blocks T_qq, T_pq and T_pp."""
         k = factor.shape[-1] - 3
         return Reduced(factor[:, 3:, :k], factor[:, :3, :k], factor[:, :3, k:])
 
     def own_order(self) -> list[int]:
-        """Return the place in (p, d, t) of each row of the triangular factor."""
+        """Return for each row of the triangular factor its index in the order (position, direction, time)."""
         sorted_rows = self.rows["p"] + self.rows["d"] + self.rows["t"]
         return sorted(range(len(sorted_rows)), key=sorted_rows.__getitem__)
 
     def moves_long(self, factor: Tensor) -> Tensor:
-        """Tell whether Gaussians move with time and are long in it, [N, n, n] -> [N] bool (7DGS, section 4.4)."""
+        """Return which Gaussians with covariance factors [N, n, n] move and are long in time (7DGS, section 4.4)."""
         if "time" not in self.observes or not self.split_in_time:
             return torch.zeros(len(factor), dtype=torch.bool, device=factor.device)
         S_pt = (factor[:, :3] @ factor[:, -1:].mT)[..., 0]
@@ -322,19 +345,19 @@ class TriangularModel(GatedModel):
 
     @torch.no_grad()
     def long_in_time(self) -> Tensor:
-        """Tell whether |S_pt| > 0.05 extent and sqrt(S_t) > 0.25 T (7DGS, section 4.4)."""
+        """Return which Gaussians are split in time: |S_pt| > 0.05 extent and sqrt(S_t) > 0.25 (7DGS, section 4.4)."""
         return self.moves_long(self.factors(dict(self.splats.items())))
 
 
 class TimedModel(TriangularModel):
-    """Gaussians conditioned on t, and maybe on d."""
+    """The base class of models whose Gaussians depend on time, such as 7DGS with or without direction."""
 
     def __init__(self, *, lambda_t: float, **options: Any) -> None:
-        """Make an empty model.
+        """Make a model without Gaussians.
 
         Args:
-            lambda_t: initial coefficient of f_temp.
-            options: as `TriangularModel`.
+            lambda_t: the initial coefficient in the exponent of f_temp, the factor of the opacity at a time.
+            options: the options of `TriangularModel`.
 
         Raises:
             InputError: an option is out of its range.
@@ -344,15 +367,15 @@ class TimedModel(TriangularModel):
 
 
 class DirectionalModel(TriangularModel):
-    """Gaussians conditioned on d, and maybe on t."""
+    """The base class of models whose Gaussians depend on view direction: 6DGS, and together with time 7DGS."""
 
     def __init__(self, *, lambda_d: float, directional_half: bool = True, **options: Any) -> None:
-        """Make an empty model.
+        """Make a model without Gaussians.
 
         Args:
-            lambda_d: initial coefficient of f_dir.
-            directional_half: whether f_dir has the 1/2 of 7DGS eq. 12, which 6DGS lacks.
-            options: as `TriangularModel`.
+            lambda_d: the initial coefficient in the exponent of f_dir, the factor of the opacity in a direction.
+            directional_half: whether the exponent of f_dir has the factor 1/2 of 7DGS eq. 12; 6DGS does not have it.
+            options: the options of `TriangularModel`.
 
         Raises:
             InputError: an option is out of its range.

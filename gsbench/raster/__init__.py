@@ -1,4 +1,4 @@
-"""Rasterize Gaussians: check the arguments of `rasterize` and call the backend."""
+"""Define `rasterize`, which checks its arguments and renders Gaussians by the torch, CPU or CUDA backend."""
 
 from torch import Tensor
 
@@ -11,8 +11,8 @@ from gsbench.raster.output import RasterInfo, RasterOutput
 
 __all__ = ["EPS2D", "FAR", "NEAR", "RasterInfo", "RasterOutput", "rasterize"]
 
-NEAR, FAR = 0.01, 1e10  # depths between which a mean is drawn, unless told
-EPS2D = 0.3  # added to the diagonal of projected covariances, unless told, pixels^2
+NEAR, FAR = 0.01, 1e10  # default range of depths; a Gaussian whose mean is outside is culled
+EPS2D = 0.3  # default number that is added to the diagonal of projected covariances, pixels^2
 
 
 def rasterize(
@@ -35,39 +35,38 @@ def rasterize(
 ) -> RasterOutput:
     """Render N Gaussians to C images by the rules of 3DGS (Kerbl et al. 2023, section 4 and appendix C).
 
-    The covariance of a Gaussian is F F^T for any square `factors` F, so it is always semi-definite.
-    Gaussians are blended front to back by camera depth (ties: lower index first). A Gaussian has
-    `alpha = min(0.999, opacity * exp(-power))`, and is skipped if that is below 1/255. The Gaussian that would bring
-    the transmittance below 1e-4 ends the pixel.
+    The covariance of a Gaussian is F F^T, where F is any square matrix in `factors`.
+
+    Gaussians are blended front to back by camera depth; of equal depths the lower index comes first. The alpha of a
+    Gaussian in a pixel is `min(0.999, opacity * exp(-power))`, and alphas below 1/255 are skipped. A pixel stops before
+    the Gaussian that would reduce its transmittance below 1e-4.
 
     Args:
-        means: centres [N, 3], world units.
-        factors: F of cov = F F^T [N, 3, 3], world units.
-        opacities: in [0, 1], [N].
-        colors: any number D of channels, one set for all cameras [N, D] or one for each [C, N, D].
-        viewmats: world to camera [C, 4, 4], rigid, OpenCV axes (x right, y down, z forward).
-        Ks: intrinsics [fx 0 cx; 0 fy cy; 0 0 1] in pixels, [C, 3, 3]; the first pixel's centre is (0.5, 0.5).
-        width: of the image, pixels.
-        height: of the image, pixels.
-        background: colour behind everything [D]; None is black.
-        near: Gaussians whose mean is nearer are culled.
-        far: Gaussians whose mean is farther are culled.
-        eps2d: added to the diagonal of the projected covariance, pixels^2.
-        backend: or its name: `reference` (torch), `cpu`, `cuda` (kernels), `auto` (the fastest installed one).
-        antialias: scale opacities by the area that `eps2d` added (Mip-Splatting's 2D filter).
-        shapes: b > 0 of each alpha profile, [N]: alpha = min(0.999, opacity * beta(r; b)) with beta(r; b) = (1 - r^2)^b
-            for r < 1 and zero elsewhere; r^2 = d^T cov2d^-1 d of the pixel's offset d (Universal Beta Splatting). None
-            is the Gaussian, of power r^2 / 2. No backend has built another profile yet: each refuses shapes.
+        means: the means, [N, 3], world units.
+        factors: the factors F of the covariances F F^T, [N, 3, 3], world units.
+        opacities: the opacities in [0, 1], [N].
+        colors: D colour channels, [N, D] for all cameras or [C, N, D] for each camera.
+        viewmats: rigid world-to-camera matrices with OpenCV axes (x right, y down, z forward), [C, 4, 4].
+        Ks: intrinsics [fx 0 cx; 0 fy cy; 0 0 1] in pixels, [C, 3, 3]; the centre of the first pixel is (0.5, 0.5).
+        width: the width of the images, pixels.
+        height: the height of the images, pixels.
+        background: the background colour, [D]; None: black.
+        near: Gaussians whose mean is nearer than this depth are culled.
+        far: Gaussians whose mean is farther than this depth are culled.
+        eps2d: the number that is added to the diagonal of the projected covariances, pixels^2.
+        backend: `reference` (torch), `cpu` or `cuda` (kernels), or `auto` (the fastest installed one).
+        antialias: whether to scale opacities for the area that `eps2d` adds, as the 2D filter of Mip-Splatting does.
+        shapes: the exponents b of the alpha profiles (1 - r^2)^b of Universal Beta Splatting, [N]; None: Gaussians.
+            These profiles are not implemented yet: every backend raises InputError if `shapes` is not None.
 
     Returns:
-        The image [C, H, W, D], its alpha [C, H, W, 1], and `RasterInfo` for density control.
+        The images [C, H, W, D], their alpha [C, H, W, 1], and `RasterInfo` for density control.
 
     Raises:
-        InputError: a shape, dtype, device or value is not as above, or the backend is unknown, not installed or without
-            what is asked for.
+        InputError: a shape, dtype, device or value is not as above, or the backend is unknown or not installed.
 
     Example:
-        A red ball of radius 0.1, two units in front of the camera.
+        A red ball of radius 0.1 is two units in front of the camera.
 
         >>> import torch
         >>> from gsbench import rasterize

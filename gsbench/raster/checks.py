@@ -1,4 +1,4 @@
-"""Check the shapes, types, devices and values of everything that is to be rendered."""
+"""Check the shapes, dtypes, devices and values of the arguments of the rasterizer."""
 
 import math
 
@@ -11,14 +11,14 @@ from gsbench.kernels.raster import LOWER
 from gsbench.kernels.tensors import check_tensor
 from gsbench.process.memory import require
 
-_known: set[tuple[object, ...]] = set()  # what was found good: a training asks the same a thousand times
+_known: set[tuple[object, ...]] = set()  # shapes and dtypes that passed the checks, since a training repeats them
 
 
 def check_arguments(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     width: int, height: int, background: Tensor | None, near: float, far: float, eps2d: float,
 ) -> None:  # fmt: skip
-    """Raise InputError unless all arguments are as `rasterize` requires."""
+    """Raise InputError if a shape, dtype or device, or the image size, is not what `rasterize` requires."""
     _check_viewport(width, height, near, far, eps2d)
     given = means, factors, opacities, colors, viewmats, Ks, background
     call = width, height, *[(x.shape, x.dtype, x.device, x.layout) if isinstance(x, Tensor) else type(x) for x in given]
@@ -53,7 +53,7 @@ def check_arguments(
 
 
 def check_shapes(shapes: Tensor | None, backend: str) -> None:
-    """Raise InputError for shapes: no backend has built a profile other than the Gaussian."""
+    """Raise InputError if `shapes` (exponents of alpha profiles) is not None, because all backends need Gaussians."""
     if shapes is not None:
         got = f"a tensor of shape {list(shapes.shape)}" if isinstance(shapes, Tensor) else type(shapes).__name__
         raise InputError(f"shapes: expected None, got {got}: raster backend '{backend:.40}' draws Gaussians only: "
@@ -61,7 +61,7 @@ def check_shapes(shapes: Tensor | None, backend: str) -> None:
 
 
 def _check_viewport(width: int, height: int, near: float, far: float, eps2d: float) -> None:
-    """Raise InputError unless the image has pixels and `far` is beyond `near`."""
+    """Raise InputError unless width and height are at least 1, 0 < near < far, and eps2d >= 0."""
     if not all(type(size) is int and size >= 1 for size in (width, height)):
         raise InputError(f"expected an image of at least 1x1 whole pixels, got width={width!r:.40}, "
                          f"height={height!r:.40}")  # fmt: skip
@@ -74,11 +74,11 @@ def _check_viewport(width: int, height: int, near: float, far: float, eps2d: flo
 def check_values(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, background: Tensor,
 ) -> None:  # fmt: skip
-    """Raise InputError unless every value is finite, opacities are in [0, 1] and focal lengths positive."""
+    """Raise InputError unless all values are finite, opacities are in [0, 1] and focal lengths are positive."""
     tensors = {"means": means, "factors": factors, "opacities": opacities, "colors": colors,
                "viewmats": viewmats, "Ks": Ks, "background": background}  # fmt: skip
     for name, tensor in tensors.items():
-        # A sum is one pass; only when it is not finite is each value looked at (a finite sum hides no NaN).
+        # The sum needs one pass. A finite sum contains no NaN, so single values are checked only if it is not finite.
         if not torch.isfinite(tensor.detach().sum()) and not torch.isfinite(tensor).all():
             row = int((~torch.isfinite(tensor)).flatten().nonzero()[0])
             raise InputError(f"{name}: expected finite values, got {tensor.flatten()[row].item()} at flat index {row}")

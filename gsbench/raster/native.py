@@ -1,4 +1,4 @@
-"""Rasterize by kernels on the CPU and on a GPU: the images of `reference`, in float32 and much faster."""
+"""Rasterize in float32 by the kernels for CPU and CUDA; the images are those of the torch reference."""
 
 from torch import Tensor
 
@@ -19,21 +19,21 @@ from gsbench.process.memory import require
 from gsbench.raster.checks import check_values
 from gsbench.raster.output import RasterInfo, RasterOutput
 
-MAX_GAUSSIANS = 1 << 24  # on the CPU, where positions in a tile's list are kept as float
+MAX_GAUSSIANS = 1 << 24  # limit of the CPU kernel, which stores positions in the list of a tile as floats
 
 
 def draw(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     background: Tensor, viewport: Viewport,
 ) -> RasterOutput:  # fmt: skip
-    """Render every camera; arguments as in `gsbench.raster.rasterize`. Intrinsics have no gradient here.
+    """Render images for all cameras by the CPU or CUDA kernels; see `gsbench.raster.rasterize` for the arguments.
 
-    On the CPU the same inputs give the same bits, for any number of threads. On a GPU threads add gradients in any
-    order, and the call waits once for the device, to read the number of intersections.
+    On a CPU the results have the same bits for any number of threads. On a GPU gradients are added in random order, and
+    the call synchronises once, to read the number of tile intersections.
 
     Raises:
-        InputError: `Ks` requires a gradient, a value is out of range, or memory does not suffice.
-        torch.OutOfMemoryError: on a GPU, naming the buffer, its size and what to lower.
+        InputError: the intrinsics `Ks` require a gradient, a value is out of range, or the CPU memory does not suffice.
+        torch.OutOfMemoryError: the GPU memory does not suffice.
     """
     device = means.device.type
     if Ks.requires_grad:
@@ -47,7 +47,7 @@ def draw(
     flags = flag_values(means, factors, opacities, colors, viewmats, Ks, background)
     splats = project(means, factors, opacities, viewmats, Ks, viewport)
     bins, flagged = bin_tiles(splats, viewport, flags)
-    if flagged:  # looked at by the kernel, so that only a bad value waits for the words
+    if flagged:  # the kernel found a bad value: find out which one, for the error message
         check_values(means, factors, opacities, colors, viewmats, Ks, background)
     image, alpha = blend(splats, colors, background, bins, viewport)
     return RasterOutput(image, alpha, RasterInfo(splats.half_sizes, splats.means2d, splats.depths, len(bins.ids)))
@@ -57,10 +57,10 @@ def draw_within(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     background: Tensor, viewport: Viewport, room: int,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Return the image [C, H, W, D] without waiting for a GPU, with memory for `room` intersections.
+    """Render images [C, H, W, D] without a GPU synchronisation, with memory for `room` tile intersections.
 
-    The second result, [2] int64, has the number of intersections, and a flag that is not zero if a value was out of
-    range. The caller must compare the number with `room`.
+    The second result, [2] int64, is the number of intersections, and a flag that is not zero if an input is out of
+    range. If the number is larger than `room`, the image is incomplete.
     """
     flags = flag_values(means, factors, opacities, colors, viewmats, Ks, background)
     splats = project(means, factors, opacities, viewmats, Ks, viewport)
@@ -69,7 +69,7 @@ def draw_within(
 
 
 def _check_room(C: int, N: int, D: int, viewport: Viewport) -> None:
-    """Raise InputError if there are too many Gaussians to count, or if memory does not suffice."""
+    """Raise InputError if there are more Gaussians than the CPU kernel can index, or if the memory does not suffice."""
     if N >= MAX_GAUSSIANS:
         raise InputError(f"raster backend 'cpu': expected fewer than {MAX_GAUSSIANS} Gaussians, got {N}")
     pixels = C * count_tiles(viewport.width, viewport.height) * TILE_PIXELS

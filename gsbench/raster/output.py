@@ -1,4 +1,4 @@
-"""Define the results of the rasterizer."""
+"""Define the data types of the rasterizer's results."""
 
 from dataclasses import dataclass
 
@@ -7,27 +7,27 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class RasterInfo:
-    """The results of the rasterizer for density control."""
+    """Hold the results of the rasterizer that density control needs: 2D means, sizes and depths of the splats."""
 
-    half_sizes: Tensor  # [C, N, 2] pixels: half the sides of the rectangle that holds every pixel drawn; 0: not drawn
-    means2d: Tensor  # [C, N, 2] pixels, in the autograd graph: its gradient drives densification
-    depths: Tensor  # [C, N] camera-space z of the means
-    pairs: int  # (tile, Gaussian) pairs blended
+    half_sizes: Tensor  # [C, N, 2] pixels: half width and height of the splat's bounding rectangle; 0: culled
+    means2d: Tensor  # [C, N, 2] pixels, in the autograd graph; density control uses its gradient
+    depths: Tensor  # [C, N] z of the means in camera space
+    pairs: int  # number of tile intersections
 
     @property
     def drawn(self) -> Tensor:
-        """Tell which Gaussians reach a pixel at an alpha of 1/255 or more, [C, N] bool."""
+        """Which Gaussians are not culled in each of C images, [C, N] bool."""
         return self.half_sizes.detach()[..., 0] > 0
 
     @property
     def radii(self) -> Tensor:
-        """Return half the side of the square around each splat, [C, N] int32, pixels; 0 if the Gaussian is culled."""
+        """The radii of the splats in pixels, rounded up, [C, N] int32; 0 for a culled Gaussian."""
         return self.half_sizes.detach().amax(-1).ceil_().int()
 
 
 @dataclass(frozen=True)
 class RasterOutput:
-    """An image, its alpha, and `RasterInfo`."""
+    """Hold the rendered images, their alpha, and further results for density control."""
 
     image: Tensor  # [C, H, W, D]
     alpha: Tensor  # [C, H, W, 1]

@@ -1,7 +1,7 @@
-"""Rasterize in torch: any dtype and device, differentiable by every input, the reference of other backends.
+"""Rasterize Gaussians in torch, for any dtype and device, with gradients for all inputs.
 
-Read it beside Kerbl et al. 2023 ("3DGS") and Zwicker et al. 2001 ("EWA splatting"):
-project -> bin into tiles -> blend.
+The kernels for CPU and CUDA are tested against this code. Its three steps are those of 3DGS (Kerbl et al. 2023):
+project the Gaussians (EWA splatting, Zwicker et al. 2001), sort them into tiles, and blend.
 """
 
 from typing import NamedTuple
@@ -13,31 +13,31 @@ from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from gsbench.kernels.raster import Viewport
 from gsbench.raster.output import RasterInfo, RasterOutput
 
-TILE = 8  # pixels a side; small tiles waste fewer of the pairs that blending evaluates
-CHUNK = 1 << 21  # (Gaussian, pixel) products blended at a time: bounds memory, and fits caches
+TILE = 8  # pixels; in small tiles fewer pixels are evaluated for Gaussians that do not reach them
+CHUNK = 1 << 21  # (Gaussian, pixel) pairs that are blended at once, which limits memory and fits caches
 
 
 class CameraSplats(NamedTuple):
-    """The splats of one camera."""
+    """Hold the Gaussians of a scene after projection to the image plane of one camera."""
 
     means2d: Tensor  # [N, 2] pixels
     conics: Tensor  # [N, 3] a, b, c: the inverse of the 2D covariance is U^T U with U = [a b; 0 c]
     opacities: Tensor  # [N]
     depths: Tensor  # [N]
-    half_sizes: Tensor  # [N, 2] pixels: alpha < ALPHA_MIN outside means2d +- half_sizes; 0: not drawn
+    half_sizes: Tensor  # [N, 2] pixels: alpha < ALPHA_MIN outside of means2d +- half_sizes; 0: culled
 
 
 def draw(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     background: Tensor, viewport: Viewport,
 ) -> RasterOutput:  # fmt: skip
-    """Render every camera in turn; arguments as in `gsbench.raster.rasterize`."""
+    """Render images for all cameras, one after the other; see `gsbench.raster.rasterize` for the arguments."""
     if colors.dim() == 2:
         colors = colors.expand(len(viewmats), *colors.shape)
     splats = [
         project(means, factors, opacities, viewmat, K, *viewport) for viewmat, K in zip(viewmats, Ks, strict=True)
     ]
-    means2d = torch.stack([s.means2d for s in splats])  # every image is made from it, so it has a gradient
+    means2d = torch.stack([s.means2d for s in splats])  # all images are computed from it, so it gets a gradient
     images, alphas, pairs = [], [], 0
     for splat, mean2d, color in zip(splats, means2d, colors, strict=True):
         tiles, gaussians = bin_tiles(splat, viewport.width, viewport.height)
@@ -67,45 +67,46 @@ def project(
     eps2d: float,
     antialias: bool,
 ) -> CameraSplats:
-    """Project Gaussians by the affine approximation of the pinhole at their means (EWA splatting, eq. 29)."""
+    """Project Gaussians to an image by the affine approximation at each mean (EWA splatting, eq. 29)."""
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     means_c = means @ rotation.T + translation
     drawn = (means_c[:, 2] > near) & (means_c[:, 2] < far)
-    # What is not drawn still passes through every line below: give it a harmless depth, and a zero gradient.
+    # Culled Gaussians go through all lines below too, so they get a harmless depth and a zero gradient.
     x, y, z = torch.where(drawn[:, None], means_c, means_c.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
 
-    # The Jacobian is taken no farther than 15 % of the image's width outside of it (3DGS, forward.cu), where the
-    # affine approximation would blow up.
+    # The Jacobian is evaluated at most 15 % of the image size outside of the image (3DGS, forward.cu), because the
+    # affine approximation diverges far outside.
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
     u = (x / z).clamp(-cx / fx - margin_x, (width - cx) / fx + margin_x)
     v = (y / z).clamp(-cy / fy - margin_y, (height - cy) / fy + margin_y)
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).unflatten(-1, (2, 3))
-    M = J @ rotation @ factors  # [N, 2, 3]: the 2D covariance is M M^T, never formed from a 3D one
-    # In units of the splat's own size: det is of the fourth degree in pixels, and leaves float32 for a splat of 10^9.
+    M = J @ rotation @ factors  # [N, 2, 3]: the 2D covariance is M M^T; no 3D covariance is computed
+    # The unit is the size of the splat: in pixels, det of a splat of 10^9 pixels would overflow in float32.
     size = (M.detach().square().sum((-2, -1)) + eps2d).sqrt()
     size = torch.where(size > 0, size, 1.0)
     m1, m2 = (M / size[:, None, None]).unbind(-2)
     eps = eps2d / size.square()
 
     xx, xy, yy = (m1 * m1).sum(-1), (m1 * m2).sum(-1), (m2 * m2).sum(-1)
-    # det(M M^T + e I) by Lagrange's identity, |m1|^2 |m2|^2 - (m1 m2)^2 = |m1 x m2|^2: nothing cancels for a needle.
+    # det(M M^T + e I) by Lagrange's identity, |m1|^2 |m2|^2 - (m1 m2)^2 = |m1 x m2|^2, which avoids cancellation for
+    # long thin splats.
     area2 = torch.linalg.cross(m1, m2).square().sum(-1)
     det = area2 + eps * (xx + yy) + eps**2
     drawn = drawn & (det > 0)
     det = torch.where(drawn, det, 1.0)
-    # Factored (x given y, then y), power = |U d|^2 / 2 is a sum of squares. Multiplied out it would cancel: along a
-    # needle 400 pixels long, images in float32 were off by 2e-3.
+    # With the factor U of the conic, power = |U d|^2 / 2 is a sum of squares. The quadratic form of 3DGS suffers from
+    # cancellation: along a splat 400 pixels long, images in float32 had errors of 2e-3.
     yy = torch.where(drawn, yy + eps, 1.0)
     conics = torch.stack([yy, -xy, det.sqrt()], -1) / (yy * det).sqrt()[:, None] / size[:, None]
     if antialias:
         ratio = torch.where(area2 > 0, area2, 1.0) / det
         opacities = torch.where(area2 > 0, opacities * ratio.sqrt(), 0.0)
 
-    # alpha >= 1/255 only where power <= ln(255 opacity); that ellipse's bounding box has half sizes
-    # sqrt(2 power cov_xx), sqrt(2 power cov_yy). A hundredth of a pixel more: rounding cuts off no pixel.
+    # alpha >= 1/255 only where power <= ln(255 opacity). The bounding box of this ellipse has the half sizes
+    # sqrt(2 power cov_xx), sqrt(2 power cov_yy). A hundredth of a pixel is added for rounding.
     power = (255 * opacities.detach()).clamp(min=1).log()
     half_sizes = (2 * power[:, None] * torch.stack([xx + eps, yy], -1).detach()).sqrt() * size[:, None] + 0.01
     inside = ((means2d + half_sizes > 0) & (means2d - half_sizes < means2d.new_tensor([width, height]))).all(-1)
@@ -115,23 +116,27 @@ def project(
 
 @torch.no_grad()
 def bin_tiles(splats: CameraSplats, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """List intersections sorted by tile, then by depth, then by index: tiles [P], gaussians [P]."""
+    """List the P tile intersections of an image, sorted by tile, then by depth, then by the index of the Gaussian.
+
+    Returns:
+        The tile [P] and the Gaussian [P] of each intersection.
+    """
     order = torch.argsort(splats.depths, stable=True)
     order = order[splats.half_sizes[order].amax(-1) > 0]
     center, half = splats.means2d[order], splats.half_sizes[order]
     size = center.new_tensor([width, height])
-    # Clamped as floats: a huge Gaussian's bounds overflow integers.
+    # The bounds are clamped as floats, because those of a huge Gaussian would overflow integers.
     low = (torch.minimum((center - half).clamp(min=0), size) / TILE).floor().long()
     high = (torch.minimum((center + half).clamp(min=0), size) / TILE).ceil().long()
     columns, rows = (high - low).clamp(min=1).unbind(-1)
     count = columns * rows
     owner = torch.repeat_interleave(torch.arange(len(order), device=order.device), count)
-    nth = torch.arange(len(owner), device=order.device) - (count.cumsum(0) - count)[owner]  # 0, 1, .. within an owner
+    nth = torch.arange(len(owner), device=order.device) - (count.cumsum(0) - count)[owner]  # 0, 1, .. of each Gaussian
     across = -(-width // TILE)
     down = -(-height // TILE)
     tile_x = (low[owner, 0] + nth % columns[owner]).clamp(max=across - 1)
     tile_y = (low[owner, 1] + nth // columns[owner]).clamp(max=down - 1)
-    tiles, by_tile = torch.sort(tile_y * across + tile_x, stable=True)  # stable: depth order survives within a tile
+    tiles, by_tile = torch.sort(tile_y * across + tile_x, stable=True)  # stable sort keeps the depth order in a tile
     return tiles, order[owner[by_tile]]
 
 
@@ -143,13 +148,17 @@ def blend(
     width: int,
     height: int,
 ) -> tuple[Tensor, Tensor]:
-    """Blend each tile's Gaussians front to back (3DGS eq. 3): image [H, W, D] without background, alpha [H, W, 1].
+    """Blend the Gaussians of each tile front to back (3DGS, eq. 3).
 
-    Tiles of similar length are blended together, padded to the longest with a Gaussian of zero opacity.
+    Tiles with similar numbers of Gaussians are processed together, padded to the same number by Gaussians of zero
+    opacity.
+
+    Returns:
+        The image without the background, [H, W, D], and its alpha, [H, W, 1].
     """
     across, down = -(-width // TILE), -(-height // TILE)
     D = colors.shape[-1]
-    # One row a Gaussian, plus the padding's row of zeros, so that one gather (and one scatter backward) serves all.
+    # A table with a row for each Gaussian and a row of zeros for padding, so that one gather reads all parameters.
     table = torch.cat([splats.means2d, splats.conics, splats.opacities[:, None], colors], -1)
     table = torch.cat([table, table.new_zeros(1, 6 + D)])
 
@@ -165,7 +174,7 @@ def blend(
         padding = nth >= lengths[chosen, None]
         index = gaussians[(starts[chosen, None] + nth).clamp(max=len(gaussians) - 1)]
         index = index.masked_fill(padding, len(table) - 1)
-        # Not table[index]: its backward adds rows as threads come by, so that two runs differ in the last bits.
+        # index_select, not table[index]: the backward pass of the latter adds rows in random order.
         rows = table.index_select(0, index.flatten()).unflatten(0, index.shape)
         pieces.append(_blend_tiles(rows, chosen % across * TILE, chosen // across * TILE))
         first = last

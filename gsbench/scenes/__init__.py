@@ -1,4 +1,4 @@
-"""Load scenes from files: `load(path)` detects the layout of a data set by a file in its folder."""
+"""Load a scene (cameras, images, times) from a folder; `load(path)` recognises the layout of the data set."""
 
 import importlib
 import os
@@ -14,7 +14,7 @@ __all__ = ["Camera", "Points", "Scene", "View", "load", "scene_extent"]
 
 @dataclass(frozen=True)
 class _Layout:
-    """One layout of data sets: the file that identifies it and the module that reads it."""
+    """Describe a layout of data sets: the file by which it is recognised, and the module that reads it."""
 
     marker: str
     expected: str  # the files of the layout and where such data is published, for the error message
@@ -44,23 +44,22 @@ def load(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     frames: Sequence[int] | None = None,
 ) -> Scene:
-    """Load the scene in a folder and detect its layout.
+    """Load a scene from a folder in the Blender layout (NeRF-synthetic, D-NeRF) or the Technicolor layout.
 
-    Images are composited over the background once, and then averaged over blocks of pixels, which must tile them
-    exactly. Everything is float32 on the CPU, in OpenCV axes. The images of a large scene stay in 8 bits until they are
-    used, with the same result.
+    RGBA images are composited over the background, then reduced. Tensors are float32 on the CPU; cameras have OpenCV
+    axes (x right, y down, z forward). The images of a large scene stay in 8 bits until they are used.
 
     Args:
-        path: the scene's folder.
-        downscale: images become smaller by this whole factor.
-        background: RGB in [0, 1].
-        frames: the first and the last frame, if the layout numbers frames; None: all.
+        path: the folder of the scene.
+        downscale: the integer factor by which images are reduced; it must divide their size.
+        background: the background colour, RGB in [0, 1].
+        frames: the first and the last frame, for a layout with numbered frames; None: all.
 
     Raises:
-        InputError: there is no known layout at `path`, or the data has a fault; the message names file and field.
+        InputError: the layout is unknown, or the data has an error; the message names the file and field.
 
     Example:
-        One of the two embedded scenes.
+        `suzanne` is one of the two scenes that come with gsbench.
 
         >>> from gsbench import load_scene
         >>> from gsbench.scenes import sample
@@ -89,7 +88,7 @@ def load(
 
 
 def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
-    """Check the given first and last frame; raises InputError if the layout has no frames."""
+    """Check and return the numbers of the first and the last frame; raise InputError for a layout without frames."""
     if layout.reader != "technicolor":
         raise InputError(f"frames: {layout.marker} lists its own frames and times, got {frames!r:.80}: leave it out")
     if not isinstance(frames, tuple | list) or len(frames) != 2 or not all(type(n) is int for n in frames):
@@ -100,7 +99,7 @@ def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
 
 
 def _folder(path: object) -> Path:
-    """Return `path` as a Path; raises InputError if it is no text that can be shown and looked up."""
+    """Convert `path` to a Path; raise InputError if it is not a printable string or cannot be accessed."""
     if not isinstance(path, str | Path) or not str(path).isprintable():
         raise InputError(f"path: expected the path of a scene's folder, got {path!r:.200}")
     try:

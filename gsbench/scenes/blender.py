@@ -1,4 +1,4 @@
-"""Load the Blender layout of NeRF-synthetic, D-NeRF and 7DGS-PBR: transforms_{train,val,test}.json and PNG images."""
+"""Load scenes in the Blender layout of NeRF-synthetic, D-NeRF and 7DGS-PBR: transforms_*.json and PNG images."""
 
 import json
 import math
@@ -19,23 +19,26 @@ from gsbench.scenes import files, images
 from gsbench.scenes.scene import Camera, Scene, View, scene_extent
 
 _RIGID_TOLERANCE = 1e-4  # D-NeRF writes single precision: its trex is orthonormal to 2.2e-6
-_SMALLEST = 1e-6  # pixels; smaller ones become zero in single precision
-_LARGEST = 1e30  # squares in double and sums in single precision stay finite up to here
-_MASKS = "masks"  # the folder beside images that has object numbers, one PNG an image, of the same name
+_SMALLEST = 1e-6  # pixels; smaller lengths become zero in single precision
+_LARGEST = 1e30  # largest number in a file; its square in double and its sums in single precision are finite
+_MASKS = "masks"  # the folder beside the images with the object number of each pixel, in PNG files of the same names
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # as instant-ngp and nerfstudio write them
 
 
 @dataclass(frozen=True)
 class _Intrinsics:
-    """A pinhole camera in pixels of the full image; missing numbers follow from the size of the image."""
+    """Hold the camera intrinsics of a JSON file, in pixels of the full image; missing values follow from its size."""
 
-    angle_x: float | None  # horizontal field of view in radians; None where the focal length is given
+    angle_x: float | None  # horizontal field of view in radians; None if the focal length is given
     focal: tuple[float, float] | None
     principal: tuple[float | None, float | None]
     size: tuple[float | None, float | None]  # width and height that the file states
 
     def matrix(self, width: int, height: int, downscale: int) -> Tensor:  # [3, 3] float32
-        """Compute K of the downscaled image. Pixel centres are at +0.5, so the first rows of K scale with it."""
+        """Compute the intrinsics K of an image of width x height pixels after it was reduced by `downscale`.
+
+        The first two rows of K are divided by the factor, because pixel centres are at +0.5.
+        """
         if self.focal is not None:
             fx, fy = self.focal
         else:
@@ -49,10 +52,10 @@ class _Intrinsics:
 
 @dataclass(frozen=True)
 class _Frame:
-    """One checked entry of `frames`, whose image is not read yet."""
+    """Hold a checked entry of the list `frames` of a JSON file; its image is not read yet."""
 
     path: Path
-    mask: Path | None  # of the image's object numbers
+    mask: Path | None  # file of the object number of each pixel
     name: str  # relative to the scene's folder: "train/r_000.png"
     where: str  # the image's path and the field that names it, for messages
     time: float | None
@@ -61,7 +64,7 @@ class _Frame:
 
 @dataclass(frozen=True)
 class _Split:
-    """One checked transforms_<split>.json."""
+    """Hold the checked content of the file transforms_<split>.json."""
 
     source: Path
     intrinsics: _Intrinsics
@@ -72,22 +75,24 @@ class _Split:
 def load(root: Path, *, downscale: int, background: tuple[float, float, float]) -> Scene:
     """Load a scene in the Blender layout; see `gsbench.scenes.load` for the arguments.
 
-    The JSON has `camera_angle_x`, or `fl_x` with optional `fl_y`, `cx`, `cy`, `w`, `h` in pixels of the full image,
-    and `frames` of `file_path` (relative, ".png" may be left out), `time` in [0, 1] (all frames or none) and
-    `transform_matrix`, camera to world in OpenGL axes. Without transforms_val.json there are no validation views.
-    Initial points are never taken from the folder: a points3d.ply there was drawn at random by 3DGS.
+    Each file transforms_{train,val,test}.json has
 
-    A folder `masks` beside the images has an 8-bit grey PNG for each of them, of the same name, whose values are the
-    numbers of the objects seen; they are the regions of its view. Nothing is fitted to or measured by them, so they do
-    not change the fingerprint.
+    - `camera_angle_x` in radians, or `fl_x` and optionally `fl_y`, `cx`, `cy`, `w`, `h` in pixels of the full image;
+    - `frames`, a list of objects with `file_path` (relative to the folder), `transform_matrix` (camera to world, OpenGL
+      axes), and optionally `time` in [0, 1].
+
+    transforms_val.json may be missing. A file points3d.ply is ignored, because in these data sets it has random points.
+
+    An optional folder `masks` beside the images has an 8-bit grey PNG for each image, with the number of the object in
+    each pixel (`View.regions`). Masks are not used in training or measurement.
 
     Raises:
-        InputError: something is missing, damaged or contradictory; the message names file and field.
+        InputError: something is missing, damaged or contradictory; the message names the file and field.
     """
-    name = Path(os.path.abspath(root)).name  # of the link, where the folder is one
+    name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
     root = root.resolve()
     splits = {"train": _read_split(root, "train"), "test": _read_split(root, "test")}
-    if os.path.lexists(root / "transforms_val.json"):  # a broken link is a fault, and not a data set without val
+    if os.path.lexists(root / "transforms_val.json"):  # a broken link is an error, not a data set without val
         splits["val"] = _read_split(root, "val")
     _check_times(splits)
     views, digests = _read_views(root, splits, downscale, background)
@@ -105,7 +110,7 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float]) 
 
 
 def _read_split(root: Path, name: str) -> _Split:
-    """Read and check transforms_<name>.json."""
+    """Read and check the file transforms_<name>.json in the folder `root`."""
     source = root / f"transforms_{name}.json"
     data = read_file(source, str(source), MAX_JSON)
     content = parse_json(data, str(source))
@@ -125,7 +130,7 @@ def _read_split(root: Path, name: str) -> _Split:
 
 
 def _read_intrinsics(content: dict[str, Any], source: Path) -> _Intrinsics:
-    """Read `fl_x` and its companions, else `camera_angle_x`."""
+    """Read the intrinsics of a JSON file: focal length and principal point in pixels, or the field of view."""
     given = ("camera_angle_x", "fl_x", "fl_y", "cx", "cy", "w", "h", *_DISTORTION)
     values = {key: _number(content[key], f"{source}: {key}") for key in given if key in content}
     for key in _DISTORTION:
@@ -144,7 +149,7 @@ def _read_intrinsics(content: dict[str, Any], source: Path) -> _Intrinsics:
 
 
 def _read_frame(root: Path, frame: object, source: Path, index: int) -> _Frame:
-    """Check one entry of `frames`."""
+    """Check entry number `index` of the list `frames` of a JSON file: image path, time and camera pose."""
     where = f"{source}: frames[{index}]"
     if not isinstance(frame, dict):
         raise InputError(f"{where}: expected an object with 'file_path' and 'transform_matrix', got {_brief(frame)}")
@@ -168,7 +173,11 @@ def _viewmat(
     matrix: object,  # [4, 4] nested lists: camera to world, OpenGL axes (x right, y up, z backward)
     where: str,
 ) -> Tensor:  # [4, 4] float32: world to camera, OpenCV axes (x right, y down, z forward)
-    """Invert a rigid camera-to-world matrix as [R^T | -R^T c], with its y and z axes flipped."""
+    """Convert a camera-to-world matrix in OpenGL axes to a world-to-camera matrix in OpenCV axes.
+
+    Raises:
+        InputError: the matrix is not a rigid motion.
+    """
     rows = matrix if isinstance(matrix, list) else []
     if len(rows) != 4 or not all(isinstance(row, list) and len(row) == 4 for row in rows):
         raise InputError(f"{where}: expected 4 rows of 4 numbers, got {_brief(matrix)}")
@@ -191,7 +200,7 @@ def _viewmat(
 
 
 def _check_times(splits: dict[str, _Split]) -> None:
-    """Refuse a data set in which only some frames have a time."""
+    """Raise InputError if some frames of a data set have a time and others do not."""
     first = splits["train"].frames[0].time
     for split in splits.values():
         for index, frame in enumerate(split.frames):
@@ -206,11 +215,12 @@ def _check_times(splits: dict[str, _Split]) -> None:
 def _read_views(
     root: Path, splits: dict[str, _Split], downscale: int, background: tuple[float, float, float]
 ) -> tuple[dict[str, list[View]], dict[str, str]]:
-    """Read all images on threads, in order; return the views by split and the images' digests by name.
+    """Read all images by several threads.
 
-    Threads suffice because reading and decoding release the interpreter's lock; a fork after OpenMP ran would hang.
-    Only the final images are kept: floats of a small scene, the 8 bits of a large one. An image of another size than
-    the first is refused before it is decoded, so that the memory of all of them is known at the first.
+    Images of a small scene are stored as floats, those of a large scene in 8 bits. All images must have the same size.
+
+    Returns:
+        The views of each split, and the SHA-256 of each image file by name.
     """
     listed = [(split, frame) for split in splits.values() for frame in split.frames]
     first = listed[0][1]
@@ -232,7 +242,7 @@ def _read_views(
         return View(name, camera, frame.time, image, background, alpha, regions), files.digest(data)
 
     masked = any(frame.mask is not None for _, frame in listed)
-    kept = (4 if in_8_bits else 13) + masked  # an alpha and a region have a byte each
+    kept = (4 if in_8_bits else 13) + masked  # bytes a pixel; alpha and object number have one byte each
     threads = images.count_readers(expected, len(listed), downscale, first.where, kept)
     with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
         decoded = pool.map(read, listed)
@@ -246,7 +256,7 @@ def _read_views(
 
 
 def _read_mask(root: Path, frame: _Frame, size: tuple[int, int], downscale: int) -> Tensor:  # [H, W] 8 bits
-    """Read the object numbers of an image whose folder has masks; raises InputError where they cannot be read."""
+    """Read the mask of an image: a PNG with the number of the object in each pixel. Raise InputError if this fails."""
     assert frame.mask is not None
     where = f"{frame.mask} (the mask of {frame.name}; without a folder '{_MASKS}' a scene has no regions)"
     path = files.find_inside(root, frame.mask.relative_to(root).as_posix(), where)
@@ -254,7 +264,7 @@ def _read_mask(root: Path, frame: _Frame, size: tuple[int, int], downscale: int)
 
 
 def _check_size(size: tuple[int, int], expected: tuple[int, int], split: _Split, frame: _Frame) -> None:
-    """Refuse an image whose size differs from that of the first image or from the size in its JSON."""
+    """Raise InputError if the size of an image is not that of the first image or not that in its JSON file."""
     if size != expected:
         raise InputError(
             f"{frame.where}: expected {expected[0]}x{expected[1]} as the first training image, got {size[0]}x{size[1]}"
@@ -267,7 +277,7 @@ def _check_size(size: tuple[int, int], expected: tuple[int, int], split: _Split,
 
 
 def _number(value: object, where: str) -> float:
-    """Return `value` as a finite float; true and false are not numbers."""
+    """Convert a JSON value to a finite float; raise InputError for other values, also for true and false."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         try:
             number = float(value)
@@ -279,7 +289,7 @@ def _number(value: object, where: str) -> float:
 
 
 def _brief(value: object) -> str:
-    """Shorten a JSON value for a message."""
+    """Return a JSON value as a short text for an error message."""
     if isinstance(value, list | dict):
         return f"a {type(value).__name__} of {len(value)}"
     text = json.dumps(value)

@@ -1,4 +1,4 @@
-"""Read the points of a COLMAP sparse model, points3D.bin or points3D.txt, as untrusted input."""
+"""Read the points of a COLMAP sparse model from points3D.bin or points3D.txt; the files are checked."""
 
 import struct
 from pathlib import Path
@@ -12,14 +12,14 @@ from gsbench.scenes.scene import Points
 
 _MAX_FILE = 1 << 32  # bytes
 _POINT = struct.Struct("<Q3d3BdQ")  # id, position, colour, error, length of the track (COLMAP, "Output format")
-_TRACK = 8  # bytes an element: the image and the keypoint
+_TRACK = 8  # bytes of an element of a track: the number of the image and that of the keypoint
 
 
 def read_points(folder: Path) -> Points:
-    """Read the points of the model in `folder`, such as sparse/0.
+    """Read positions and colours of the points of a COLMAP model, whose folder is for example sparse/0.
 
     Raises:
-        InputError: it has neither points3D.bin nor points3D.txt, or the file is damaged or has no point.
+        InputError: the folder has neither points3D.bin nor points3D.txt, or the file is damaged or has no points.
     """
     for name, parse in (("points3D.bin", _parse_binary), ("points3D.txt", _parse_text)):
         path = folder / name
@@ -40,7 +40,10 @@ def read_points(folder: Path) -> Points:
 
 
 def _parse_binary(data: bytes, path: Path) -> list[tuple[float, ...]]:
-    """Parse points3D.bin: a count, then points of different lengths, as each holds its track."""
+    """Parse points3D.bin and return (x, y, z, r, g, b) of each point.
+
+    The file has the number of points, then the points, whose lengths differ because each has a track of keypoints.
+    """
     rows: list[tuple[float, ...]] = []
     count = struct.unpack_from("<Q", data)[0] if len(data) >= 8 else -1
     at = 8
@@ -56,7 +59,10 @@ def _parse_binary(data: bytes, path: Path) -> list[tuple[float, ...]]:
 
 
 def _parse_text(data: bytes, path: Path) -> list[tuple[float, ...]]:
-    """Parse points3D.txt: POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]."""
+    """Parse points3D.txt and return (x, y, z, r, g, b) of each point.
+
+    A line of the file has an id, x, y, z, r, g, b, an error and a track of keypoints.
+    """
     rows = []
     for number, line in enumerate(data.decode("ascii", "replace").splitlines(), 1):
         words = line.split()

@@ -1,4 +1,4 @@
-"""Find the files of a data set inside the scene's folder only, and compute their fingerprint."""
+"""Find the files of a data set, which must be inside the scene's folder, and compute a hash of all of them."""
 
 import hashlib
 from collections.abc import Mapping
@@ -12,7 +12,10 @@ def find_inside(
     name: str,  # a path relative to `root`, as the data set writes it
     where: str,  # the file and field that hold `name`, for the message
 ) -> Path:
-    """Return the resolved path of `name`; refuse one that leaves `root` by "..", as an absolute path or by a link."""
+    """Return the resolved path of a file; raise InputError if it is outside of the scene's folder `root`.
+
+    A path can leave the folder through "..", through a link, or as an absolute path.
+    """
     if not name.isprintable():  # a NUL byte, a lone surrogate, a line break that would break the message
         raise InputError(f"{where}: expected a path inside {root}, got {name!r}, which is not printable: rename it")
     try:
@@ -27,17 +30,17 @@ def find_inside(
 
 
 def digest(data: bytes) -> str:
-    """Return the sha256 of `data` in hexadecimal."""
+    """Return the SHA-256 of `data` in hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()
 
 
 def fingerprint(
     digests: Mapping[str, str],  # file name relative to the scene's folder -> its sha256
 ) -> str:
-    """Return one sha256 for a set of files: that of the lines `sha256sum` prints for them, sorted by name.
+    """Return one SHA-256 for a set of files: the hash of the output of `sha256sum` for the files, sorted by name.
 
-    Names are relative, so the same data has the same fingerprint in any folder. To check it inside the folder of a
-    scene: ``LC_ALL=C; sha256sum $(printf '%s\\n' transforms_*.json */*.png | sort) | sha256sum``.
+    Names are relative to the scene's folder, so the hash does not depend on its place. To compute the hash of a Blender
+    scene, run in its folder: ``LC_ALL=C; sha256sum $(printf '%s\\n' transforms_*.json */*.png | sort) | sha256sum``.
     """
     lines = "".join(f"{digests[name]}  {name}\n" for name in sorted(digests))
     return digest(lines.encode("utf-8", "surrogateescape"))

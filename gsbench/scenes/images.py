@@ -1,4 +1,4 @@
-"""Read images from PNG: check the file, decode it by OpenCV, composite it over the background, filter it to size."""
+"""Read PNG images: check the file, decode it with OpenCV, composite it over the background, and reduce its size."""
 
 import os
 import struct
@@ -22,27 +22,27 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 class Kind(NamedTuple):
-    """What a PNG may hold."""
+    """Describe the colour types and bit depths of PNG files that are accepted."""
 
-    depths: dict[int, tuple[int, ...]]  # bits of a channel, by PNG's colour type
-    words: str  # for messages
+    depths: dict[int, tuple[int, ...]]  # accepted bits per channel, by the colour type of PNG
+    words: str  # description for error messages
 
 
 COLORS = Kind({2: (8, 16), 6: (8, 16), 3: (1, 2, 4, 8)}, "8- or 16-bit RGB or RGBA")  # 3: a palette of RGB
 NUMBERS = Kind({0: (8,)}, "8-bit grey, the number of the object in each pixel")
-_DEPTH_AT = 24  # the byte of a PNG that says how many bits a channel has
-_DECODING = 64  # bytes a pixel while an image is decoded and composited; measured: 48 for 8 bits, 52 for 16
-# Bytes of all images of a scene as floats, up to which they are kept so. To look at 8 bits of 800 x 800 takes 6 ms
-# on one thread; of 160 x 160 it would take 0.2 ms for each view of a step that takes 6.
+_DEPTH_AT = 24  # index of the byte of a PNG that has the bits per channel
+_DECODING = 64  # bytes per pixel while an image is decoded and composited; measured: 48 for 8 bits, 52 for 16
+# The images of a scene are stored as floats if all together need at most this many bytes, else in 8 bits. To convert an
+# image of 800 x 800 from 8 bits takes 6 ms on one thread. With 160 x 160 it would take 0.2 ms of a step of 6 ms.
 _MOST_FLOATS = 1 << 29
-_MAX_FILE = 1 << 30  # bytes; the largest image has 2^29 before it is compressed
+_MAX_FILE = 1 << 30  # bytes; the largest accepted image has 2^29 bytes before compression
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_MAX_PIXELS = 2**26  # a few kilobytes of PNG can claim gigabytes of pixels; 8192 x 8192 is beyond every data set
+_MAX_PIXELS = 2**26  # a PNG of a few kilobytes can claim gigabytes of pixels; no data set has more than 8192 x 8192
 
 
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV's own log off stderr; an InputError describes a broken file in one line."""
+    """Silence the log messages of OpenCV on stderr within a `with` block; errors are raised as InputError instead."""
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
@@ -54,7 +54,7 @@ def read_png(
     path: Path,
     where: str,  # the path, and the file and field that name it, for the message
 ) -> bytes:
-    """Return the bytes of the file `path`; raises InputError as `gsbench.reading.read_file`."""
+    """Return the bytes of a PNG file; raise InputError if the file is missing, too large or not a regular file."""
     return read_file(path, where, _MAX_FILE)
 
 
@@ -63,12 +63,10 @@ def png_size(
     where: str,  # the file's path, for the message
     kind: Kind = COLORS,
 ) -> tuple[int, int]:
-    """Return width and height of a PNG, without decoding it.
-
-    Length and checksum of all chunks are checked, IHDR to IEND (PNG specification, section 5).
+    """Return the width and height of a PNG after checking the length and checksum of all chunks, without decoding.
 
     Raises:
-        InputError: the file is not a PNG, truncated, damaged, of another kind, of zero size, or too large.
+        InputError: the data is not a PNG, is damaged, has zero or too many pixels, or an unexpected colour type.
     """
     if not data.startswith(_SIGNATURE):
         raise InputError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
@@ -97,9 +95,9 @@ def stays_in_8_bits(
     count: int,
     downscale: int,
 ) -> bool:
-    """Tell whether the images of a scene stay in 8 bits, and are composited at each access.
+    """Return whether the images of a scene are stored in 8 bits to save memory, and composited at each access.
 
-    This takes less memory than floats. Reduced images do not have 8 bits any more, and are small.
+    This is so for a large scene of 8-bit images that are not reduced.
     """
     return downscale == 1 and data[_DEPTH_AT] == 8 and 12 * count * size[0] * size[1] > _MOST_FLOATS
 
@@ -111,10 +109,10 @@ def count_readers(
     where: str,  # the first image's path, for the message
     kept: int = 12,  # bytes a pixel of the reduced image
 ) -> int:
-    """Return how many threads may decode images at once, within the memory that is left beside all images.
+    """Return how many threads can decode images at the same time, given the free memory and the size of all images.
 
     Raises:
-        TooLargeError: memory does not suffice for one.
+        TooLargeError: the memory does not suffice for one thread.
     """
     pixels = size[0] * size[1]
     all_kept, decoding = count * kept * pixels // downscale**2, _DECODING * pixels
@@ -129,13 +127,12 @@ def decode_png(
     data: bytes,
     where: str,  # the file's path, for the message
 ) -> Pixels:  # [H, W, 3|4] RGB or RGBA, as stored: straight alpha
-    """Decode an 8- or 16-bit RGB or RGBA PNG.
+    """Decode an 8- or 16-bit PNG to RGB or RGBA pixels.
 
-    The file's structure is checked before OpenCV sees it, since a decoder may return the rows it found of a truncated
-    file and leave the rest black.
+    The file is checked first, because OpenCV may fill the missing rows of a truncated file with black.
 
     Raises:
-        InputError: the file is not a PNG, truncated, damaged, of zero size, or neither RGB nor RGBA.
+        InputError: the data is not a PNG, is damaged, has no pixels, or is neither RGB nor RGBA.
     """
     png_size(data, where)
     pixels = _decode(data, where)
@@ -151,10 +148,10 @@ def decode_regions(
     downscale: int,  # divides the size
     where: str,  # the file's path, for the message
 ) -> Tensor:  # [H / downscale, W / downscale] 8 bits
-    """Decode a mask, an 8-bit grey PNG whose values are object numbers; of each block a pixel near its middle is taken.
+    """Decode a mask, an 8-bit grey PNG with the number of the object in each pixel, and reduce it by subsampling.
 
     Raises:
-        InputError: the file is not such a PNG, truncated, damaged, or of another size than its image.
+        InputError: the data is not such a PNG, is damaged, or has another size than the image of the mask.
     """
     own = png_size(data, where, NUMBERS)
     if own != size:
@@ -167,7 +164,7 @@ def alpha_of(
     pixels: Pixels,  # [H, W, 3|4] as stored
     downscale: int,  # divides the size
 ) -> Tensor | None:  # [H / downscale, W / downscale] 8 bits
-    """Return the alpha of an image, averaged as its colours are; None where it has none."""
+    """Return the alpha channel of an image, reduced by averaging; None for an image without alpha."""
     if pixels.shape[2] == 3:
         return None
     alpha: NDArray[Any] = pixels[..., 3].astype(np.float32) * np.float32(255 / np.iinfo(pixels.dtype).max)
@@ -183,14 +180,13 @@ def composite(
     downscale: int,
     where: str,  # the file's path, for the message
 ) -> Tensor:  # [H / downscale, W / downscale, 3] float32 in [0, 1]
-    """Composite straight alpha over `background` once, in float, and average every downscale x downscale block.
+    """Composite an image with straight alpha over a background colour, then average blocks of downscale^2 pixels.
 
-    The composite comes before the filter: averaging straight colours and alpha apart would let the (arbitrary) colour
-    of transparent pixels bleed into every silhouette. Over a constant background it equals filtering premultiplied
-    colours and compositing afterwards, as both steps are linear.
+    The order matters: if colours and alpha were averaged separately, the arbitrary colours of transparent pixels would
+    show at silhouettes.
 
     Raises:
-        InputError: `downscale` does not divide the image.
+        InputError: `downscale` does not divide the width and the height.
     """
     height, width = pixels.shape[:2]
     if height % downscale or width % downscale:
@@ -208,7 +204,7 @@ def composite(
 
 
 def _decode(data: bytes, where: str) -> NDArray[Any]:
-    """Decode a PNG that was checked; raises InputError where OpenCV cannot."""
+    """Decode a checked PNG with OpenCV; raise InputError if OpenCV fails."""
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -221,7 +217,7 @@ def _decode(data: bytes, where: str) -> NDArray[Any]:
 
 
 def _check_header(header: bytes, where: str, kind: Kind) -> tuple[int, int]:
-    """Check the 13 bytes of IHDR (PNG specification, section 11.2.2); return width and height."""
+    """Check the header chunk IHDR of a PNG and return width and height (PNG specification, section 11.2.2)."""
     width, height, depth, color, compression, filtering, interlacing = struct.unpack(">IIBBBBB", header)
     if width == 0 or height == 0:
         raise InputError(f"{where}: expected an image with pixels, its size is {width}x{height}: render it again")

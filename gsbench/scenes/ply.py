@@ -1,4 +1,4 @@
-"""Read the vertices of a PLY file in any of its three encodings, as untrusted input, into a structured array."""
+"""Read the vertices of an ascii or binary PLY file into a structured numpy array; the file is checked."""
 
 import re
 from pathlib import Path
@@ -20,21 +20,21 @@ _TYPES = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
-_ENCODINGS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}  # and their order of bytes
+_ENCODINGS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}  # with the byte order of numpy
 MAX_FILE = 1 << 32  # bytes; 17 million Gaussians of 3DGS
-_ASCII_VALUE = 100  # bytes of memory that a value takes while it is parsed
+_ASCII_VALUE = 100  # bytes of memory that a value needs while it is parsed
 _HEADER_LIMIT = 65536  # bytes; a 3DGS header of 62 properties takes 1,600
 _HEADER_END = re.compile(rb"\nend_header[ \t]*\r?\n")
 
 
 def read_vertices(path: Path) -> NDArray[np.void]:
-    """Return the vertex element of a PLY file as a structured array [P] with a field for each property.
+    """Return the vertices of a PLY file as a structured array [P] with a field for each property.
 
-    The vertex element must come first and hold scalars only, as in every point cloud of COLMAP and 3DGS; what follows
-    it is not read. The count is compared with the size of the file before memory is allocated for it.
+    The vertex element must be the first element and have scalar properties only, as in files of COLMAP and 3DGS. Other
+    elements are ignored.
 
     Raises:
-        InputError: the file is not such a PLY, or has fewer bytes or values than its header states.
+        InputError: the file is not such a PLY, or has fewer values than its header states.
     """
     data = read_file(path, str(path), MAX_FILE)
     end = _HEADER_END.search(data, 0, _HEADER_LIMIT)
@@ -79,10 +79,10 @@ def _read_header(lines: list[str], path: Path) -> tuple[str, int, np.dtype[np.vo
 
 
 def _read_ascii(body: bytes, count: int, dtype: np.dtype[np.void], path: Path) -> NDArray[np.void]:
-    """Parse `count` rows of numbers; refuse a value that the type of its property cannot hold."""
+    """Parse the rows of an ascii PLY; raise InputError for a number that the type of its property cannot represent."""
     names = dtype.names or ()
     expected = count * len(names)
-    # A value takes two bytes at least, so that a count which is a lie allocates nothing.
+    # A value needs at least two bytes, so a wrong count in the header is found before memory is allocated.
     values = []
     if 2 * expected <= len(body) + 1:
         require(_ASCII_VALUE * expected, f"{path}: {expected} values in ascii", "write a binary PLY")

@@ -1,4 +1,4 @@
-"""Provide initial points, at random or from a PLY, and measure their distances and their extent."""
+"""Draw initial points at random or read them from a PLY file, and compute distances to their neighbours."""
 
 import math
 from collections.abc import Sequence
@@ -18,18 +18,18 @@ from gsbench.scenes.scene import Camera, Points
 
 SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic Y_00; 3DGS: colour = 0.5 + SH_C0 f_dc
 
-_POINT = 100  # bytes a point takes while it is drawn or its neighbours are looked for, at least
-NEAREST, FARTHEST = 2.0, 100.0  # depth of points in a frustum, in radii of the cameras
-ROUNDS = 50  # of drawing points in a frustum
+_POINT = 100  # least number of bytes that a point needs while it is drawn or its neighbours are searched
+NEAREST, FARTHEST = 2.0, 100.0  # range of depths of points in a frustum, in units of the radius of the cameras
+ROUNDS = 50  # largest number of rounds in which points in a frustum are drawn
 
 _MIN_SQUARED_DISTANCE = 1e-7  # 3DGS, create_from_pcd: clamp_min(distCUDA2, 1e-7), so that log(scale) stays finite
 
 
 def random_points(count: int, half_width: float, generator: torch.Generator) -> Points:
-    """Draw `count` points uniformly in the cube [-half_width, half_width]^3, all of nearly the same grey.
+    """Draw `count` points uniformly in the cube [-half_width, half_width]^3, as 3DGS does for synthetic scenes.
 
-    Colours are 0.5 + SH_C0 u / 255 with u uniform in [0, 1), as 3DGS and 4DGS draw them (readNerfSyntheticInfo:
-    SH2RGB(random / 255)). Everything is float32 on the generator's device.
+    Colours are 0.5 + SH_C0 u / 255 with u uniform in [0, 1), so nearly grey, as in the code of 3DGS and 4DGS. The
+    result is float32 on the device of the generator.
     """
     if type(count) is not int or count < 1:
         raise InputError(f"random points: expected a count of at least 1, got {count!r:.80}")
@@ -40,19 +40,19 @@ def random_points(count: int, half_width: float, generator: torch.Generator) -> 
 
 
 def frustum_points(count: int, cameras: Sequence[Camera], radius: float, generator: torch.Generator) -> Points:
-    """Draw `count` points in the frustum that all cameras share, all of nearly the same grey.
+    """Draw `count` nearly grey points in the part of space that all cameras see, for a scene without known points.
 
-    Each lies on a random pixel's ray of a random camera, uniformly in inverse depth between `NEAREST` and `FARTHEST`
-    times the cameras' radius: a rig that looks in one direction says nothing about how far away the scene is.
+    A point lies on the ray through a random pixel of a random camera. Its inverse depth is uniform between
+    1 / (NEAREST radius) and 1 / (FARTHEST radius).
 
     Args:
-        count: of points.
-        cameras: of the training views.
-        radius: of the cameras around their mean, world units.
+        count: the number of points.
+        cameras: the cameras of the training views.
+        radius: the radius of the cameras around their mean, world units.
         generator: the source of all random numbers.
 
     Raises:
-        InputError: the cameras share too little for that many points.
+        InputError: the part of space that all cameras see is too small.
     """
     K, viewmats = torch.stack([camera.K for camera in cameras]), torch.stack([camera.viewmat for camera in cameras])
     size = torch.tensor([[camera.width, camera.height] for camera in cameras])  # [C, 2]
@@ -74,7 +74,7 @@ def frustum_points(count: int, cameras: Sequence[Camera], radius: float, generat
 
 
 def _seen_by_all(points: Tensor, K: Tensor, viewmats: Tensor, size: Tensor) -> Tensor:
-    """Tell which points [P, 3] every camera has in its image, [P] bool."""
+    """Return which of the points [P, 3] are inside the images of all cameras, [P] bool."""
     seen = torch.ones(len(points), dtype=torch.bool)
     for camera, viewmat, extent in zip(K, viewmats, size, strict=True):
         x = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ camera.T
@@ -84,13 +84,12 @@ def _seen_by_all(points: Tensor, K: Tensor, viewmats: Tensor, size: Tensor) -> T
 
 
 def read_ply(path: str | Path) -> Points:
-    """Read points from a PLY: `x y z` and `red green blue`, else 3DGS' `f_dc_0..2`.
+    """Read positions and colours of points from a PLY file with `x y z` and `red green blue`, or `f_dc_0..2` of 3DGS.
 
-    Integer colours are divided by their type's largest value, float colours are used unchanged; a colour outside
-    [0, 1] is refused, except one from `f_dc`, where it is usual and is clamped.
+    Integer colours are divided by the largest value of their type. Colours from `f_dc_0..2` are clamped to [0, 1].
 
     Raises:
-        InputError: the file is not such a PLY, is truncated, lacks positions or colours, or is not finite.
+        InputError: the file is not such a PLY, is truncated, or has values that are not finite or outside of [0, 1].
     """
     vertices = read_vertices(Path(path))
     means = _columns(vertices, ("x", "y", "z"), path)
@@ -111,9 +110,9 @@ def nearest_distances(
     means: Tensor,  # [P, 3]
     k: int = 3,
 ) -> Tensor:  # [P] in the dtype and on the device of `means`
-    """Return the root of the mean squared distance of every point to its `k` nearest others, at least sqrt(1e-7).
+    """Return the root mean square distance of each point to its `k` nearest neighbours, the initial scale of 3DGS.
 
-    This is the initial scale of 3DGS, sqrt(clamp_min(distCUDA2, 1e-7)); distCUDA2 is the mean SQUARED distance.
+    The result is at least sqrt(1e-7), as in the code of 3DGS.
 
     Raises:
         InputError: there are at most `k` points, or a point is not finite.
@@ -133,16 +132,16 @@ def nearest_distances(
 
 
 def size_of(points: Points) -> float:
-    """Return the size of a scene, world units: the mean standard deviation of points along an axis; 1 for one point.
+    """Return the size of a scene in world units: the standard deviation of the points, averaged over the axes x, y, z.
 
-    Unlike the extent, it does not depend on the cameras.
+    The size of a single point is 1.
     """
     size = float(points.means.std(0).mean()) if len(points.means) > 1 else 0.0
     return size if 0 < size < math.inf else 1.0
 
 
 def _columns(vertices: NDArray[np.void], names: tuple[str, str, str], path: str | Path) -> NDArray[np.float64]:
-    """Return three properties as [P, 3] float64, finite in single precision."""
+    """Return three properties of PLY vertices as [P, 3] float64; raise InputError if a value is not finite."""
     for name in names:
         if name not in (vertices.dtype.names or ()):
             raise InputError(f"{path}: {name}: expected this vertex property, found {vertices.dtype.names!r:.120}")

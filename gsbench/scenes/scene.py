@@ -1,4 +1,4 @@
-"""Define cameras, views (a camera, a time and an image) and scenes (views by split, background, extent)."""
+"""Define the data types Camera, View (camera, time and image), Points and Scene (train, val and test views)."""
 
 from dataclasses import dataclass, replace
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera in OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
+    """A pinhole camera with OpenCV axes (x right, y down, z forward) and pixel centres at +0.5."""
 
     viewmat: Tensor  # [4, 4] world to camera, rigid
     K: Tensor  # [3, 3] intrinsics in pixels
@@ -17,11 +17,11 @@ class Camera:
 
     @property
     def center(self) -> Tensor:
-        """Return the camera's position in the world, [3]."""
+        """The position of the camera in world space, [3]."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def to(self, device: str) -> "Camera":
-        """Return the same camera with its tensors on `device`."""
+        """Return a copy of the camera whose tensors are on `device`."""
         return Camera(self.viewmat.to(device), self.K.to(device), self.width, self.height)
 
 
@@ -29,28 +29,29 @@ class Camera:
 class View:
     """An image with the camera and the time at which it was taken."""
 
-    name: str  # in the data set, such as "train/r_000"
+    name: str  # name in the data set, such as "train/r_000"
     camera: Camera
-    time: float | None  # in [0, 1]; None where the data set has no time
-    pixels: Tensor  # [H, W, 3] of floats in [0, 1] or of 8 bits; or [H, W, 4] of 8 bits: straight alpha ..
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # .. which is composited over this when it is looked at
-    composited_alpha: Tensor | None = None  # [H, W] 8 bits, of pixels that were composited when they were loaded
+    time: float | None  # in [0, 1]; None if the data set has no times
+    pixels: Tensor  # [H, W, 3] floats in [0, 1] or 8 bits, or [H, W, 4] 8 bits with straight alpha
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # `image` composites pixels with alpha over this colour
+    composited_alpha: Tensor | None = None  # [H, W] 8 bits: alpha of an image that was composited when it was loaded
     regions: Tensor | None = None  # [H, W] 8 bits: the number of the object seen in each pixel, 0 = none; None: unknown
 
     @property
     def alpha(self) -> Tensor | None:
-        """The alpha of the image as stored, [H, W] of 8 bits; None where the image has none."""
+        """The alpha channel of the image file, [H, W] 8 bits; None if the image has none."""
         return self.pixels[..., 3] if self.pixels.shape[-1] == 4 else self.composited_alpha
 
     @property
     def image(self) -> Tensor:
-        """Return the image, [H, W, 3] of floats in [0, 1]; an image of 8 bits is converted at each access.
+        """The image composited over the background, [H, W, 3] floats in [0, 1].
 
-        The result has the bits of an image that was composited when it was loaded.
+        An image that is stored in 8 bits is converted at each access.
         """
         if self.pixels.is_floating_point():
             return self.pixels
-        # Divided by a tensor: by a number, a GPU would multiply by its reciprocal, which rounds in another way.
+        # The divisor is a tensor, because a GPU would replace a division by a number by a product, which rounds
+        # differently.
         values = self.pixels.float().div_(torch.full((), 255.0, device=self.pixels.device))
         if values.shape[-1] == 3:
             return values
@@ -61,7 +62,7 @@ class View:
         return image
 
     def to(self, device: str) -> "View":
-        """Return the same view with its tensors on `device`."""
+        """Return a copy of the view whose tensors are on `device`."""
         alpha, regions = (x if x is None else x.to(device) for x in (self.composited_alpha, self.regions))
         camera, pixels = self.camera.to(device), self.pixels.to(device)
         return replace(self, camera=camera, pixels=pixels, composited_alpha=alpha, regions=regions)
@@ -69,7 +70,7 @@ class View:
 
 @dataclass(frozen=True)
 class Points:
-    """Initial points, given by the data set or drawn at random."""
+    """The points at which Gaussians start, given by the data set or drawn at random."""
 
     means: Tensor  # [P, 3]
     colors: Tensor  # [P, 3] in [0, 1]
@@ -77,24 +78,24 @@ class Points:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything a model is fitted to and measured on."""
+    """A data set of one scene: training, validation and test views, background colour, extent and initial points."""
 
     name: str
     train: list[View]
     val: list[View]
     test: list[View]
-    background: tuple[float, float, float]  # the colour every image was composited over
+    background: tuple[float, float, float]  # the colour over which every image is composited
     extent: float  # 1.1 x the radius of the training cameras around their mean (3DGS, getNerfppNorm)
-    points: Points | None  # None: the data set gives none
-    fingerprint: str  # SHA-256 of the files, so that a record identifies its data
+    points: Points | None  # None: the data set has no points
+    fingerprint: str  # SHA-256 of the files, by which record.json identifies the data
 
     @property
     def has_time(self) -> bool:
-        """Tell whether every training view has a time."""
+        """Whether every training view has a time."""
         return all(view.time is not None for view in self.train)
 
     def to(self, device: str) -> "Scene":
-        """Return the same scene with its views on `device`."""
+        """Return a copy of the scene whose views are on `device`."""
         train, val, test = ([view.to(device) for view in views] for views in (self.train, self.val, self.test))
         return replace(self, train=train, val=val, test=test)
 
@@ -102,10 +103,10 @@ class Scene:
 def scene_extent(
     viewmats: Tensor,  # [C, 4, 4] the training cameras
 ) -> float:
-    """Return 1.1 x the largest distance of a camera from the cameras' mean, in world units; 0 if all are at one place.
+    """Return the extent of a scene: 1.1 x the largest distance of a camera from the mean camera position.
 
-    Source: 3DGS, `getNerfppNorm` in scene/dataset_readers.py. Learning rates of positions and the size at which a
-    Gaussian splits are multiples of it.
+    3DGS computes the extent in the same way (`getNerfppNorm`). Learning rates of positions and the threshold between
+    clone and split are multiples of the extent.
     """
     rotations, translations = viewmats[:, :3, :3].double(), viewmats[:, :3, 3].double()
     centers = -torch.einsum("cji,cj->ci", rotations, translations)

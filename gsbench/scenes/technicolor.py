@@ -1,4 +1,4 @@
-"""Load the raw Technicolor layout: cameras_parameters.txt and a PNG for each frame and camera of a 4 x 4 array."""
+"""Load scenes of the Technicolor light field data: a PNG for each frame and camera of a 4 x 4 camera array."""
 
 import math
 import re
@@ -16,17 +16,17 @@ from gsbench.scenes.points import read_ply
 from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent
 
 CAMERAS = "cameras_parameters.txt"
-COLUMNS = ("f", "cu", "cv", "ar", "sk", "qw", "qx", "qy", "qz", "tx", "ty", "tz")  # pixels, w first, world units
-DISTORTION = ("d1", "d2")  # of the originals, which are not undistorted
-TEST_CAMERA = 10  # held out by every paper that reports on this data (row 2, column 2 of the array)
+COLUMNS = ("f", "cu", "cv", "ar", "sk", "qw", "qx", "qy", "qz", "tx", "ty", "tz")  # intrinsics, rotation, translation
+DISTORTION = ("d1", "d2")  # coefficients of the original images, which have lens distortion
+TEST_CAMERA = 10  # the camera that papers on this data hold out (row 2, column 2 of the array)
 IMAGE = re.compile(r"(?P<scene>.+)_undist_(?P<frame>\d{5})_(?P<camera>\d{2})\.png")
 _MAX_TEXT = 1 << 20  # bytes of cameras_parameters.txt
-_UNIT = 1e-3  # quaternions are written with nine digits
+_UNIT = 1e-3  # tolerance of the length of quaternions
 
 
 @dataclass(frozen=True)
 class _Image:
-    """One image that is to be read."""
+    """Hold the path, the frame number and the camera number of an image file."""
 
     path: Path
     frame: int
@@ -36,18 +36,18 @@ class _Image:
 def load(
     root: Path, *, downscale: int, background: tuple[float, float, float], frames: tuple[int, int] | None = None
 ) -> Scene:
-    """Load a scene of the released Technicolor light field data (Sabater et al. 2017).
+    """Load a scene of the Technicolor light field data (Sabater et al. 2017).
 
-    The folder has `cameras_parameters.txt`, a header and a row for each camera (intrinsics in pixels of the images,
-    world to camera in OpenCV axes), and images `<Scene>_undist_<frame>_<camera>.png`. Camera 10 is the test split, all
-    others are for training; there is no val split. The first frame has the time 0, the last 1. Initial points are those
-    of a COLMAP model in `sparse/0`, else of `points3d.ply`, else none.
+    The folder has images `<Scene>_undist_<frame>_<camera>.png` and a table of cameras `cameras_parameters.txt` with
+    intrinsics in pixels and poses (world to camera, OpenCV axes). Camera 10 is the test split, the others are for
+    training. Times are 0 for the first frame to 1 for the last. Initial points come from a COLMAP model in `sparse/0`
+    or from `points3d.ply`, if one of these exists.
 
     Args:
-        root: the scene's folder.
-        downscale: as `gsbench.scenes.load`; images that are not reduced stay in 8 bits.
-        background: of the renders; the images are opaque.
-        frames: the first and the last frame, which is included; None: all frames.
+        root: the folder of the scene.
+        downscale: the integer factor by which images are reduced; with 1 they stay in 8 bits.
+        background: the background colour of renders; the images of the data set are opaque.
+        frames: the first and the last frame to load; None: all frames.
 
     Raises:
         InputError: something is missing, damaged or contradictory; the message names the file.
@@ -77,7 +77,7 @@ def load(
 
 
 def _read_rows(text: str, source: Path) -> list[dict[str, float]]:
-    """Read the table of cameras by the names in its header."""
+    """Parse the table of cameras and return a dictionary of each row, keyed by the column names of the header."""
     lines = [line.split() for line in text.splitlines() if line.strip()]
     header = lines[0] if lines else []
     missing = [name for name in COLUMNS if name not in header]
@@ -112,7 +112,7 @@ def _number(text: str, where: str) -> float:
 
 
 def _camera(row: dict[str, float], width: int, height: int, downscale: int) -> Camera:
-    """Make the camera of a row for images of width x height after they were reduced."""
+    """Make a camera from a row of the table; width and height are those of the reduced image."""
     viewmat = torch.eye(4, dtype=torch.float64)
     rotation = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")])  # scipy has w last
     viewmat[:3, :3] = torch.from_numpy(rotation.as_matrix())
@@ -123,7 +123,7 @@ def _camera(row: dict[str, float], width: int, height: int, downscale: int) -> C
 
 
 def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> list[_Image]:
-    """List the images by frame, then camera; refuse a frame that a camera lacks."""
+    """List the image files, sorted by frame and then camera; raise InputError if an image is missing."""
     found: dict[tuple[int, int], Path] = {}
     scenes = set()
     for path in sorted(root.glob("*.png")):
@@ -150,7 +150,7 @@ def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> li
 def _read_views(
     listed: list[_Image], rows: list[dict[str, float]], downscale: int
 ) -> tuple[list[View], dict[str, str]]:
-    """Read all images on threads, in order; return their views, and the digests of the files by name."""
+    """Read all images by several threads; return their views, and the SHA-256 of each file by name."""
     first, last = listed[0].frame, listed[-1].frame
     where = str(listed[0].path)
     size = images.png_size(images.read_png(listed[0].path, where), where)
@@ -178,7 +178,7 @@ def _read_views(
 
 
 def _points(root: Path) -> Points | None:
-    """Read the initial points that the folder has; None if it has none."""
+    """Read initial points from the COLMAP model in sparse/0 or from points3d.ply; None if neither exists."""
     if (root / "sparse" / "0").is_dir():
         return colmap.read_points(root / "sparse" / "0")
     ply = root / "points3d.ply"

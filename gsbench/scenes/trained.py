@@ -1,7 +1,8 @@
-"""Read and write trained 3D Gaussians as the PLY of 3DGS, which other trainers and viewers share.
+"""Read and write trained 3D Gaussians in the PLY format of 3DGS, which other trainers and viewers use too.
 
 Columns: `x y z [nx ny nz] f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`. Scales are logarithms, the opacity is a
-logit, the rotation a quaternion wxyz, and `f_rest` holds the harmonics above degree 0 channel after channel.
+logit, and the rotation is a quaternion wxyz. The columns `f_rest_*` are the SH coefficients above degree 0, first all
+of the red channel, then green, then blue.
 """
 
 from dataclasses import dataclass, fields
@@ -16,8 +17,8 @@ from gsbench.errors import InputError
 from gsbench.process.memory import require
 from gsbench.scenes.ply import read_vertices
 
-MAX_DEGREE = 3  # of the harmonics that gsbench's models have; a file may have one more
-_FILE_DEGREES = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(MAX_DEGREE + 2)}  # by the count of f_rest_*
+MAX_DEGREE = 3  # largest SH degree of gsbench's models; a file may have degree 4
+_FILE_DEGREES = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(MAX_DEGREE + 2)}  # by the number of f_rest_*
 _COLUMNS = {
     "means": ("x", "y", "z"),
     "dc": ("f_dc_0", "f_dc_1", "f_dc_2"),
@@ -25,32 +26,30 @@ _COLUMNS = {
     "log_scales": ("scale_0", "scale_1", "scale_2"),
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
-_LARGEST = 1e30  # squares of what is read stay finite in double, and sums in single precision
-_VALUE = 40  # bytes that a value of a Gaussian takes while it is read: in the file, in double and in single precision
+_LARGEST = 1e30  # largest accepted number; its square in double and its sums in single precision are finite
+_VALUE = 40  # bytes that a number of a Gaussian needs while it is read: in the file, in double and in single precision
 
 
 @dataclass(frozen=True)
 class TrainedGaussians:
-    """N trained 3D Gaussians in raw parameters, float32 on the CPU."""
+    """Hold N trained 3D Gaussians as raw parameters (log scales, logits of opacities), float32 on the CPU."""
 
     means: Tensor  # [N, 3] world units
     log_scales: Tensor  # [N, 3] ln of standard deviations in world units
-    quats: Tensor  # [N, 4] wxyz, of any length but zero
-    logits: Tensor  # [N] of opacities
-    dc: Tensor  # [N, 3] harmonics of degree 0: colour = 0.5 + Y_00 dc
-    rest: Tensor  # [N, K - 1, 3] harmonics above degree 0, in 3DGS' order
+    quats: Tensor  # [N, 4] wxyz, not zero, not necessarily normalised
+    logits: Tensor  # [N] logits of opacities
+    dc: Tensor  # [N, 3] SH coefficients of degree 0: colour = 0.5 + Y_00 dc
+    rest: Tensor  # [N, K - 1, 3] SH coefficients above degree 0, in the order of 3DGS
 
     def __len__(self) -> int:
         return len(self.means)
 
 
 def read_trained(path: Path) -> TrainedGaussians:
-    """Read trained Gaussians from a PLY of 3DGS, in any encoding and of any degree from 0 to 4.
-
-    Normals and other columns are not read.
+    """Read trained 3D Gaussians from an ascii or binary PLY file of 3DGS with SH degree 0 to 4.
 
     Raises:
-        InputError: the file is no such PLY, lacks a column, or has a value that is not finite.
+        InputError: the file is not such a PLY, lacks a column, or has a value that is not finite.
     """
     vertices = read_vertices(path)
     names = vertices.dtype.names or ()
@@ -75,10 +74,10 @@ def read_trained(path: Path) -> TrainedGaussians:
 
 
 def ply_of(trained: TrainedGaussians) -> bytes:
-    """Return the bytes of a little-endian PLY with the columns of 3DGS at degree 3, which the viewer of 3DGS needs.
+    """Return trained 3D Gaussians as the bytes of a binary PLY file of 3DGS with SH degree 3.
 
     Raises:
-        InputError: a value is not finite, or the harmonics are above degree 3.
+        InputError: a value is not finite, or the SH degree is above 3.
     """
     N, K = len(trained), (MAX_DEGREE + 1) ** 2
     if trained.rest.shape[1] > K - 1:
@@ -98,7 +97,7 @@ def ply_of(trained: TrainedGaussians) -> bytes:
 
 
 def _table(vertices: NDArray[np.void], names: tuple[str, ...], path: Path) -> Tensor:
-    """Return columns as [N, len(names)] float32; raises InputError unless they are finite."""
+    """Return some properties of PLY vertices as [N, len(names)] float32; raise InputError if a value is not finite."""
     table = np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
     if not (np.abs(table) <= _LARGEST).all():
         wrong = int((~(np.abs(table) <= _LARGEST)).any(axis=1).sum())

@@ -1,4 +1,4 @@
-"""Save a training to a checkpoint, atomically and with its SHA-256, and read it back as untrusted input."""
+"""Write checkpoints of a training atomically and with a SHA-256, and read them as untrusted input."""
 
 import hashlib
 import io
@@ -18,14 +18,14 @@ from gsbench.measure.renamed import with_present_keys
 MAGIC = b"gsbench checkpoint 4\n"  # then the SHA-256 of the rest in hex and a line feed, then what torch.save writes
 FILE_NAME = "checkpoint.pt"
 DIGEST = 64  # hex digits
-# Keys of a training's state. Every training of a seed ends with the same bits in these, interrupted or not ..
+# Keys of a training's state whose values are bit-equal in all trainings with one seed, interrupted or not.
 REPRODUCED = frozenset({"step", "model", "optimizer", "density", "minimum_scale", "gating", "best"})
-# .. and no two have the same seconds: the state without these keys, at any depth, is what can be compared.
+# Keys of measured times, at any depth of the state. They differ between two trainings with one seed.
 TIMES = frozenset({"stages", "effort", "curve", "seconds", "frame_ms_before", "frame_ms", "frame_ms_without"})
 
 
-# Keys of a training's state in checkpoints of older versions, and their names now; and how keys of its model, and of
-# the moments of its parameters, began.
+# Keys of a training's state in checkpoints of older versions, with their present names; then prefixes of the names of
+# the optimizer's moments and of the model's parameters.
 RENAMED = {"floor": "minimum_scale"}
 RENAMED_IN_OPTIMIZER = {"modulation.": "lambda."}
 RENAMED_IN_MODEL = {
@@ -38,17 +38,17 @@ RENAMED_IN_MODEL = {
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The state of a training, and all that is needed to render its model without the data set."""
+    """Hold the state of a training, and what is needed to render its model without the data set."""
 
-    training: str  # hash of what the training reads: gsbench.measure.settings.training_hash
-    data: str  # Scene.fingerprint
+    training: str  # hash of the settings that affect the training: gsbench.measure.settings.training_hash
+    data: str  # hash of the data set: Scene.fingerprint
     state: dict[str, Any]  # Trainer.state_dict
-    config: dict[str, Any] = field(default_factory=dict)  # the whole resolved config, plain
-    scene: dict[str, Any] = field(default_factory=dict)  # gsbench.run.load.SceneDescription, plain
+    config: dict[str, Any] = field(default_factory=dict)  # the whole resolved config as plain containers
+    scene: dict[str, Any] = field(default_factory=dict)  # gsbench.run.load.SceneDescription as plain containers
 
 
 def save(path: Path, content: Checkpoint) -> None:
-    """Write a checkpoint; a reader of `path` sees the old one or the new one, never a part."""
+    """Write a checkpoint atomically: another process that reads `path` gets the old file or the new file."""
     buffer = io.BytesIO()
     torch.save({f.name: getattr(content, f.name) for f in fields(content)}, buffer)
     payload = buffer.getbuffer()
@@ -56,10 +56,19 @@ def save(path: Path, content: Checkpoint) -> None:
 
 
 def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | None:
-    """Read the state at `path`; None if there is no file, or it is of another training or other data.
+    """Read the state of a training from the checkpoint at `path`.
+
+    Args:
+        path: the file.
+        training: the hash of the training's settings.
+        data: the hash of the data set.
+        device: the device of the loaded tensors.
+
+    Returns:
+        The state; None if there is no file, or if the file belongs to other settings or other data.
 
     Raises:
-        InputError: the file exists and is not a checkpoint, or is a damaged one.
+        InputError: the file is not a checkpoint, or it is damaged.
     """
     if not path.exists():
         return None
@@ -68,10 +77,10 @@ def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | 
 
 
 def read(path: Path, device: str = "cpu") -> Checkpoint:
-    """Read the checkpoint at `path`, of any training.
+    """Read the checkpoint at `path`, whatever training wrote it.
 
     Raises:
-        InputError: there is no file, it is not a checkpoint, or it was changed after it was written.
+        InputError: the file is missing, is not a checkpoint, or was changed after it was written.
     """
     try:
         if not stat.S_ISREG(path.stat().st_mode):
@@ -101,7 +110,7 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
 
 
 def with_present_names(state: dict[str, Any]) -> dict[str, Any]:
-    """Return a training's state with its present keys, also if an older version wrote it."""
+    """Rename the keys of a training's state that an older version of gsbench wrote to the names in use now."""
     state = {RENAMED.get(key, key): value for key, value in state.items()}
     for part, names in (("model", RENAMED_IN_MODEL), ("optimizer", RENAMED_IN_OPTIMIZER)):
         if isinstance(one := state.get(part), dict):
@@ -110,7 +119,7 @@ def with_present_names(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def _present_key(key: Any, names: dict[str, str]) -> Any:
-    """Return the name that a key of a part of the state has now."""
+    """Return the name in use now for a key of an old checkpoint; `names` maps old prefixes to new ones."""
     for old, new in names.items():
         if isinstance(key, str) and key.startswith(old):
             return new + key.removeprefix(old)
@@ -118,14 +127,14 @@ def _present_key(key: Any, names: dict[str, str]) -> Any:
 
 
 def check_plain(value: object, most: int) -> None:
-    """Check that a loaded state has only containers, numbers, text, and tensors of the size that they claim.
+    """Check that a state loaded from a file contains only dictionaries, lists, numbers, strings and dense tensors.
 
     Args:
         value: the state.
-        most: bytes of the file; no tensor may be larger.
+        most: the size of the file in bytes; a tensor must not be larger.
 
     Raises:
-        InputError: it holds something else, or a tensor without memory of its own.
+        InputError: the state contains another type, or a sparse, quantized or too large tensor.
         RecursionError: a container contains itself.
     """
     if isinstance(value, Tensor):
@@ -148,23 +157,23 @@ def check_plain(value: object, most: int) -> None:
 
 
 def without_times(state: Any) -> Any:
-    """Return a training's state without its TIMES: the rest has the same bits in two trainings of one seed."""
+    """Remove measured times from a training's state, so that two trainings with one seed can be compared bit by bit."""
     if isinstance(state, dict):
         return {key: without_times(value) for key, value in state.items() if key not in TIMES}
     return [without_times(value) for value in state] if isinstance(state, (list, tuple)) else state
 
 
 def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    """Take a tensor out of a checkpoint's state, contiguous.
+    """Return a contiguous tensor from the state in a checkpoint, after checking its shape and dtype.
 
     Args:
-        state: the dict that should hold it.
-        name: its key.
-        shape: its required shape.
-        dtype: its required type.
+        state: a dictionary from the checkpoint; any other object raises InputError.
+        name: the key of the tensor.
+        shape: the required shape.
+        dtype: the required dtype.
 
     Raises:
-        InputError: it is missing, or its shape or type is not that of this training.
+        InputError: the tensor is missing, or its shape or dtype is different.
     """
     value = state.get(name) if isinstance(state, dict) else None
     if not isinstance(value, Tensor) or value.layout != torch.strided or value.device.type == "meta":
@@ -176,7 +185,7 @@ def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -
 
 
 def whole_number(name: str, value: object, most: int) -> int:
-    """Take a whole number from 0 to `most` out of a checkpoint's state; raises InputError if it is something else."""
+    """Return `value`, read from a checkpoint, if it is an int from 0 to `most`; otherwise raise InputError."""
     if type(value) is not int or not 0 <= value <= most:
         raise InputError(f"checkpoint: expected '{name}' from 0 to {most}, got {value!r:.80}")
     return value

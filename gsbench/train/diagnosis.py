@@ -1,4 +1,4 @@
-"""Explain why a training diverged: find the first Gaussian whose gradient is not finite, and a hard case like it."""
+"""Explain why a training diverged: find a Gaussian with a non-finite gradient, and name what is unusual about it."""
 
 import math
 
@@ -7,14 +7,14 @@ import torch
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models import GaussianModel
 
-THIN = -10.0  # log of a size in time: e^-10 of the clip is less than a frame of any scene
-NEEDLE = math.log(1e5)
+THIN = -10.0  # log of a size in time; e^-10 of a scene's length is less than a frame
+NEEDLE = math.log(1e5)  # log ratio of the largest to the smallest size
 FAR = 1e3  # in units of the scene's extent
-LOUD = 1e3  # size of a colour coefficient
+LOUD = 1e3  # absolute value of a colour coefficient
 
 
 def explain(model: GaussianModel) -> str:
-    """Describe in one line which gradients of a model are not finite."""
+    """Return one line on the first Gaussian with a NaN or infinite gradient, and a numerical stress test like it."""
     for name, parameter in model.splats.items():
         if parameter.grad is None:
             continue
@@ -30,7 +30,7 @@ def explain(model: GaussianModel) -> str:
 
 @torch.no_grad()
 def resembles(model: GaussianModel, index: int) -> str | None:
-    """Name the case of `gsbench.stability` that a Gaussian's raw parameters resemble; None if they look ordinary."""
+    """Return the name of a numerical stress test (`gsbench.stability`) that resembles a Gaussian, or None."""
     raw = {name: parameter[index].flatten() for name, parameter in model.splats.items()}
     if not all(value.isfinite().all() for value in raw.values()):
         return "learning_rates_times_30"  # the previous step was too long

@@ -1,38 +1,43 @@
-"""Check every loss and gradient of a training for NaN and infinity, without a wait for the GPU at every step."""
+"""Check the loss and the gradients of every training step for NaN and infinity, with few GPU synchronisations."""
 
 import math
 
 import torch
 from torch import Tensor, nn
 
-LOOK_EVERY = 50  # steps on a GPU, since a look waits for it; on the CPU every step is looked at
+LOOK_EVERY = 50  # steps between two reads of the result on a GPU, since a read synchronises; on a CPU it is 1
 
 
 class DivergedError(RuntimeError):
-    """A loss or a gradient was not finite."""
+    """A loss or a gradient of a training was NaN or infinite."""
 
 
 class FiniteCheck:
-    """Checks the loss and the gradients of every step on their device, and raises when the result is read.
+    """Check the loss and the gradients of every step for NaN and infinity.
 
-    On a GPU the result is read some steps later. From the first bad step on, `skip` [] is therefore 1 instead of 0, and
-    torch's fused Adam, which takes it as its `found_inf`, changes no parameter.
+    On a GPU the result is read only every LOOK_EVERY steps. Until then, the tensor `skip` [] stops the updates: it is 1
+    from the first bad step on, and torch's fused Adam reads it as `found_inf`.
     """
 
     def __init__(self, device: str) -> None:
-        """Check a training on `device` ("cpu", "cuda", "cuda:1")."""
+        """Prepare the checks of a training on `device`, such as "cpu", "cuda" or "cuda:1"."""
         self.every = LOOK_EVERY if device.startswith("cuda") else 1
-        self.loss = math.nan  # of the last step that was read
+        self.loss = math.nan  # loss of the last step whose result was read
         self._names: list[str] = []
-        self._state = torch.zeros(4, device=device)  # skip, step, the first bad one of `_names`, loss
+        self._state = torch.zeros(4, device=device)  # skip, step, index of the first bad group in `_names`, loss
         self.skip = self._state[0]
 
     @torch.no_grad()
     def see(self, step: int, loss: Tensor, groups: dict[str, list[nn.Parameter]]) -> None:
-        """Check a step before its gradients are applied; `look` every `every` steps.
+        """Check the loss and the gradients of a step, before the optimizer uses them.
+
+        Args:
+            step: the number of the step.
+            loss: the loss, [].
+            groups: the parameters by group.
 
         Raises:
-            DivergedError: as `look`.
+            DivergedError: a check failed, in this step or since the result was last read.
         """
         gradients = {name: [p.grad for p in group if p.grad is not None] for name, group in groups.items()}
         if self.every == 1:
@@ -50,7 +55,7 @@ class FiniteCheck:
             self.look()
 
     def look(self) -> None:
-        """Read the result of the checks so far.
+        """Read the result of all checks so far; on a GPU this waits for the kernels to finish.
 
         Raises:
             DivergedError: a check failed; the message names the step and the parameter.
@@ -65,7 +70,7 @@ class FiniteCheck:
 
 
 def _all_finite(gradients: list[Tensor], like: Tensor) -> Tensor:
-    """Tell whether all gradients are finite, as [] bool on the device."""
+    """Return whether all gradients are finite, as a bool tensor [] on the device of `like`."""
     finite = torch.ones_like(like, dtype=torch.bool)
     for gradient in gradients:
         finite = finite & gradient.isfinite().all()

@@ -1,4 +1,8 @@
-"""Remove effects that Gaussians do not need: once after densification, so that the rest is faster, and at the end."""
+"""Make Gaussians independent of time, direction or AGR (neural refinement) where the images allow it.
+
+This is done once after densification and once at the end of a training.
+The first simplification makes the rest of the training faster.
+"""
 
 import copy
 import time
@@ -25,47 +29,47 @@ from gsbench.train.renderer import Renderer
 from gsbench.train.rows import Rows
 
 GATES = ("off", "end", "both")
-# dB on val that a gate in training may cost at once: of 0.5, 0.2 and 0.1 the largest that the rest of the training
-# makes up for on every scene tried, without AGR and with it (docs/effects.md).
+# Largest loss of PSNR on val, in dB, when Gaussians are simplified in training. Of 0.5, 0.2 and 0.1 these are the
+# largest losses from which the rest of the training recovers on every scene tried (docs/effects.md).
 LOSS_IN_TRAINING = 0.1
 LOSS_WITH_AGR = 0.5
-# A model of fewer Gaussians is not gated in training, for it needs them all: limited to 300 and 600 Gaussians, models
-# of four of five scenes ended 0.2 to 0.5 dB lower on val by that gate (docs/tuning.md).
+# A model with fewer Gaussians than this is not simplified in training. With 300 and 600 Gaussians, models of four of
+# five scenes lost 0.2 to 0.5 dB on val by that (docs/tuning.md).
 LEAST_IN_TRAINING = 1_000
-VIEWS_IN_TRAINING = 30  # that the probe looks at: the gate must cost less than it saves
-# AGR's rate is constant, and fewer Gaussians end farther from where its steps swing around: on trex a gated training
-# ended 0.4 dB lower by that.
+VIEWS_IN_TRAINING = 30  # views from which errors are predicted; more would cost more time than simplification saves
+# AGR's learning rate does not decay by itself. With fewer Gaussians the last steps are then too large: on trex a
+# training with simplified Gaussians ended 0.4 dB lower.
 LAST_RATE = 0.1
-HELD_OUT = 8  # every so many training views one, to check on where the scene has no val split of its own
-FEW = 12  # training views, of which none is held out
+HELD_OUT = 8  # every 8th training view is held out to check PSNR, if the scene has no val split
+FEW = 12  # with fewer training views than this, none is held out
 
 NO_GATES: dict[str, Any] = {"gates": [], "notes": []}  # the state of a training without gates
-Shape = tuple[dict[str, Tensor], EffectSets | None]  # raw parameters and effect sets
+Shape = tuple[dict[str, Tensor], EffectSets | None]  # raw parameters, and the effects of each Gaussian
 
 
 def shape_of(model: GaussianModel) -> Shape:
-    """Return all tensors of a model's Gaussians, from which `become` restores them."""
+    """Return the parameters of a model's Gaussians and what each depends on; `become` restores them."""
     return {name: x.data for name, x in model.splats.items()}, model.effect_sets
 
 
 def become(model: GaussianModel, shape: Shape) -> None:
-    """Replace the Gaussians of a model by those that `shape_of` returned."""
+    """Replace the Gaussians of a model by those that `shape_of` returned for it or for another model."""
     for name, value in shape[0].items():
         model.splats[name].data = value
     model.effect_sets = shape[1]
 
 
 class Gating:
-    """The removal of effects (time, direction, AGR) from Gaussians in one training."""
+    """Simplify Gaussians in a training: make them independent of time, direction or AGR (the neural refinement)."""
 
     def __init__(self, rows: Rows, scene: Scene, renderer: Renderer, config: Config) -> None:
-        """Prepare for the model of `rows`; whatever is kept for each of its rows follows the changes.
+        """Choose the views to predict the errors of simplified Gaussians from, and the views to measure PSNR on.
 
         Args:
-            rows: the rows (Gaussians) of the training.
-            scene: its views are used to predict errors and to measure losses.
-            renderer: renders views as the training does.
-            config: says when effects are removed, and how much PSNR this may cost.
+            rows: the model, together with the per-Gaussian state of the training, which must change with it.
+            scene: the scene with its training and val views.
+            renderer: renders views with the settings of the training.
+            config: the config, which has the allowed loss of PSNR.
         """
         self.rows = rows
         self.model = rows.model
@@ -87,32 +91,57 @@ class Gating:
                 self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
 
     def in_training(self, step: int) -> bool:
-        """Remove effects before a step if this is due, within LOSS_IN_TRAINING dB; tell whether it was done."""
+        """Make Gaussians independent of time, direction or AGR (the refinement) before a step of the training.
+
+        This is not done if the model has fewer than LEAST_IN_TRAINING Gaussians, or if PSNR on val would fall too much.
+
+        Returns:
+            Whether it was done.
+        """
         if len(self.model) < LEAST_IN_TRAINING:
             self.notes.append(f"at step {step} the model has {len(self.model)} Gaussians: of fewer than "
                               f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
             return False
         most = LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING
-        # Kernels keep the entries of static Gaussians; those of one that is frozen by halves would learn on.
+        # Static Gaussians do not learn unused parameters. Those that are independent of only time or direction would.
         return self._gate(step, most, VIEWS_IN_TRAINING, by_halves=False)
 
     def slows_agr(self, step: int) -> float:
-        """Return the factor of AGR's learning rate: it falls log-linearly to LAST_RATE after effects were removed."""
+        """Return the factor of the learning rate of AGR, the neural refinement, at a step.
+
+        The factor is 1 until Gaussians are simplified in training. Then it falls log-linearly to LAST_RATE at the end.
+        """
         if not self.gates or self.gates[0].step is None:
             return 1.0
         begun, iterations = self.gates[0].step, self.config.train.iterations
         return float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))
 
     def at_end(self, by_halves: bool) -> bool:
-        """Remove effects from the finished model within `effects.budget_db`, and tell whether that was done."""
+        """Make Gaussians independent of time, direction or AGR (the refinement) after the training.
+
+        This is not done if PSNR would fall by more than `effects.budget_db` dB.
+
+        Args:
+            by_halves: whether a Gaussian may become independent of only one of time and direction.
+
+        Returns:
+            Whether it was done.
+        """
         return self._gate(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
 
     def now(self) -> Shape:
-        """Return the model's Gaussians as they are, for `compare`."""
+        """Return the present parameters of the model's Gaussians and what each depends on, for `compare`."""
         return shape_of(self.model)
 
     def compare(self, ungated: Shape, views: list[View]) -> None:
-        """Measure on `views` what the removal of effects changed, and what freezing direction would change."""
+        """Measure how PSNR and frame time changed when Gaussians were simplified at the end of the training.
+
+        The function also measures how PSNR and frame time would change if no Gaussian depended on direction.
+
+        Args:
+            ungated: the Gaussians before they were simplified, from `now`.
+            views: the views (test or val) on which results are measured.
+        """
         if self.gates and self.gates[-1].step is None:
             before = copy.deepcopy(self.model)
             become(before, ungated)
@@ -124,7 +153,7 @@ class Gating:
             self.direction = Direction(share_with_direction(self.model), loss, *times)
 
     def _beside(self, one: GaussianModel, other: GaussianModel, views: list[View]) -> tuple[float, list[float]]:
-        """Return how much lower the other model's PSNR on views is, and the median frame times of both models in ms."""
+        """Return how much lower the PSNR of `other` is than that of `one`, dB, and both median frame times, ms."""
         count = max(self.config.protocol.renders, len(views))
         frames = [lambda i, model=model: self.renderer.image(model, views[i % len(views)]) for model in (one, other)]
         times = time_in_turns(frames, count, synchroniser(self.config.device))
@@ -133,10 +162,17 @@ class Gating:
 
     @torch.no_grad()
     def _gate(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> bool:
-        """Choose and apply simplifications, and tell whether that was done; note if none was within the budget."""
+        """Make Gaussians independent of time, direction or AGR (the refinement); return whether this was done.
+
+        Args:
+            step: the step of the training; None at its end.
+            budget_db: the largest allowed loss of PSNR, dB.
+            most: the largest number of views from which errors are predicted.
+            by_halves: whether a Gaussian may become independent of only one of time and direction.
+        """
         started = time.perf_counter()
         model, at_end = as_gated(self.model), step is None
-        # In training AGR does not rest: when a Gaussian can be seen still changes.
+        # In training AGR changes Gaussians at all times, because the times at which they are visible still change.
         intervals = seen_times(model, self.probed) if at_end else None
         hidden = None if intervals is None else intervals[:, 0].isinf()
         sensitivity = probe(model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
@@ -159,12 +195,12 @@ class Gating:
         self.rows.moved(found.rows, found.changed)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the decisions, for the checkpoint; the effect sets are part of the model's state."""
+        """Return for the checkpoint when Gaussians were simplified, and how PSNR and frame time changed."""
         direction = asdict(self.direction) if self.direction else None
         return {"gates": [asdict(gate) for gate in self.gates], "notes": list(self.notes), "direction": direction}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from the `state_dict` of a checkpoint after its model; raises InputError if it is damaged."""
+        """Restore from a checkpoint when Gaussians were simplified; raises InputError if the state is damaged."""
         if not isinstance(state, dict):
             raise InputError(f"checkpoint: expected 'gating' as a dict, got {type(state).__name__}")
         gates, notes = state["gates"], state["notes"]

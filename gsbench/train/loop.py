@@ -1,4 +1,4 @@
-"""Train a model in a loop: descend on a batch of views, control the density, measure on the val split."""
+"""Train a model: gradient steps on batches of views, density control, and measurements of PSNR on val."""
 
 import math
 import sys
@@ -36,23 +36,26 @@ from gsbench.train.thinning import blend_weights, heaviest
 
 @dataclass
 class Best:
-    """PSNR on the evaluated split at the iterations that were best on val or on test, dB."""
+    """Hold the best PSNR on val so far, and two PSNRs of the evaluated split, which is test or val.
 
-    val: float = -math.inf  # the best on val so far ..
-    eval_at_best_val: float | None = None  # .. and what the evaluated split had then
-    eval: float | None = None  # the best on the evaluated split itself: this leaks
+    One is its PSNR at the iteration that was best on val, the other its own best PSNR.
+    """
+
+    val: float = -math.inf  # best PSNR on val so far, dB
+    eval_at_best_val: float | None = None  # PSNR of the evaluated split at that iteration
+    eval: float | None = None  # best PSNR of the evaluated split; to choose an iteration by it leaks test data
 
 
 class Trainer:
-    """The training of one run. `step` counts finished steps; between two steps the state is complete."""
+    """Train one model on one scene. `step` is the number of finished steps; the state can be saved after each step."""
 
     def __init__(self, model: GaussianModel, scene: Scene, views: list[View], config: Config) -> None:
-        """Prepare the training.
+        """Make the optimizer, the density control and all other parts of the training of a model.
 
         Args:
             model: the initialised model on `config.device`.
             scene: the scene, which has the training and the val views.
-            views: the views of the evaluated split.
+            views: the views (test or val) on which results are measured.
             config: the config of the run.
 
         Raises:
@@ -84,26 +87,26 @@ class Trainer:
         self.curve = Curve()
         self.best = Best()
         self.step = 0
-        self._is_full = False  # whether there were as many Gaussians as there may be
+        self._is_full = False  # whether the largest allowed number of Gaussians was reached
 
     def run(
         self, save: Callable[[dict[str, Any]], None], label: str, goes_on: Callable[[], bool] = lambda: True
     ) -> None:
-        """Train to the end, or until `goes_on()` says no after a step; `step` tells which.
+        """Train until the last step, or until `goes_on()` returns False.
 
         Args:
-            save: called with the state every `checkpoint_minutes` and once at the end.
+            save: a function that gets the state every `checkpoint_minutes` and once at the end.
             label: the name of the run in the progress bar.
-            goes_on: called after every step; False stops the training.
+            goes_on: a function that is called after every step; the training stops if it returns False.
 
         Raises:
-            DivergedError: a loss or gradient was not finite; the last saved state is from before that step.
+            DivergedError: a loss or gradient was not finite. The last saved state is from before that step.
         """
         train = self.config.train
         if self.step == train.iterations:  # a checkpoint of a finished training
             return
         saved = time.monotonic()
-        every = 0.2 if sys.stderr.isatty() else 20.0  # seconds between updates, fewer where stderr is a log file
+        every = 0.2 if sys.stderr.isatty() else 20.0  # seconds between updates of the bar; rare if stderr is a file
         with tqdm(
             total=train.iterations, initial=self.step, desc=label, unit="it", mininterval=every, maxinterval=every
         ) as bar:
@@ -118,7 +121,7 @@ class Trainer:
                         self.density.reset_opacities()
                 self.step += 1
                 bar.update()
-                # Seconds are those of the last point: reading the clock's own would wait for a GPU at every step.
+                # The bar shows the seconds of the last measurement: the clock itself waits for a GPU when it is read.
                 loss = f"loss {self.finite_check.loss:.4f}"
                 bar.set_postfix_str(f"{self.curve.progress}, {loss}, {len(self.model)} Gaussians", refresh=False)
                 if not goes_on():
@@ -131,13 +134,13 @@ class Trainer:
         save(self.state_dict())
 
     def gate_at_end(self, by_halves: bool = False) -> None:
-        """Remove effects from the finished model, and measure what this changed.
+        """Make Gaussians independent of time, direction or AGR (the refinement) after the training.
 
-        The measuring does not count as training time.
+        PSNR and frame time are measured before and after. The measurement does not count as training time.
 
         Args:
-            by_halves: whether time alone or direction alone may be frozen. This saves bytes but no frame time, and
-                nearly doubles the seconds (docs/effects.md).
+            by_halves: whether a Gaussian may become independent of only one of time and direction. This saves bytes but
+                no frame time, and nearly doubles the time of this function (docs/effects.md).
         """
         self.model.set_active(self.schedule.active(self.step - 1))
         ungated = self.gating.now()
@@ -147,7 +150,7 @@ class Trainer:
         self.gating.compare(ungated, self.views)
 
     def _descend(self) -> None:
-        """Do one step: the loss is the mean over a batch of views."""
+        """Do one training step on a batch of views: compute gradients, update parameters, control the density."""
         step, train, stages, schedule = self.step, self.config.train, self.stages, self.schedule
         self.model.set_active(self.schedule.active(step))
         factor = schedule.resolution(step)
@@ -186,13 +189,13 @@ class Trainer:
                     self.minimum_scale.update()
 
     def _thin(self) -> None:
-        """Drop the Gaussians of the smallest summed blend weight, until `train.densify.thin_to` of them are left."""
+        """Keep the Gaussians with the largest blend weights, summed over all views: a share `train.densify.thin_to`."""
         share = self.config.train.densify.thin_to
         assert share is not None
         self.rows.select(heaviest(blend_weights(self.model, self.scene.train, self.renderer.antialias), share))
 
     def _tell_full(self, refused: int) -> None:
-        """Say once that no more Gaussians are made than the config allows."""
+        """Print once that the limit `train.densify.max_gaussians` is reached; `refused` Gaussians were not added."""
         if refused and not self._is_full:
             self._is_full = True
             most = self.config.train.densify.max_gaussians or MOST_GAUSSIANS
@@ -200,7 +203,7 @@ class Trainer:
                        f"{refused} of smaller gradients are not cloned or split", file=sys.stderr)  # fmt: skip
 
     def _measure(self) -> None:
-        """Add a point to the curve; its seconds belong to no stage and so do not count as training time."""
+        """Measure PSNR on val and add it to the training curve. This time does not count as training time."""
         self.model.set_active(self.schedule.active(self.step))
         val = self.psnr(self.scene.val) if self.scene.val else math.nan
         self.curve.add(self.step + 1, sum(self.stages.seconds.values()), val)
@@ -214,18 +217,18 @@ class Trainer:
             self.best.eval = now
 
     def psnr(self, views: list[View]) -> float:
-        """Measure the mean PSNR over views, dB."""
+        """Return the mean PSNR of the model over views, dB."""
         return self.renderer.psnr(self.model, views)
 
     def render(self, view: View) -> Tensor:
-        """Render the image of a view, [H, W, 3]."""
+        """Render the image of the model for the camera and time of a view, [H, W, 3]."""
         return self.renderer.image(self.model, view)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next step depends on, and everything measured so far, for the checkpoint.
+        """Return the state of the training for a checkpoint, with all measurements so far.
 
         Raises:
-            DivergedError: as `run`.
+            DivergedError: a loss or gradient was not finite.
         """
         self.finite_check.look()
         return {
@@ -242,10 +245,10 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`: results are bit-equal to those of an uninterrupted run.
+        """Restore the training from a `state_dict`. Its results are bit-equal to those of an uninterrupted run.
 
         Raises:
-            InputError: a part is missing, or is not of this training.
+            InputError: a part of the state is missing or belongs to another training.
         """
         try:
             self.step = whole_number("step", state["step"], self.config.train.iterations)

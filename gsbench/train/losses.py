@@ -1,4 +1,4 @@
-"""Compute the training loss (1 - w) L1 + w (1 - SSIM) of an image (3DGS eq. 7)."""
+"""Compute the photometric training loss of 3DGS, (1 - w) L1 + w (1 - SSIM) (3DGS, eq. 7)."""
 
 import functools
 
@@ -14,7 +14,7 @@ SIGMA = 1.5
 
 
 def photometric(image: Tensor, target: Tensor, ssim_weight: float, backend: Backend = AUTO) -> Tensor:
-    """Compute the training loss [] of an image and its target, both [H, W, 3] or [1, H, W, 3] in [0, 1]."""
+    """Compute the loss (1 - ssim_weight) L1 + ssim_weight (1 - SSIM) of an image and its target, [H, W, 3] each."""
     if backend.serves(image):
         return l1_ssim(image, target, ssim_weight)
     loss = F.l1_loss(image, target)
@@ -24,9 +24,9 @@ def photometric(image: Tensor, target: Tensor, ssim_weight: float, backend: Back
 
 
 def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
-    """Compute the mean SSIM in a zero-padded 11 x 11 Gaussian window, as 3DGS does for its loss.
+    """Compute the mean SSIM with a zero-padded 11 x 11 Gaussian window, as the loss of 3DGS does.
 
-    Results are measured by `gsbench.measure.quality.ssim` instead (Wang et al. 2004).
+    The SSIM in tables of results is `gsbench.measure.quality.ssim` (Wang et al. 2004), not this one.
     """
     a, b = (x.reshape(x.shape[-3:]).permute(2, 0, 1) for x in (a, b))
     moments = _blur(torch.cat([a, b, a * a, b * b, a * b]))
@@ -38,9 +38,9 @@ def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _blur(planes: Tensor) -> Tensor:  # [P, H, W]
-    """Blur by the zero-padded Gaussian window. It is separable: a product with a banded matrix from either side.
+    """Convolve images [P, H, W] with the zero-padded Gaussian window, by a banded matrix on the left and on the right.
 
-    For small images on the CPU this, and its gradient, is many times faster than torch's convolutions.
+    For small images on a CPU this is many times faster than torch's convolutions, forward and backward.
     """
     height, width = planes.shape[-2:]
     return _band(height, planes.device, planes.dtype) @ planes @ _band(width, planes.device, planes.dtype)

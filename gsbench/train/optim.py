@@ -1,4 +1,7 @@
-"""Optimize by Adam, with a learning rate for each parameter group and moments that follow the Gaussians."""
+"""Optimize a model by Adam, with a learning rate for each parameter group.
+
+Adam's moments are kept, copied or cleared when Gaussians are pruned, cloned or split.
+"""
 
 from __future__ import annotations
 
@@ -25,28 +28,28 @@ COOLED = 0.1  # share of a learning rate that is left at the end of a cooldown
 
 
 class Optimizer:
-    """Adam over a model's parameter groups (eps 1e-15, as 3DGS).
+    """Optimize the parameters of a model by Adam with eps = 1e-15, as 3DGS does.
 
-    One call of the CPU's kernel updates its parameters. torch.optim.Adam updates those of a GPU and of the reference.
+    On the CPU, one call of a kernel updates all parameters. On a GPU and in the reference, torch.optim.Adam does.
 
-    `adam` moves Gaussians that no view of the batch sees by their remaining momentum. `sparse_adam` leaves them and
-    their moments unchanged (Mallick et al. 2024, Taming 3DGS). Where all Gaussians are visible the two are the same.
+    The two kinds differ for Gaussians that no view of a batch sees. `adam` still moves them by their momentum.
+    `sparse_adam` leaves them and their moments unchanged (Mallick et al. 2024, Taming 3DGS).
     """
 
     def __init__(
         self, model: GaussianModel, config: ModelConfig, train: TrainConfig, extent: float, kind: str = "adam"
     ) -> None:
-        """Make a parameter group for each name of `model.groups()`.
+        """Make an Adam parameter group with a learning rate for each group of the model's parameters.
 
         Args:
             model: the initialised model.
-            config: the model's config, with the learning rates.
-            train: the config with the length of the run, and the length that the rates are stated for.
-            extent: the scene's extent, world units.
-            kind: the optimizer, one of OPTIMIZERS.
+            config: the config of the model, with the learning rates.
+            train: the config of the training, with its number of iterations.
+            extent: the radius of the scene, world units.
+            kind: `adam` or `sparse_adam`.
 
         Raises:
-            InputError: a parameter has no learning rate, or a rate is for a parameter that no variant of the model has.
+            InputError: a parameter has no learning rate, or a learning rate has no parameter.
         """
         groups = model.groups()
         for name in groups:
@@ -79,15 +82,14 @@ class Optimizer:
         drawn: Tensor | None,  # [N] bool
         slowed: float = 1.0,
     ) -> None:
-        """Update the parameters that have a gradient, at the rates of this step, and drop the gradients.
+        """Update the parameters that have a gradient, then delete the gradients.
 
-        If `skip` [] is 1, nothing is updated.
+        On a GPU nothing is updated if an earlier gradient was not finite (`skip` is 1).
 
         Args:
-            step: number of the step, counted from 0.
-            drawn: the Gaussians that some view of the batch sees, which `sparse_adam` needs; the others have no
-                gradient.
-            slowed: factor of AGR's learning rate.
+            step: the number of the step, counted from 0; it determines the learning rates.
+            drawn: which Gaussians are visible in the batch, [N] bool; only `sparse_adam` needs it.
+            slowed: the factor by which the learning rate of AGR, the neural refinement, is multiplied.
         """
         rates = self.rates_at(step, slowed)
         by_kernel: list[tuple[nn.Parameter, float]] = []
@@ -117,11 +119,11 @@ class Optimizer:
         return {name: rate * slowed if name == "refinement" else rate for name, rate in rates.items()}
 
     def _is_native(self, parameter: Tensor) -> bool:
-        """Tell whether the kernel of the CPU updates a parameter."""
+        """Return whether the CPU kernel, not torch, updates a parameter."""
         return parameter.device.type == "cpu" and self.model.backend.serves(parameter) and self.skip is None
 
     def _state_of(self, parameter: Tensor) -> dict[str, Tensor]:
-        """Return the moments of a parameter, zero at first."""
+        """Return Adam's step count and moments of a parameter; create them with zeros if they do not exist."""
         state = self.moments[parameter]
         if not state:
             state["step"] = torch.zeros((), device=parameter.device)
@@ -129,7 +131,7 @@ class Optimizer:
         return state
 
     def _step_all(self, rated: list[tuple[nn.Parameter, float]]) -> None:
-        """Update parameters, each at its rate, in one call of the kernel."""
+        """Update all given parameters by one call of the CPU kernel; `rated` pairs each with its learning rate."""
         parameters, rates = [p.data for p, _ in rated], [rate for _, rate in rated]
         gradients = [p.grad for p, _ in rated if p.grad is not None]
         states = [self._state_of(p) for p, _ in rated]
@@ -140,7 +142,7 @@ class Optimizer:
             parameter.grad = None
 
     def _step_rows(self, parameter: nn.Parameter, rate: float, drawn: Tensor) -> None:
-        """Update the rows `drawn` of a parameter with a gradient, unless the step is to be skipped."""
+        """Update only the Gaussians `drawn` [N] bool of a parameter, unless a gradient was not finite."""
         if parameter.grad is None:
             return
         if self.skip is not None:
@@ -154,7 +156,12 @@ class Optimizer:
         parameter.grad = None
 
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Move Adam's moments as `model.select(rows)` moved the Gaussians; those of `fresh` rows become zero."""
+        """Reorder Adam's moments after Gaussians were pruned, cloned or split.
+
+        Args:
+            rows: for each Gaussian now, the index of the Gaussian before whose moments it takes, [M].
+            fresh: which Gaussians are new, [M] bool; their moments become zero.
+        """
         for parameter in self.model.splats.values():
             state = self.moments.get(parameter, {})
             for name in ("exp_avg", "exp_avg_sq"):
@@ -164,20 +171,20 @@ class Optimizer:
                     state[name] = moments
 
     def forget(self, parameter: Tensor) -> None:
-        """Zero the moments of a parameter that was set directly, as 3DGS does after an opacity reset."""
+        """Set Adam's moments of a parameter to zero, as 3DGS does after it resets the opacities."""
         for name in ("exp_avg", "exp_avg_sq"):
             if parameter in self.moments:
                 self.moments[parameter][name].zero_()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the moments and the number of steps of every parameter, for the checkpoint."""
+        """Return Adam's moments and step count of every parameter, for the checkpoint."""
         return {key: dict(self.moments[parameter]) for key, parameter in self._keyed() if parameter in self.moments}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from the `state_dict` of a checkpoint, once the model's parameters are loaded.
+        """Restore Adam's moments from a checkpoint; the parameters of the model must be loaded first.
 
         Raises:
-            InputError: moments are not of this model's parameters.
+            InputError: the moments do not belong to the parameters of this model.
         """
         self.moments.clear()
         own = dict(self._keyed())
@@ -199,12 +206,11 @@ class Optimizer:
 
 
 def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) -> float:
-    """Compute the learning rate of a step counted from 0: log-linear from start to end over the run (3DGS).
+    """Compute the learning rate of a step, counted from 0; it decays log-linearly from start to end, as in 3DGS.
 
-    A `per_run` rate is multiplied by sqrt(recipe_iterations / iterations). The length of an Adam step is its rate,
-    whatever the size of the gradient. The steps of a run add up in proportion to its length where gradients keep their
-    sign, and to its square root where they are noise. The root improved every model (docs/tuning.md). From
-    `cooldown_from` on, a rate also falls linearly to COOLED of itself.
+    A rate with `per_extent` is multiplied by the radius of the scene. A rate with `per_run` is multiplied by
+    sqrt(recipe_iterations / iterations), so a short run takes larger steps; this improved every model (docs/tuning.md).
+    From step `cooldown_from` of the recipe on, every rate also falls linearly, to COOLED of itself at the end.
     """
     scale = extent if rate.per_extent else 1.0
     if rate.per_run:
@@ -221,7 +227,7 @@ def adam_reference(
     parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, drawn: Tensor, rate: float, betas: list[float],
     eps: float, step: Tensor,
 ) -> None:  # fmt: skip
-    """Compute `gsbench.kernels.adam.adam` in torch; see there for the arguments."""
+    """Do an Adam step in torch on the Gaussians `drawn` [N] bool only; the kernel `adam` does the same."""
     rows = drawn.nonzero()[:, 0]
     g = gradient[rows]
     m = mean[rows].lerp(g, 1 - betas[0])

@@ -1,9 +1,9 @@
-"""Add penalties to the loss of a step: a list of (model, query) -> scalar, each with a weight and a window of steps.
+"""Define regularisers that are added to the photometric loss, each with a weight and a range of steps.
 
     loss = (1 - w) L1 + w (1 - SSIM) + sum_k weight_k penalty_k(model, query)
 
-A penalty is computed for every view of a batch, on the tape of that view. To add one, write a function and name it in
-PENALTIES and in `gsbench.config.PenaltiesConfig`.
+A penalty is a function of the model and of the camera centre and time of a view. It is computed for every view of a
+batch. To add a penalty, write its function and add its name to PENALTIES and to `gsbench.config.PenaltiesConfig`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ Penalty = Callable[[GaussianModel, Query], Tensor]
 
 
 def mean_opacity(model: GaussianModel, _query: Query) -> Tensor:
-    """Return the mean opacity of all Gaussians, [] in (0, 1) (a regulariser of 3DGS-MCMC)."""
+    """Return the mean opacity of all Gaussians, [], a regulariser of 3DGS-MCMC."""
     return torch.sigmoid(model.splats["opacities"]).mean()
 
 
 def mean_size(model: GaussianModel, _query: Query) -> Tensor:
-    """Return the mean of the Gaussians' largest standard deviations in parts of the scene's extent, []."""
+    """Return the mean over Gaussians of the largest standard deviation, divided by the radius of the scene, []."""
     return model.scales().mean() / model.extent
 
 
@@ -38,7 +38,7 @@ PENALTIES: dict[str, Penalty] = {"opacity": mean_opacity, "size": mean_size}
 
 
 def check_penalties(config: PenaltiesConfig) -> None:
-    """Raise InputError for a penalty whose window is empty."""
+    """Raise InputError if the last step of a penalty is not after its first step."""
     for name in PENALTIES:
         one: PenaltyConfig = getattr(config, name)
         if one.stop is not None and one.stop <= one.start:
@@ -46,7 +46,7 @@ def check_penalties(config: PenaltiesConfig) -> None:
 
 
 def penalties_at(step: int, config: PenaltiesConfig, schedule: Schedule) -> list[tuple[float, Penalty]]:
-    """List (weight, penalty) of those whose window holds a step, counted from 0."""
+    """Return the pairs (weight, penalty) of the penalties that are active at a step, counted from 0."""
     asked = [(getattr(config, name), penalty) for name, penalty in PENALTIES.items()]
     return [(one.weight, penalty) for one, penalty in asked
             if one.weight and schedule.within(step, one.start, one.stop)]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Keep training views at smaller resolutions: a step early in a training needs no fine detail."""
+"""Reduce the resolution of training views, for the early steps of a training, which need no fine detail."""
 
 import torch
 import torch.nn.functional as F
@@ -7,15 +7,15 @@ from gsbench.scenes import Camera, View
 
 
 class Pyramid:
-    """The training views at every resolution that was requested; each is reduced once and kept."""
+    """Provide the training views at several resolutions; a reduced view is cached."""
 
     def __init__(self, views: list[View]) -> None:
-        """Start with the views as they are."""
+        """Store the training views at full resolution."""
         self.views = views
         self._reduced: dict[tuple[int, int], View] = {}
 
     def view(self, index: int, factor: int) -> View:
-        """Return a view whose image is `factor` times smaller in width and height; 1 returns the view itself."""
+        """Return training view number `index` with an image that is `factor` times smaller in width and height."""
         if factor == 1:
             return self.views[index]
         key = (index, factor)
@@ -24,15 +24,16 @@ class Pyramid:
         return self._reduced[key]
 
     def keep_only(self, factor: int) -> None:
-        """Forget the views of other factors."""
+        """Delete the cached views of all factors except this one."""
         self._reduced = {key: view for key, view in self._reduced.items() if key[1] == factor}
 
 
 @torch.no_grad()
 def reduced(view: View, factor: int) -> View:
-    """Average every factor x factor block of a view's image; incomplete blocks at the right and below are dropped.
+    """Return a view whose pixels are the means of factor x factor blocks of pixels.
 
-    Pixel centres are at +0.5, so the first two rows of the intrinsics K are divided by the factor.
+    Incomplete blocks at the right and the bottom are dropped. The first two rows of the intrinsics K are divided by the
+    factor, because pixel centres are at +0.5.
     """
     camera = view.camera
     width, height = camera.width // factor, camera.height // factor

@@ -1,4 +1,4 @@
-"""Render views of a model by the config of its run, and measure their PSNR."""
+"""Render views of a model with the background and antialiasing of its run, and measure PSNR."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,19 +15,19 @@ from gsbench.scenes import View
 
 @dataclass(frozen=True)
 class Renderer:
-    """The settings of rendering that all images of a run share."""
+    """Hold the rendering settings of a run: the background colour and antialiasing."""
 
     background: Tensor  # [3]
     antialias: bool  # see `gsbench.raster.rasterize`
 
     @torch.no_grad()
     def image(self, model: GaussianModel, view: View) -> Tensor:
-        """Render the image [H, W, 3] of a view."""
+        """Render the image [H, W, 3] of a model for the camera and the time of a view."""
         return render(model, view.camera, view.time, self.background, self.antialias)
 
     @torch.no_grad()
     def psnr(self, model: GaussianModel, views: Sequence[View]) -> float:
-        """Measure the mean PSNR of a model over views in dB; several views are rendered at the same time."""
+        """Return the mean PSNR of a model over views in dB; on a CPU several views are rendered in parallel."""
 
         def of_view(view: View) -> float:
             return psnr(self.image(model, view), view.image)

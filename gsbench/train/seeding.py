@@ -1,18 +1,19 @@
-"""Derive every random draw of a training from the seed of its run: the order of views, and the generators."""
+"""Make the random generators of a training from the seed of its run, and draw the order of the views."""
 
 import torch
 
 
 def batch(step: int, views: int, batch_size: int, seed: int) -> list[int]:
-    """List the views of a step: every view appears once an epoch, in an order drawn from (seed, epoch).
+    """Return the indices of the training views of a step.
 
-    The result depends only on the arguments, so a resumed run sees the same views as an uninterrupted one.
+    Each epoch is a random permutation of all views. The result depends only on the arguments, so a resumed run uses the
+    same views as an uninterrupted one.
 
     Args:
-        step: number of the step, counted from 0.
+        step: the number of the step, counted from 0.
         views: the number of training views.
-        batch_size: number of views in a step.
-        seed: seed of the run.
+        batch_size: the number of views in a step.
+        seed: the seed of the run.
     """
     chosen = []
     for position in range(step * batch_size, (step + 1) * batch_size):
@@ -22,7 +23,7 @@ def batch(step: int, views: int, batch_size: int, seed: int) -> list[int]:
 
 
 def generator(seed: int, *purpose: int) -> torch.Generator:
-    """Make a random generator for a seed and a purpose, such as the number of a step."""
+    """Return a random generator whose seed is a hash of the run's seed and more numbers, such as the step."""
     mixed = 0
     for number in (seed, *purpose):
         mixed = (mixed * 6364136223846793005 + number + 1442695040888963407) % (1 << 63)

@@ -1,7 +1,6 @@
-"""Compute the gradients of one training step: the views of a batch side by side, each on a tape of its own.
+"""Compute the gradients of one training step. On a CPU, threads render different views of the batch in parallel.
 
-Threads share the views, not the kernels: a batch has few views and each of them many small kernels. Gradients are added
-in an order that depends on the views alone, so that any number of threads gives the same bits.
+The gradients of the views are added in a fixed order, so the result has the same bits for any number of threads.
 """
 
 import time
@@ -24,17 +23,18 @@ from gsbench.train.finite_check import DivergedError
 from gsbench.train.losses import photometric
 from gsbench.train.penalties import Penalty
 
-Sums = dict[int, Tensor]  # gradients by the id of what they are by
+Sums = dict[int, Tensor]  # gradients by the id of the tensor with respect to which they are taken
 
-# A view of fewer Gaussians, with what its pixels cost in Gaussians, is done before a second thread is awake: on two
-# cores a step of 1,000 Gaussians at 80 x 80 took twice as long by two threads as by one.
+# A step with less work than this many Gaussians runs on one thread, because a second thread takes longer to start: on
+# two cores a step of 1,000 Gaussians at 80 x 80 took twice as long with two threads as with one. In this comparison 12
+# pixels count as a Gaussian.
 WORTH_A_THREAD = 4_000
 PIXELS_OF_A_GAUSSIAN = 12
 
 
 @contextmanager
 def fitting_threads(gaussians: int, pixels: int) -> Iterator[None]:
-    """Run a step on one thread where a view has too little work for two; the results are the same bits."""
+    """Run the enclosed training step on one thread if it has few Gaussians and pixels; results have the same bits."""
     threads = torch.get_num_threads()
     if gaussians + pixels / PIXELS_OF_A_GAUSSIAN < WORTH_A_THREAD:
         torch.set_num_threads(1)
@@ -45,21 +45,21 @@ def fitting_threads(gaussians: int, pixels: int) -> Iterator[None]:
 
 
 def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
-    """Choose what each view's gradients are added to, so that few are held at once and any number of workers agrees.
+    """Assign to each view of a batch the dictionary to which its gradients are added.
 
-    Views of one part of the batch (`_parts`) share a sum. Views of a worker that begins within a part have a sum each,
-    which `add_up` adds to that of the part. To the last bit it makes no difference whether a view adds to a sum or is
-    added to it (`gsbench.kernels.tape`).
+    Views share a dictionary if one thread renders them and they are in the same half of the batch. If a thread begins
+    inside a half, its views there have a dictionary each. `add_up` adds all dictionaries in the order of the views, so
+    the total has the same bits for any number of threads.
 
     Args:
-        views: number of views in the batch.
-        bounds: worker i sees the views from bounds[i] to bounds[i + 1].
+        views: the number of views in the batch.
+        bounds: thread i renders the views from bounds[i] to bounds[i + 1].
 
     Returns:
-        For each view the dictionary of its sum; views that share a sum have the same one.
+        The dictionary of each view; views that share a sum have the same object.
     """
     sums: list[Sums] = []
-    begins = 0  # of the part or the worker that the view belongs to
+    begins = 0  # first view of the half, or of the thread, that view i belongs to
     for i in range(views):
         if i in _parts(views) or i in bounds:
             begins = i
@@ -68,19 +68,19 @@ def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
 
 
 def add_up(sums: Sequence[Sums]) -> Sums:
-    """Add the sums that `deal` chose: those of a part in the order of the views, then one part to the other."""
+    """Return the sum of the gradients of all views; each half of the batch is summed first, then the two halves."""
     ends = [*_parts(len(sums))[1:], len(sums)]
     return _in_order([_in_order(sums[i:end]) for i, end in zip(_parts(len(sums)), ends, strict=True)])
 
 
 def _parts(views: int) -> list[int]:
-    """Return where the two halves of a batch begin; a last half of one view would only cost a sum of its own."""
+    """Return the index of the first view of each half of a batch; a batch of at most three views is not halved."""
     middle = (views + 1) // 2
     return [0, middle] if views - middle > 1 else [0]
 
 
 def _in_order(parts: Sequence[Sums]) -> Sums:
-    """Add sums to the first of them, in their order; a sum that several views share is added once."""
+    """Add dictionaries of gradients to the first one, in their order; an object that occurs twice is added once."""
     total = parts[0]
     done = {id(total)}
     for part in parts[1:]:
@@ -92,20 +92,28 @@ def _in_order(parts: Sequence[Sums]) -> Sums:
 
 
 class Seen(NamedTuple):
-    """What a step learns from one view."""
+    """Hold the results of one view of a training step: loss, visible Gaussians, and gradients of the 2D means."""
 
     loss: Tensor  # []
     info: RasterInfo
-    g_means2d: Tensor  # [1, N, 2] of the batch's loss, by pixels
+    g_means2d: Tensor  # [1, N, 2] gradient of the batch's loss by the 2D means, per pixel
 
 
 class Step:
-    """Render views, and leave the gradient of their mean loss in the model's parameters."""
+    """Render a batch of views and store the gradient of their mean loss in the parameters of a model."""
 
     def __init__(
         self, model: GaussianModel, background: Tensor, ssim_weight: float, antialias: bool, stages: StageClock
     ) -> None:
-        """Prepare steps of `model` over a background colour [3]; `stages` sums the seconds of each stage."""
+        """Store the settings of the training steps.
+
+        Args:
+            model: the model.
+            background: the background colour, [3].
+            ssim_weight: the weight w of 1 - SSIM in the loss.
+            antialias: whether to scale opacities by the 2D filter of Mip-Splatting.
+            stages: a clock that adds up the seconds of each stage (slice, raster, loss, backward).
+        """
         self.model = model
         self.background = background
         self.ssim_weight = ssim_weight
@@ -114,11 +122,21 @@ class Step:
         self.penalties: Sequence[tuple[float, Penalty]] = ()
 
     def __call__(self, views: Sequence[View], penalties: Sequence[tuple[float, Penalty]] = ()) -> list[Seen]:
-        """The loss is the mean over `views`, each with `penalties` (weight, penalty) added to it.
+        """Render `views` and store the gradient of the loss in the model's parameters.
+
+        The loss is the mean over views of the photometric loss plus weighted penalties.
+
+        Args:
+            views: the views of the batch.
+            penalties: pairs (weight, penalty) that are added to the loss of each view.
+
+        Returns:
+            The loss and the gradients of the 2D means for each view.
 
         Raises:
-            DivergedError: a slice is not finite.
-            InputError: the rasterizer refuses a slice for another reason; TooLargeError: memory would not suffice.
+            DivergedError: a slice has a value that is not finite.
+            InputError: the rasterizer refuses a slice for another reason.
+            TooLargeError: the memory does not suffice.
         """
         self.penalties = penalties
         sources = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
@@ -140,7 +158,7 @@ class Step:
     def _by_workers(
         self, views: Sequence[View], sources: list[nn.Parameter], sums: list[Sums], bounds: list[int]
     ) -> list[Seen]:
-        """Let each worker render the views between its two `bounds`."""
+        """Compute the gradients of the views by several threads; thread i renders views bounds[i] to bounds[i + 1]."""
         started = time.perf_counter()
         workers = len(bounds) - 1
         clocks = [StageClock() for _ in range(workers)]
@@ -164,7 +182,7 @@ class Step:
                     output = rasterize_slice(
                         gaussians, view.camera, self.background, self.model.backend, self.antialias
                     )
-                except InputError as error:  # the rasterizer's door is the first to see a slice that is not finite
+                except InputError as error:  # the rasterizer checks its inputs, so it is the first to see NaN
                     if all(tensor.isfinite().all() for tensor in gaussians if tensor is not None):
                         raise
                     raise DivergedError(str(error)) from None

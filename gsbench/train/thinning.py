@@ -1,7 +1,7 @@
-"""Drop the Gaussians of the smallest blend weight, summed over the training views.
+"""Find the Gaussians that contribute most to the training images, so that the others can be removed.
 
-The blend weight of a Gaussian in a pixel is its alpha times the transmittance before it, so the sum over all pixels of
-all views says how much it adds to the training images (the weight w_i of 3DGS eq. 3, summed).
+The contribution of a Gaussian is the sum of its blend weights over all pixels of all views. A blend weight is alpha
+times the transmittance in front of the Gaussian (3DGS, eq. 3).
 """
 
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ from gsbench.scenes import View
 
 
 def blend_weights(model: GaussianModel, views: Sequence[View], antialias: bool) -> Tensor:
-    """Sum each Gaussian's blend weights over the pixels of views, [N].
+    """Return for each Gaussian the sum of its blend weights over all pixels of the views, [N].
 
-    An image is linear in the colours: with one channel of colour 1 for each Gaussian, the gradient of the sum of all
-    pixels by a Gaussian's colour is the sum of its blend weights.
+    The sum is computed as a gradient: a pixel is linear in the colours, so the derivative of the sum of all pixels with
+    respect to the colour of a Gaussian is the sum of its blend weights.
     """
     total = torch.zeros_like(model.splats["opacities"].detach())
     for view in views:
@@ -33,6 +33,6 @@ def blend_weights(model: GaussianModel, views: Sequence[View], antialias: bool) 
 
 
 def heaviest(weights: Tensor, share: float) -> Tensor:
-    """Return the rows of the `share` of Gaussians with the largest weights, in their order; the first of equal ones."""
+    """Return the sorted indices of the Gaussians with the largest weights, a fraction `share` of all Gaussians."""
     keep = max(1, round(share * len(weights)))
     return weights.argsort(descending=True, stable=True)[:keep].sort().values

@@ -1,9 +1,9 @@
-"""Locate the embedded scenes, which are package data in the layout of `gsbench.scenes.blender`."""
+"""Locate the two small scenes that come with gsbench, moving-matte and suzanne, as package data."""
 
 from importlib import resources
 from pathlib import Path
 
 
 def folder() -> Path:
-    """Return the folder that holds `moving-matte` and `suzanne`, in a checkout as in an installed wheel."""
+    """Return the folder of the scenes `moving-matte` and `suzanne`, in a git checkout or in the installed package."""
     return Path(str(resources.files(__name__)))

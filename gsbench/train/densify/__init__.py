@@ -1,4 +1,4 @@
-"""Choose how a training adds and removes Gaussians: one interface (base.py), a rule for each `train.densify.kind`."""
+"""Choose the rule of densification (how a training adds and removes Gaussians) by `train.densify.kind`."""
 
 from gsbench.config import DensifyConfig
 from gsbench.errors import InputError, did_you_mean
@@ -10,12 +10,12 @@ KINDS: dict[str, type[Densification]] = {rule.kind: rule for rule in (GradientDe
 
 
 def check_kind(kind: str) -> None:
-    """Raise InputError for a kind of densification that is not known."""
+    """Raise InputError if `kind` is not the name of a densification rule."""
     if kind not in KINDS:
         raise InputError(f"train.densify.kind '{kind}' is not known. {did_you_mean(kind, KINDS)}")
 
 
 def densification(rows: Rows, config: DensifyConfig, min_opacity: float, views: int) -> Densification:
-    """Make the rule of a training; see `Densification` for the arguments."""
+    """Make the densification rule that `config.kind` names; see `Densification` for the arguments."""
     check_kind(config.kind)
     return KINDS[config.kind](rows, config, min_opacity, views)

@@ -1,7 +1,7 @@
-"""Define the interface of a rule of densification.
+"""Define the interface of a densification rule, which adds and removes Gaussians during a training.
 
-A rule sees every view's gradients (`accumulate`), and changes rows in rounds (`densify`). It edits Gaussians by
-`Rows.select` and the model's own `split`, so it does not depend on the parameters of a model.
+A rule accumulates the gradients of 2D means after each view (`accumulate`), and adds and removes Gaussians every few
+steps (`densify`). It works with all models, because it calls the model's own method to split Gaussians.
 """
 
 from abc import ABC, abstractmethod
@@ -13,24 +13,24 @@ from torch import Tensor
 from gsbench.config import DensifyConfig
 from gsbench.train.rows import Rows
 
-# Of the runs of the 7DGS paper the largest has 1.41 million, of those here 0.55. A Gaussian of 7DGS has 84 numbers,
-# four times with its gradient and moments: 2.7 GB for so many.
+# The largest model of the 7DGS paper has 1.41 million Gaussians, the largest here 0.55 million. A Gaussian of 7DGS has
+# 84 numbers, with gradient and moments four times as many: 2.7 GB for 2 million Gaussians.
 MOST_GAUSSIANS = 2_000_000
 
 
 class Densification(ABC):
-    """A rule that adds and removes Gaussians during a training."""
+    """The base class of densification rules, which add and remove Gaussians during a training."""
 
     kind: ClassVar[str]  # its name in train.densify.kind
 
     def __init__(self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int) -> None:
-        """Prepare the rule for a training, and follow its rows.
+        """Prepare the rule for a training.
 
         Args:
-            rows: the rows (Gaussians) of the initialised model.
+            rows: the Gaussians of the initialised model; the rule adds and removes Gaussians through this object.
             config: the thresholds of densification.
-            min_opacity: Gaussians of lower opacity may be pruned.
-            views: the number of training views, which make an epoch.
+            min_opacity: the opacity below which a Gaussian may be pruned.
+            views: the number of training views, which is the length of an epoch.
         """
         self.rows = rows
         self.model = rows.model
@@ -48,14 +48,14 @@ class Densification(ABC):
         height: int,
         views: int,
     ) -> None:
-        """Accumulate the gradients of one view of a batch.
+        """Accumulate the gradients of the 2D means in one view of a batch.
 
         Args:
             drawn: which Gaussians were not culled.
-            g_means2d: gradient of the loss, a mean over `views`, by the 2D means.
-            width: width of the image, pixels.
-            height: height of the image, pixels.
-            views: number of views in the batch.
+            g_means2d: the gradient of the loss, a mean over the batch, with respect to the 2D means.
+            width: the width of the image, pixels.
+            height: the height of the image, pixels.
+            views: the number of views in the batch.
         """
 
     @abstractmethod
@@ -63,25 +63,30 @@ class Densification(ABC):
         """Do one round of densification: add and remove Gaussians.
 
         Args:
-            generator: gives all random numbers of this round.
+            generator: the source of all random numbers of this round.
             has_reset: whether opacities were reset earlier in the training.
 
         Returns:
-            How many Gaussians were refused because there would be too many.
+            The number of Gaussians that were not added, because the model would have more than allowed.
         """
 
     @abstractmethod
     def reset_opacities(self) -> None:
-        """Lower all opacities, if the rule does so; called at the steps that `Schedule.resets` names."""
+        """Lower all opacities, if the rule does this; the training calls this method at fixed intervals."""
 
     @abstractmethod
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Keep the accumulated values of `rows`; see `gsbench.train.rows.Follower`."""
+        """Reorder the accumulated gradients and counts after Gaussians were added or removed.
+
+        Args:
+            rows: for each Gaussian now, its index before the change, [M].
+            fresh: which Gaussians are new, [M] bool.
+        """
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """Return the accumulated values, for the checkpoint."""
+        """Return the gradients and counts that the rule has accumulated, for the checkpoint."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from the `state_dict` of a checkpoint; raises InputError if it is not of this many Gaussians."""
+        """Restore the accumulated gradients from a checkpoint; raises InputError if the number of Gaussians differs."""

@@ -1,4 +1,4 @@
-"""Densify by gradients: clone small Gaussians, split large ones, prune faint and unseen ones (3DGS, section 5.2)."""
+"""Define the density control of 3DGS: clone small Gaussians, split large ones, prune transparent and unseen ones."""
 
 import torch
 from torch import Tensor
@@ -11,31 +11,30 @@ from gsbench.train.rows import Rows
 
 
 class GradientDensification(Densification):
-    """The adaptive density control of 3DGS: Gaussians whose 2D mean has a large mean gradient are cloned or split.
+    """The adaptive density control of 3DGS (section 5.2), with the splits in time of 7DGS (section 4.4).
 
-    Defaults of `train.densify`, whose steps are those of a run of 30,000:
+    By default, in a run of 30,000 iterations:
 
-    - every 100 steps (and at most 36 rounds) from 500 to 15,000, Gaussians are chosen whose 2D mean has a mean gradient
-      above 2e-4, in units of half the image. Such a Gaussian is cloned if its largest scale is at most 0.01 of the
-      scene's extent and it is not long in time. Otherwise it is split into two that are 1.6 times smaller;
-    - in the same round a Gaussian is pruned whose opacity is below 0.005, that no view of an epoch has seen, or, after
-      the first reset of opacities, whose largest scale is above 0.1 of the extent;
-    - every 3,000 steps opacities are lowered to at most twice the pruning threshold.
-
-    Source: 3DGS, section 5.2, and its code for the numbers; 7DGS, section 4.4, for splits of Gaussians long in time.
+    - Rounds take place between iterations 500 and 15,000, at most every 100 iterations and at most 36 times. A Gaussian
+      is chosen if the mean gradient of its 2D mean is above 2e-4, in units of half the image.
+    - A chosen Gaussian is cloned if its largest scale is at most 0.01 of the scene's radius and it is not long in time.
+      Otherwise it is split into two Gaussians that are 1.6 times smaller.
+    - A round also prunes Gaussians with an opacity below 0.005, Gaussians that no view of an epoch sees, and, after the
+      first reset of opacities, Gaussians with a scale above 0.1 of the radius.
+    - Every 3,000 iterations all opacities are lowered to at most twice the pruning threshold.
     """
 
     kind = "gradient"
 
     def __init__(self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int) -> None:
-        """Start with nothing accumulated; see `Densification`."""
+        """Start the density control with gradient sums of zero; see `Densification` for the arguments."""
         super().__init__(rows, config, min_opacity, views)
-        self.patience = 2 * views - 1  # this many views in a row contain a whole epoch, wherever they begin
+        self.patience = 2 * views - 1  # so many consecutive views always contain a whole epoch
         self.unseen = torch.zeros(len(rows), dtype=torch.int32, device=self.model.splats["means"].device)
         self.forget()
 
     def forget(self) -> None:
-        """Drop the accumulated gradients."""
+        """Set the accumulated gradients of the 2D means, and the counts of views, to zero."""
         like = self.model.splats["opacities"].detach()
         self.gradient = torch.zeros_like(like)  # [N] sum over views of |gradient of the 2D mean|
         self.seen = torch.zeros_like(like)  # [N] number of views in which the Gaussian was visible
@@ -49,7 +48,7 @@ class GradientDensification(Densification):
         height: int,
         views: int,
     ) -> None:
-        """Add the gradients of one view, in units of half the image (NDC); see `Densification.accumulate`."""
+        """Add the norms of the gradients of the 2D means in one view, in units of half the image (NDC)."""
         x, y = g_means2d.unbind(-1)  # scaled separately: making a tensor of the two sizes would wait for the GPU
         self.gradient += torch.hypot(x * (views * width / 2), y * (views * height / 2)).sum(0)
         self.seen += drawn.sum(0)
@@ -58,10 +57,14 @@ class GradientDensification(Densification):
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator, has_reset: bool) -> int:
-        """Clone, split and prune Gaussians; the children of a split are sampled with `generator`.
+        """Clone and split Gaussians with a large gradient, then prune.
+
+        Args:
+            generator: the source of random numbers for the children of split Gaussians.
+            has_reset: whether opacities were reset before; only then are large Gaussians pruned.
 
         Returns:
-            How many Gaussians of large gradient were neither cloned nor split, because there would be too many.
+            The number of Gaussians with a large gradient that were not cloned or split, because of the allowed maximum.
         """
         model, config = self.model, self.config
         scales = model.scales()
@@ -77,7 +80,7 @@ class GradientDensification(Densification):
         children = torch.arange(len(model) - len(parents), len(model), device=parents.device)
         model.split_rows(children, generator)
 
-        # A Gaussian that no view sees gets no gradient, so it would never come back, and it costs as much as any other.
+        # A Gaussian that no view sees has no gradient, so it never becomes visible again, but it costs as much time.
         keep = (torch.sigmoid(model.splats["opacities"]) >= self.min_opacity) & (self.unseen < self.patience)
         if has_reset:  # from then on Gaussians that are too large are pruned
             keep &= model.scales() <= config.prune_above * model.extent
@@ -85,9 +88,9 @@ class GradientDensification(Densification):
         return refused
 
     def _wanted(self) -> tuple[Tensor, int]:
-        """Tell which Gaussians to clone or split, [N] bool, and how many are refused; each makes one more Gaussian.
+        """Return which Gaussians to clone or split, [N] bool, and how many more were left out because of the maximum.
 
-        If there is no room for all, those of the largest gradients are taken, and the first of equal ones.
+        If the model would have more Gaussians than allowed, those with the largest gradients are chosen.
         """
         gradient = self.gradient / self.seen.clamp(min=1)
         wanted = gradient > self.config.grad_threshold
@@ -99,21 +102,21 @@ class GradientDensification(Densification):
         return wanted, max(0, len(rows) - room)
 
     def reset_opacities(self) -> None:
-        """Lower opacities to twice the pruning threshold; needed Gaussians grow back before the next pruning."""
+        """Lower all opacities to at most twice the pruning threshold; those of useful Gaussians rise again."""
         self.model.reset_opacities(2 * self.min_opacity)
         self.rows.forget("opacities")
 
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Keep for how many views the given rows are unseen; gradients begin anew with every change of the rows."""
+        """Set the sums of gradients to zero after Gaussians were added or removed, and reorder the counts of views."""
         self.unseen = self.unseen[rows]
         self.forget()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the collected gradients and counts, for the checkpoint."""
+        """Return the sums of gradients and the counts of views of each Gaussian, for the checkpoint."""
         return {"gradient": self.gradient, "seen": self.seen, "unseen": self.unseen}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from the `state_dict` of a checkpoint; raises InputError if it is not of this many Gaussians."""
+        """Restore the sums of gradients from a checkpoint; raises InputError if the number of Gaussians differs."""
         opacities = self.model.splats["opacities"]
         self.gradient, self.seen = (
             tensor(state, name, opacities.shape, opacities.dtype) for name in ("gradient", "seen")
