@@ -158,6 +158,14 @@ class GaussianModel(nn.Module, ABC):
         """Return each Gaussian's standard deviation in time, [N] (1 = the length of the scene); None without time."""
         return None
 
+    def lifetimes(self) -> tuple[Tensor, Tensor] | None:
+        """Return the mean time mu_t [N] and the lifetime s [N] of each Gaussian; None without time.
+
+        The opacity is proportional to exp(-1/2 ((t - mu_t) / s)^2), so s is the standard deviation over sqrt(lambda_t).
+        """
+        deviations = self.durations()
+        return None if deviations is None else (self.splats["times"][:, 0], deviations / self.lambda_of("time").sqrt())
+
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the spatial sizes of each Gaussian to at least `least` [N], world units; by default do nothing."""
         return
@@ -326,16 +334,17 @@ class GaussianModel(nn.Module, ABC):
     def visible_intervals(self) -> Tensor | None:
         """Return the first and the last time at which each Gaussian can be visible, [N, 2]; None without time.
 
-        A Gaussian with opacity o, mean time mu_t and variance S_t in time is visible at time t if
-        o exp(-lambda_t (t - mu_t)^2 / (2 S_t)) is at least ALPHA_MIN. Times are in [0, 1]; (inf, inf) marks a Gaussian
-        that is never visible. The intervals only serve to sort the Gaussians: they ignore AGR, the neural refinement.
+        A Gaussian with opacity o, mean time mu_t and lifetime s is visible at time t if o exp(-((t - mu_t) / s)^2 / 2)
+        is at least ALPHA_MIN. Times are in [0, 1]; (inf, inf) marks a Gaussian that is never visible. The intervals
+        only serve to sort the Gaussians: they ignore AGR, the neural refinement.
         """
-        deviations = self.durations()
-        if deviations is None:
+        lifetimes = self.lifetimes()
+        if lifetimes is None:
             return None
-        opacities, times = torch.sigmoid(self.splats["opacities"]), self.splats["times"]
-        reach = (2 * (opacities / ALPHA_MIN).log().clamp(min=0) / self.lambda_of("time")).sqrt() * deviations
-        interval = torch.cat([times - reach[:, None], times + reach[:, None]], 1)
+        times, deviations = lifetimes
+        opacities = torch.sigmoid(self.splats["opacities"])
+        reach = (2 * (opacities / ALPHA_MIN).log().clamp(min=0)).sqrt() * deviations
+        interval = torch.stack([times - reach, times + reach], 1)
         never = (reach == 0) | (interval[:, 1] < 0) | (interval[:, 0] > 1)
         return torch.where(never[:, None], math.inf, interval.clamp(0, 1))
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from gsbench.scenes.trained import TrainedGaussians
 class Gaussians3DModel(GatedModel):
     """3DGS: the covariance of a Gaussian is R S S^T R^T, with rotation R and scales S (3DGS, eq. 6)."""
 
-    geometry = ("scales", "quats")
+    geometry: ClassVar[tuple[str, ...]] = ("scales", "quats")
 
     def __init__(self, **options: Any) -> None:
         """Make a model without Gaussians. Options are those of `GatedModel`."""

@@ -1,0 +1,110 @@
+"""Model moving, view-dependent scenes by dGS: Gaussians that a precision in time and direction moves and fades (2026).
+
+The equations are those of "direct conditioning", a text under review for NeurIPS 2026, with the constants of its code.
+"""
+
+import math
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gsbench.errors import InputError, did_you_mean
+from gsbench.models.base import Raw
+from gsbench.models.factors import sizes
+from gsbench.models.moving3d import MovingGaussians3D
+from gsbench.models.query import Query, unit
+from gsbench.models.registry import register
+from gsbench.scenes.scene import Points
+
+COUPLINGS = ("text", "interpolated", "none")
+FADING = 0.35  # lambda_o, the coefficient in the exponent of the opacity factor
+TIME_PRECISION = math.sqrt(10)  # initial L_tt
+SHARES = -1.2  # initial logits of Lam
+COUPLING_SPREAD = 0.01  # initial standard deviation of the entries of Theta
+TIME_MARGIN = 1e-6  # least distance of an initial mean time from 0 and 1, whose logits are infinite
+
+
+@register("dgs")
+class DirectModel(MovingGaussians3D):
+    """dGS: with q = (d, t), delta = q - mu_q and the precision V_qq = L L^T over direction and time,
+
+        mean    = mu_p + V_pq diag(Lam) V_qq delta        V_pq = s Theta / |Theta|, s: mean of the three scales
+        opacity = sigmoid(o) exp(-lambda_o |L^T delta|^2)   lambda_o = 0.35
+        cov     = R S S^T R^T, the same for every query
+
+    L is lower triangular over direction and has one entry for time. Lam in [0, 1] has one number for the three columns
+    of direction and one for time. The direction d of a query has no gradient.
+    """  # fmt: skip
+
+    observes = ("time", "direction")
+    centers = ("means", "times", "directions")
+    geometry = ("scales", "quats", "precision", "coupling", "shares")
+    moving = ("times", "directions", "precision", "coupling", "shares")
+
+    def __init__(self, *, coupling: str = "text", view_precision: float = 1.0, **options: Any) -> None:
+        """Make a model without Gaussians.
+
+        Args:
+            coupling: how the mean moves. `text`: as above. `interpolated`: by V_pq ((1 - Lam) delta + Lam V_qq delta),
+                as the comments of the authors' code say. `none`: not at all (the authors' dGS-O).
+            view_precision: the initial diagonal of L over direction. The authors use 0.02 for D-NeRF, 2.5 for the cloud
+                of 7DGS-PBR, 0.4 for its other scenes, and 1.0 elsewhere.
+            options: the options of `GatedModel`.
+
+        Raises:
+            InputError: an option is out of its range.
+        """
+        super().__init__(**options)
+        if coupling not in COUPLINGS:
+            raise InputError(f"coupling '{coupling}' is not known. {did_you_mean(coupling, COUPLINGS)}")
+        if not isinstance(view_precision, int | float) or not 0 < view_precision < math.inf:
+            raise InputError(f"view_precision: expected a positive number, got {view_precision}")
+        self.coupling = coupling
+        self.view_precision = view_precision
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        """Return spheres with random mean directions, and mean times uniform in [-0.1, 1.1], clipped to [0, 1]."""
+        N = len(distances)
+        times = (torch.rand(N, 1, generator=generator) * 1.2 - 0.1).clamp(TIME_MARGIN, 1 - TIME_MARGIN)
+        view, time = math.log(self.view_precision), math.log(TIME_PRECISION)
+        return super().initial_geometry(points, distances, generator) | {
+            "times": times.logit(),
+            "directions": F.normalize(torch.randn(N, 3, generator=generator), dim=-1),
+            "precision": torch.tensor([view, 0.0, view, 0.0, 0.0, view, time]).repeat(N, 1),
+            "coupling": COUPLING_SPREAD * torch.randn(N, 12, generator=generator),
+            "shares": torch.full((N, 2), SHARES),
+        }
+
+    def change(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor]:
+        """Return V_pq diag(Lam) V_qq delta [N, 3] and exp(-lambda_o |L^T delta|^2) [N]."""
+        assert query.time is not None
+        direction = unit(raw["means"] - query.center).detach()
+        delta = torch.cat([direction - unit(raw["directions"]), query.time - torch.sigmoid(raw["times"])], -1)
+        L = precision_factor(raw["precision"])
+        white = (L.mT @ delta[..., None])[..., 0]
+        opacity_factor = torch.exp(-FADING * white.square().sum(-1))
+        if self.coupling == "none":
+            return torch.zeros_like(raw["means"]), opacity_factor
+        size = sizes(raw["scales"]).mean(-1)[:, None, None]
+        V_pq = size * F.normalize(raw["coupling"], dim=-1).unflatten(-1, (3, 4))
+        shares = torch.sigmoid(raw["shares"])[:, [0, 0, 0, 1]]
+        shift = shares * (L @ white[..., None])[..., 0]
+        if self.coupling == "interpolated":
+            shift = shift + (1 - shares) * delta
+        return (V_pq @ shift[..., None])[..., 0], opacity_factor
+
+    def lifetimes(self) -> tuple[Tensor, Tensor]:
+        """Return mu_t [N] and 1 / (sqrt(2 lambda_o) L_tt) [N]."""
+        L_tt = sizes(self.splats["precision"].detach()[:, 6])
+        return torch.sigmoid(self.splats["times"].detach()[:, 0]), 1 / (math.sqrt(2 * FADING) * L_tt)
+
+
+def precision_factor(raw: Tensor) -> Tensor:
+    """Compute L [N, 4, 4] of V_qq = L L^T: its lower triangle over direction row by row, then time, [N, 7]."""
+    zero = torch.zeros_like(raw[:, 0])
+    xx, yx, yy, zx, zy, zz, tt = raw.unbind(-1)
+    xx, yy, zz, tt = (sizes(log) for log in (xx, yy, zz, tt))
+    rows = [xx, zero, zero, zero, yx, yy, zero, zero, zx, zy, zz, zero, zero, zero, zero, tt]
+    return torch.stack(rows, -1).unflatten(-1, (4, 4))

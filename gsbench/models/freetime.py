@@ -1,0 +1,69 @@
+"""Model a moving scene by FreeTimeGS: 3D Gaussians with a velocity that appear around a time of their own (2025).
+
+Wang et al., "FreeTimeGS: Free Gaussian Primitives at Anytime and Anywhere", arXiv 2506.05348.
+"""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.models.base import Raw
+from gsbench.models.factors import sizes
+from gsbench.models.moving3d import MovingGaussians3D
+from gsbench.models.query import Query
+from gsbench.models.registry import register
+from gsbench.scenes.scene import Points
+
+
+@register("freetime")
+class FreeTimeModel(MovingGaussians3D):
+    """FreeTimeGS: each Gaussian has a mean time mu_t, a standard deviation in time s and a velocity v,
+
+        mean = mu_p + v (t - mu_t)      opacity = sigmoid(o) exp(-1/2 ((t - mu_t) / s)^2)      cov = R S S^T R^T
+
+    A velocity is the movement during the whole time range [0, 1], in world units.
+    """  # fmt: skip
+
+    observes = ("time",)
+    centers = ("means", "times")
+    geometry = ("scales", "quats", "durations", "velocities")
+    lengths = ("means", "velocities")
+    moving = ("times", "durations", "velocities")
+
+    def __init__(self, *, duration: float = math.sqrt(1 / 5), **options: Any) -> None:
+        """Make a model without Gaussians.
+
+        Args:
+            duration: the initial standard deviation in time; by default that of 4DGS, because points have no times.
+            options: the options of `GatedModel`.
+
+        Raises:
+            InputError: an option is out of its range.
+        """
+        super().__init__(**options)
+        if not isinstance(duration, int | float) or not 0 < duration < math.inf:
+            raise InputError(f"duration: expected a positive number, got {duration}")
+        self.duration = duration
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        """Return spheres at rest with mean times uniform in [-0.1, 1.1]."""
+        N = len(distances)
+        return super().initial_geometry(points, distances, generator) | {
+            "times": torch.rand(N, 1, generator=generator) * 1.2 - 0.1,
+            "durations": torch.full((N, 1), math.log(self.duration)),
+            "velocities": torch.zeros(N, 3),
+        }
+
+    def change(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor]:
+        """Return v (t - mu_t) [N, 3] and exp(-1/2 ((t - mu_t) / s)^2) [N]."""
+        assert query.time is not None
+        delta = query.time - raw["times"]
+        opacity_factor = torch.exp(-0.5 * (delta / sizes(raw["durations"])).square())[:, 0]
+        return raw["velocities"] * delta, opacity_factor
+
+    def lifetimes(self) -> tuple[Tensor, Tensor]:
+        """Return mu_t [N] and s [N]."""
+        return self.splats["times"].detach()[:, 0], sizes(self.splats["durations"].detach()[:, 0])
