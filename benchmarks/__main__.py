@@ -9,14 +9,14 @@ from typing import Any
 import torch
 
 from benchmarks.roofline import UNITS, Limits, limits
-from benchmarks.rows import SECTIONS, Row
-from benchmarks.timing import measure
+from benchmarks.rows import SECTIONS
+from benchmarks.timing import Row, measure
 from gsbench import kernels
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.machine import processor_name
 from gsbench.measure.provenance import git_commit, versions
 
-HEADER = "| | median ms | p10 | p90 | wall ms | target ms | least ms by the machine's limit | ratio |"
+HEADER = "| | median ms | p10 | p90 | wall ms | ns a pixel | target ms | least ms by the machine's limit | ratio |"
 
 
 def main() -> None:
@@ -31,7 +31,7 @@ def main() -> None:
     print("\n".join(lines), flush=True)
     results: list[dict[str, Any]] = []
     for section in options.sections or SECTIONS:
-        start = [f"## {section}", "", HEADER, "| --- |" + " ---: |" * 7]
+        start = [f"## {section}", "", SECTIONS[section].__doc__ or "", "", HEADER, "| --- |" + " ---: |" * 8]
         print("\n".join(start), flush=True)
         lines += start
         for row in SECTIONS[section]():
@@ -67,7 +67,7 @@ def run(row: Row, bounds: Limits) -> dict[str, Any]:
     torch.set_num_threads(1)
     least = row.floor and row.floor[1] / getattr(bounds, row.floor[0]) / 1e6
     return {"section": row.section, "name": row.name, "threads": row.threads, "target_ms": row.target_ms,
-            "least_ms": least, "limit": row.floor and row.floor[0], **cost._asdict()}  # fmt: skip
+            "pixels": row.pixels, "least_ms": least, "limit": row.floor and row.floor[0], **cost._asdict()}  # fmt: skip
 
 
 def line(result: dict[str, Any]) -> str:
@@ -76,7 +76,8 @@ def line(result: dict[str, Any]) -> str:
     limit = "" if least is None else f"{least:.2f} ({result['limit']})"
     ratio = "" if least is None else f"{result['median'] / least:.1f}"
     numbers = " | ".join(f"{result[key]:.2f}" for key in ("median", "p10", "p90", "wall"))
-    return f"| {result['name']} | {numbers} | {met} | {limit} | {ratio} |"
+    each = "" if result["pixels"] is None else f"{1e6 * result['median'] / result['pixels']:.1f}"
+    return f"| {result['name']} | {numbers} | {each} | {met} | {limit} | {ratio} |"
 
 
 if __name__ == "__main__":
