@@ -83,9 +83,8 @@ def built(commit: str, log: Path) -> Iterator[Built]:
 
 
 def _install(found: Built, log: Path) -> None:
-    levels = (
-        f"cmake.define.GSB_LEVELS={kernels.native().active()}"  # the one that is timed; not every commit has `native`
-    )
+    # Only the instruction set that is timed; not every commit has the word `native` for it.
+    levels = f"cmake.define.GSB_LEVELS={kernels.native().active()}"
     site, tree = (os.fspath(found.folder / name) for name in ("site", "tree"))
     done = subprocess.run([sys.executable, *INSTALL, "--config-settings", levels, "--target", site, tree], check=False,
                           stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)  # fmt: skip
