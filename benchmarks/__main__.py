@@ -3,50 +3,83 @@
 import argparse
 import json
 import os
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from benchmarks.against import Built, built
 from benchmarks.roofline import UNITS, Limits, limits
-from benchmarks.rows import SECTIONS, Row
-from benchmarks.timing import measure
+from benchmarks.rows import SECTIONS
+from benchmarks.timing import Row, measure
 from gsbench import kernels
+from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.machine import processor_name
 from gsbench.measure.provenance import git_commit, versions
 
-HEADER = "| | median ms | p10 | p90 | wall ms | target ms | least ms by the machine's limit | ratio |"
+HEADER = "| | median ms | p10 | p90 | wall ms | ns a pixel | target ms | least ms by the machine's limit | ratio |"
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Return 0; 2 if the commit to compare with is unknown or cannot be built; 130 after Ctrl-C."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("sections", nargs="*", choices=[*SECTIONS, []], help="default: all")
     parser.add_argument("--out", type=Path, default=Path("results/benchmarks"), help="folder of the results")
     parser.add_argument("--name", default="cpu", help="of the two files")
-    options = parser.parse_args()
+    parser.add_argument("--against", metavar="COMMIT", help="build it too, time it in turns, and show the ratios to it")
+    options = parser.parse_args(arguments)
+    sections = options.sections or list(SECTIONS)
+    try:
+        if options.against is None:
+            measure_all(sections, options.out, options.name, None)
+        else:
+            with built(options.against, options.out / "against.log") as other:
+                measure_all(sections, options.out, options.name, other)
+    except InputError as error:
+        print(one_line(error), file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+def measure_all(sections: Sequence[str], out: Path, name: str, other: Built | None) -> None:
+    """Time the sections of this tree, each after that of the `other` commit, so that a slow minute hits both."""
     torch.set_num_threads(1)
     bounds = limits()
-    lines = ["# What the kernels cost", "", *conditions(bounds), ""]
-    print("\n".join(lines), flush=True)
+    lines = []
+
+    def tell(*more: str) -> None:
+        lines.extend(more)
+        print("\n".join(more), flush=True)
+
+    tell("# What the kernels cost", "", *conditions(bounds), "")
     results: list[dict[str, Any]] = []
-    for section in options.sections or SECTIONS:
-        start = [f"## {section}", "", HEADER, "| --- |" + " ---: |" * 7]
-        print("\n".join(start), flush=True)
-        lines += start
+    theirs = other.sections() if other else []
+    for section in sections:
+        tell(f"## {section}", "", SECTIONS[section].__doc__ or "", "")
+        medians = other.medians(section) if other and section in theirs else {}
+        if other and section not in theirs:
+            tell(f"{other.short} has no section {section}: its column is empty.", "")
+        header = HEADER + (f" x {other.short} |" if other else "")
+        tell(header, "| --- |" + " ---: |" * (header.count("|") - 2))
         for row in SECTIONS[section]():
             result = run(row, bounds)
+            if other:
+                result["against_ms"] = medians.get((row.section, row.name))
             results.append(result)
-            lines.append(line(result))
-            print(lines[-1], flush=True)
-        lines.append("")
+            tell(line(result))
+        tell("")
     machine = {"processor": processor_name(), "cores": os.cpu_count(), "load": os.getloadavg(),
                "instruction_set": kernels.native().active(), "versions": versions(), "git_commit": git_commit(),
-               "limits": bounds._asdict()}  # fmt: skip
-    options.out.mkdir(parents=True, exist_ok=True)
+               "against": other and other.commit, "limits": bounds._asdict()}  # fmt: skip
+    out.mkdir(parents=True, exist_ok=True)
     content = json.dumps({"machine": machine, "rows": results}, indent=1)
-    write_atomically(options.out / f"{options.name}.json", content.encode())
-    write_atomically(options.out / f"{options.name}.md", "\n".join(lines).encode())
+    write_atomically(out / f"{name}.json", content.encode())
+    write_atomically(out / f"{name}.md", "\n".join(lines).encode())
 
 
 def conditions(bounds: Limits) -> list[str]:
@@ -67,7 +100,7 @@ def run(row: Row, bounds: Limits) -> dict[str, Any]:
     torch.set_num_threads(1)
     least = row.floor and row.floor[1] / getattr(bounds, row.floor[0]) / 1e6
     return {"section": row.section, "name": row.name, "threads": row.threads, "target_ms": row.target_ms,
-            "least_ms": least, "limit": row.floor and row.floor[0], **cost._asdict()}  # fmt: skip
+            "pixels": row.pixels, "least_ms": least, "limit": row.floor and row.floor[0], **cost._asdict()}  # fmt: skip
 
 
 def line(result: dict[str, Any]) -> str:
@@ -76,8 +109,13 @@ def line(result: dict[str, Any]) -> str:
     limit = "" if least is None else f"{least:.2f} ({result['limit']})"
     ratio = "" if least is None else f"{result['median'] / least:.1f}"
     numbers = " | ".join(f"{result[key]:.2f}" for key in ("median", "p10", "p90", "wall"))
-    return f"| {result['name']} | {numbers} | {met} | {limit} | {ratio} |"
+    each = "" if result["pixels"] is None else f"{1e6 * result['median'] / result['pixels']:.1f}"
+    cells = [result["name"], numbers, each, met, limit, ratio]
+    if "against_ms" in result:  # medians of this tree over those of another commit
+        theirs = result["against_ms"]
+        cells.append("" if theirs is None else f"{result['median'] / theirs:.2f}")
+    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

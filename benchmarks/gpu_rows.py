@@ -9,8 +9,9 @@ from torch import Tensor
 
 from benchmarks.compare import Call, Case, Cost, Place, Row, attempted, compared
 from benchmarks.gsplat_way import gsplat_image
-from benchmarks.rows import training_step, useful_alphas
+from benchmarks.rows import useful_alphas
 from benchmarks.scene import camera, gaussians, model
+from benchmarks.training import training_step
 from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.raster import backward_by_splat
@@ -144,7 +145,7 @@ def step_rows(place: Place) -> Iterator[Row]:
 
 
 def step_row(place: Place, case: str, agr: bool, N: int, size: int) -> Row:
-    ours = training_step(model("7dgs", N, agr=agr).to(place.device), size, 1)
+    ours = training_step(model("7dgs", N, agr=agr).to(place.device), size, size, 1)
     theirs = place.cost(their_step(place, agr, N, size)) if place.gsplat else None
     return compared("step", case, "all", place.cost(ours), theirs)
 

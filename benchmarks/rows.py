@@ -1,36 +1,23 @@
-"""The rows of the benchmark: each a name, what is called, the target where there is one, and the machine's limit."""
+"""List the rows of each section: a name, a call, the target if there is one, and the limit of the machine."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 
 from benchmarks.scene import camera, gaussians, model
+from benchmarks.stages import loss_flops, refine_flops, stages
+from benchmarks.timing import Row
+from benchmarks.training import training_step
 from gsbench import kernels
 from gsbench.kernels.backends import BACKENDS, CPU, REFERENCE
 from gsbench.kernels.loss import l1_ssim
-from gsbench.measure.speed import StageClock
-from gsbench.models import GaussianModel, Query
+from gsbench.models import Query
 from gsbench.models.base import tensors_of
 from gsbench.raster import rasterize
-from gsbench.scenes import Camera, View
 from gsbench.train.losses import photometric
-from gsbench.train.step import Step
 
 RASTER_TARGETS = {(10_000, 400): (2.8, 3.8), (100_000, 800): (30.0, 37.0)}  # ms forward, backward
-
-
-@dataclass(frozen=True)
-class Row:
-    """One measurement."""
-
-    section: str
-    name: str
-    call: Callable[[], Any]
-    target_ms: float | None = None
-    floor: tuple[str, float] | None = None  # (which limit, units of it the call cannot do without)
-    threads: int = 1
 
 
 def raster() -> Iterator[Row]:
@@ -73,16 +60,16 @@ def useful_alphas(N: int, size: int) -> float:
 def observing() -> Iterator[Row]:
     """Slices, colours and projection of 100k Gaussians, one after the other, and AGR."""
     center = torch.tensor([0.0, 0.0, -4.0])
-    for name, agr in (("3dgs", False), ("4dgs", False), ("6dgs", False), ("7dgs", False), ("7dgs", True)):
+    for name in ("3dgs", "4dgs", "6dgs", "7dgs"):
         for backend in ("cpu", "reference"):
-            observed = model(name, 100_000, agr=agr, backend=BACKENDS[backend])
+            observed = model(name, 100_000, backend=BACKENDS[backend])
             time = 0.4 if "time" in observed.observes else None
             parameters = [p for p in observed.parameters() if p.requires_grad]
             query = Query.at(center, time)
             out = tensors_of(observed.slice(query))
             upstream = [torch.ones_like(x) for x in out]
-            targets = (15.0, 25.0) if name == "7dgs" and not agr and backend == "cpu" else (None, None)
-            title = f"{name}{'+agr' if agr else ''} 100k slice and colours, {backend}"
+            targets = (15.0, 25.0) if name == "7dgs" and backend == "cpu" else (None, None)
+            title = f"{name} 100k slice and colours, {backend}"
             values = sum(p.numel() for p in observed.splats.values())
             yield Row("observe", f"{title} forward", lambda o=observed, q=query: o.slice(q), targets[0],
                       ("bytes", 4 * values))  # fmt: skip
@@ -97,7 +84,6 @@ def refining() -> Iterator[Row]:
     assert refinement is not None
     widths = [3, 1, 3, 7, 21]
     values = [torch.randn(100_000, width).requires_grad_() for width in widths]
-    multiplications = 100_000 * 64 * (4 * 7 + 35)
     for native in (True, False):
         out = refinement(values, torch.tensor(0.3), by_kernel=native)
         upstream = [torch.ones_like(x) for x in out]
@@ -105,23 +91,23 @@ def refining() -> Iterator[Row]:
         backend = "cpu" if native else "reference"
         yield Row("agr", f"AGR 100k forward, {backend}",
                   lambda n=native: refinement(values, torch.tensor(0.3), by_kernel=n), 20.0 if native else None,
-                  ("flops", 2 * multiplications))  # fmt: skip
+                  ("flops", refine_flops(100_000)))  # fmt: skip
         yield Row("agr", f"AGR 100k backward, {backend}",
                   lambda o=out, u=upstream, i=inputs: torch.autograd.grad(o, i, u, retain_graph=True),
-                  60.0 if native else None, ("flops", 6 * multiplications))  # fmt: skip
+                  60.0 if native else None, ("flops", 3 * refine_flops(100_000)))  # fmt: skip
 
 
 def loss() -> Iterator[Row]:
     """L1 + SSIM, forward and backward; eight separable filters of eleven taps along two axes."""
-    for size in (400, 800):
+    for width, height in ((400, 400), (800, 800), (2048, 1088)):
         g = torch.Generator().manual_seed(0)
-        image, target = (torch.rand(size, size, 3, generator=g) for _ in range(2))
+        image, target = (torch.rand(height, width, 3, generator=g) for _ in range(2))
         image.requires_grad_()
-        work = ("flops", 2.0 * 8 * 22 * 3 * size * size)
-        yield Row("loss", f"{size}x{size} forward + backward, cpu", lambda a=image, b=target: torch.autograd.grad(
-            l1_ssim(a, b, 0.2), a), 6.0 if size == 400 else None, work)  # fmt: skip
-        yield Row("loss", f"{size}x{size} forward + backward, reference", lambda a=image, b=target: torch.autograd.grad(
-            photometric(a, b, 0.2, REFERENCE), a), None, work)  # fmt: skip
+        for backend in (CPU, REFERENCE):
+            yield Row("loss", f"{width}x{height} forward + backward, {backend.name}",
+                      lambda a=image, b=target, by=backend: torch.autograd.grad(photometric(a, b, 0.2, by), a),
+                      6.0 if (width, backend) == (400, CPU) else None,
+                      ("flops", loss_flops(width * height)), pixels=width * height)  # fmt: skip
 
 
 def step() -> Iterator[Row]:
@@ -129,30 +115,12 @@ def step() -> Iterator[Row]:
     for name, agr in (("3dgs", False), ("4dgs", False), ("6dgs", False), ("7dgs", False), ("7dgs", True)):
         for backend in (CPU, REFERENCE):
             yield Row("step", f"{name}{'+agr' if agr else ''} 10k / 400x400, {backend.name}",
-                      training_step(model(name, 10_000, agr=agr, backend=backend), 400, 1))  # fmt: skip
+                      training_step(model(name, 10_000, agr=agr, backend=backend), 400, 400, 1))  # fmt: skip
     for N, size in ((16, 16), (1_000, 80), (5_000, 80), (10_000, 400), (50_000, 400)):
         for name, agr in (("7dgs", False), ("4dgs", False), ("7dgs", True)):
             for threads in (1, 2):
                 title = f"{name}{'+agr' if agr else ''} {N} / {size}x{size}, 4 views, {threads} threads"
-                yield Row("step", title, training_step(model(name, N, agr=agr), size, 4), threads=threads)
-
-
-def training_step(fitted: GaussianModel, size: int, views: int) -> Callable[[], None]:
-    """The gradients of a batch, where the model is, and Adam at a rate that moves nothing."""
-    viewmats, Ks = camera(size)
-    target = torch.rand(size, size, 3, generator=torch.Generator().manual_seed(0))
-    device = fitted.splats["means"].device.type
-    view = View("0", Camera(viewmats[0], Ks[0], size, size), 0.4, target).to(device)
-    batch = [view] * views
-    gradients = Step(fitted, torch.zeros(3, device=device), 0.2, False, StageClock(device))
-    adam = torch.optim.Adam([p for p in fitted.parameters() if p.requires_grad], lr=1e-9, fused=True)
-
-    def call() -> None:
-        gradients(batch)
-        adam.step()
-        adam.zero_grad()
-
-    return call
+                yield Row("step", title, training_step(model(name, N, agr=agr), size, size, 4), threads=threads)
 
 
 def instruction_sets() -> Iterator[Row]:
@@ -177,4 +145,6 @@ def instruction_sets() -> Iterator[Row]:
         kernels.use_instruction_set(best)
 
 
-SECTIONS = {"raster": raster, "observe": observing, "loss": loss, "step": step, "isa": instruction_sets}
+SECTIONS: dict[str, Callable[[], Iterator[Row]]] = {
+    "stages": stages, "raster": raster, "observe": observing, "loss": loss, "step": step, "isa": instruction_sets,
+}  # fmt: skip

@@ -28,11 +28,11 @@ def gaussians(N: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return means, rotations * scales[:, None, :], opacities, torch.rand(N, 3, generator=g)
 
 
-def camera(size: int) -> tuple[Tensor, Tensor]:
-    """viewmats [1, 4, 4] and Ks [1, 3, 3] that look at the cube from DISTANCE, in a picture of `size` pixels."""
+def camera(width: int, height: int | None = None) -> tuple[Tensor, Tensor]:
+    """viewmats [1, 4, 4] and Ks [1, 3, 3] that look at the cube from DISTANCE; the image is square by default."""
     viewmat = torch.eye(4)
     viewmat[2, 3] = DISTANCE
-    K = torch.tensor([[FOCAL * size, 0, size / 2], [0, FOCAL * size, size / 2], [0, 0, 1]])
+    K = torch.tensor([[FOCAL * width, 0, width / 2], [0, FOCAL * width, (height or width) / 2], [0, 0, 1]])
     return viewmat[None], K[None]
 
 

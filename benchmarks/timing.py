@@ -1,9 +1,23 @@
-"""Measuring: process-CPU and wall time of a call, its median and spread."""
+"""Measure the process-CPU and wall time of a call: its median and spread."""
 
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement."""
+
+    section: str
+    name: str
+    call: Callable[[], Any]
+    target_ms: float | None = None
+    floor: tuple[str, float] | None = None  # (which limit, units of it the call cannot do without)
+    threads: int = 1
+    pixels: int | None = None  # the table shows the time of one
 
 
 class Cost(NamedTuple):

@@ -1,0 +1,57 @@
+"""Make the training steps that are timed: gradients and Adam, as the trainer calls them."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from benchmarks.scene import camera
+from gsbench.kernels.adam import adam_all
+from gsbench.measure.speed import StageClock
+from gsbench.models import GaussianModel
+from gsbench.scenes import Camera, View
+from gsbench.train.step import Step
+
+RATE, BETAS, EPS = 1e-9, (0.9, 0.999), 1e-15  # a rate that moves nothing
+
+
+def one_view(width: int, height: int) -> View:
+    """Return a view of the benchmark's scene, with a random image."""
+    viewmats, Ks = camera(width, height)
+    target = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
+    return View("0", Camera(viewmats[0], Ks[0], width, height), 0.4, target)
+
+
+def training_step(fitted: GaussianModel, width: int, height: int, views: int) -> Callable[[], None]:
+    """Return a call that computes the gradients of a batch on the model's device, and updates the model by Adam."""
+    device = fitted.splats["means"].device.type
+    batch = [one_view(width, height).to(device)] * views
+    gradients = Step(fitted, torch.zeros(3, device=device), 0.2, False, StageClock(device))
+    update = adam_of(fitted)
+
+    def call() -> None:
+        gradients(batch)
+        update()
+        for parameter in fitted.parameters():
+            parameter.grad = None
+
+    return call
+
+
+def adam_of(fitted: GaussianModel) -> Callable[[], None]:
+    """Return a call that updates all parameters with a gradient: by the CPU's kernel if it serves them, else by torch.
+
+    `gsbench.train.optim.Optimizer` chooses the same way.
+    """
+    parameters = [p for p in fitted.parameters() if p.requires_grad]
+    if parameters[0].device.type != "cpu" or not fitted.backend.serves(parameters[0]):
+        return torch.optim.Adam(parameters, lr=RATE, betas=BETAS, eps=EPS, fused=True).step
+    means, squares = ([torch.zeros_like(p) for p in parameters] for _ in range(2))
+    steps = [torch.zeros(()) for _ in parameters]
+
+    def call() -> None:
+        given: list[Tensor] = [p.grad for p in parameters if p.grad is not None]
+        torch._foreach_add_(steps, 1)
+        adam_all([p.data for p in parameters], given, means, squares, steps, [RATE] * len(given), list(BETAS), EPS)
+
+    return call
