@@ -79,7 +79,7 @@ class ModelConfig:
 class DensifyConfig:
     """Set the adaptive density control of 3DGS (section 5.2). All steps but `every` scale with `train.iterations`."""
 
-    kind: str = "gradient"  # rule of density control
+    kind: str = "gradient"  # rule of density control: gradient (3DGS) or mcmc (relocation)
     start: int = 500  # step after which Gaussians are cloned, split and pruned
     stop: int = 15_000  # step at which densification ends
     every: int = 100  # least number of steps between two rounds
@@ -90,6 +90,7 @@ class DensifyConfig:
     prune_above: float = 0.1  # prune if the largest scale is above this share, after the first opacity reset
     thin_to: float | None = None  # share of Gaussians that stay after `stop`, by blend weight; None: all
     max_gaussians: int | None = None  # most Gaussians; None: 2,000,000
+    noise: float = 5e5  # of mcmc: noise on the means of transparent Gaussians, times their learning rate; 0: none
 
 
 @dataclass

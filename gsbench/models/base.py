@@ -146,6 +146,21 @@ class GaussianModel(nn.Module, ABC):
             generator: the source of all random numbers.
         """
 
+    def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
+        """Multiply the spatial standard deviations of slices by factors in (0, 1]; by default do nothing.
+
+        Positions, velocities and lifetimes do not change. Relocation needs this (`gsbench.train.densify.mcmc`).
+
+        Args:
+            rows: the indices of the Gaussians, [M].
+            factors: the factor of each of them, [M].
+        """
+        return
+
+    def spread(self) -> Tensor:
+        """Return factors F [N, 3, 3] of the spatial covariances F F^T of slices; by default of balls of the largest."""
+        return torch.diag_embed(self.scales()[:, None].expand(-1, 3))
+
     def log_sizes(self, index: int) -> Tensor:
         """Return the logarithms of the sizes of one Gaussian in its n dimensions, [n]; by default only the largest."""
         return self.scales()[index : index + 1].log()

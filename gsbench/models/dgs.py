@@ -22,6 +22,7 @@ COUPLINGS = ("text", "interpolated", "none")
 FADING = 0.35  # lambda_o, the coefficient in the exponent of the opacity factor
 TIME_PRECISION = math.sqrt(10)  # initial L_tt
 SHARES = -1.2  # initial logits of Lam
+LARGEST_SHARE = 0.999  # of Lam after `shrink_rows`: the logit of 1 is infinite
 COUPLING_SPREAD = 0.01  # initial standard deviation of the entries of Theta
 TIME_MARGIN = 1e-6  # least distance of an initial mean time from 0 and 1, whose logits are infinite
 
@@ -94,6 +95,14 @@ class DirectModel(MovingGaussians3D):
         if self.coupling == "interpolated":
             shift = shift + (1 - shares) * delta
         return (V_pq @ shift[..., None])[..., 0], opacity_factor
+
+    @torch.no_grad()
+    def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
+        """Multiply the scales by factors, and divide Lam by them so that the mean moves as before, up to Lam = 1."""
+        super().shrink_rows(rows, factors)
+        shares = torch.sigmoid(self.splats["shares"].data[rows])
+        larger = (shares / factors[:, None].to(shares.dtype)).clamp(max=LARGEST_SHARE)
+        self.splats["shares"].data[rows] = larger.logit()
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
         """Return mu_t [N] and 1 / (sqrt(2 lambda_o) L_tt) [N]."""

@@ -67,6 +67,15 @@ class Gaussians3DModel(GatedModel):
         """Raise all three scales of each Gaussian to at least `least` [N]."""
         self.splats["scales"].data.clamp_(min=least.log()[:, None])
 
+    @torch.no_grad()
+    def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
+        """Multiply the three scales of Gaussians by factors; see `GaussianModel.shrink_rows`."""
+        self.splats["scales"].data[rows] += factors.log()[:, None].to(self.splats["scales"].dtype)
+
+    def spread(self) -> Tensor:
+        """Return the factors R S of the covariances, [N, 3, 3]."""
+        return self.factors({name: value.detach() for name, value in self.splats.items()})
+
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Sample the means of children from the parent Gaussian, with scales 1.6 times smaller (3DGS, section 5.2)."""
         z = torch.randn(raw["means"].shape, generator=generator).to(raw["means"])

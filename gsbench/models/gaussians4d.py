@@ -231,6 +231,15 @@ class Gaussians4DModel(GatedModel):
         """Raise the three spatial scales of each Gaussian to at least `least` [N]."""
         self.splats["scales"].data[:, :3].clamp_(min=least.log()[:, None])
 
+    @torch.no_grad()
+    def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
+        """Multiply the three spatial scales by factors. This is exact if the 4D rotation does not mix in time."""
+        self.splats["scales"].data[rows, :3] += factors.log()[:, None].to(self.splats["scales"].dtype)
+
+    def spread(self) -> Tensor:
+        """Return the factors of the covariances of slices, [N, 3, 3], which are the same at all times."""
+        return reduce(self.factors({name: value.detach() for name, value in self.splats.items()})).T_pp
+
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Sample means and times of children from the parent Gaussian; all four scales are 1.6 times smaller."""
         z = torch.randn(len(raw["means"]), 4, generator=generator).to(raw["means"])

@@ -196,10 +196,28 @@ class TriangularModel(GatedModel):
             children["means"] = children["means"] + gain[..., -1] * dt
             children["times"] = raw["times"] + dt
             T_qq = torch.cat([T_qq[:, :-1], torch.where(in_time[..., None], T_qq[:, -1:] / SHRINK, T_qq[:, -1:])], 1)
-        p_rows = torch.cat([gain @ T_qq, T_pp], -1)
-        q_rows = torch.cat([T_qq, T_pp.new_zeros(len(T_qq), T_qq.shape[1], 3)], -1)
-        factor = torch.cat([p_rows, q_rows], 1)[:, self.own_order()]
-        return children | self.triangle.parameters(factor)
+        return children | self._parameters_of(T_qq, gain @ T_qq, T_pp)
+
+    @torch.no_grad()
+    def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
+        """Multiply the block T_pp of Gaussians by factors; T_qq and T_pq, and so the gain K, do not change."""
+        raw = {name: value.detach()[rows].double() for name, value in self.splats.items()}
+        T_qq, T_pq, T_pp = reduce(self.factors(raw))
+        for name, value in self._parameters_of(T_qq, T_pq, T_pp * factors[:, None, None]).items():
+            self.splats[name].data[rows] = value.to(self.splats[name].dtype)
+
+    def spread(self) -> Tensor:
+        """Return the factors T_pp of the covariances of slices, [N, 3, 3], which are the same for all queries."""
+        return reduce(self.factors({name: value.detach() for name, value in self.splats.items()})).T_pp
+
+    def _parameters_of(self, T_qq: Tensor, T_pq: Tensor, T_pp: Tensor) -> dict[str, Tensor]:
+        """Compute the parameters of the factors with the given blocks; see `_assembled`."""
+        return self.triangle.parameters(self._assembled(T_qq, T_pq, T_pp))
+
+    def _assembled(self, T_qq: Tensor, T_pq: Tensor, T_pp: Tensor) -> Tensor:
+        """Put factors [N, n, n] together from their blocks [T_qq 0; T_pq T_pp] of query q and position p."""
+        q_rows = torch.cat([T_qq, T_qq.new_zeros(*T_qq.shape[:2], 3)], -1)
+        return torch.cat([torch.cat([T_pq, T_pp], -1), q_rows], 1)[:, self.own_order()]
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
         """Return masks of the parameter entries that are used, given what each Gaussian depends on.
@@ -287,9 +305,7 @@ class TriangularModel(GatedModel):
             T_qq[:, column] = 0
             T_qq[:, column, column] = math.exp(LOG_SIZE_MAX)
             kept[..., column] = 0
-        p_rows = torch.cat([kept @ T_qq, blocks.T_pp], -1)
-        q_rows = torch.cat([T_qq, T_qq.new_zeros(*T_qq.shape[:2], 3)], -1)
-        return torch.cat([p_rows, q_rows], 1)[:, self.own_order()]
+        return self._assembled(T_qq, kept @ T_qq, blocks.T_pp)
 
     def factors(self, raw: Raw) -> Tensor:
         """Compute Cholesky factors from raw parameters, with rows sorted to (position, direction, time), [N, n, n]."""

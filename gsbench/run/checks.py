@@ -51,6 +51,7 @@ RANGES = {  # the ranges of settings, both ends included
     "train.densify.clone_below": (0, math.inf),
     "train.densify.prune_above": (0, math.inf),
     "train.densify.thin_to": (1e-3, 1),
+    "train.densify.noise": (0, ENDLESS),
     "train.penalties.opacity.weight": (0, math.inf),
     "train.penalties.size.weight": (0, math.inf),
     "train.densify.max_gaussians": (LEAST_GAUSSIANS, ENDLESS),

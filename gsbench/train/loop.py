@@ -172,6 +172,9 @@ class Trainer:
             self.optimizer.step(step, drawn, slowed=self.gating.slows_agr(step))
             self.minimum_scale.hold()
         with stages("density"):
+            if self.density.adds_noise:
+                rate = self.optimizer.rates_at(step)["means"]
+                self.density.add_noise(rate, generator(self.config.seed, step, 1))  # 1: not the numbers of `densify`
             if schedule.densifies(step):
                 refused = self.density.densify(generator(self.config.seed, step), schedule.has_reset(step))
                 self._tell_full(refused)

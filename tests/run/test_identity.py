@@ -105,8 +105,9 @@ def test_every_key_is_of_training_or_of_measuring() -> None:
             "iterations", "recipe_iterations", "batch_size", "ssim_weight", "sh_every", "refine_from",
             "lambda_from", "cooldown_from", "curve_points", *(f"densify.{name}" for name in (
                 "start", "stop", "every", "rounds", "reset_every", "grad_threshold", "clone_below", "prune_above",
-                "max_gaussians", "thin_to", "kind")), "coarse", "penalties.opacity.weight", "penalties.opacity.start",
-                "penalties.opacity.stop", "penalties.size.weight", "penalties.size.start", "penalties.size.stop")),
+                "max_gaussians", "thin_to", "noise", "kind")), "coarse",
+                "penalties.opacity.weight", "penalties.opacity.start", "penalties.opacity.stop",
+                "penalties.size.weight", "penalties.size.start", "penalties.size.stop")),
     }  # fmt: skip
 
 

@@ -4,9 +4,10 @@ from gsbench.config import DensifyConfig
 from gsbench.errors import InputError, did_you_mean
 from gsbench.train.densify.base import Densification
 from gsbench.train.densify.gradient import GradientDensification
+from gsbench.train.densify.mcmc import MCMCDensification
 from gsbench.train.rows import Rows
 
-KINDS: dict[str, type[Densification]] = {rule.kind: rule for rule in (GradientDensification,)}
+KINDS: dict[str, type[Densification]] = {rule.kind: rule for rule in (GradientDensification, MCMCDensification)}
 
 
 def check_kind(kind: str) -> None:

@@ -22,6 +22,7 @@ class Densification(ABC):
     """The base class of densification rules, which add and remove Gaussians during a training."""
 
     kind: ClassVar[str]  # its name in train.densify.kind
+    adds_noise: bool = False  # whether `add_noise` is called after every step
 
     def __init__(self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int) -> None:
         """Prepare the rule for a training.
@@ -69,6 +70,15 @@ class Densification(ABC):
         Returns:
             The number of Gaussians that were not added, because the model would have more than allowed.
         """
+
+    def add_noise(self, rate: float, generator: torch.Generator) -> None:
+        """Move means by noise after a step, if `adds_noise`; by default do nothing.
+
+        Args:
+            rate: the learning rate of the means in this step, world units.
+            generator: the source of all random numbers of this step.
+        """
+        return
 
     @abstractmethod
     def reset_opacities(self) -> None:

@@ -1,0 +1,128 @@
+"""Densify by relocation under a limit, as 3DGS-MCMC does: move dead Gaussians to opaque ones, grow, and add noise.
+
+Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", arXiv 2404.09591.
+"""
+
+import torch
+from torch import Tensor
+
+from gsbench.train.densify.base import MOST_GAUSSIANS, Densification
+
+GROWTH = 0.05  # share of Gaussians that a round adds, until there are `max_gaussians`
+MOST_COPIES = 51  # equal Gaussians that one Gaussian becomes in a round, at most
+LARGEST_OPACITY = 1 - 1.2e-7  # the largest float32 below 1
+
+
+class MCMCDensification(Densification):
+    """The relocation of 3DGS-MCMC (section 4). No Gaussian is cloned, split or pruned, and no opacity reset.
+
+    - A round takes place every 100 iterations or more, between `train.densify.start` and `stop`. A Gaussian is dead if
+      its opacity is at most the model's `min_opacity`. Each dead Gaussian moves to a living one, which is drawn with a
+      probability proportional to its opacity.
+    - Then 5 % more Gaussians are added in the same way, up to `train.densify.max_gaussians`.
+    - The n Gaussians that are now at one place get opacities and sizes with which they look as the one before.
+    - After every step each mean moves by normal noise with the covariance of its Gaussian, times `train.densify.noise`,
+      the learning rate of means and sigmoid(-100 (opacity - 0.005)): only transparent Gaussians move.
+    """
+
+    kind = "mcmc"
+
+    def accumulate(self, drawn: Tensor, g_means2d: Tensor, width: int, height: int, views: int) -> None:
+        """Do nothing: relocation does not use gradients of 2D means."""
+
+    @torch.no_grad()
+    def densify(self, generator: torch.Generator, has_reset: bool) -> int:
+        """Relocate dead Gaussians, then add Gaussians; see the class. Returns 0: the limit is part of the rule."""
+        N = len(self.model)
+        opacities = self._opacities()
+        dead = opacities <= self.min_opacity
+        if dead.all():
+            return 0
+        most = self.config.max_gaussians or MOST_GAUSSIANS
+        self._copy(drawn(opacities.masked_fill(dead, 0), int(dead.sum()), generator), dead.nonzero()[:, 0])
+        added = max(0, min(most, int(N * (1 + GROWTH))) - N)
+        self._copy(drawn(self._opacities(), added, generator), torch.arange(N, N + added, device=dead.device))
+        return 0
+
+    def _opacities(self) -> Tensor:
+        return torch.sigmoid(self.model.splats["opacities"].detach())
+
+    def _copy(self, sources: Tensor, places: Tensor) -> None:
+        """Copy Gaussians to other rows, and change all copies such that together they look as the source did.
+
+        Args:
+            sources: the row of the source of each copy, [M]; a row may occur several times.
+            places: the rows of the copies, [M]: existing rows are replaced, others appended.
+        """
+        if not len(sources):
+            return
+        N, model = len(self.model), self.model
+        rows = torch.arange(max(N, int(places.max()) + 1), device=sources.device)
+        rows[places] = sources
+        chosen, copies = sources.unique(return_counts=True)
+        opacities, shrink = relocated(self._opacities()[chosen], (copies + 1).clamp(max=MOST_COPIES))
+        opacities = opacities.clamp(self.min_opacity, LARGEST_OPACITY)
+        model.splats["opacities"].data[chosen] = torch.logit(opacities).to(model.splats["opacities"].dtype)
+        model.shrink_rows(chosen, shrink)
+        fresh = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
+        fresh[places] = fresh[chosen] = True
+        self.rows.select(rows, fresh)
+
+    @property
+    def adds_noise(self) -> bool:  # type: ignore[override]
+        """Whether noise is added: until a gate has removed effects from Gaussians."""
+        return self.config.noise > 0 and self.model.effect_sets is None
+
+    @torch.no_grad()
+    def add_noise(self, rate: float, generator: torch.Generator) -> None:
+        """Move the means of transparent Gaussians by noise; `rate` is the learning rate of means, world units."""
+        spread = self.model.spread()
+        noise = torch.randn(len(spread), 3, 1, generator=generator).to(spread)
+        weight = torch.sigmoid(-100 * (self._opacities() - 0.005)) * (self.config.noise * rate)
+        self.model.splats["means"].data += weight[:, None] * (spread @ (spread.mT @ noise))[..., 0]
+
+    def reset_opacities(self) -> None:
+        """Do nothing: opacities are not reset."""
+
+    def follow(self, rows: Tensor, fresh: Tensor) -> None:
+        """Do nothing: the rule keeps no sums of single Gaussians."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return an empty dictionary: all random numbers come from the seed and the step."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Do nothing, because `state_dict` is empty."""
+
+
+def drawn(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Draw `count` rows with replacement, with probabilities proportional to `weights` [N].
+
+    The sums are in float64 on the CPU, so that the same seed draws the same rows everywhere.
+    """
+    ends = weights.double().cpu().cumsum(0)
+    at = torch.rand(count, generator=generator, dtype=torch.float64) * ends[-1]
+    return torch.searchsorted(ends, at, right=True).clamp(max=len(ends) - 1).to(weights.device)
+
+
+def relocated(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the opacity and the size of n equal Gaussians that together look as one (3DGS-MCMC, eq. 9).
+
+        o' = 1 - (1 - o)^(1/n)      c = o / sum_{k=1..n} binom(n, k) (-1)^(k-1) o'^k / sqrt(k)
+
+    The binomials are those of the paper's double sum over i and k, added over i.
+
+    Args:
+        opacities: the opacity o of each Gaussian before, [M].
+        copies: the number n of Gaussians that take its place, [M].
+
+    Returns:
+        (o', c), each [M] in float64: the new opacities, and the factors of the standard deviations.
+    """  # fmt: skip
+    o, n = opacities.double(), copies.double()
+    new = 1 - (1 - o) ** (1 / n)
+    k = torch.arange(1, int(copies.max()) + 1, dtype=torch.float64, device=o.device)
+    log_binomials = torch.lgamma(n + 1)[:, None] - torch.lgamma(k + 1) - torch.lgamma((n[:, None] - k + 1).clamp(min=1))
+    terms = torch.exp(log_binomials + k * new[:, None].log()) / k.sqrt()
+    signs = torch.where(k % 2 == 1, 1.0, -1.0).double()
+    return new, o / (terms * signs).masked_fill(k > n[:, None], 0).sum(-1)
