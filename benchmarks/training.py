@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from benchmarks.scene import camera
+from benchmarks.scene import TIME, camera
 from gsbench.kernels.adam import adam_all
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel
@@ -19,7 +19,7 @@ def one_view(width: int, height: int) -> View:
     """Return a view of the benchmark's scene, with a random image."""
     viewmats, Ks = camera(width, height)
     target = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
-    return View("0", Camera(viewmats[0], Ks[0], width, height), 0.4, target)
+    return View("0", Camera(viewmats[0], Ks[0], width, height), TIME, target)
 
 
 def training_step(fitted: GaussianModel, width: int, height: int, views: int) -> Callable[[], None]:
