@@ -92,8 +92,8 @@ stability-long: $(VENV)/levels-all  ## the same with long trainings, and 10,000 
 	$(BIN)/python -m gsbench.stability --long
 	$(BIN)/python -m pytest tests/stability -m slow
 
-bench: $(VENV)/levels-all  ## time every kernel against the machine's own limits; results/benchmarks/
-	$(BIN)/python -m benchmarks
+bench: $(VENV)/levels-all  ## time every stage and kernel against the machine's limits; ARGS="--against COMMIT" too; results/benchmarks/
+	$(BIN)/python -m benchmarks $(ARGS)
 
 gpu-check:  ## on a machine with a GPU, offline: build, test, train, sanitize and time the CUDA kernels; results/benchmarks/
 	$(PYTHON) benchmarks/gpu_check.py $(ARGS)

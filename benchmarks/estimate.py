@@ -9,7 +9,7 @@ from itertools import groupby
 
 import torch
 
-from benchmarks.scene import SIGMA, model
+from benchmarks.scene import SIGMA, VISIBLE, trained
 from benchmarks.stages import MODELS
 from benchmarks.timing import Cost, measure
 from benchmarks.training import training_step
@@ -24,9 +24,9 @@ CORES, THREADS = 64, 2  # of a larger machine; a run has two threads
 MS_AN_HOUR = 3.6e6
 ASSUMPTIONS = (
     f"Assumptions: CPU time of a step is linear in Gaussians, timed at {COUNTS[0]:,} and {COUNTS[1]:,}; their number "
-    f"goes linearly from {FIRST:,} to the paper's until densification ends (half of a run), then stays; Gaussians are "
-    "all visible and of a 3-sigma radius of 5 pixels; AGR and degree 3 act from the first step; only steps count, not "
-    f"loading or measuring; {CORES} cores are as fast as this machine's, also when all are busy."
+    f"goes linearly from {FIRST:,} to the paper's until densification ends (half of a run), then stays; a view shows "
+    f"{VISIBLE:.0%} of them, of a 3-sigma radius of 5 pixels; AGR and degree 3 act from the first step; only steps "
+    f"count, not loading or measuring; {CORES} cores are as fast as this machine's, also when all are busy."
 )
 
 
@@ -70,7 +70,7 @@ def time_step(run: Run, gaussians: int, threads: int) -> Cost:
     """Time a step of a run on the benchmark's scene, with so many Gaussians and threads."""
     name, agr = MODELS[run.model]
     width, height = run.size
-    step = training_step(model(name, gaussians, agr=agr, sigma=SIGMA * 400 / width), width, height, run.views)
+    step = training_step(trained(name, gaussians, agr=agr, sigma=SIGMA * 400 / width), width, height, run.views)
     torch.set_num_threads(threads)
     cost = measure(step)
     torch.set_num_threads(1)

@@ -6,15 +6,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsbench.models import GaussianModel, build
+from gsbench.kernels.headers import ALPHA_MIN
+from gsbench.models import GaussianModel, Query, build
 from gsbench.models.factors import KINDS
 from gsbench.models.triangular import TriangularModel
 from gsbench.scenes.scene import Points
 from gsbench.schedule import ActiveComponents
+from gsbench.train.rows import Rows
 
 SIGMA = 0.0083  # median standard deviation along an axis: a mean 3-sigma radius of 5 pixels at 400 x 400
 SPREAD = 0.4  # of its logarithm
 DISTANCE = 4.0
+VISIBLE = 0.36  # of the Gaussians in a view of 4DGS at a quarter of trex' iterations (gsbench/train/rows.py)
+TIME = 0.4  # of every view
 FOCAL = 1.39  # times the width: D-NeRF's field of view, 0.69
 
 
@@ -58,4 +62,32 @@ def model(
         space = made.rows["p"] if isinstance(made, TriangularModel) else [0, 1, 2]
         logs[:, space] = math.log(sigma) + SPREAD * torch.randn(N, 3, generator=g)
     made.set_active(ActiveComponents(3, refine=agr, tunes_lambda=False))
+    return made
+
+
+class NoMoments:
+    """Stands for the moments of an optimizer that has not begun."""
+
+    def follow(self, rows: Tensor, fresh: Tensor) -> None:
+        """Have nothing to move."""
+
+    def forget(self, parameter: Tensor) -> None:
+        """Have nothing to zero."""
+
+
+def trained(name: str, N: int, **options: Any) -> GaussianModel:
+    """A `model` that observes time, of which VISIBLE is visible at TIME; its rows are sorted by time as in training.
+
+    Mean times are spread around TIME until so few Gaussians reach it; some then lie outside of the clip.
+    """
+    made = model(name, N, **options)
+    query = Query.at(torch.tensor([0.0, 0.0, -DISTANCE]), TIME)
+    with torch.no_grad():
+        offsets = made.splats["times"] - TIME
+        log_spread = 0.0
+        for halvings in range(12):  # the share that is visible falls with the spread
+            made.splats["times"].copy_(TIME + offsets * math.exp(log_spread))
+            seen = (made.slice(query).opacities >= ALPHA_MIN).float().mean()
+            log_spread += (1 if seen > VISIBLE else -1) * 4.0 / 2**halvings
+    Rows(made, NoMoments()).sort_by_time()
     return made

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.scene import model
+from benchmarks.scene import trained
 from benchmarks.timing import Row
 from benchmarks.training import adam_of, one_view, training_step
 from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, HIDDEN, TRANSMITTANCE_MIN
@@ -17,7 +17,6 @@ from gsbench.models.render import rasterize_slice
 from gsbench.raster import reference
 from gsbench.scenes import View
 from gsbench.train.losses import photometric
-from gsbench.train.rows import Rows
 
 MODELS = {"7dgs_noagr": ("7dgs", False), "7dgs": ("7dgs", True), "4dgs": ("4dgs", False)}  # name: model, AGR
 STAGES = {"refine": "AGR", "slice_triangular": "slice", "slice_rotated": "slice", "show_colors": "colours",
@@ -87,16 +86,6 @@ class Recording(Tape):
         return super().record(call, tensors, numbers)
 
 
-class _NoMoments:
-    """Stands for the moments of an optimizer that has not begun."""
-
-    def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Have nothing to move."""
-
-    def forget(self, parameter: Tensor) -> None:
-        """Have nothing to zero."""
-
-
 def recorded(fitted: GaussianModel, view: View) -> dict[str, Call]:
     """Return the calls of the second of two views by name; its gradients are added to those of the first.
 
@@ -124,9 +113,8 @@ def stages(N: int = 150_000, size: int = 400) -> Iterator[Row]:
 
 
 def stages_of(name: str, N: int, size: int) -> Iterator[Row]:
-    """The stages of one model, whose rows are sorted by time as in training."""
-    fitted, view = model(MODELS[name][0], N, agr=MODELS[name][1]), one_view(size, size)
-    Rows(fitted, _NoMoments()).sort_by_time()
+    """The stages of one model, of which a view shows as many Gaussians as in training."""
+    fitted, view = trained(MODELS[name][0], N, agr=MODELS[name][1]), one_view(size, size)
     calls = recorded(fitted, view)
 
     def row(stage: str, call: Callable[[], Any], floor: tuple[str, float], pixels: int | None = None) -> Row:

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
 
-from benchmarks.scene import camera
+from benchmarks.scene import TIME, camera
 from gsbench.kernels.adam import adam_all
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel
@@ -19,7 +18,7 @@ def one_view(width: int, height: int) -> View:
     """Return a view of the benchmark's scene, with a random image."""
     viewmats, Ks = camera(width, height)
     target = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
-    return View("0", Camera(viewmats[0], Ks[0], width, height), 0.4, target)
+    return View("0", Camera(viewmats[0], Ks[0], width, height), TIME, target)
 
 
 def training_step(fitted: GaussianModel, width: int, height: int, views: int) -> Callable[[], None]:
@@ -46,12 +45,14 @@ def adam_of(fitted: GaussianModel) -> Callable[[], None]:
     parameters = [p for p in fitted.parameters() if p.requires_grad]
     if parameters[0].device.type != "cpu" or not fitted.backend.serves(parameters[0]):
         return torch.optim.Adam(parameters, lr=RATE, betas=BETAS, eps=EPS, fused=True).step
-    means, squares = ([torch.zeros_like(p) for p in parameters] for _ in range(2))
-    steps = [torch.zeros(()) for _ in parameters]
+    states = [(p, torch.zeros_like(p), torch.zeros_like(p), torch.zeros(())) for p in parameters]
 
     def call() -> None:
-        given: list[Tensor] = [p.grad for p in parameters if p.grad is not None]
+        learning = [state for state in states if state[0].grad is not None]
+        gradients = [p.grad for p, *_ in learning]
+        means, squares, steps = ([state[i] for state in learning] for i in (1, 2, 3))
         torch._foreach_add_(steps, 1)
-        adam_all([p.data for p in parameters], given, means, squares, steps, [RATE] * len(given), list(BETAS), EPS)
+        adam_all([p.data for p, *_ in learning], gradients, means, squares, steps, [RATE] * len(learning), list(BETAS),
+                 EPS)  # fmt: skip
 
     return call

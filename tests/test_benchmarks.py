@@ -9,6 +9,7 @@ from benchmarks import rows, scene
 from benchmarks.__main__ import HEADER, line
 from benchmarks.stages import MODELS, blended_alphas, recorded, stages
 from benchmarks.training import one_view
+from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import Query
 from gsbench.models.render import rasterize_slice
 
@@ -37,6 +38,15 @@ def test_every_stage_is_timed_once_and_has_a_floor() -> None:
         agr = {"AGR forward", "AGR backward"} if name == "7dgs" else set()
         found = [row.name.removeprefix(f"{name} ") for row in stage_rows if row.name.startswith(f"{name} ")]
         assert sorted(found) == sorted(expected | agr)
+
+
+def test_a_trained_model_shows_a_part_of_its_rows_in_order() -> None:
+    """Catches stages that are timed with every Gaussian visible, or with visible ones far apart."""
+    for name in ("4dgs", "7dgs"):
+        fitted, view = scene.trained(name, 1600), one_view(32, 32)
+        seen = fitted.slice(Query.of(view.camera, view.time)).opacities >= ALPHA_MIN
+        assert abs(float(seen.float().mean()) - scene.VISIBLE) < 0.02
+        assert seen.unflatten(0, (-1, 16)).any(1).float().mean() < 0.6  # it is 1 in any order
 
 
 def test_gradients_of_a_stage_are_added_in_place() -> None:
