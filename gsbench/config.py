@@ -151,7 +151,7 @@ class ProtocolConfig:
 
 @dataclass
 class EffectsConfig:
-    """Remove time, direction and AGR from Gaussians that do not need them (docs/effects.md)."""
+    """Remove time, direction and AGR (a network) from Gaussians that do not need them (docs/effects.md)."""
 
     gate: str = "${model.gate}"  # off; end: after the training; both: also during it
     budget_db: float = 0.05  # PSNR on val that this may cost after the training

@@ -84,7 +84,7 @@ class Operation:
         self._traced = _register(self)
 
     def __call__(self, *arguments: Any) -> Tensors:
-        """Call the operation with tensors (None for an optional one), then numbers, in the order of the declaration.
+        """Run the kernel with tensors (None for an optional one), then numbers, in the order of the declaration.
 
         Raises:
             InputError: shapes do not match, tensors are not float32 on one device, or an input requires a gradient that
@@ -167,8 +167,8 @@ class Operation:
             slots: the kernel arguments that `run` returned.
             outputs: the outputs that `run` returned.
             given: the gradient of each output; None for zero.
-            wanted: whether the caller needs the gradient of each input; used only for gradients of kind ON_REQUEST.
-            sums: tensors to which gradients of kind ADDED are added, by the index of the input.
+            wanted: whether the caller needs the gradient of each input; others are left out if declared ON_REQUEST.
+            sums: tensors to which gradients that are declared ADDED are added, by the index of the input.
         """
         like = tensors[0]
         library = library_of(like.device.type)
@@ -295,7 +295,7 @@ def addresses(tensors: Sequence[Tensor]) -> tuple[int, ...]:
 
 
 def first_rows(name: str, count: int, x: Tensor) -> int:
-    """Return the number of rows, counted from the first, that an operation changes.
+    """Return how many rows (Gaussians) of a tensor a kernel changes, counted from the first.
 
     `count` may be EVERY_ROW, which means all rows of the tensor.
 

@@ -24,7 +24,7 @@ class Triangle:
     The entries below the diagonal are of three kinds, each with its own learning rate:
 
     - `shape`: the row and the column are both of p;
-    - `motion`: one of them is of p, the other of t or d; these entries move the slice with time and direction;
+    - `motion`: one of them is of p, the other of t or d; these entries move the 3D Gaussian with time and direction;
     - `coupling`: the row and the column are both of t or d.
     """
 

@@ -77,7 +77,7 @@ class Gaussians4DModel(GatedModel):
         return {"times": times, "scales": scales, "left_quats": quats, "right_quats": quats.clone()}
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Slice the Gaussians at time t; the opacity factor is f_temp = exp(-1/2 lambda_t (t - mu_t)^2 / S_t)."""
+        """Condition Gaussians on time t; f_temp = exp(-1/2 lambda_t (t - mu_t)^2 / S_t) multiplies opacities."""
         time = query.time
         assert time is not None
         factor, delta = _leading_first(self.factors(raw)), time - raw["times"]
@@ -92,7 +92,7 @@ class Gaussians4DModel(GatedModel):
         return Conditioned(means, factors, torch.where(seen, opacity_factor, 0.0))
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return the slice of Gaussians that do not depend on time, from left quaternions and spatial scales."""
+        """Return the 3D Gaussians of Gaussians that ignore time, from left quaternions and spatial scales."""
         factors = rotation(turn_of_space(raw["left_quats"])) * sizes(raw["scales"][:, :3])[:, None, :]
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
@@ -106,7 +106,7 @@ class Gaussians4DModel(GatedModel):
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
         """Remove the dependence on time: replace means and opacities by their weighted averages over views.
 
-        The covariance becomes that of the slice, which is the same at all times.
+        The covariance becomes the conditional one, which is the same at all times.
         """
         factor = self.factors(raw).double()
         blocks = reduce(factor)
@@ -176,7 +176,7 @@ class Gaussians4DModel(GatedModel):
         self.splats["right_quats"].data[effect_sets.conditioned :] = partner(left)
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Slice by the backend's kernel if it has one for the numerical method `scheme`, else in torch."""
+        """Compute conditional 3D Gaussians by the backend's kernel if it has one for `scheme`, else in torch."""
         if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
         assert query.time is not None

@@ -157,7 +157,8 @@ class Group:
     def compared(self) -> list[Configuration]:
         """Return the configurations (a model with its settings) that the report compares in pairs.
 
-        Their settings are those that most models share. Only ablations and the removal of effects may differ.
+        Their settings are those that most models share. Only ablations and the removal of time, direction and AGR (a
+        network) from Gaussians may differ.
         """
         return [c for c in self.configurations if _common(c.variant) == _common(self.variant)]
 
@@ -278,7 +279,7 @@ def without(variant: str, *names: str) -> str:
 
 
 def _common(variant: str) -> str:
-    """Return a variant (a text of settings) without the settings for ablations and for the removal of effects."""
+    """Return a variant (a text of settings) without the settings for ablations and `effects.gate`."""
     return without(variant, "gate", "budget_db", "ablation")
 
 

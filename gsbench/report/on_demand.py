@@ -43,7 +43,7 @@ class Decided:
 
     @property
     def before(self) -> float:
-        """Return the number of Gaussians before any effect or Gaussian was removed."""
+        """Return the number of Gaussians before time, direction, AGR (a network) or whole Gaussians were removed."""
         return sum(self.rows.values())
 
     @property

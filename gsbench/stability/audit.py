@@ -135,7 +135,7 @@ def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Step]]:
 
 
 def hard_slices(audit: Audit, order: str, N: int) -> None:
-    """Slice N random 7D Gaussians with ill-conditioned factors, and add the errors to the audit.
+    """Measure the errors of conditional 3D Gaussians for N random 7D Gaussians with ill-conditioned factors.
 
     The diagonal entries of the factors go down to 1e-5. An error is the 99.9th percentile over the Gaussians.
     """

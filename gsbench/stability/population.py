@@ -1,4 +1,4 @@
-"""Test slicing of a million random 7D Gaussians with ill-conditioned factors, against an exact float64 method.
+"""Test conditional 3D Gaussians of a million random ill-conditioned 7D Gaussians against an exact float64 method.
 
 The exact method is modified Gram-Schmidt, done twice ("twice is enough": Giraud et al. 2005). mpmath would need weeks
 for a million Gaussians, so each audit compares Gram-Schmidt with mpmath on a few of them (`verify`).
@@ -212,11 +212,11 @@ def _relative(found: Floats, exact: Floats) -> float:
 
 
 def judge(hard: Hard, known: PopulationTruth, order: str, scheme: str, backend: str) -> Errors:
-    """Measure the errors of slicing ill-conditioned 7D Gaussians in float32.
+    """Measure the float32 errors of the conditional 3D Gaussians of ill-conditioned 7D Gaussians.
 
     Args:
         hard: the Gaussians to slice.
-        known: the exact slices of these Gaussians.
+        known: the exact conditional 3D Gaussians.
         order: the order of rows in the triangular factor.
         scheme: the slicing scheme, which computes the conditional Gaussian.
         backend: the name of the backend.

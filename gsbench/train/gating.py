@@ -1,4 +1,4 @@
-"""Make Gaussians independent of time, direction or AGR (neural refinement) where the images allow it.
+"""Make Gaussians independent of time, direction or AGR (a network) if the images hardly change.
 
 This is done once after densification and once at the end of a training.
 The first simplification makes the rest of the training faster.
@@ -91,7 +91,7 @@ class Gating:
                 self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
 
     def in_training(self, step: int) -> bool:
-        """Make Gaussians independent of time, direction or AGR (the refinement) before a step of the training.
+        """Make Gaussians independent of time, direction or AGR (a network) before a step of the training.
 
         This is not done if the model has fewer than LEAST_IN_TRAINING Gaussians, or if PSNR on val would fall too much.
 
@@ -117,7 +117,7 @@ class Gating:
         return float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))
 
     def at_end(self, by_halves: bool) -> bool:
-        """Make Gaussians independent of time, direction or AGR (the refinement) after the training.
+        """Make Gaussians independent of time, direction or AGR (a network) after the training.
 
         This is not done if PSNR would fall by more than `effects.budget_db` dB.
 
@@ -162,7 +162,7 @@ class Gating:
 
     @torch.no_grad()
     def _gate(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> bool:
-        """Make Gaussians independent of time, direction or AGR (the refinement); return whether this was done.
+        """Make Gaussians independent of time, direction or AGR (a network); return whether this was done.
 
         Args:
             step: the step of the training; None at its end.

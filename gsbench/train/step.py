@@ -80,7 +80,7 @@ def _parts(views: int) -> list[int]:
 
 
 def _in_order(parts: Sequence[Sums]) -> Sums:
-    """Add dictionaries of gradients to the first one, in their order; an object that occurs twice is added once."""
+    """Add dictionaries of gradients, in order, to the first one; a dictionary that views share is added only once."""
     total = parts[0]
     done = {id(total)}
     for part in parts[1:]:
@@ -134,8 +134,8 @@ class Step:
             The loss and the gradients of the 2D means for each view.
 
         Raises:
-            DivergedError: a slice has a value that is not finite.
-            InputError: the rasterizer refuses a slice for another reason.
+            DivergedError: a 3D Gaussian of a view has a value that is not finite.
+            InputError: the rasterizer refuses 3D Gaussians for another reason.
             TooLargeError: the memory does not suffice.
         """
         self.penalties = penalties

@@ -22,7 +22,7 @@ EVERY_DEGREE = 3  # the highest SH degree of any model
 
 
 class FrameRequest(NamedTuple):
-    """The settings of a frame that a browser requests, apart from the camera: the time, the effects and the colours."""
+    """The settings of a requested frame: time, viewpoint of the Gaussians, AGR (a network) on or off, SH, colours."""
 
     time: float | None  # in [0, 1]; None if the scene is static
     center: torch.Tensor | None = None  # [3], viewpoint for which Gaussians are computed; None: the camera's

@@ -121,7 +121,7 @@ def _change(of: Estimate, unit: str, digits: int) -> str:
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
-    """List the notes on the choice of effects: what could not be decided, and what the numbers leave out.
+    """List notes on the removal of time, direction and AGR (a network): what was undecided, what the numbers leave out.
 
     Equal notes of several seeds are merged.
     """
@@ -186,14 +186,14 @@ def _mean_degree(one: Decided) -> str:
 
 
 def _swatches() -> list[Swatch]:
-    """Return the legend of the colours for sets of effects, such as "static", and for SH degrees."""
+    """Return the legend of the colours for what Gaussians depend on, such as "static", and for SH degrees."""
     effect_sets = [Swatch(said, f"model-{MODELS.index(EFFECT_SET_LIKE[name])}") for name, said in EFFECT_SETS.items()]
     degrees = [Swatch(f"degree {i}", f"stage-{_stage(i)}") for i in range(DEGREES)]
     return [*effect_sets, Swatch(NAMES[REMOVED], "line"), *degrees]
 
 
 def _images(found: list[Decided], folder: Path) -> list[Image]:
-    """Return images in which each Gaussian has the colour of the effects that it keeps, such as time.
+    """Return images in which the colour of a Gaussian shows whether it depends on time, direction or AGR (a network).
 
     There is one image for each scene and model, from the first seed that has one.
     """
