@@ -97,7 +97,7 @@ def probe(
     seeds = torch.randint(2**62, (len(looked_at),), generator=random).tolist()
 
     def errors_in(v: int) -> tuple[float, list[Tensor]]:
-        """Return the squared error of view `v`, and how much it grows if each Gaussian is simplified, in each way."""
+        """Return the squared error of view `v`, and its growth by each simplification of each Gaussian."""
         view = looked_at[v]
         drawing = ViewRasterizer(model, view.camera, background, antialias)
         here = drawing(seen[v])
@@ -176,7 +176,7 @@ class Place(NamedTuple):
 
 
 def _error(simplification: Simplification, here: Place, draw: ViewRasterizer) -> Tensor:
-    """Predict how much the squared error of one view grows if each Gaussian is simplified in this way, [N].
+    """Predict how much the squared error of one view grows if a Gaussian is simplified, for each Gaussian, [N].
 
     Args:
         simplification: the parameters of the simplified Gaussians.

@@ -1,4 +1,4 @@
-"""Provide compiled kernels for slicing, rasterization and losses as differentiable operations on torch tensors.
+"""Provide compiled kernels for conditioning, rasterization and losses as differentiable functions of tensors.
 
 The compiled extension `_native` is optional. Without it this package can be imported, but its operations raise
 InputError; the backend "reference" (plain PyTorch) computes the same.

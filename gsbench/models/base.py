@@ -61,7 +61,7 @@ class Geometry(NamedTuple):
 
 
 def tensors_of(parts: Iterable[Tensor | None]) -> list[Tensor]:
-    """Return the tensors of 3D Gaussians (means, factors, ...) in order, without fields that are None."""
+    """Return the tensors of 3D Gaussians (means, covariance factors, ...) in order, without fields that are None."""
     return [part for part in parts if part is not None]
 
 
@@ -196,7 +196,7 @@ class GaussianModel(nn.Module, ABC):
         return ColorOrder(self.active.sh_degree, 1).packed
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
-        """Compute the SH colours [N, 3] of 3D Gaussians as seen from the camera centre of `query`.
+        """Compute the SH colours [N, 3] of 3D Gaussians as seen from `query.center`, the camera's centre.
 
         The kernel skips Gaussians that are culled because of their opacity. A model with other colours overrides this.
         """

@@ -29,7 +29,7 @@ class Triangle:
     """
 
     def __init__(self, letters: str, form: str = "relative") -> None:
-        """Describe a factor by the variables of its rows.
+        """Describe a Cholesky factor by the variables of its rows.
 
         Args:
             letters: the variable of each row, "p", "t" or "d"; for example "dddtppp".
@@ -98,7 +98,7 @@ class Triangle:
         return {"log_diagonal": diagonal.log()} | self.split(x)
 
     def split(self, below: Tensor) -> dict[str, Tensor]:
-        """Split the factor's parameters below the diagonal, [N, n (n - 1) / 2], into three kinds.
+        """Split the Cholesky factor's parameters below the diagonal, [N, n (n - 1) / 2], into three kinds.
 
         These are `shape` (within position), `motion` (position with time or direction) and `coupling` (within time and
         direction).

@@ -49,7 +49,7 @@ class Gaussians4DModel(GatedModel):
 
         Args:
             time_degree: the number of frequencies of the colours in time, without the constant; 0: constant colours.
-            scheme: the numerical method of slicing, see `slice_gaussians`.
+            scheme: the numerical method of conditioning on time, see `slice_gaussians`.
             lambda_t: the coefficient in the exponent of f_temp, the factor of the opacity at a time.
             options: the options of `GatedModel`.
 
@@ -224,7 +224,7 @@ class Gaussians4DModel(GatedModel):
         return float(self.splats["scales"].detach()[index, 3] - self.clock.log())
 
     def durations(self) -> Tensor:
-        """Return the standard deviation in time of each Gaussian, [N]: the norm of the row of t of its factor."""
+        """Return the standard deviation in time of each Gaussian, [N]: the norm of its covariance factor's row of t."""
         return self.factors(dict(self.splats.items())).detach()[:, 3].norm(dim=-1)
 
     def hold_sizes(self, least: Tensor) -> None:

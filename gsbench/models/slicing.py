@@ -113,7 +113,7 @@ def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
 
 
 def check_scheme(scheme: str) -> None:
-    """Raise InputError unless `scheme`, the numerical method of slicing, is `square_root`, `schur` or `cholesky`."""
+    """Raise InputError unless `scheme` is a method of conditioning: `square_root`, `schur` or `cholesky`."""
     if scheme not in SCHEMES:
         raise InputError(f"slicing scheme '{scheme}' is not known. {did_you_mean(scheme, SCHEMES)}")
 

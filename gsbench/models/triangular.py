@@ -55,7 +55,7 @@ class TriangularModel(GatedModel):
         Args:
             factor_order: the order of variables in the triangular factor: `paper` is (position, time, direction),
                 `conditioned_first` is (direction, time, position).
-            scheme: the numerical method of slicing, see `slice_gaussians`.
+            scheme: the numerical method of conditioning, see `slice_gaussians`.
             off_diagonal: how a parameter gives an entry below the diagonal, see `form` of `Triangle`.
             split_in_time: whether moving Gaussians are also split if they are long in time (7DGS, section 4.4).
             options: the options of `GatedModel`.
@@ -309,7 +309,7 @@ class TriangularModel(GatedModel):
         """Compute -ln of the opacity factors f_dir and f_temp (7DGS, eq. 11 and 12), [N] for each variable.
 
         Args:
-            T_qq: the triangular factor of the covariance of direction and time.
+            T_qq: the triangular factor of the covariance of q, which is direction and time.
             delta: the offset of direction and time from their means, q - mu_q.
             white: T_qq^-1 delta.
         """
@@ -345,7 +345,11 @@ class TriangularModel(GatedModel):
 
     @torch.no_grad()
     def long_in_time(self) -> Tensor:
-        """Return which Gaussians are split in time: |S_pt| > 0.05 extent and sqrt(S_t) > 0.25 (7DGS, section 4.4)."""
+        """Return which Gaussians move far and live long, and are split in time (7DGS, section 4.4).
+
+        The conditions are |S_pt| > 0.05 extent and sqrt(S_t) > 0.25, with the covariance S_pt of position and time and
+        the variance S_t of time.
+        """
         return self.moves_long(self.factors(dict(self.splats.items())))
 
 

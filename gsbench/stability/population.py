@@ -27,9 +27,10 @@ NEVER = -110.0  # log lambda; its exp is zero in float32, so that no Gaussian is
 
 @dataclass(frozen=True)
 class Hard:
-    """Raw parameters of 7D Gaussians with ill-conditioned factors and means at the origin.
+    """Raw parameters of 7D Gaussians with ill-conditioned covariance factors and means at the origin.
 
-    They are sliced for a camera at the origin at time 0, so that direction and time are exactly 0, without rounding.
+    They are conditioned on time 0 and on a camera at the origin, so that direction and time are exactly 0, without
+    rounding.
     """
 
     log_diagonal: Tensor  # [N, 7] float32
@@ -215,10 +216,10 @@ def judge(hard: Hard, known: PopulationTruth, order: str, scheme: str, backend: 
     """Measure the float32 errors of the conditional 3D Gaussians of ill-conditioned 7D Gaussians.
 
     Args:
-        hard: the Gaussians to slice.
+        hard: the 7D Gaussians.
         known: the exact conditional 3D Gaussians.
         order: the order of rows in the triangular factor.
-        scheme: the slicing scheme, which computes the conditional Gaussian.
+        scheme: the algorithm that computes the conditional Gaussian.
         backend: the name of the backend.
     """
     model = all_seen(order, scheme, backend)

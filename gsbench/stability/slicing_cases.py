@@ -116,7 +116,7 @@ def diagonals_over_eight_decades(g: Generator, severity: float, model: str) -> O
 def narrow_in_direction(g: Generator, severity: float, model: str) -> Observed:
     """Use Gaussians that are visible from a range of directions 10^-3 wide, such as highlights.
 
-    Float32 stores a unit direction to 6e-8, which is 6e-5 of this width; no scheme can be more exact.
+    Float32 stores a unit direction to 6e-8, which is 6e-5 of this width; no algorithm can be more exact.
     """
     observed = ordinary(g, model)
     sizes(observed, "d")[:] = -3 * LN_10 * severity

@@ -63,7 +63,7 @@ class Gating:
     """Simplify Gaussians in a training: make them independent of time, direction or AGR (the neural refinement)."""
 
     def __init__(self, rows: Rows, scene: Scene, renderer: Renderer, config: Config) -> None:
-        """Choose the views to predict the errors of simplified Gaussians from, and the views to measure PSNR on.
+        """Choose the views from which errors of simplified Gaussians are predicted, and those for measuring PSNR.
 
         Args:
             rows: the model, together with the per-Gaussian state of the training, which must change with it.
@@ -109,7 +109,8 @@ class Gating:
     def slows_agr(self, step: int) -> float:
         """Return the factor of the learning rate of AGR, the neural refinement, at a step.
 
-        The factor is 1 until Gaussians are simplified in training. Then it falls log-linearly to LAST_RATE at the end.
+        The factor is 1 until some Gaussians are made independent of time, direction or AGR in training. Then it falls
+        log-linearly to LAST_RATE at the end.
         """
         if not self.gates or self.gates[0].step is None:
             return 1.0
@@ -195,12 +196,12 @@ class Gating:
         self.rows.moved(found.rows, found.changed)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return for the checkpoint when Gaussians were simplified, and how PSNR and frame time changed."""
+        """Return when time, direction or AGR were removed from Gaussians, and how PSNR and frame time changed."""
         direction = asdict(self.direction) if self.direction else None
         return {"gates": [asdict(gate) for gate in self.gates], "notes": list(self.notes), "direction": direction}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore from a checkpoint when Gaussians were simplified; raises InputError if the state is damaged."""
+        """Restore the `state_dict` of a checkpoint; raises InputError if it is damaged."""
         if not isinstance(state, dict):
             raise InputError(f"checkpoint: expected 'gating' as a dict, got {type(state).__name__}")
         gates, notes = state["gates"], state["notes"]

@@ -49,15 +49,15 @@ class Frame(NamedTuple):
     costs: tuple[FrameCost, ...]  # of each model in it
 
     def ms(self, part: str) -> float:
-        """Return the milliseconds of slicing or of rasterization, summed over the models in the image."""
+        """Return the milliseconds of conditioning or of rasterization, summed over the models in the image."""
         return sum(cost.of(part) for cost in self.costs)
 
 
 class FrameRenderer:
     """Renders the frames of one run's model, one frame at a time.
 
-    The renderer switches effects of the model, such as the neural refinement, on and off for each frame. Therefore it
-    cannot render two frames at once.
+    The renderer switches parts of the model, such as AGR (a network), on and off for each frame. Therefore it cannot
+    render two frames at once.
     """
 
     def __init__(self, run: LoadedRun, most_cost: float) -> None:
@@ -110,7 +110,7 @@ class FrameRenderer:
             return image[0], watch.ms
 
     def _active(self, request: FrameRequest) -> ActiveComponents:
-        """Return the active parts of the model, such as neural refinement, without those that the user switches off."""
+        """Return the active parts of the model, such as AGR (a network), without those that the user switches off."""
         trained = self.trained_active
         degree = min(request.sh_degree, trained.sh_degree)
         return replace(trained, refine=request.agr and trained.refine, sh_degree=degree)

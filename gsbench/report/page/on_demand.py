@@ -36,7 +36,7 @@ NAMES = EFFECT_SETS | {REMOVED: "removed"}
 def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection | None:
     """Make the section on which effects the Gaussians keep; None if no run chose effects.
 
-    The effects are time, view direction and neural refinement. The figures show how many Gaussians keep which effects,
+    The effects are time, view direction and the network AGR. The figures show how many Gaussians keep which effects,
     and the degrees of their spherical harmonics.
     """
     found = decided(group)
@@ -63,7 +63,7 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection
 
 
 def _sentence(one: Decided) -> str:
-    """Describe which effects (time, view direction, neural refinement) a model and its Gaussians keep on a scene."""
+    """Describe which effects (time, view direction, the network AGR) a model and its Gaussians keep on a scene."""
     parts = [_screen_words(one.runs), *_gate_words(one)]
     return f"On {one.scene}, {one.name}: {' '.join(part for part in parts if part)}"
 
@@ -92,7 +92,7 @@ def _screens(runs: list[Record]) -> list[TimeScreen]:
 
 
 def _gate_words(one: Decided) -> list[str]:
-    """Say which effects (time, view direction, neural refinement) Gaussians keep, and what removing the others changed.
+    """Say which effects (time, view direction, the network AGR) Gaussians keep, and what removing the others changed.
 
     The text gives the change of PSNR and of the milliseconds per frame.
     """
@@ -149,7 +149,7 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
 def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
     """Draw two stacked bars for each scene and model: Gaussians by the effects that they keep, and by SH degree.
 
-    The effects are time, view direction and neural refinement.
+    The effects are time, view direction and the network AGR.
     """
     label = lambda one: messages.shorten_middle(f"{one.scene}, {one.name}", LONGEST_LABEL, LABEL_END)  # noqa: E731
     effect_sets = [
