@@ -1,4 +1,4 @@
-"""Provide compiled kernels for conditioning, rasterization and losses as differentiable functions of tensors.
+"""Provide compiled kernels for conditional Gaussians, rasterization and losses, as differentiable functions.
 
 The compiled extension `_native` is optional. Without it this package can be imported, but its operations raise
 InputError; the backend "reference" (plain PyTorch) computes the same.

@@ -1,8 +1,8 @@
 """Declare a differentiable operation by its kernels; checks, calls and the gradient follow from the declaration.
 
-An operation is a pair of compiled kernels, forward and backward. If a tape (`gsbench.kernels.tape`) is active, it
-records each call for the backward pass. Otherwise torch's autograd does, for which the operation is registered as
-`torch.ops.gsbench.NAME`.
+An operation is a pair of compiled kernels, forward and backward. If a tape is active (a list of kernel calls, see
+`gsbench.kernels.tape`), it records each call for the backward pass. Otherwise torch's autograd does, for which the
+operation is registered as `torch.ops.gsbench.NAME`.
 """
 
 from collections.abc import Callable, Sequence
@@ -208,7 +208,7 @@ class Operation:
     # ---- what follows from the declaration
 
     def match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        """Return the sizes and numbers of a call.
+        """Return the named dimensions of the tensors of a call, and its arguments that are numbers.
 
         Raises:
             InputError: an argument does not match the declaration.

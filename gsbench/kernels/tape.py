@@ -158,7 +158,7 @@ class _Gradients:
                 self.give(x, gradient)
 
     def finish(self) -> None:
-        """Add the gradients of all sources to the sums of the caller."""
+        """Add the gradients of all source tensors to the caller's sums of gradients."""
         for key in self.sources:
             gradient = self.found.get(key)
             if gradient is not None:

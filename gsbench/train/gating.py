@@ -63,7 +63,7 @@ class Gating:
     """Simplify Gaussians in a training: make them independent of time, direction or AGR (the neural refinement)."""
 
     def __init__(self, rows: Rows, scene: Scene, renderer: Renderer, config: Config) -> None:
-        """Choose the views from which errors of simplified Gaussians are predicted, and those for measuring PSNR.
+        """Choose the views from which errors are predicted (e.g. of removing time from a Gaussian), and those for PSNR.
 
         Args:
             rows: the model, together with the per-Gaussian state of the training, which must change with it.
@@ -135,12 +135,13 @@ class Gating:
         return shape_of(self.model)
 
     def compare(self, ungated: Shape, views: list[View]) -> None:
-        """Measure how PSNR and frame time changed when Gaussians were simplified at the end of the training.
+        """Measure how PSNR and frame time changed when time, direction or AGR were removed at the end of the training.
 
-        The function also measures how PSNR and frame time would change if no Gaussian depended on direction.
+        AGR is a network. The function also measures how PSNR and frame time would change if no Gaussian depended on
+        direction.
 
         Args:
-            ungated: the Gaussians before they were simplified, from `now`.
+            ungated: the Gaussians before this removal, from `now`.
             views: the views (test or val) on which results are measured.
         """
         if self.gates and self.gates[-1].step is None:

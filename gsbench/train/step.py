@@ -112,7 +112,8 @@ class Step:
             background: the background colour, [3].
             ssim_weight: the weight w of 1 - SSIM in the loss.
             antialias: whether to scale opacities by the 2D filter of Mip-Splatting.
-            stages: a clock that sums the seconds of each stage (conditioning, rasterization, loss, backward pass).
+            stages: a clock that sums the seconds of each stage (conditional Gaussians, rasterization, loss, backward
+                pass).
         """
         self.model = model
         self.background = background

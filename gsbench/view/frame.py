@@ -38,7 +38,7 @@ class FrameCost(NamedTuple):
     ms: dict[str, float]  # by stage, in their order
 
     def of(self, part: str) -> float:
-        """Return the milliseconds of slicing (which computes the conditional Gaussians) or of rasterization."""
+        """Return the milliseconds to compute the conditional 3D Gaussians, or to rasterize them."""
         return sum(ms for stage, ms in self.ms.items() if part_of(stage) == part)
 
 
@@ -49,7 +49,7 @@ class Frame(NamedTuple):
     costs: tuple[FrameCost, ...]  # of each model in it
 
     def ms(self, part: str) -> float:
-        """Return the milliseconds of conditioning or of rasterization, summed over the models in the image."""
+        """Return the milliseconds to compute or to rasterize 3D Gaussians, summed over the models in the image."""
         return sum(cost.of(part) for cost in self.costs)
 
 

@@ -19,11 +19,11 @@ _FOLLOWS = {"show_colors": "conditioning", "blend": "binning"}
 
 
 class StageWatch(Tape):
-    """Times conditioning (slicing) and rasterization of a frame, and the stages of each if kernels compute them.
+    """Times how long a frame's 3D Gaussians are computed (slicing) and rasterized, and the stages of both.
 
     Usage: ``with StageWatch(device) as watch: ...; watch.end(SLICE); ...; watch.end(RASTER)``. The watch replaces the
     tape that records kernel calls for the backward pass. Thus it sees when each kernel begins and ends; it records
-    none, so there are no gradients. If torch computes the slicing or the rasterization, it is timed as a single stage.
+    none, so there are no gradients. If torch computes or rasterizes the Gaussians, this is timed as a single stage.
     """
 
     def __init__(self, device: str) -> None:
@@ -41,7 +41,7 @@ class StageWatch(Tape):
         return outputs
 
     def end(self, part: str) -> None:
-        """End one of the two parts of a frame, conditioning or rasterization.
+        """End one of the two parts of a frame: computing its 3D Gaussians, or rasterizing them.
 
         The time since its last stage is added to that stage. If no stage was measured, the whole part is one stage.
         """
@@ -55,5 +55,5 @@ class StageWatch(Tape):
 
 
 def part_of(stage: str) -> str:
-    """Return the part of a frame to which a stage belongs: `slice` (conditioning) or `raster` (rasterization)."""
+    """Return the part of a frame to which a stage belongs: `slice` (compute 3D Gaussians) or `raster`."""
     return SLICE if stage == SLICE or stage in STAGES[SLICE] else RASTER
