@@ -261,7 +261,10 @@ class GaussianModel(nn.Module, ABC):
 
     @property
     def orders(self) -> Tensor | None:
-        """The SH degree and frequencies in time of each colour, degree + 4 (frequencies - 1), [N]; None: the most."""
+        """The SH degree and number of frequencies in time of each colour, [N].
+
+        They are encoded as degree + 4 (frequencies - 1). None: every colour uses all coefficients.
+        """
         return None if self.effect_sets is None else self.effect_sets.orders
 
     def count_by_effects(self) -> dict[str, int]:

@@ -82,7 +82,7 @@ class GatedModel(GaussianModel):
         return None if self.effect_sets is None or not self.observes else self.effect_sets.conditioned
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Compute the conditional 3D Gaussians; static Gaussians are not conditioned but copied."""
+        """Compute the 3D Gaussians for a camera and time; Gaussians that ignore both are copied, not conditioned."""
         if self.conditioned is None:
             return super().slice_geometry(raw, query)
         changing = {name: x[: self.conditioned] for name, x in raw.items()}
