@@ -69,7 +69,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     shading = _shading(orders)
 
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the best simplification of each Gaussian, such as without time, and its error, for one lambda."""
+        """Return each Gaussian's best simplification (such as without time) and its error, for one weight lambda."""
         shade, hue = (shading + price * hues).min(0)
         _, form = (costs + price * forms + torch.where(removes, 0.0, shade)).min(0)  # argmin takes 8 to 30 times longer
         error = forms.gather(0, form[None])[0] + hues.gather(0, hue[None])[0] * ~removes[form, 0]

@@ -335,9 +335,9 @@ class GaussianModel(nn.Module, ABC):
     def visible_intervals(self) -> Tensor | None:
         """Return the first and the last time at which each Gaussian can be visible, [N, 2]; None without time.
 
-        A Gaussian with opacity o, mean time mu_t and variance S_t in time is visible at time t if
-        o exp(-lambda_t (t - mu_t)^2 / (2 S_t)) is at least ALPHA_MIN. Times are in [0, 1]; (inf, inf) marks a Gaussian
-        that is never visible. The intervals only serve to sort the Gaussians: they ignore AGR, the neural refinement.
+        A Gaussian with opacity o, mean time mu_t and variance S_t in time is visible at time t if o exp(-lambda_t (t -
+        mu_t)^2 / (2 S_t)) is at least ALPHA_MIN = 1/255. Times are in [0, 1]; (inf, inf) marks a Gaussian that is never
+        visible. The intervals only serve to sort the Gaussians: they ignore AGR, the neural refinement.
         """
         deviations = self.durations()
         if deviations is None:

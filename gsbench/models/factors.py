@@ -106,7 +106,7 @@ class Triangle:
         return {kind: below[:, self.places[kind]] for kind in self.kinds}
 
     def join(self, kinds: dict[str, Tensor]) -> Tensor:
-        """Concatenate the three kinds of parameters from `split` to all parameters below the diagonal, row by row."""
+        """Concatenate the parameters `shape`, `motion` and `coupling` to all those below the diagonal, row by row."""
         return torch.cat([kinds[kind] for kind in self.kinds], -1)[:, self.columns]
 
 

@@ -176,7 +176,7 @@ class Gaussians4DModel(GatedModel):
         self.splats["right_quats"].data[effect_sets.conditioned :] = partner(left)
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Compute conditional 3D Gaussians by the backend's kernel if it has one for the method `scheme`, else in torch."""
+        """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the method `scheme`."""
         if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
         assert query.time is not None

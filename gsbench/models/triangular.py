@@ -126,7 +126,7 @@ class TriangularModel(GatedModel):
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Compute conditional 3D Gaussians by the backend's kernel if it has one for the method `scheme`, else in torch."""
+        """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the method `scheme`."""
         has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
         if not has_kernel or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)

@@ -70,7 +70,7 @@ def draw(generator: torch.Generator, N: int, order: str, decades: Tensor | float
     """Draw N random 7D Gaussians with ill-conditioned triangular factors.
 
     Diagonal entries are 10^-u with u uniform in [0, decades], and entries below are standard normal. The direction and
-    time at which the Gaussians are sliced are about one standard deviation from their means.
+    time of the view are about one standard deviation from the means of the Gaussians.
     """
     u = torch.rand(N, 7, generator=generator, dtype=torch.float64)
     log_diagonal = -(decades * u) * np.log(10.0)
@@ -278,7 +278,7 @@ def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
 
 
 def raw_parameters(hard: Hard, model: TriangularModel) -> dict[str, Tensor]:
-    """Return the raw parameters of the given Gaussians for a model made by `all_seen`."""
+    """Return the raw parameters of the given 7D Gaussians for a model made by `all_seen`."""
     N = len(hard)
     return {"means": torch.zeros(N, 3), "directions": hard.offset[:, :3], "times": hard.offset[:, 3:],
             "log_diagonal": hard.log_diagonal, **model.triangle.split(hard.off_diagonal),

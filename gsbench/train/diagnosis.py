@@ -14,7 +14,7 @@ LOUD = 1e3  # absolute value of a colour coefficient
 
 
 def explain(model: GaussianModel) -> str:
-    """Name the first Gaussian with a NaN or infinite gradient, and a test of gsbench.stability that is similar."""
+    """Name the first Gaussian with a NaN or infinite gradient, and a test case of gsbench.stability like it."""
     for name, parameter in model.splats.items():
         if parameter.grad is None:
             continue
