@@ -111,7 +111,7 @@ class PenaltiesConfig:
 
 @dataclass
 class TrainConfig:
-    """Set the schedule and the loss. Steps are those of a run of `recipe_iterations`, and scale with `iterations`."""
+    """Set the schedule and the loss. Steps are given for `recipe_iterations` iterations, and scaled to `iterations`."""
 
     iterations: int = 30_000  # steps of this run
     recipe_iterations: int = 30_000  # length of the run that other steps refer to

@@ -46,7 +46,7 @@ class Schedule:
     """
 
     def __init__(self, config: TrainConfig, sh_degree: int, agr: bool) -> None:
-        """Convert the steps in the settings, which are those of a run of `recipe_iterations`, to steps of this run.
+        """Convert the step numbers in the settings, given for `recipe_iterations` iterations, to steps of this run.
 
         Args:
             config: the settings of the training.
