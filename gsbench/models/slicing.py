@@ -129,7 +129,10 @@ def slice_reduced(mean: Tensor, reduced: Reduced, query: Tensor) -> Slice:
 
 
 def reduce(factor: Tensor) -> Reduced:
-    """Reflect covariance factors with rows p (position) and q (time, direction), [N, 3+k, n]: [T_qq 0; T_pq T_pp]."""
+    """Transform covariance factors with rows (p, q) to the form [T_qq 0; T_pq T_pp] by Householder reflections.
+
+    Here p is position, and q is time and direction. The factors are [N, 3+k, n]; T_qq is lower triangular.
+    """
     k = factor.shape[1] - 3
     T, rest = triangularise(torch.cat([factor[:, 3:], factor[:, :3]], 1), k)
     return Reduced(T[:, :k], T[:, k:], rest[:, k:])
