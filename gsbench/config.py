@@ -112,7 +112,7 @@ class PenaltiesConfig:
 
 @dataclass
 class TrainConfig:
-    """Set the schedule and the loss. Steps are those of a run of `recipe_iterations`, and scale with `iterations`."""
+    """Set the schedule and the loss. Steps are given for `recipe_iterations` iterations, and scaled to `iterations`."""
 
     iterations: int = 30_000  # steps of this run
     recipe_iterations: int = 30_000  # length of the run that other steps refer to
@@ -152,7 +152,7 @@ class ProtocolConfig:
 
 @dataclass
 class EffectsConfig:
-    """Remove time, direction and AGR from Gaussians that do not need them (docs/effects.md)."""
+    """Remove time, direction and AGR (a network) from Gaussians that do not need them (docs/effects.md)."""
 
     gate: str = "${model.gate}"  # off; end: after the training; both: also during it
     budget_db: float = 0.05  # PSNR on val that this may cost after the training

@@ -97,7 +97,7 @@ def prepare(options: argparse.Namespace) -> ExportRequest:
 
 
 def write_ply(asked: ExportRequest, path: Path) -> None:
-    """Write the 3D Gaussians of one slice as a PLY file and print their number, time and colours."""
+    """Write a model's 3D Gaussians for one camera and time as a PLY file; print their number, time and colours."""
     run, options = asked.run, asked.options
     query, keep = slice_place(asked)
     trained = trained_of(run.model, query, keep_harmonics=keep)
@@ -111,9 +111,9 @@ def write_ply(asked: ExportRequest, path: Path) -> None:
 
 
 def slice_place(asked: ExportRequest) -> tuple[Query, bool]:
-    """Return the camera centre and time of the exported slice, and whether the PLY keeps SH colours.
+    """Return the camera centre and time of the exported 3D Gaussians, and whether the PLY keeps SH colours.
 
-    If a camera or direction is given, each Gaussian gets instead the one colour that is seen from there.
+    If the user names a camera or a direction, each Gaussian has only the colour that is seen from there.
     """
     run, options = asked.run, asked.options
     time = options.time

@@ -31,7 +31,7 @@ STEPS_TO_RECOVER = 300
 
 @dataclass(frozen=True)
 class ActiveComponents:
-    """Hold which parts of a model are active at a step: the SH degree, AGR (neural refinement), and learned lambdas."""
+    """Hold the SH degree at a step, and whether AGR (a network), lambda_t and lambda_d are trained."""
 
     sh_degree: int
     refine: bool  # AGR changes the Gaussians and learns
@@ -46,7 +46,7 @@ class Schedule:
     """
 
     def __init__(self, config: TrainConfig, sh_degree: int, agr: bool) -> None:
-        """Convert the steps in the settings, which are those of a run of `recipe_iterations`, to steps of this run.
+        """Convert the step numbers in the settings, given for `recipe_iterations` iterations, to steps of this run.
 
         Args:
             config: the settings of the training.
@@ -70,7 +70,7 @@ class Schedule:
         return max(1, round(step * self.config.iterations / self.config.recipe_iterations))
 
     def active(self, step: int) -> ActiveComponents:
-        """Return which parts of the model are active at a step: SH degree, AGR (neural refinement), learned lambdas."""
+        """Return the SH degree at a step, and whether AGR (a network), lambda_t and lambda_d are trained."""
         return ActiveComponents(
             sh_degree=min(self.sh_degree, step // self.scaled(self.config.sh_every)),
             refine=self.agr and step >= self.scaled(self.config.refine_from),
@@ -107,7 +107,7 @@ class Schedule:
         return self.config.densify.thin_to is not None and step + 1 == max(self.scaled(THIN), self.densify_stop)
 
     def gates(self, step: int) -> bool:
-        """Return whether Gaussians are made independent of time, direction or AGR (the refinement) after a step.
+        """Return whether Gaussians are made independent of time, direction or AGR (a network) after a step.
 
         This is done once after densification, if at least STEPS_TO_RECOVER steps are left.
         """

@@ -48,7 +48,7 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
     Args:
         scene: the scene.
         seed: the seed of the initial points of the static fit and of the random permutations.
-        backend: the backend that renders the static fit: `reference`, `cpu`, `cuda` or `auto`.
+        backend: the rasterizer of the static fit: `reference` (plain PyTorch), `cpu`, `cuda` or `auto`.
 
     Raises:
         InputError: the scene has no training view.
@@ -70,7 +70,7 @@ def import_compiler() -> None:
 
 
 def _answer(scene: Scene, seed: int, backend: str) -> ScreenResult:
-    """Test for change with time by views from the same camera position, by other views, or by both tests combined."""
+    """Test whether the scene changes with time, by views from the same camera position, by other views, or by both."""
     views = scene.train
     if not scene.has_time:
         return ScreenResult(OFF, "the views have no times")
@@ -142,10 +142,10 @@ def _dummies(places: list[list[int]]) -> Array:  # [V, P]
 
 
 def _both(fixed: ScreenResult, loose: ScreenResult) -> ScreenResult:
-    """Combine the two tests for change with time, of repeated camera positions and of other views, by Fisher's method.
+    """Combine the p-values of two tests whether a scene changes with time, by Fisher's method.
 
-    The two tests have no view in common. The combined p-value is q (1 - ln q), where q is the product of the two
-    p-values.
+    One test has the views from repeated camera positions, the other has all other views. The combined p-value is q (1 -
+    ln q), where q is the product of both.
     """
     reason = f"{fixed.reason}; of the other views, {loose.reason}"
     if OFF == fixed.decision == loose.decision:

@@ -17,7 +17,7 @@ from gsbench.scenes import View
 
 @torch.no_grad()
 def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianModel | None:
-    """Return a copy of a model whose slices do not depend on the view direction; None for a model without direction.
+    """Return a copy of a model whose means and opacities ignore the view direction; None for a model without direction.
 
     The neural refinement (AGR), the dependence on time and the SH coefficients of the colours stay.
 
@@ -41,7 +41,7 @@ def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianMo
 
 
 def share_with_direction(model: GaussianModel) -> float:
-    """Return the share of the Gaussians of a model whose slices depend on the view direction."""
+    """Return the share of a model's Gaussians whose mean or opacity depends on the view direction."""
     effect_sets = effect_sets_of(model)
     assert effect_sets.frozen is not None
     return float((effect_sets.frozen[: effect_sets.conditioned] & DIRECTION == 0).sum()) / max(1, len(model))

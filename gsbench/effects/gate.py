@@ -69,7 +69,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     shading = _shading(orders)
 
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return for one weight lambda of the error the best simplification of each Gaussian, and its error."""
+        """Return each Gaussian's best simplification (such as without time) and its error, for one weight lambda."""
         shade, hue = (shading + price * hues).min(0)
         _, form = (costs + price * forms + torch.where(removes, 0.0, shade)).min(0)  # argmin takes 8 to 30 times longer
         error = forms.gather(0, form[None])[0] + hues.gather(0, hue[None])[0] * ~removes[form, 0]
@@ -88,7 +88,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
 
 
 def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
-    """Return the time that slicing and neural refinement (AGR) of each Gaussian take in a frame, nanoseconds, [N]."""
+    """Return the nanoseconds that conditioning and AGR (a network) take for each Gaussian in a frame, [N]."""
     like = model.splats["opacities"].detach()
     cost = torch.full_like(like, COSTS[STATIC])
     cost[: now.conditioned] = SLICING
@@ -99,19 +99,19 @@ def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
 
 
 def cost_of(model: GaussianModel) -> Tensor:
-    """Return the time that slicing, refinement (AGR) and colour of each Gaussian take in a frame, nanoseconds, [N]."""
+    """Return the nanoseconds that conditioning, AGR (a network) and colour take for each Gaussian in a frame, [N]."""
     now = effect_sets_of(model)
     assert now.orders is not None
     return _live_cost(model, now) + _shading(now.orders)
 
 
 def most_cost(model: GaussianModel) -> float:
-    """Return the time that a Gaussian with slicing, refinement (AGR) and full colour takes in a frame, nanoseconds."""
+    """Return the nanoseconds that a Gaussian with conditioning, AGR (a network) and full SH degree takes in a frame."""
     return REFINING + SLICING + float(_shading(torch.tensor(model.full_order())))
 
 
 def _shading(orders: Tensor) -> Tensor:
-    """Return the time to evaluate each colour, nanoseconds; `orders` encode SH degrees and frequencies in time."""
+    """Return the nanoseconds to evaluate colours with the SH degrees and frequencies in time that `orders` encodes."""
     order = order_of(orders)
     return torch.tensor(COLORING, device=orders.device)[order.degree] * order.waves
 

@@ -74,7 +74,7 @@ def _gradients(model: Gaussians3DModel, by: list[nn.Parameter], background: Tens
 
 
 def smaller(view: View) -> View:
-    """Reduce a view by an integer factor, so that its longer side has LONG_SIDE pixels or a few more."""
+    """Reduce the image of a view by an integer factor, so that its longer side has LONG_SIDE pixels or a few more."""
     camera = view.camera
     factor = max(1, max(camera.width, camera.height) // LONG_SIDE)
     height, width = camera.height // factor, camera.width // factor

@@ -33,7 +33,7 @@ def of_screen(screen: TimeScreen) -> str:
 
 
 def of_gate(gate: Gate) -> str:
-    """Return a message on a simplification of a model: what its Gaussians still depend on, PSNR, frame time, bytes."""
+    """Return a message on a simplified model: what its Gaussians still depend on, its PSNR, frame time and bytes."""
     left = sum(number for name, number in gate.rows.items() if name != "removed")
     when = "at the end" if gate.step is None else f"after step {gate.step}"
     kept = ", ".join(f"{gate.rows[name]} {words}" for name, words in _KEEP.items() if gate.rows.get(name))
@@ -57,6 +57,6 @@ def of_direction(found: Direction) -> str:
 
 
 def lines(found: OnDemand) -> list[str]:
-    """Return the messages about Gaussians that a run made independent of time, direction or AGR (refinement)."""
+    """Return the messages about Gaussians that a run made independent of time, direction or AGR (a network)."""
     said = [of_gate(gate) for gate in found.gates]
     return said + ([of_direction(found.direction)] if found.direction else []) + found.notes

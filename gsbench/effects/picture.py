@@ -68,7 +68,7 @@ def draw(
 
 
 def effect_set_colors(model: GaussianModel) -> Tensor:
-    """Return a colour for each Gaussian that shows whether it depends on time, direction and refinement, [N, 3]."""
+    """Return a colour for each Gaussian that shows if it depends on time, direction and AGR (a network), [N, 3]."""
     return torch.tensor([COLOURS[name] for name in NAMES]).to(model.splats["means"])[kinds_of(model)] / 255
 
 
@@ -78,7 +78,7 @@ def cost_colors(model: GaussianModel, most: float) -> Tensor:
 
 
 def kinds_of(model: GaussianModel) -> Tensor:
-    """Return what each Gaussian depends on (refinement, time, direction, nothing) as an index into NAMES, [N]."""
+    """Return what each Gaussian depends on (AGR's network, time, direction, nothing) as an index into NAMES, [N]."""
     effect_sets = effect_sets_of(model)
     assert effect_sets.frozen is not None
     place = torch.arange(len(model), device=effect_sets.frozen.device)

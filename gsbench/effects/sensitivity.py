@@ -97,7 +97,7 @@ def probe(
     seeds = torch.randint(2**62, (len(looked_at),), generator=random).tolist()
 
     def errors_in(v: int) -> tuple[float, list[Tensor]]:
-        """Return the squared error of view `v`, and how much it grows if each Gaussian is simplified, in each way."""
+        """Return the squared error of view `v`, and its growth by each simplification of each Gaussian."""
         view = looked_at[v]
         drawing = ViewRasterizer(model, view.camera, background, antialias)
         here = drawing(seen[v])
@@ -122,7 +122,7 @@ def probe(
 
 
 class Drawn(NamedTuple):
-    """Hold a rendered image, its 3D Gaussians, and the recorded operations (tape) for backward passes."""
+    """Hold a rendered image, its 3D Gaussians, and the recorded kernel calls (tape) for backward passes."""
 
     at: Gaussians3D  # the 3D Gaussians
     tape: Tape  # the operations of the rendering, for the backward pass
@@ -136,7 +136,7 @@ class Drawn(NamedTuple):
         return self.images[0].detach()
 
     def products(self, vectors: list[Tensor]) -> Tensor:
-        """Return gradients of K scalar products <image, vector> with respect to the Gaussians' numbers, [K, N, 16]."""
+        """Return gradients of K products <image, vector> with respect to 16 numbers of each Gaussian, [K, N, 16]."""
         found = []
         for vector in vectors:
             sums: dict[int, Tensor] = {}
@@ -146,7 +146,7 @@ class Drawn(NamedTuple):
 
 
 class ViewRasterizer(NamedTuple):
-    """Rasterize 3D Gaussians for one camera, and record the operations for derivatives."""
+    """Rasterize 3D Gaussians for one camera, and record the kernel calls for backward passes."""
 
     model: GaussianModel
     camera: Camera
@@ -155,7 +155,7 @@ class ViewRasterizer(NamedTuple):
 
     @torch.enable_grad()
     def __call__(self, gaussians: Gaussians3D) -> Drawn:
-        """Rasterize 3D Gaussians for the camera; return the image and the recorded operations for backward passes."""
+        """Rasterize 3D Gaussians for the camera; return the image and the recorded kernel calls for backward passes."""
         at = Gaussians3D(*(x.detach().requires_grad_() for x in tensors_of(gaussians)))
         with Tape() as tape:
             output = rasterize_slice(at, self.camera, self.background, self.model.backend, self.antialias)
@@ -163,7 +163,7 @@ class ViewRasterizer(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Hold the slice of a model in one view, its image, and the derivatives from which errors are predicted."""
+    """Hold a model's 3D Gaussians in one view, their image, and the derivatives from which errors are predicted."""
 
     model: GaussianModel
     query: Query
@@ -176,11 +176,11 @@ class Place(NamedTuple):
 
 
 def _error(simplification: Simplification, here: Place, draw: ViewRasterizer) -> Tensor:
-    """Predict how much the squared error of one view grows if each Gaussian is simplified in this way, [N].
+    """Predict how much the squared error of one view grows if a Gaussian is simplified, for each Gaussian, [N].
 
     Args:
         simplification: the parameters of the simplified Gaussians.
-        here: the present slice and image of the view.
+        here: the present 3D Gaussians and image of the view.
         draw: the rasterizer of the view.
     """
     model, live = here.model, here.live
@@ -218,8 +218,9 @@ def _rows_of(gaussians: Gaussians3D) -> Tensor:
 def _grown(*changes: Tensor) -> Tensor:
     """Compute the growth of the squared error, max(0, 2 <r, x>) + |x|^2, [N].
 
-    The change x of the image is a sum of changes that do not overlap. Each argument [K, N] has the scalar products of
-    one of them: first with the residual r, then with K - 1 images of random signs g, which estimate |x|^2.
+    The change x of the image is a sum of changes that do not overlap. There is one argument [K, N] for each of these
+    changes. It has the scalar products of the change with the residual r, and with K - 1 images of random signs g,
+    which estimate |x|^2.
     """
     products = torch.stack(changes)
     return (2 * products[:, 0].sum(0)).clamp(min=0) + products[:, 1:].square().mean(1).sum(0)

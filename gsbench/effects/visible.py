@@ -1,4 +1,4 @@
-"""Find the interval of time in which each Gaussian is visible; AGR (neural refinement) skips it at other times."""
+"""Find the interval of time in which each Gaussian is visible; AGR (a network) skips it at other times."""
 
 import itertools
 import math
@@ -17,9 +17,9 @@ from gsbench.scenes import View
 def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
     """Return the first and the last time at which each Gaussian is visible in a training view, in [0, 1].
 
-    A Gaussian is visible in a view if its opacity in the slice is at least ALPHA_MIN, with or without AGR (the neural
-    refinement). The interval is extended on both sides by the largest gap between the times of neighbouring views. It
-    is (inf, -inf) for a Gaussian that is never visible.
+    A Gaussian is visible in a view if its opacity at this time and direction is at least 1/255, with or without AGR (a
+    network). The interval is extended on both sides by the largest gap between the times of neighbouring views. It is
+    (inf, -inf) for a Gaussian that is never visible.
 
     Args:
         model: the trained model.
@@ -48,9 +48,9 @@ def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
 
 
 def share_asleep(model: GaussianModel, views: Sequence[View]) -> float | None:
-    """Return the share of neural refinement (AGR) that is skipped, because a Gaussian is invisible at a view's time.
+    """Return the share of AGR's evaluations that are skipped because the Gaussian is invisible at the time of a view.
 
-    Return None if the times at which Gaussians are visible are unknown.
+    AGR is the neural refinement of Gaussians. Return None if the times at which Gaussians are visible are unknown.
     """
     intervals = None if model.effect_sets is None else model.effect_sets.intervals
     if intervals is None or not len(intervals):

@@ -35,7 +35,7 @@ def evidence(
     Args:
         leftovers: the scalar products of the gradients of all pairs of views.
         times: the times of the views.
-        camera: functions of the camera; their effect is removed from gradients and cosines by linear regression.
+        camera: functions of the camera; their influence on gradients and cosines is removed by linear regression.
         seed: the seed of the random permutations.
         places: groups of views within which times are permuted; by default all views are one group.
     """
@@ -50,7 +50,7 @@ def evidence(
     random = np.random.default_rng(seed)
 
     def share(rows: NDArray[np.int64]) -> float:
-        """Return the share of gradients, permuted by `rows`, that follows the cosines and not the camera."""
+        """Return the share of gradients, permuted by `rows`, that cosines of time explain and the camera does not."""
         turned = np.concatenate([slow, known], 1)[rows]
         energies = np.einsum("vk,vk->k", turned, gram @ turned)
         left = total - energies[slow.shape[1] :].sum()

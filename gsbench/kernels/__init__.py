@@ -1,7 +1,7 @@
-"""Provide compiled kernels for slicing, rasterization and losses as differentiable operations on torch tensors.
+"""Provide compiled kernels for conditional Gaussians, rasterization and losses, as differentiable functions.
 
 The compiled extension `_native` is optional. Without it this package can be imported, but its operations raise
-InputError, and the backend "reference" computes the same in torch.
+InputError; the backend "reference" (plain PyTorch) computes the same.
 """
 
 import importlib

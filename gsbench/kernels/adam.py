@@ -1,4 +1,4 @@
-"""Update parameters by Adam in place: some rows of one parameter, or several whole parameters in one call."""
+"""Update parameters by Adam in place: some Gaussians of one parameter, or several whole parameters in one call."""
 
 from collections.abc import Sequence
 

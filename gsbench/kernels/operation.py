@@ -1,8 +1,8 @@
 """Declare a differentiable operation by its kernels; checks, calls and the gradient follow from the declaration.
 
-An operation is a pair of compiled kernels, forward and backward. If a tape (`gsbench.kernels.tape`) is active, it
-records each call for the backward pass. Otherwise torch's autograd does, for which the operation is registered as
-`torch.ops.gsbench.NAME`.
+An operation is a pair of compiled kernels, forward and backward. If a tape is active (a list of kernel calls, see
+`gsbench.kernels.tape`), it records each call for the backward pass. Otherwise torch's autograd does, for which the
+operation is registered as `torch.ops.gsbench.NAME`.
 """
 
 from collections.abc import Callable, Sequence
@@ -84,7 +84,7 @@ class Operation:
         self._traced = _register(self)
 
     def __call__(self, *arguments: Any) -> Tensors:
-        """Call the operation with tensors (None for an optional one), then numbers, in the order of the declaration.
+        """Run the kernel with tensors (None for an optional one), then numbers, in the order of the declaration.
 
         Raises:
             InputError: shapes do not match, tensors are not float32 on one device, or an input requires a gradient that
@@ -167,8 +167,8 @@ class Operation:
             slots: the kernel arguments that `run` returned.
             outputs: the outputs that `run` returned.
             given: the gradient of each output; None for zero.
-            wanted: whether the caller needs the gradient of each input; used only for gradients of kind ON_REQUEST.
-            sums: tensors to which gradients of kind ADDED are added, by the index of the input.
+            wanted: whether the caller needs the gradient of each input; others are left out if declared ON_REQUEST.
+            sums: tensors to which gradients that are declared ADDED are added, by the index of the input.
         """
         like = tensors[0]
         library = library_of(like.device.type)
@@ -208,7 +208,7 @@ class Operation:
     # ---- what follows from the declaration
 
     def match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        """Return the sizes and numbers of a call.
+        """Return the named dimensions of the tensors of a call, and its arguments that are numbers.
 
         Raises:
             InputError: an argument does not match the declaration.
@@ -295,7 +295,7 @@ def addresses(tensors: Sequence[Tensor]) -> tuple[int, ...]:
 
 
 def first_rows(name: str, count: int, x: Tensor) -> int:
-    """Return the number of rows, counted from the first, that an operation changes.
+    """Return how many rows (Gaussians) of a tensor a kernel changes, counted from the first.
 
     `count` may be EVERY_ROW, which means all rows of the tensor.
 

@@ -158,8 +158,8 @@ def flag_values(*values: Tensor) -> Tensor:
 def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, int]:
     """List the projected Gaussians that touch each tile, sorted by depth, and by index if depths are equal.
 
-    Also return `flags` [1] int64 as an int. On a GPU the CPU waits once for the number of tile intersections and for
-    `flags`.
+    Also return the int64 tensor `flags` [1], which is not zero if an input is invalid, as an int. On a GPU the CPU
+    waits once for the number of tile intersections and for `flags`.
 
     Raises:
         InputError: there are more tile intersections than int32 can count or than fit into memory.
@@ -177,8 +177,9 @@ def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, 
 def bin_within(splats: Splats, viewport: Viewport, flags: Tensor, room: int) -> tuple[Bins, Tensor]:
     """List the projected Gaussians that touch each tile, as `bin_tiles`, on a GPU and without waiting for it.
 
-    Memory is allocated for `room` tile intersections, and further ones are left out. Also return a tensor [2] int64
-    with the number of intersections and `flags`; without Gaussians it has only `flags`.
+    Memory is allocated for `room` tile intersections, and further ones are left out. Also return an int64 tensor [2]:
+    the number of intersections, and `flags`, which is not zero if an input is invalid. Without Gaussians the tensor has
+    only `flags`.
     """
     library = library_of(splats.depths.device.type)
     order, ends = _sort_on_gpu(library, splats, viewport, flags)

@@ -18,7 +18,7 @@ from gsbench.kernels.tensors import check_tensor
 
 
 class _Inputs(NamedTuple):
-    """The inputs of the AGR operation by name; the operation itself takes them as one list of tensors."""
+    """The inputs of AGR (neural refinement) by name; the kernels take them as one list of tensors."""
 
     values: Tensors
     weight_in: Tensor
@@ -67,7 +67,7 @@ class _Inputs(NamedTuple):
 
 
 class _Refine(Operation):
-    """The AGR operation, whose tensors are the fields of `_Inputs` in order.
+    """The kernels of AGR (neural refinement), whose inputs are the fields of `_Inputs` in order.
 
     Values that are equal for all Gaussians are merged into the weights of the MLPs first: the encoded time gamma(t)
     into the biases of the first layers, and the scales `units` of inputs and outputs into the weights.

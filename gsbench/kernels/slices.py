@@ -42,7 +42,7 @@ def _conditioned(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str,
 
 
 def _entries(given: dict[str, Tensor]) -> dict[str, int]:
-    """Return the numbers of entries of each kind in a triangular factor over position, time and direction."""
+    """Return the numbers of rows and of trained entries of a Cholesky factor over position, time and direction."""
     k = 3 * ("directions" in given) + ("times" in given)
     if k == 0:
         raise InputError("slice_triangular: expected directions, times or both, got neither")

@@ -20,7 +20,7 @@ _in_charge = threading.local()  # each thread has its own
 
 
 def current() -> Tape | None:
-    """Return the tape that records operations in this thread, or None."""
+    """Return the tape (list of kernel calls for a backward pass) that is active in this thread, or None."""
     return getattr(_in_charge, "tape", None)
 
 
@@ -33,7 +33,7 @@ def add_to(sums: dict[int, Tensor], key: int, gradient: Tensor) -> None:
 
 
 class Differentiable(Protocol):
-    """The interface of an operation that a tape can record and run backwards, such as a kernel `Operation`."""
+    """The interface of a function that a tape can record and run backwards, such as a pair of kernels (`Operation`)."""
 
     name: str
     adds: set[int]  # the indices of inputs whose gradients the backward kernel adds to given memory
@@ -68,7 +68,7 @@ class _Note(NamedTuple):
 
 
 class Tape:
-    """Records the operations that run inside `with Tape() as tape: ...`; `tape.backward` computes their gradients."""
+    """Records the kernels called inside `with Tape() as tape: ...`; `tape.backward` computes their gradients."""
 
     def __init__(self) -> None:
         """Create a tape without operations."""
@@ -83,7 +83,7 @@ class Tape:
         _in_charge.tape = self._outer
 
     def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
-        """Run an operation, and record it if an input requires a gradient which the operation computes."""
+        """Run a kernel, and record the call if an input requires a gradient that the backward kernel computes."""
         outputs, slots = operation.run(tensors, numbers)
         if not torch.is_grad_enabled():
             return outputs
@@ -136,7 +136,7 @@ class _Gradients:
         self.found[id(x)] = gradient if before is None else before + gradient
 
     def through(self, note: _Note) -> None:
-        """Run one recorded operation backwards, if one of its outputs has a gradient."""
+        """Run the backward kernel of one recorded call, if one of its outputs has a gradient."""
         given = [self.found.get(id(x)) for x in note.outputs]
         if all(g is None for g in given):
             return
@@ -158,7 +158,7 @@ class _Gradients:
                 self.give(x, gradient)
 
     def finish(self) -> None:
-        """Add the gradients of all sources to the sums of the caller."""
+        """Add the gradients of all source tensors to the caller's sums of gradients."""
         for key in self.sources:
             gradient = self.found.get(key)
             if gradient is not None:

@@ -94,7 +94,7 @@ RENAMED_EFFECT_SETS = {"sliced": "conditioned", "still": "static"}  # .. and nam
 
 @dataclass(frozen=True)
 class Gate:
-    """The result of removing time, direction or AGR from the Gaussians that do not need them: savings and lost PSNR."""
+    """The savings and the lost PSNR by removing time, direction or AGR (a network) from Gaussians."""
 
     share: float  # share of the squared error that the removal is predicted to add at most
     predicted_db: float
@@ -113,7 +113,7 @@ class Gate:
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return the JSON of a `Gate` in which keys of earlier versions of gsbench have their present names."""
+        """Return the JSON of a `Gate`, a part of a record, with the present names of the keys of earlier versions."""
         plain = {RENAMED_KEYS.get(key, key): value for key, value in plain.items()}
         if isinstance(rows := plain.get("rows"), dict):
             plain["rows"] = {RENAMED_EFFECT_SETS.get(name, name): count for name, count in rows.items()}
@@ -132,7 +132,7 @@ class Direction:
 
 @dataclass(frozen=True)
 class OnDemand:
-    """The decisions of a run to remove time, direction or AGR from its model or from single Gaussians, with reasons."""
+    """The decisions of a run to remove time, direction or AGR (a network) from Gaussians, with reasons."""
 
     screen: TimeScreen | None = None
     gates: list[Gate] = field(default_factory=list)
@@ -156,7 +156,7 @@ class Provenance:
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return the JSON of a `Provenance` in which config keys of earlier versions have their present names."""
+        """Return the JSON of a `Provenance`, in which config keys of earlier versions have their present names."""
         config = plain.get("config")
         return plain | {"config": with_present_keys(config)} if isinstance(config, dict) else plain
 
@@ -263,7 +263,8 @@ def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, 
         root: the folder of all results.
         experiment: the name of the experiment.
         scene: the name of the scene.
-        model: the model's name, with the suffix _agr or _noagr if its use of AGR differs from the published method.
+        model: the model's name, with the suffix _agr or _noagr if its use of AGR (a network) differs from the published
+            method.
         seed: the seed of the run, at least 0 and below 2^63.
         variant: the settings that differ from the experiment's, such as "iterations=10"; "" for none.
 

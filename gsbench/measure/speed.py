@@ -114,7 +114,7 @@ def time_in_turns(
 
 
 class StageClock:
-    """Sums the seconds of each stage of training; `with stages("slice"): ...` adds to the stage "slice".
+    """Sums the seconds of each stage of training; `with stages("loss"): ...` adds to the stage "loss".
 
     On a GPU, CUDA events mark the start and end of a stage, so that the CPU waits for the GPU only when the sums are
     read. GPU work counts for the stage that launched it.

@@ -1,4 +1,4 @@
-"""Compute colours of Gaussians: by spherical harmonics (3DGS), or by these times a Fourier series of time (4DGS)."""
+"""Compute the colours of Gaussians by spherical harmonics (3DGS), in 4DGS times a Fourier series in time."""
 
 import math
 

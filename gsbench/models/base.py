@@ -1,4 +1,4 @@
-"""Define the base class of all models: N Gaussians with parameters, their slices, and the edits of density control.
+"""Define the base class of models: their parameters, the 3D Gaussians at a camera and time, and density control.
 
 `gsbench.models.gated` adds optional methods that make single Gaussians independent of time, direction or AGR (the
 neural refinement).
@@ -43,7 +43,7 @@ class Gaussians3D(NamedTuple):
 
 
 class Conditioned(NamedTuple):
-    """Hold the geometry of a slice, and the factors in [0, 1] by which slicing multiplies the opacities."""
+    """Hold means and factors of conditional 3D Gaussians, and the numbers in [0, 1] that multiply opacities."""
 
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
@@ -52,7 +52,7 @@ class Conditioned(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """Hold the geometry and the opacities of a slice, without its colours."""
+    """Hold means, covariance factors and opacities of the 3D Gaussians at a camera and time, without colours."""
 
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
@@ -61,7 +61,7 @@ class Geometry(NamedTuple):
 
 
 def tensors_of(parts: Iterable[Tensor | None]) -> list[Tensor]:
-    """Return the tensors of a slice in their order, without fields that are None."""
+    """Return the tensors of 3D Gaussians (means, covariance factors, ...) in order, without fields that are None."""
     return [part for part in parts if part is not None]
 
 
@@ -80,7 +80,10 @@ def joined_shapes(first: Tensor | None, second: Tensor | None) -> Tensor | None:
 
 
 class GaussianModel(nn.Module, ABC):
-    """The base class of models. A subclass defines its parameters, and how its Gaussians are sliced and split."""
+    """The base class of models.
+
+    A subclass defines its parameters, how they give 3D Gaussians for a camera and a time, and how Gaussians are split.
+    """
 
     observes: ClassVar[tuple[str, ...]] = ()  # of "time", "direction"
     centers: ClassVar[tuple[str, ...]] = ("means",)  # the raw parameters that are means: AGR reads and changes them
@@ -96,7 +99,7 @@ class GaussianModel(nn.Module, ABC):
             agr: whether AGR, the adaptive Gaussian refinement of 7DGS, changes the Gaussians with time.
             agr_octaves: the number of frequencies of AGR's time encoding.
             sh_degree: the SH degree of the colours, 0 to 3.
-            backend: the implementation that computes slices, colours and AGR.
+            backend: the implementation that computes conditional 3D Gaussians, colours and AGR.
 
         Raises:
             InputError: an option is out of its range.
@@ -131,7 +134,7 @@ class GaussianModel(nn.Module, ABC):
 
     @abstractmethod
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Slice Gaussians with the raw parameters `raw` (before exp and sigmoid) at a camera centre and time."""
+        """Condition Gaussians with raw parameters (before exp and sigmoid) on a camera centre and time."""
 
     @abstractmethod
     def scales(self) -> Tensor:
@@ -216,7 +219,7 @@ class GaussianModel(nn.Module, ABC):
         return ColorOrder(self.active.sh_degree, 1).packed
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
-        """Compute the SH colours [N, 3] of a slice as seen from the camera centre of `query`.
+        """Compute the SH colours [N, 3] of 3D Gaussians as seen from `query.center`, the camera's centre.
 
         The kernel skips Gaussians that are culled because of their opacity. A model with other colours overrides this.
         """
@@ -267,22 +270,28 @@ class GaussianModel(nn.Module, ABC):
         return self.colored(self.slice_geometry(raw, query), raw, query)
 
     def colored(self, geometry: Geometry, raw: Raw, query: Query) -> Gaussians3D:
-        """Compute the colours of a slice and return them together with its geometry."""
+        """Compute the colours of 3D Gaussians, and return them together with means, factors and opacities."""
         means, factors, opacities, shapes = geometry
         return Gaussians3D(means, factors, opacities, self.shade(raw, means, opacities, query), shapes)
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Compute the geometry and the opacities of a slice. A subclass that has a kernel for this overrides it."""
+        """Compute means, covariance factors and opacities of the 3D Gaussians for a camera and a time.
+
+        A subclass that has a kernel for this overrides it.
+        """
         means, factors, opacity_factor, shapes = self.condition(raw, query)
         return Geometry(means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor, shapes)
 
     @property
     def orders(self) -> Tensor | None:
-        """The SH degree and frequencies in time of each colour, as degree + 4 (frequencies - 1), [N]; None: all."""
+        """The SH degree and number of frequencies in time of each colour, [N].
+
+        They are encoded as degree + 4 (frequencies - 1). None: every colour uses all coefficients.
+        """
         return None if self.effect_sets is None else self.effect_sets.orders
 
     def count_by_effects(self) -> dict[str, int]:
-        """Count Gaussians by what they depend on: neural refinement, time and direction, one of the two, or nothing."""
+        """Count Gaussians by what they depend on: AGR (a network), time and direction, one of the two, or nothing."""
         N, effect_sets = len(self), self.effect_sets
         if effect_sets is not None:
             return effect_sets.by_name(N)
@@ -327,7 +336,7 @@ class GaussianModel(nn.Module, ABC):
         return self.log_lambda[name].exp()
 
     def set_active(self, active: ActiveComponents) -> None:
-        """Set which parts of the model are active: SH degree, neural refinement (AGR), and learning of the lambdas."""
+        """Set the SH degree, whether AGR (a network) is active, and whether lambda_t and lambda_d are trained."""
         self.active = active
         for parameter in self.log_lambda.parameters():
             parameter.requires_grad_(active.tunes_lambda)
@@ -350,7 +359,7 @@ class GaussianModel(nn.Module, ABC):
         """Return the first and the last time at which each Gaussian can be visible, [N, 2]; None without time.
 
         A Gaussian with opacity o, mean time mu_t and lifetime s is visible at time t if o exp(-((t - mu_t) / s)^2 / 2)
-        is at least ALPHA_MIN. Times are in [0, 1]; (inf, inf) marks a Gaussian that is never visible. The intervals
+        is at least ALPHA_MIN = 1/255. Times are in [0, 1]; (inf, inf) marks a Gaussian that is never visible. The intervals
         only serve to sort the Gaussians: they ignore AGR, the neural refinement.
         """
         lifetimes = self.lifetimes()

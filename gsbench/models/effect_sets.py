@@ -28,8 +28,8 @@ class EffectSets(NamedTuple):
     def by_name(self, rows: int) -> dict[str, int]:
         """Return the number of Gaussians in each group of NAMES, for a model of `rows` Gaussians.
 
-        The groups are: refined by AGR; sliced by time and direction; independent of time; independent of direction;
-        static.
+        The groups are: changed by AGR (a network); dependent on time and direction; independent of time; independent of
+        direction; static.
         """
         frozen = [0, 0] if self.frozen is None else [int((self.frozen == bit).sum()) for bit in (TIME, DIRECTION)]
         conditioned = self.conditioned - self.refined - sum(frozen)

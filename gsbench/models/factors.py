@@ -24,12 +24,12 @@ class Triangle:
     The entries below the diagonal are of three kinds, each with its own learning rate:
 
     - `shape`: the row and the column are both of p;
-    - `motion`: one of them is of p, the other of t or d; these entries move the slice with time and direction;
+    - `motion`: one of them is of p, the other of t or d; these entries move the 3D Gaussian with time and direction;
     - `coupling`: the row and the column are both of t or d.
     """
 
     def __init__(self, letters: str, form: str = "relative") -> None:
-        """Describe a factor by the variables of its rows.
+        """Describe a Cholesky factor by the variables of its rows.
 
         Args:
             letters: the variable of each row, "p", "t" or "d"; for example "dddtppp".
@@ -98,7 +98,7 @@ class Triangle:
         return {"log_diagonal": diagonal.log()} | self.split(x)
 
     def split(self, below: Tensor) -> dict[str, Tensor]:
-        """Split the factor's parameters below the diagonal, [N, n (n - 1) / 2], into three kinds.
+        """Split the Cholesky factor's parameters below the diagonal, [N, n (n - 1) / 2], into three kinds.
 
         These are `shape` (within position), `motion` (position with time or direction) and `coupling` (within time and
         direction).
@@ -106,7 +106,7 @@ class Triangle:
         return {kind: below[:, self.places[kind]] for kind in self.kinds}
 
     def join(self, kinds: dict[str, Tensor]) -> Tensor:
-        """Concatenate the three kinds of parameters from `split` to all parameters below the diagonal, row by row."""
+        """Concatenate the parameters `shape`, `motion` and `coupling` to all those below the diagonal, row by row."""
         return torch.cat([kinds[kind] for kind in self.kinds], -1)[:, self.columns]
 
 

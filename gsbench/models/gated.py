@@ -31,7 +31,7 @@ class GatedModel(GaussianModel):
 
     @abstractmethod
     def static(self, raw: Raw) -> Conditioned:
-        """Return the slice of Gaussians that do not depend on time or direction; their opacity factors are 1.
+        """Return the 3D Gaussians of Gaussians that do not depend on time or direction; f_temp and f_dir are 1.
 
         They are the limit of `condition` for standard deviations of time and direction that go to infinity, and means
         that do not move.
@@ -82,7 +82,7 @@ class GatedModel(GaussianModel):
         return None if self.effect_sets is None or not self.observes else self.effect_sets.conditioned
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Compute the geometry of a slice; static Gaussians are not sliced but copied."""
+        """Compute the 3D Gaussians for a camera and time; Gaussians that ignore both are copied, not conditioned."""
         if self.conditioned is None:
             return super().slice_geometry(raw, query)
         changing = {name: x[: self.conditioned] for name, x in raw.items()}
@@ -145,7 +145,7 @@ def as_gated(model: GaussianModel) -> GatedModel:
 
 
 def effect_sets_in(state: dict[str, Any]) -> EffectSets | None:
-    """Read from a checkpoint which Gaussians depend on time, direction and refinement; None if it is not stored.
+    """Read from a checkpoint which Gaussians depend on time, direction and AGR (a network); None if not stored.
 
     Raises:
         InputError: the stored tensors are damaged.

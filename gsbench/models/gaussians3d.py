@@ -1,4 +1,4 @@
-"""Model a static scene by 3DGS, whose slice is the Gaussian itself (Kerbl et al. 2023)."""
+"""Model a static scene by the 3D Gaussians of 3DGS (Kerbl et al. 2023)."""
 
 import math
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ class Gaussians3DModel(GatedModel):
         return {"scales": trained.log_scales, "quats": trained.quats}
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return the Gaussians themselves, with factors R S and an opacity factor of 1."""
+        """Return the Gaussians themselves, with covariance factors R S and unchanged opacities."""
         return Conditioned(raw["means"], self.factors(raw), torch.ones_like(raw["opacities"]))
 
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
@@ -50,7 +50,7 @@ class Gaussians3DModel(GatedModel):
         return {}
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Compute factors and opacities by the backend's kernel if it has one, else in torch."""
+        """Compute covariance factors and opacities by the backend's kernel if it has one, else in torch."""
         if not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
         return Geometry(raw["means"], *slice_static(raw["scales"], raw["quats"], raw["opacities"]))

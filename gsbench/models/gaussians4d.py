@@ -49,7 +49,7 @@ class Gaussians4DModel(GatedModel):
 
         Args:
             time_degree: the number of frequencies of the colours in time, without the constant; 0: constant colours.
-            scheme: the numerical method of slicing, see `slice_gaussians`.
+            scheme: the numerical method of conditioning on time, see `slice_gaussians`.
             lambda_t: the coefficient in the exponent of f_temp, the factor of the opacity at a time.
             options: the options of `GatedModel`.
 
@@ -77,7 +77,7 @@ class Gaussians4DModel(GatedModel):
         return {"times": times, "scales": scales, "left_quats": quats, "right_quats": quats.clone()}
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Slice the Gaussians at time t; the opacity factor is f_temp = exp(-1/2 lambda_t (t - mu_t)^2 / S_t)."""
+        """Condition Gaussians on time t; f_temp = exp(-1/2 lambda_t (t - mu_t)^2 / S_t) multiplies opacities."""
         time = query.time
         assert time is not None
         factor, delta = _leading_first(self.factors(raw)), time - raw["times"]
@@ -92,7 +92,7 @@ class Gaussians4DModel(GatedModel):
         return Conditioned(means, factors, torch.where(seen, opacity_factor, 0.0))
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return the slice of Gaussians that do not depend on time, from left quaternions and spatial scales."""
+        """Return the 3D Gaussians of Gaussians that ignore time, from left quaternions and spatial scales."""
         factors = rotation(turn_of_space(raw["left_quats"])) * sizes(raw["scales"][:, :3])[:, None, :]
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
@@ -106,7 +106,7 @@ class Gaussians4DModel(GatedModel):
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
         """Remove the dependence on time: replace means and opacities by their weighted averages over views.
 
-        The covariance becomes that of the slice, which is the same at all times.
+        The covariance becomes the conditional one, which is the same at all times.
         """
         factor = self.factors(raw).double()
         blocks = reduce(factor)
@@ -176,7 +176,7 @@ class Gaussians4DModel(GatedModel):
         self.splats["right_quats"].data[effect_sets.conditioned :] = partner(left)
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Slice by the backend's kernel if it has one for the numerical method `scheme`, else in torch."""
+        """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the method `scheme`."""
         if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
         assert query.time is not None
@@ -224,7 +224,7 @@ class Gaussians4DModel(GatedModel):
         return float(self.splats["scales"].detach()[index, 3] - self.clock.log())
 
     def durations(self) -> Tensor:
-        """Return the standard deviation in time of each Gaussian, [N]: the norm of the row of t of its factor."""
+        """Return the standard deviation in time of each Gaussian, [N]: the norm of its covariance factor's row of t."""
         return self.factors(dict(self.splats.items())).detach()[:, 3].norm(dim=-1)
 
     def hold_sizes(self, least: Tensor) -> None:

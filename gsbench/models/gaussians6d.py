@@ -6,7 +6,7 @@ from gsbench.models.triangular import DirectionalModel
 
 @register("6dgs")
 class Gaussians6DModel(DirectionalModel):
-    """6DGS: Gaussians over position and direction, sliced at the direction from the camera to the Gaussian."""
+    """6DGS: Gaussians over position and direction, conditioned on the direction from the camera to the Gaussian."""
 
     observes = ("direction",)
     centers = ("means", "directions")

@@ -6,7 +6,7 @@ from gsbench.models.triangular import DirectionalModel, TimedModel
 
 @register("7dgs")
 class Gaussians7DModel(TimedModel, DirectionalModel):
-    """7DGS: Gaussians over position, time and direction, sliced at a time and the direction from the camera."""
+    """7DGS: Gaussians over position, time and direction, conditioned on a time and the direction from the camera."""
 
     observes = ("time", "direction")
     centers = ("means", "times", "directions")

@@ -10,7 +10,7 @@ from gsbench.models.triangular import TimedModel
 
 @register("7dgs_nodir")
 class Gaussians7DWithoutDirectionModel(TimedModel):
-    """7DGS without direction: Gaussians over position and time, sliced at a time."""
+    """7DGS without direction: Gaussians over position and time, conditioned on a time."""
 
     observes = ("time",)
     centers = ("means", "times")

@@ -1,4 +1,4 @@
-"""Define `Query`: the camera centre and the time at which a model is sliced."""
+"""Define `Query`: the camera centre and the time for which a model returns 3D Gaussians."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Query(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera, time: float | Tensor | None) -> Query:
-        """Make a query from a camera and a time in [0, 1]; raises InputError if the time is not a finite number."""
+        """Take the centre of a camera and a time in [0, 1]; raises InputError if the time is not a finite number."""
         return cls.at(camera.center, time)
 
     @classmethod

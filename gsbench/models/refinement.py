@@ -68,7 +68,7 @@ class Refinement(nn.Module):
         self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False, rows: int | None = None,
         intervals: Tensor | None = None,
     ) -> list[Tensor]:  # fmt: skip
-        """Return the raw parameters plus the outputs of the networks at a time.
+        """Return the raw parameters plus the outputs of AGR's networks at a time.
 
         Args:
             values: raw parameters, [N, c] each: first the means, which are the input, then those of the covariance.

@@ -1,4 +1,4 @@
-"""Render an image of a model: slice the model at a camera centre and time, then rasterize the slice."""
+"""Render an image of a model: compute its 3D Gaussians for a camera and a time, and rasterize these."""
 
 from torch import Tensor
 
@@ -12,11 +12,11 @@ from gsbench.scenes.scene import Camera
 def rasterize_slice(
     gaussians: Gaussians3D, camera: Camera, background: Tensor, backend: Backend, antialias: bool = False
 ) -> RasterOutput:
-    """Rasterize the slice of a model (3D Gaussians with colours) for one camera.
+    """Rasterize the 3D Gaussians of a model (with colours) for one camera.
 
     Args:
-        gaussians: the slice.
-        camera: the camera that sees the slice.
+        gaussians: the 3D Gaussians.
+        camera: the camera of the image.
         background: the background colour, [3].
         backend: the implementation of the rasterizer.
         antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.

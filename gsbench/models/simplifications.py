@@ -43,7 +43,7 @@ def simplifications_of(
     Args:
         model: the model, which does not change.
         queries: the camera centres and times of the views over which constants are averaged.
-        slices: the slices of the model for these views; their opacities are the weights of the average.
+        slices: the 3D Gaussians of the model for these views; their opacities are the weights of the average.
         by_halves: whether to include Gaussians that are independent of only one of time and direction.
     """
     weights = shares_of([one.opacities for one in slices])
@@ -77,7 +77,7 @@ def shares_of(opacities: Sequence[Tensor]) -> Tensor:
 
 
 def _all(model: GaussianModel, order: int) -> Tensor:
-    """Return `order`, an encoded SH degree and number of frequencies, for all Gaussians of a model, [N]."""
+    """Return `order` (an encoded SH degree and number of frequencies in time) for all Gaussians of a model, [N]."""
     return torch.full((len(model),), order, dtype=torch.int32, device=model.splats["means"].device)
 
 
@@ -85,12 +85,12 @@ def _averages(
     model: GaussianModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], weights: Tensor,
     names: Sequence[str], fewer: Sequence[Raw],
 ) -> tuple[Raw, list[Tensor]]:  # fmt: skip
-    """Return means over views of refined parameters (AGR), and of the colour [N, 3] that a lower SH degree removes.
+    """Return means over views of parameters after AGR (a network), and of the colour that a lower SH degree drops.
 
     Args:
         model: the model, which does not change.
         queries: the camera centres and times of V views.
-        slices: the slices of the model for these views.
+        slices: the 3D Gaussians of the model for these views.
         weights: the weight of each view for each Gaussian, [V, N].
         names: the names of the raw parameters that AGR changes; empty without AGR.
         fewer: raw parameters with lower SH degrees, one dictionary for each degree.

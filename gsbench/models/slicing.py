@@ -33,7 +33,7 @@ class Slice(NamedTuple):
 
 
 class Reduced(NamedTuple):
-    """Hold the blocks of the factor [T_qq 0; T_pq T_pp] of a covariance over (q, p), with T_qq lower triangular."""
+    """Hold the blocks of the factor [T_qq 0; T_pq T_pp] of a covariance; p is position, q time and direction."""
 
     T_qq: Tensor  # [N, k, k]
     T_pq: Tensor  # [N, 3, k]
@@ -99,9 +99,9 @@ def slice_gaussians(
 
 
 def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
-    """Slice by a scheme that computes S = F F^T: return K = S_pq S_qq^-1 [N, 3, k] and S_pp - K S_pq^T [N, 3, 3].
+    """Return the gain K = S_pq S_qq^-1 [N, 3, k] and the conditional covariance S_pp - K S_pq^T [N, 3, 3].
 
-    Rounding may make this covariance indefinite.
+    Here p is position, q is time and direction, and S = F F^T is computed. Rounding may make the result indefinite.
     """
     S = factor @ factor.mT
     S_pp, S_pq, S_qq = S[:, :3, :3], S[:, :3, 3:], S[:, 3:, 3:]
@@ -113,15 +113,15 @@ def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
 
 
 def check_scheme(scheme: str) -> None:
-    """Raise InputError unless `scheme`, the numerical method of slicing, is `square_root`, `schur` or `cholesky`."""
+    """Raise InputError unless `scheme` is a method of conditioning: `square_root`, `schur` or `cholesky`."""
     if scheme not in SCHEMES:
         raise InputError(f"slicing scheme '{scheme}' is not known. {did_you_mean(scheme, SCHEMES)}")
 
 
 def slice_reduced(mean: Tensor, reduced: Reduced, query: Tensor) -> Slice:
-    """Slice Gaussians whose covariance factor over (q, p) has the form [T_qq 0; T_pq T_pp], at the value `query` of q.
+    """Condition Gaussians with covariance factors [T_qq 0; T_pq T_pp] on the value `query` of q (time, direction).
 
-    The slice has the mean mu_p + T_pq T_qq^-1 (q - mu_q) and the covariance factor T_pp.
+    The 3D Gaussian over position p has the mean mu_p + T_pq T_qq^-1 (q - mu_q) and the covariance factor T_pp.
     """
     white = whiten(reduced.T_qq, query - mean[:, 3:])
     moved = mean[:, :3] + (reduced.T_pq * white[:, None]).sum(-1)
@@ -129,7 +129,10 @@ def slice_reduced(mean: Tensor, reduced: Reduced, query: Tensor) -> Slice:
 
 
 def reduce(factor: Tensor) -> Reduced:
-    """Transform covariance factors with rows (p, q), [N, 3+k, n], to [T_qq 0; T_pq T_pp] by Householder reflections."""
+    """Transform covariance factors with rows (p, q) to the form [T_qq 0; T_pq T_pp] by Householder reflections.
+
+    Here p is position, and q is time and direction. The factors are [N, 3+k, n]; T_qq is lower triangular.
+    """
     k = factor.shape[1] - 3
     T, rest = triangularise(torch.cat([factor[:, 3:], factor[:, :3]], 1), k)
     return Reduced(T[:, :k], T[:, k:], rest[:, k:])
@@ -185,7 +188,7 @@ def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 def gain_of(T_pq: Tensor, T_qq: Tensor) -> Tensor:
-    """Compute the gain K = T_pq T_qq^-1 for lower triangular T_qq, [N, 3, k] and [N, k, k] -> [N, 3, k]."""
+    """Compute K = T_pq T_qq^-1, by which means (p) move with time and direction (q); T_qq is lower triangular."""
     k = T_qq.shape[-1]
     solved: list[Tensor] = []  # columns k-1, k-2, ..
     for j in reversed(range(k)):

@@ -33,8 +33,8 @@ TIME_SCALE = 0.25  # .. and sqrt(S_t) is above this part of the scene's length (
 class TriangularModel(GatedModel):
     """The base class of 6DGS and 7DGS: Gaussians over position p and direction d, time t or both.
 
-    The parameters are those of a lower triangular factor of the covariance. For slicing, its rows are sorted to
-    (p, d, t).
+    The parameters are those of a lower triangular factor of the covariance. Before conditioning on d and t, its rows
+    are sorted to (p, d, t).
     """
 
     geometry: ClassVar[tuple[str, ...]] = ("log_diagonal", *KINDS)
@@ -55,7 +55,7 @@ class TriangularModel(GatedModel):
         Args:
             factor_order: the order of variables in the triangular factor: `paper` is (position, time, direction),
                 `conditioned_first` is (direction, time, position).
-            scheme: the numerical method of slicing, see `slice_gaussians`.
+            scheme: the numerical method of conditioning, see `slice_gaussians`.
             off_diagonal: how a parameter gives an entry below the diagonal, see `form` of `Triangle`.
             split_in_time: whether moving Gaussians are also split if they are long in time (7DGS, section 4.4).
             options: the options of `GatedModel`.
@@ -98,7 +98,7 @@ class TriangularModel(GatedModel):
         return raw
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Slice the Gaussians at time t and at the unit vector d from the camera to their means (7DGS, algorithm 1)."""
+        """Condition Gaussians on time t and on the unit vector d from the camera to their means (7DGS, algorithm 1)."""
         factor, offset = self.factors(raw), self.offset(raw, query)
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
         # If q is so far from mu_q that the opacity is zero, T_qq is replaced by the identity and q by mu_q, and the
@@ -117,7 +117,7 @@ class TriangularModel(GatedModel):
         return Conditioned(means, factors, opacity_factor)
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return the slice of Gaussians that do not depend on time or direction.
+        """Return the 3D Gaussians of Gaussians that do not depend on time or direction.
 
         Their covariance factor L_pp is the position block of the Cholesky factor.
         """
@@ -126,7 +126,7 @@ class TriangularModel(GatedModel):
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Slice by the backend's kernel if it has one for the numerical method `scheme`, else in torch."""
+        """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the method `scheme`."""
         has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
         if not has_kernel or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
@@ -152,7 +152,7 @@ class TriangularModel(GatedModel):
         return Geometry(*geometry)
 
     def scales(self) -> Tensor:
-        """Return the largest standard deviation of each slice, [N]; it does not depend on time and direction."""
+        """Return the largest standard deviation of each conditional 3D Gaussian, [N]; it is the same at all times."""
         T_pp = reduce(self.factors(dict(self.splats.items())).detach()).T_pp
         return torch.linalg.matrix_norm(T_pp, ord=2)
 
@@ -178,8 +178,8 @@ class TriangularModel(GatedModel):
 
         A split in time samples the mean times of the children and moves their means along the parent's path. The
         standard deviation in time becomes 1.6 times smaller. A split in space samples the means of the children from
-        the parent's slice, and the scales of the slice become 1.6 times smaller. The gain K, the derivative of the mean
-        with respect to time and direction, does not change.
+        the parent's conditional 3D Gaussian, whose scales become 1.6 times smaller. The gain K, the derivative of the
+        mean with respect to time and direction, does not change.
         """
         factor = self.factors(raw)
         T_qq, T_pq, T_pp = reduce(factor)
@@ -288,10 +288,10 @@ class TriangularModel(GatedModel):
         return changed
 
     def _without(self, blocks: Reduced, gain: Tensor, variables: list[str]) -> Tensor:
-        """Compute Cholesky factors [N, n, n] of Gaussians whose slices do not depend on the given variables.
+        """Compute Cholesky factors [N, n, n] of Gaussians that do not depend on the given variables.
 
         Args:
-            blocks: the blocks T_qq, T_pq and T_pp of the present factors.
+            blocks: the blocks T_qq, T_pq and T_pp of the present factors (p: position; q: time and direction).
             gain: the gain K = T_pq T_qq^-1 of the present factors.
             variables: `time`, `direction` or both.
         """
@@ -325,7 +325,7 @@ class TriangularModel(GatedModel):
         """Compute -ln of the opacity factors f_dir and f_temp (7DGS, eq. 11 and 12), [N] for each variable.
 
         Args:
-            T_qq: the triangular factor of the covariance of direction and time.
+            T_qq: the triangular factor of the covariance of q, which is direction and time.
             delta: the offset of direction and time from their means, q - mu_q.
             white: T_qq^-1 delta.
         """
@@ -343,7 +343,7 @@ class TriangularModel(GatedModel):
         return torch.stack(list(self.exponents(T_qq, delta, white).values())).sum(0)
 
     def _blocks(self, factor: Tensor) -> Reduced:
-        """Split factors that are triangular over (direction, time, position) into the blocks T_qq, T_pq and T_pp."""
+        """Split triangular factors into the blocks T_qq, T_pq, T_pp; q is direction and time, p is position."""
         k = factor.shape[-1] - 3
         return Reduced(factor[:, 3:, :k], factor[:, :3, :k], factor[:, :3, k:])
 
@@ -361,7 +361,11 @@ class TriangularModel(GatedModel):
 
     @torch.no_grad()
     def long_in_time(self) -> Tensor:
-        """Return which Gaussians are split in time: |S_pt| > 0.05 extent and sqrt(S_t) > 0.25 (7DGS, section 4.4)."""
+        """Return which Gaussians move far and live long, and are split in time (7DGS, section 4.4).
+
+        The conditions are |S_pt| > 0.05 extent and sqrt(S_t) > 0.25, with the covariance S_pt of position and time and
+        the variance S_t of time.
+        """
         return self.moves_long(self.factors(dict(self.splats.items())))
 
 

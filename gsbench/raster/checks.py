@@ -53,7 +53,7 @@ def check_arguments(
 
 
 def check_shapes(shapes: Tensor | None, backend: str) -> None:
-    """Raise InputError if `shapes` (exponents of alpha profiles) is not None, because all backends need Gaussians."""
+    """Raise InputError if `shapes` (exponents of alpha profiles) is not None: no backend renders such profiles yet."""
     if shapes is not None:
         got = f"a tensor of shape {list(shapes.shape)}" if isinstance(shapes, Tensor) else type(shapes).__name__
         raise InputError(f"shapes: expected None, got {got}: raster backend '{backend:.40}' draws Gaussians only: "

@@ -1,4 +1,4 @@
-"""Rasterize in float32 by the kernels for CPU and CUDA; the images are those of the torch reference."""
+"""Rasterize in float32 by the kernels for CPU and CUDA; the images equal those of the PyTorch code."""
 
 from torch import Tensor
 

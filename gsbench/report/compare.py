@@ -89,7 +89,7 @@ def _views(group: Group, configuration: Configuration, scene: str) -> dict[str, 
 
 @dataclass(frozen=True)
 class Price:
-    """The gain of an effect (time, view direction or neural refinement) in PSNR, and its cost in time and memory.
+    """The gain of an effect (time, view direction or the network AGR) in PSNR, and its cost in time and memory.
 
     An interaction of effects is stored in the same way: it is the change of one effect's gain when another is added.
     """
@@ -170,7 +170,7 @@ def _filled(group: Group) -> tuple[dict[Cell, Configuration], dict[Cell, Configu
 
 
 def is_single(name: str) -> bool:
-    """Tell whether the name of a gain stands for a single effect, not for an interaction or a mean over models."""
+    """Tell whether a gain is that of time, direction or AGR alone, not an interaction or a mean over models."""
     return " × " not in name and MEAN not in name
 
 

@@ -22,7 +22,7 @@ def psnr_val(record: Record) -> float:
     """Return the PSNR in dB on the validation views at the end of a run; NaN if it was not measured.
 
     If the run was evaluated on the validation views, this is its final PSNR. Otherwise it is the last value of the
-    training curve. The curve ends before effects (time, view direction, neural refinement) are removed from the
+    training curve. The curve ends before effects (time, view direction, the network AGR) are removed from the
     Gaussians of the finished model, so the PSNR that this removal costs is subtracted.
     """
     if record.protocol.get("eval_split") == "val":
@@ -59,7 +59,7 @@ class Configuration:
     def on_demand(self) -> bool:
         """Tell whether a run chose the effects of its Gaussians automatically, so that some Gaussians may lack some.
 
-        The effects are time, view direction and neural refinement.
+        The effects are time, view direction and the network AGR.
         """
         return any(r.on_demand for runs in self.runs.values() for r in runs)
 
@@ -119,7 +119,7 @@ class Group:
     def series(self) -> list[str]:
         """Return the names of the report's curves.
 
-        Each model has one curve. Its runs from which effects (time, view direction, neural refinement) were removed
+        Each model has one curve. Its runs from which effects (time, view direction, the network AGR) were removed
         have another one.
         """
         return sorted({self.series_of(r) for r in self.records})
@@ -128,7 +128,7 @@ class Group:
         """Return the name of the report's curve that a run belongs to.
 
         Runs of a model with different training lengths and sizes share a curve. The setting `effects.gate` says when
-        effects (time, view direction, neural refinement) are removed from Gaussians that do not need them. Runs whose
+        effects (time, view direction, the network AGR) are removed from Gaussians that do not need them. Runs whose
         setting differs from the model's default have a curve of their own, unless all runs of the group have the same
         setting.
         """
@@ -157,7 +157,8 @@ class Group:
     def compared(self) -> list[Configuration]:
         """Return the configurations (a model with its settings) that the report compares in pairs.
 
-        Their settings are those that most models share. Only ablations and the removal of effects may differ.
+        Their settings are those that most models share. Only ablations and the removal of time, direction and AGR (a
+        network) from Gaussians may differ.
         """
         return [c for c in self.configurations if _common(c.variant) == _common(self.variant)]
 
@@ -253,7 +254,7 @@ def groups(records: list[Record]) -> list[Group]:
 def gating(record: Record) -> str:
     """Return the setting `effects.gate` of a run as text, such as "gate=end"; "" if it is the model's default.
 
-    The setting says when effects (time, view direction, neural refinement) are removed from Gaussians that do not need
+    The setting says when effects (time, view direction, the network AGR) are removed from Gaussians that do not need
     them.
     """
     config = record.provenance.config
@@ -278,7 +279,7 @@ def without(variant: str, *names: str) -> str:
 
 
 def _common(variant: str) -> str:
-    """Return a variant (a text of settings) without the settings for ablations and for the removal of effects."""
+    """Return a variant (a text of settings) without the settings for ablations and `effects.gate`."""
     return without(variant, "gate", "budget_db", "ablation")
 
 

@@ -71,7 +71,7 @@ def _tested(group: Group, quantity: str, contrasts: Iterable[Weights]) -> dict[K
 
 
 def _key(weights: Weights) -> tuple[Key, float]:
-    """Return a key for a weighted sum, and the sign of the sum.
+    """Return a key for a weighted sum of models' results, and the sign of the sum.
 
     The key does not depend on the order of the terms, and it is the same if all terms change their sign.
     """

@@ -30,7 +30,7 @@ class FrontierPoint:
     def series(self) -> str:
         """Return the name of the report's curve that has this point.
 
-        The name is the model. If effects (time, view direction, neural refinement) were removed from its Gaussians, the
+        The name is the model. If effects (time, view direction, the network AGR) were removed from its Gaussians, the
         name says so.
         """
         return self.configuration.series

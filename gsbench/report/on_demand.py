@@ -1,4 +1,4 @@
-"""Average over seeds how many Gaussians keep which effects (time, view direction, neural refinement)."""
+"""Average over seeds how many Gaussians keep which effects (time, view direction, the network AGR)."""
 
 import math
 import re
@@ -20,7 +20,7 @@ DEGREES = 4  # of spherical harmonics: 0, 1, 2, 3
 
 @dataclass(frozen=True)
 class Decided:
-    """How many Gaussians of a model keep which effects (time, view direction, neural refinement) on a scene.
+    """How many Gaussians of a model keep which effects (time, view direction, the network AGR) on a scene.
 
     The numbers are means over seeds. The step that removes effects from Gaussians is called a gate.
     """
@@ -43,7 +43,7 @@ class Decided:
 
     @property
     def before(self) -> float:
-        """Return the number of Gaussians before any effect or Gaussian was removed."""
+        """Return the number of Gaussians before time, direction, AGR (a network) or whole Gaussians were removed."""
         return sum(self.rows.values())
 
     @property
@@ -53,7 +53,7 @@ class Decided:
 
 
 def decided(group: Group) -> list[Decided]:
-    """Return how many Gaussians keep which effects (time, view direction, neural refinement).
+    """Return how many Gaussians keep which effects (time, view direction, the network AGR).
 
     The list has one entry for each scene and each model with its settings. It is empty if no run removed an effect or
     chose its effects automatically.

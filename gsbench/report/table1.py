@@ -50,7 +50,7 @@ def build(found: Sorted) -> tuple[list[Table], list[Line]]:
 
 
 def _other_protocol(runs: list[Record]) -> str:
-    """Return a note that says how these runs differ from the paper's protocol, so its rows are not shown."""
+    """Return a note that says how these runs differ from the paper's protocol; the paper's rows are not shown."""
     what = sorted({word for r in runs for word in departure(r).split(", ")})
     return f"Measured otherwise than in the paper (in {', '.join(what)}), so the paper's rows are not shown."
 

@@ -80,7 +80,7 @@ class Attempt:
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:
-        """Return the run's decisions to remove time, direction or AGR; None if its settings do not ask for any."""
+        """Return the decisions to remove time, direction or AGR (a network); None if the settings ask for none."""
         screen, gating = self.resolved.screen, trainer.gating
         if screen is None and self.resolved.config.effects.gate == "off":
             return None

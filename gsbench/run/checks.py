@@ -234,7 +234,7 @@ def data_root(root: str) -> Path:
 
 
 def check_gates(model: GaussianModel, config: Config) -> None:
-    """Raise InputError if `effects.gate` asks to remove time, direction or AGR, but the model does not support this."""
+    """Raise InputError if `effects.gate` asks to remove time, direction or AGR (a network) and the model cannot."""
     if config.effects.gate != "off":
         as_gated(model)
 

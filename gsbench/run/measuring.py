@@ -40,9 +40,8 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
     Args:
         trainer: the finished training.
         config: the settings of the run.
-        with_effect_sets: whether to also draw an image with a colour for each set of effects (time, direction, AGR)
-            that
-            Gaussians keep.
+        with_effect_sets: whether to also draw an image whose colours show which Gaussians depend on time, direction and
+            AGR (a network).
     """
     views = trainer.views
     shown: Pairs = []

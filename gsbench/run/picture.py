@@ -1,4 +1,4 @@
-"""Draw the Gaussians of a finished run, coloured by the effects (time, direction, AGR) that they keep."""
+"""Draw the Gaussians of a finished run in colours for their dependence on time, direction and AGR (a network)."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from gsbench.run.load import load_run, scene_of
 
 
 def draw_run(folder: Path, camera: int, time: float | None, data_root: str | None = None) -> Pixels:
-    """Draw the Gaussians of a run in colours that show which effects (time, direction, AGR) they keep.
+    """Draw the Gaussians of a run in colours that show if they depend on time, direction and AGR (a network).
 
     Returns uint8 [H', W', 3] RGB.
 

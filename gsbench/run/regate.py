@@ -1,4 +1,4 @@
-"""Remove time, direction or AGR from those Gaussians of a finished run that do not need them; write a new run."""
+"""Remove time, direction or AGR (a network) from Gaussians of a finished run that do not need them, as a new run."""
 
 import copy
 from pathlib import Path
@@ -17,7 +17,7 @@ from gsbench.train.checkpoint import Checkpoint
 
 
 def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
-    """Remove time, direction or AGR from those Gaussians of a finished run that do not need them.
+    """Remove time, direction or AGR (a network) from those Gaussians of a finished run that do not need them.
 
     `effects.gate=end` does the same at the end of a training, except that this function may also remove time or
     direction alone. Return the record and the folder of the new run.

@@ -28,7 +28,7 @@ def is_auto(config: Config) -> bool:
 def with_candidate(config: Config, name: str) -> Config:
     """Return settings with one candidate of model=auto ("moving" or "static") as the model.
 
-    The static candidate has no AGR, because AGR moves Gaussians with time.
+    The static candidate has no AGR, because AGR (a network) moves Gaussians with time.
 
     Raises:
         InputError: the settings lack the candidate, or the candidate is not a model config.

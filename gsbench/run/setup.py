@@ -17,8 +17,8 @@ def build(config: Config) -> GaussianModel:
     """Build the model that the settings name, without Gaussians.
 
     Raises:
-        InputError: the model or an option is unknown, or `effects.gate` asks to remove time, direction or AGR from
-            Gaussians and the model does not support this.
+        InputError: the model or an option is unknown, or `effects.gate` asks to remove time, direction or AGR (a
+            network) from Gaussians and the model does not support this.
     """
     own: dict[str, Any] = {
         "module": config.model.module,

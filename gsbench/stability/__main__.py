@@ -16,7 +16,7 @@ EXTRA = ("matplotlib", "mpmath")  # the packages of gsbench[stability]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the stability audit, or measure the condition numbers in the checkpoint given by `--checkpoint`.
+    """Run the tests of numerical errors, or measure the condition numbers in the checkpoint given by `--checkpoint`.
 
     Return the exit code: 0, or 1 if a default setting exceeds its error bound, or 2 if a package is missing or the file
     is not a checkpoint.

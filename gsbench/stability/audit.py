@@ -135,9 +135,10 @@ def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Step]]:
 
 
 def hard_slices(audit: Audit, order: str, N: int) -> None:
-    """Slice N random 7D Gaussians with ill-conditioned factors, and add the errors to the audit.
+    """Measure the errors of conditional 3D Gaussians for N random 7D Gaussians with ill-conditioned factors.
 
-    The diagonal entries of the factors go down to 1e-5. An error is the 99.9th percentile over the Gaussians.
+    The diagonal entries of their covariances' Cholesky factors go down to 1e-5. An error is the 99.9th percentile over
+    the Gaussians.
     """
     hard = population.draw(torch.Generator().manual_seed(SEED), N, order)
     known = population.truth(hard, order)

@@ -51,7 +51,7 @@ class ConditionCurve:
 
 @dataclass(frozen=True)
 class SliceTime:
-    """The milliseconds that one slicing scheme takes for 7D Gaussians (`TIMED` of them), forward and backward.
+    """The milliseconds that one method takes to condition `TIMED` 7D Gaussians on time and direction, and backward.
 
     For kernels this is the median of several calls (`REPEATS`), for torch one call.
     """
@@ -65,7 +65,7 @@ class SliceTime:
 
 @dataclass(frozen=True)
 class AccuracyPoint:
-    """The error and the time of one scheme or backend that slices or renders Gaussians, as a point of a plot."""
+    """The error and the time of one algorithm that conditions or renders Gaussians, as a point of a plot."""
 
     thing: str  # "slicing" or "picture"
     way: str
@@ -74,10 +74,10 @@ class AccuracyPoint:
 
 
 def accuracy_for_time(backends: list[str]) -> Iterator[AccuracyPoint]:
-    """Yield error and time of slicing (each algorithm and precision) and of rendering (each CPU instruction set).
+    """Yield error and time of conditioning (each algorithm, precision) and of rendering (each CPU instruction set).
 
-    The inputs are 7D Gaussians with ill-conditioned factors (`SLICED` of them) for slicing, and 3D Gaussians (`DRAWN`
-    of them) for rendering.
+    Conditioning computes the 3D Gaussians of `SLICED` 7D Gaussians with ill-conditioned covariance factors. Rendering
+    draws `DRAWN` 3D Gaussians.
     """
     hard = population.draw(torch.Generator().manual_seed(4), SLICED, "paper")
     known = population.truth(hard, "paper")
@@ -144,10 +144,11 @@ def percentile(errors: population.Floats) -> float:
 
 
 def by_condition() -> Iterator[ConditionCurve]:
-    """Yield, for each algorithm of slicing, its float32 errors in torch against the condition number of the factor.
+    """Yield the float32 errors of each algorithm for conditional Gaussians, over the condition number of the factor.
 
-    The rows of the factors are in the paper's order, with position first. In the default order the conditional Gaussian
-    is a block of the factor, so that the default algorithm would have nothing to compute.
+    The algorithms run in torch. The rows of the covariances' factors are in the paper's order, with position first. In
+    the default order the conditional Gaussian is a block of the factor, so that the default algorithm would have
+    nothing to compute.
     """
     order = "paper"
     generator = torch.Generator().manual_seed(2)

@@ -1,4 +1,4 @@
-"""Compute exact slices, alphas, colours and gradients of single Gaussians in mpmath, by the formulas of the papers.
+"""Compute exact conditional Gaussians, alphas, colours and gradients in mpmath, by the formulas of the papers.
 
 The code shares nothing with the models. It forms, inverts and subtracts covariances, which is safe with DIGITS decimal
 digits: the hardest case (a factor with four diagonal entries of 1e-7) has a squared condition number of 1e56, too large
@@ -108,7 +108,7 @@ def slice_rotated(x: Vector, layout: dict[str, int], log_lambda: dict[str, float
 def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vector) -> tuple[Vector, Vector]:
     """Return the conditional mean mu_p + K delta and the conditional covariance S_pp - K S_qp, with K = S_pq S_qq^-1.
 
-    Here p are the rows of position, q those of time and direction, and delta is the query minus mu_q.
+    Here p are the rows of position, q those of time and direction, and delta is the given q minus mu_q.
     """
     S_pq = _block(S, p, q)
     K = [_solve(_block(S, q, q), row) for row in S_pq]

@@ -97,7 +97,7 @@ def _grid(cells: list[Cell]) -> list[str]:
 
 
 def show(cell: Cell) -> str:
-    """Format one table cell: both errors, the share of invalid results, and milliseconds."""
+    """Format one table cell: the errors of result and gradient, the share of invalid results, and milliseconds."""
     numbers = f"{_number(cell.forward)} / {_number(cell.gradient)} / {100 * cell.bad:.3g} % / {cell.ms:.3g}"
     return ("" if cell.holds else MARK) + numbers
 

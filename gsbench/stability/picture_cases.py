@@ -99,7 +99,7 @@ def pointlike(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def larger_than_the_scene(g: Generator, severity: float) -> list[Arguments]:
-    """Use Gaussians of size 10^3 to 10^7, the limit of log sizes, for which the 2D determinant overflows.
+    """Use Gaussians of size 10^3 to 10^7 (models allow no larger one), for which the 2D determinant overflows.
 
     Met in practice: UnityGaussianSplatting issue 196.
     """

@@ -84,7 +84,7 @@ def by_condition(axes: Axes, audit: Audit) -> None:
 
 
 def by_time(axes: Axes, audit: Audit, thing: str) -> None:
-    """Plot errors over milliseconds as labelled points, one for each slicing algorithm or rasterizer backend."""
+    """Plot errors over milliseconds as labelled points, one for each algorithm that conditions or renders Gaussians."""
     points = [point for point in audit.accuracy if point.thing == thing]
     points.sort(key=lambda point: point.ms)
     for i, (point, height) in enumerate(zip(points, shown([point.error for point in points]), strict=True)):

@@ -1,4 +1,4 @@
-"""Test slicing of a million random 7D Gaussians with ill-conditioned factors, against an exact float64 method.
+"""Test conditional 3D Gaussians of a million random ill-conditioned 7D Gaussians against an exact float64 method.
 
 The exact method is modified Gram-Schmidt, done twice ("twice is enough": Giraud et al. 2005). mpmath would need weeks
 for a million Gaussians, so each audit compares Gram-Schmidt with mpmath on a few of them (`verify`).
@@ -27,9 +27,10 @@ NEVER = -110.0  # log lambda; its exp is zero in float32, so that no Gaussian is
 
 @dataclass(frozen=True)
 class Hard:
-    """Raw parameters of 7D Gaussians with ill-conditioned factors and means at the origin.
+    """Raw parameters of 7D Gaussians with ill-conditioned covariance factors and means at the origin.
 
-    They are sliced for a camera at the origin at time 0, so that direction and time are exactly 0, without rounding.
+    They are conditioned on time 0 and on a camera at the origin, so that direction and time are exactly 0, without
+    rounding.
     """
 
     log_diagonal: Tensor  # [N, 7] float32
@@ -69,7 +70,7 @@ def draw(generator: torch.Generator, N: int, order: str, decades: Tensor | float
     """Draw N random 7D Gaussians with ill-conditioned triangular factors.
 
     Diagonal entries are 10^-u with u uniform in [0, decades], and entries below are standard normal. The direction and
-    time at which the Gaussians are sliced are about one standard deviation from their means.
+    time of the view are about one standard deviation from the means of the Gaussians.
     """
     u = torch.rand(N, 7, generator=generator, dtype=torch.float64)
     log_diagonal = -(decades * u) * np.log(10.0)
@@ -212,13 +213,13 @@ def _relative(found: Floats, exact: Floats) -> float:
 
 
 def judge(hard: Hard, known: PopulationTruth, order: str, scheme: str, backend: str) -> Errors:
-    """Measure the errors of slicing ill-conditioned 7D Gaussians in float32.
+    """Measure the float32 errors of the conditional 3D Gaussians of ill-conditioned 7D Gaussians.
 
     Args:
-        hard: the Gaussians to slice.
-        known: the exact slices of these Gaussians.
+        hard: the 7D Gaussians.
+        known: the exact conditional 3D Gaussians.
         order: the order of rows in the triangular factor.
-        scheme: the slicing scheme, which computes the conditional Gaussian.
+        scheme: the algorithm that computes the conditional Gaussian.
         backend: the name of the backend.
     """
     model = all_seen(order, scheme, backend)
@@ -277,7 +278,7 @@ def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
 
 
 def raw_parameters(hard: Hard, model: TriangularModel) -> dict[str, Tensor]:
-    """Return the raw parameters of the given Gaussians for a model made by `all_seen`."""
+    """Return the raw parameters of the given 7D Gaussians for a model made by `all_seen`."""
     N = len(hard)
     return {"means": torch.zeros(N, 3), "directions": hard.offset[:, :3], "times": hard.offset[:, 3:],
             "log_diagonal": hard.log_diagonal, **model.triangle.split(hard.off_diagonal),

@@ -104,7 +104,7 @@ def load(observed: Observed, scheme: str, backend: str, copies: int = 1) -> tupl
 def differentiate(
     model: GaussianModel, raw: dict[str, Tensor], observed: Observed, weights: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Slice Gaussians in float32 and compute the gradients of their raw parameters; return both as float64.
+    """Compute conditional 3D Gaussians in float32, and the gradients of raw parameters; return both as float64.
 
     The outputs [N, 13] are mean (3), covariance (9) and opacity. The gradients are [N, parameters].
     """

@@ -1,4 +1,4 @@
-"""Define numerically hard inputs of slicing: a few Gaussians with extreme parameters, a camera and a time."""
+"""Define numerically hard inputs for conditional 3D Gaussians: extreme Gaussians, a camera and a time."""
 
 import math
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ ALL = ("4dgs", "6dgs", "7dgs")
 
 @dataclass
 class Observed:
-    """Gaussians of one model, and the camera centre and time at which they are sliced."""
+    """Gaussians of one model, and the camera centre and time for which conditional 3D Gaussians are computed."""
 
     model: str
     raw: dict[str, Tensor]  # float32, by the model's own names
@@ -87,7 +87,7 @@ def entries(observed: Observed, variable: str) -> list[int]:
 
 @case("slicing", *ALL)
 def ordinary_gaussians(g: Generator, severity: float, model: str) -> Observed:  # noqa: ARG001
-    """Slice ordinary Gaussians, for which nothing is numerically hard, as the baseline of the hard cases."""
+    """Use ordinary Gaussians, for which nothing is numerically hard, as the baseline of the hard cases."""
     return ordinary(g, model)
 
 
@@ -116,7 +116,7 @@ def diagonals_over_eight_decades(g: Generator, severity: float, model: str) -> O
 def narrow_in_direction(g: Generator, severity: float, model: str) -> Observed:
     """Use Gaussians that are visible from a range of directions 10^-3 wide, such as highlights.
 
-    Float32 stores a unit direction to 6e-8, which is 6e-5 of this width; no scheme can be more exact.
+    Float32 stores a unit direction to 6e-8, which is 6e-5 of this width; no algorithm can be more exact.
     """
     observed = ordinary(g, model)
     sizes(observed, "d")[:] = -3 * LN_10 * severity
@@ -180,7 +180,7 @@ def static(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def far_from_the_query(g: Generator, severity: float, model: str) -> Observed:
-    """Slice Gaussians whose mean time and direction are 10^3 standard deviations away from the view.
+    """Use Gaussians whose mean time and direction are 10^3 standard deviations away from those of the view.
 
     The opacity must underflow to 0 with gradient 0, not to 0 x inf = NaN. Met in practice: 4DGaussians issue 35.
     """
@@ -250,7 +250,7 @@ def direction_off_the_sphere(g: Generator, severity: float, model: str) -> Obser
 
 @case("slicing", *ALL)
 def refinement_pushes_sizes(g: Generator, severity: float, model: str) -> Observed:
-    """Shift log sizes by +-80, as AGR's networks may do: in float32 exp overflows at 89, and its square at 45."""
+    """Shift log sizes by +-80, as AGR (networks) may do: in float32 exp overflows at 89, and its square at 45."""
     observed = ordinary(g, model)
     name = "scales" if model == "4dgs" else "log_diagonal"
     sign = torch.where(torch.rand(observed.raw[name].shape, generator=g) < 0.5, -1.0, 1.0)

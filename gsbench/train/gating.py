@@ -1,4 +1,4 @@
-"""Make Gaussians independent of time, direction or AGR (neural refinement) where the images allow it.
+"""Make Gaussians independent of time, direction or AGR (a network) if the images hardly change.
 
 This is done once after densification and once at the end of a training.
 The first simplification makes the rest of the training faster.
@@ -63,7 +63,7 @@ class Gating:
     """Simplify Gaussians in a training: make them independent of time, direction or AGR (the neural refinement)."""
 
     def __init__(self, rows: Rows, scene: Scene, renderer: Renderer, config: Config) -> None:
-        """Choose the views to predict the errors of simplified Gaussians from, and the views to measure PSNR on.
+        """Choose the views from which errors are predicted (e.g. of removing time from a Gaussian), and those for PSNR.
 
         Args:
             rows: the model, together with the per-Gaussian state of the training, which must change with it.
@@ -91,7 +91,7 @@ class Gating:
                 self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
 
     def in_training(self, step: int) -> bool:
-        """Make Gaussians independent of time, direction or AGR (the refinement) before a step of the training.
+        """Make Gaussians independent of time, direction or AGR (a network) before a step of the training.
 
         This is not done if the model has fewer than LEAST_IN_TRAINING Gaussians, or if PSNR on val would fall too much.
 
@@ -109,7 +109,8 @@ class Gating:
     def slows_agr(self, step: int) -> float:
         """Return the factor of the learning rate of AGR, the neural refinement, at a step.
 
-        The factor is 1 until Gaussians are simplified in training. Then it falls log-linearly to LAST_RATE at the end.
+        The factor is 1 until some Gaussians are made independent of time, direction or AGR in training. Then it falls
+        log-linearly to LAST_RATE at the end.
         """
         if not self.gates or self.gates[0].step is None:
             return 1.0
@@ -117,7 +118,7 @@ class Gating:
         return float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))
 
     def at_end(self, by_halves: bool) -> bool:
-        """Make Gaussians independent of time, direction or AGR (the refinement) after the training.
+        """Make Gaussians independent of time, direction or AGR (a network) after the training.
 
         This is not done if PSNR would fall by more than `effects.budget_db` dB.
 
@@ -134,12 +135,13 @@ class Gating:
         return shape_of(self.model)
 
     def compare(self, ungated: Shape, views: list[View]) -> None:
-        """Measure how PSNR and frame time changed when Gaussians were simplified at the end of the training.
+        """Measure how PSNR and frame time changed when time, direction or AGR were removed at the end of the training.
 
-        The function also measures how PSNR and frame time would change if no Gaussian depended on direction.
+        AGR is a network. The function also measures how PSNR and frame time would change if no Gaussian depended on
+        direction.
 
         Args:
-            ungated: the Gaussians before they were simplified, from `now`.
+            ungated: the Gaussians before this removal, from `now`.
             views: the views (test or val) on which results are measured.
         """
         if self.gates and self.gates[-1].step is None:
@@ -162,7 +164,7 @@ class Gating:
 
     @torch.no_grad()
     def _gate(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> bool:
-        """Make Gaussians independent of time, direction or AGR (the refinement); return whether this was done.
+        """Make Gaussians independent of time, direction or AGR (a network); return whether this was done.
 
         Args:
             step: the step of the training; None at its end.
@@ -195,12 +197,12 @@ class Gating:
         self.rows.moved(found.rows, found.changed)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return for the checkpoint when Gaussians were simplified, and how PSNR and frame time changed."""
+        """Return when time, direction or AGR were removed from Gaussians, and how PSNR and frame time changed."""
         direction = asdict(self.direction) if self.direction else None
         return {"gates": [asdict(gate) for gate in self.gates], "notes": list(self.notes), "direction": direction}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore from a checkpoint when Gaussians were simplified; raises InputError if the state is damaged."""
+        """Restore the `state_dict` of a checkpoint; raises InputError if it is damaged."""
         if not isinstance(state, dict):
             raise InputError(f"checkpoint: expected 'gating' as a dict, got {type(state).__name__}")
         gates, notes = state["gates"], state["notes"]

@@ -134,7 +134,7 @@ class Trainer:
         save(self.state_dict())
 
     def gate_at_end(self, by_halves: bool = False) -> None:
-        """Make Gaussians independent of time, direction or AGR (the refinement) after the training.
+        """Make Gaussians independent of time, direction or AGR (a network) after the training.
 
         PSNR and frame time are measured before and after. The measurement does not count as training time.
 

@@ -30,9 +30,8 @@ COOLED = 0.1  # share of a learning rate that is left at the end of a cooldown
 class Optimizer:
     """Optimize the parameters of a model by Adam with eps = 1e-15, as 3DGS does.
 
-    On the CPU, one call of a kernel updates all parameters. On a GPU and in the reference, torch.optim.Adam does.
-
-    The two kinds differ for Gaussians that no view of a batch sees. `adam` still moves them by their momentum.
+    On the CPU, one call of a kernel updates all parameters. Otherwise torch.optim.Adam does. The kinds `adam` and
+    `sparse_adam` differ for Gaussians that no view of a batch sees. `adam` still moves them by their momentum.
     `sparse_adam` leaves them and their moments unchanged (Mallick et al. 2024, Taming 3DGS).
     """
 
@@ -70,7 +69,7 @@ class Optimizer:
 
     @cached_property
     def torch_adam(self) -> torch.optim.Adam:
-        """torch's Adam over the same groups and moments. Made when it is needed: it takes a second to import."""
+        """torch's Adam with the same groups and moments; created at first use, because its import takes a second."""
         groups = [{"params": parameters, "name": name} for name, parameters in self.groups.items()]
         adam = torch.optim.Adam(groups, lr=0.0, betas=BETAS, eps=EPS, fused=True)
         adam.state = self.moments
@@ -114,7 +113,7 @@ class Optimizer:
             self.torch_adam.zero_grad(set_to_none=True)
 
     def rates_at(self, step: int, slowed: float = 1.0) -> dict[str, float]:
-        """Return the learning rate of each group at a step; `slowed` is a factor of AGR's."""
+        """Return the learning rate of each group at a step; that of AGR (a network) is multiplied by `slowed`."""
         rates = {name: rate_at(rate, step, self.train, self.extent) for name, rate in self.rates.items()}
         return {name: rate * slowed if name == "refinement" else rate for name, rate in rates.items()}
 
@@ -210,7 +209,8 @@ def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) ->
 
     A rate with `per_extent` is multiplied by the radius of the scene. A rate with `per_run` is multiplied by
     sqrt(recipe_iterations / iterations), so a short run takes larger steps; this improved every model (docs/tuning.md).
-    From step `cooldown_from` of the recipe on, every rate also falls linearly, to COOLED of itself at the end.
+    From step `cooldown_from` of the recipe on, every rate is also multiplied by a factor that falls linearly from 1 to
+    COOLED.
     """
     scale = extent if rate.per_extent else 1.0
     if rate.per_run:

@@ -24,13 +24,13 @@ class Pyramid:
         return self._reduced[key]
 
     def keep_only(self, factor: int) -> None:
-        """Delete the cached views of all factors except this one."""
+        """Delete the cached reduced images, except those reduced by `factor`."""
         self._reduced = {key: view for key, view in self._reduced.items() if key[1] == factor}
 
 
 @torch.no_grad()
 def reduced(view: View, factor: int) -> View:
-    """Return a view whose pixels are the means of factor x factor blocks of pixels.
+    """Return a view whose image is `factor` times smaller: each pixel is the mean of factor x factor pixels.
 
     Incomplete blocks at the right and the bottom are dropped. The first two rows of the intrinsics K are divided by the
     factor, because pixel centres are at +0.5.

@@ -80,7 +80,7 @@ def _parts(views: int) -> list[int]:
 
 
 def _in_order(parts: Sequence[Sums]) -> Sums:
-    """Add dictionaries of gradients to the first one, in their order; an object that occurs twice is added once."""
+    """Add dictionaries of gradients, in order, to the first one; a dictionary that views share is added only once."""
     total = parts[0]
     done = {id(total)}
     for part in parts[1:]:
@@ -112,7 +112,8 @@ class Step:
             background: the background colour, [3].
             ssim_weight: the weight w of 1 - SSIM in the loss.
             antialias: whether to scale opacities by the 2D filter of Mip-Splatting.
-            stages: a clock that adds up the seconds of each stage (slice, raster, loss, backward).
+            stages: a clock that sums the seconds of each stage (conditional Gaussians, rasterization, loss, backward
+                pass).
         """
         self.model = model
         self.background = background
@@ -134,8 +135,8 @@ class Step:
             The loss and the gradients of the 2D means for each view.
 
         Raises:
-            DivergedError: a slice has a value that is not finite.
-            InputError: the rasterizer refuses a slice for another reason.
+            DivergedError: a 3D Gaussian of a view has a value that is not finite.
+            InputError: the rasterizer refuses 3D Gaussians for another reason.
             TooLargeError: the memory does not suffice.
         """
         self.penalties = penalties

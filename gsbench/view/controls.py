@@ -61,7 +61,7 @@ class Controls:
         self.play.on_update(self._start_clock)
 
     def _add_effects(self) -> None:
-        """Add controls that switch off effects of the models: time, view direction and AGR (neural refinement)."""
+        """Add controls that switch off what models depend on: time, view direction and AGR (a network)."""
         gui, renderers = self.client.gui, self._renderers.values()
         degree = max(renderer.trained_active.sh_degree for renderer in renderers)
         with gui.add_folder("effects"):
@@ -183,11 +183,11 @@ class Controls:
         ]
 
     def request(self, colours: str) -> FrameRequest:
-        """Return the request for a frame with the present time and effects, and with Gaussians in the given colours."""
+        """Return the request for a frame at the present time, with the settings of the controls and these colours."""
         return self._request_at(self.now, colours)
 
     def request_of(self, view: View) -> FrameRequest:
-        """Return the request for a frame at the time of a training view, with the effects that are switched on."""
+        """Return the request for a frame at the time of a training view, with the settings of the controls."""
         return self._request_at(view.time, IMAGE)
 
     def _request_at(self, time: float | None, colours: str) -> FrameRequest:

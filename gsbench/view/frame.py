@@ -22,7 +22,7 @@ EVERY_DEGREE = 3  # the highest SH degree of any model
 
 
 class FrameRequest(NamedTuple):
-    """The settings of a frame that a browser requests, apart from the camera: the time, the effects and the colours."""
+    """The settings of a requested frame: time, viewpoint of the Gaussians, AGR (a network) on or off, SH, colours."""
 
     time: float | None  # in [0, 1]; None if the scene is static
     center: torch.Tensor | None = None  # [3], viewpoint for which Gaussians are computed; None: the camera's
@@ -38,7 +38,7 @@ class FrameCost(NamedTuple):
     ms: dict[str, float]  # by stage, in their order
 
     def of(self, part: str) -> float:
-        """Return the milliseconds of slicing (which computes the conditional Gaussians) or of rasterization."""
+        """Return the milliseconds to compute the conditional 3D Gaussians, or to rasterize them."""
         return sum(ms for stage, ms in self.ms.items() if part_of(stage) == part)
 
 
@@ -49,15 +49,15 @@ class Frame(NamedTuple):
     costs: tuple[FrameCost, ...]  # of each model in it
 
     def ms(self, part: str) -> float:
-        """Return the milliseconds of slicing or of rasterization, summed over the models in the image."""
+        """Return the milliseconds to compute or to rasterize 3D Gaussians, summed over the models in the image."""
         return sum(cost.of(part) for cost in self.costs)
 
 
 class FrameRenderer:
     """Renders the frames of one run's model, one frame at a time.
 
-    The renderer switches effects of the model, such as the neural refinement, on and off for each frame. Therefore it
-    cannot render two frames at once.
+    The renderer switches parts of the model, such as AGR (a network), on and off for each frame. Therefore it cannot
+    render two frames at once.
     """
 
     def __init__(self, run: LoadedRun, most_cost: float) -> None:
@@ -110,7 +110,7 @@ class FrameRenderer:
             return image[0], watch.ms
 
     def _active(self, request: FrameRequest) -> ActiveComponents:
-        """Return the active parts of the model, such as neural refinement, without those that the user switches off."""
+        """Return the active parts of the model, such as AGR (a network), without those that the user switches off."""
         trained = self.trained_active
         degree = min(request.sh_degree, trained.sh_degree)
         return replace(trained, refine=request.agr and trained.refine, sh_degree=degree)

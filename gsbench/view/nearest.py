@@ -68,7 +68,7 @@ def compare(renderer: FrameRenderer, view: View, request: FrameRequest) -> ViewC
     Args:
         renderer: the renderer of the model.
         view: the training view to compare with.
-        request: the time at which to render, and the effects that are on.
+        request: the time at which to render, and the other settings of the controls.
     """
     view = view.to("cpu")
     image = renderer.image(view.camera, request)

@@ -35,7 +35,7 @@ def cost_table(costs: Sequence[FrameCost], width: int, height: int) -> str:
 
 
 def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
-    """Write the legend of the Gaussians' colours, if the colours stand for effects or costs; otherwise return "".
+    """Write the legend of the colours if they show the cost of Gaussians or what they depend on; otherwise "".
 
     Args:
         shown: the images on the screen.

@@ -19,12 +19,11 @@ _FOLLOWS = {"show_colors": "conditioning", "blend": "binning"}
 
 
 class StageWatch(Tape):
-    """Times the slicing and the rasterization of a frame, and the stages of each if gsbench's kernels compute them.
+    """Times how long a frame's 3D Gaussians are computed (slicing) and rasterized, and the stages of both.
 
     Usage: ``with StageWatch(device) as watch: ...; watch.end(SLICE); ...; watch.end(RASTER)``. The watch replaces the
-    tape that records kernel operations for the backward pass. Thus it sees when each operation begins and ends; it
-    records none, so there are no gradients. If torch computes the slicing or the rasterization, it is timed as a single
-    stage.
+    tape that records kernel calls for the backward pass. Thus it sees when each kernel begins and ends; it records
+    none, so there are no gradients. If torch computes or rasterizes the Gaussians, this is timed as a single stage.
     """
 
     def __init__(self, device: str) -> None:
@@ -33,7 +32,7 @@ class StageWatch(Tape):
         self._laps = Laps(device)
 
     def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
-        """Run a kernel operation, and stop the time of the stages that end before or after it."""
+        """Run a kernel, and stop the time of the stages that end before or after it."""
         if operation.name in _FOLLOWS:
             self._laps.end(_FOLLOWS[operation.name])
         outputs, _ = operation.run(tensors, numbers)
@@ -42,7 +41,7 @@ class StageWatch(Tape):
         return outputs
 
     def end(self, part: str) -> None:
-        """End the slicing or the rasterization.
+        """End one of the two parts of a frame: computing its 3D Gaussians, or rasterizing them.
 
         The time since its last stage is added to that stage. If no stage was measured, the whole part is one stage.
         """
@@ -56,5 +55,5 @@ class StageWatch(Tape):
 
 
 def part_of(stage: str) -> str:
-    """Return the part of a frame, `slice` or `raster`, to which a stage belongs."""
+    """Return the part of a frame to which a stage belongs: `slice` (compute 3D Gaussians) or `raster`."""
     return SLICE if stage == SLICE or stage in STAGES[SLICE] else RASTER

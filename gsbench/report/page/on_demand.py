@@ -36,7 +36,7 @@ NAMES = EFFECT_SETS | {REMOVED: "removed"}
 def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection | None:
     """Make the section on which effects the Gaussians keep; None if no run chose effects.
 
-    The effects are time, view direction and neural refinement. The figures show how many Gaussians keep which effects,
+    The effects are time, view direction and the network AGR. The figures show how many Gaussians keep which effects,
     and the degrees of their spherical harmonics.
     """
     found = decided(group)
@@ -63,7 +63,7 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection
 
 
 def _sentence(one: Decided) -> str:
-    """Describe which effects (time, view direction, neural refinement) a model and its Gaussians keep on a scene."""
+    """Describe which effects (time, view direction, the network AGR) a model and its Gaussians keep on a scene."""
     parts = [_screen_words(one.runs), *_gate_words(one)]
     return f"On {one.scene}, {one.name}: {' '.join(part for part in parts if part)}"
 
@@ -92,7 +92,7 @@ def _screens(runs: list[Record]) -> list[TimeScreen]:
 
 
 def _gate_words(one: Decided) -> list[str]:
-    """Say which effects (time, view direction, neural refinement) Gaussians keep, and what removing the others changed.
+    """Say which effects (time, view direction, the network AGR) Gaussians keep, and what removing the others changed.
 
     The text gives the change of PSNR and of the milliseconds per frame.
     """
@@ -121,7 +121,7 @@ def _change(of: Estimate, unit: str, digits: int) -> str:
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
-    """List the notes on the choice of effects: what could not be decided, and what the numbers leave out.
+    """List notes on the removal of time, direction and AGR (a network): what was undecided, what the numbers leave out.
 
     Equal notes of several seeds are merged.
     """
@@ -149,7 +149,7 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
 def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
     """Draw two stacked bars for each scene and model: Gaussians by the effects that they keep, and by SH degree.
 
-    The effects are time, view direction and neural refinement.
+    The effects are time, view direction and the network AGR.
     """
     label = lambda one: messages.shorten_middle(f"{one.scene}, {one.name}", LONGEST_LABEL, LABEL_END)  # noqa: E731
     effect_sets = [
@@ -186,14 +186,14 @@ def _mean_degree(one: Decided) -> str:
 
 
 def _swatches() -> list[Swatch]:
-    """Return the legend of the colours for sets of effects, such as "static", and for SH degrees."""
+    """Return the legend of the colours for what Gaussians depend on, such as "static", and for SH degrees."""
     effect_sets = [Swatch(said, f"model-{MODELS.index(EFFECT_SET_LIKE[name])}") for name, said in EFFECT_SETS.items()]
     degrees = [Swatch(f"degree {i}", f"stage-{_stage(i)}") for i in range(DEGREES)]
     return [*effect_sets, Swatch(NAMES[REMOVED], "line"), *degrees]
 
 
 def _images(found: list[Decided], folder: Path) -> list[Image]:
-    """Return images in which each Gaussian has the colour of the effects that it keeps, such as time.
+    """Return images in which the colour of a Gaussian shows whether it depends on time, direction or AGR (a network).
 
     There is one image for each scene and model, from the first seed that has one.
     """

@@ -88,7 +88,7 @@ def _cells(price: Price, unit: str) -> tuple[Value, ...]:
 
 
 def _scope(cube: Cube, family: Family) -> list[str]:
-    """Say whether the intervals of the effects' gains hold for other scenes or only for other seeds.
+    """Say if the intervals of the gains by time, direction and AGR hold for other scenes or only for other seeds.
 
     The text also says for how many comparisons the p-values are adjusted.
     """
@@ -104,7 +104,7 @@ def _scope(cube: Cube, family: Family) -> list[str]:
 
 
 def _effect_words(cube: Cube) -> list[str]:
-    """Say which effect (time, view direction, neural refinement) raises PSNR most, and what it costs.
+    """Say which effect (time, view direction, the network AGR) raises PSNR most, and what it costs.
 
     The text also says which effects are not significant and how effects interact.
     """
