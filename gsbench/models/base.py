@@ -359,8 +359,8 @@ class GaussianModel(nn.Module, ABC):
         """Return the first and the last time at which each Gaussian can be visible, [N, 2]; None without time.
 
         A Gaussian with opacity o, mean time mu_t and lifetime s is visible at time t if o exp(-((t - mu_t) / s)^2 / 2)
-        is at least ALPHA_MIN = 1/255. Times are in [0, 1]; (inf, inf) marks a Gaussian that is never visible. The intervals
-        only serve to sort the Gaussians: they ignore AGR, the neural refinement.
+        is at least 1/255. Times are in [0, 1]; (inf, inf) marks a Gaussian that is never visible. The intervals only
+        serve to sort the Gaussians: they ignore AGR, the neural refinement.
         """
         lifetimes = self.lifetimes()
         if lifetimes is None:
