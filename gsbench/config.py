@@ -123,6 +123,7 @@ class TrainConfig:
     lambda_from: int = 15_000  # step from which lambda_t and lambda_d learn
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     cooldown_from: int | None = None  # step from which all learning rates fall, to a tenth at the end; None: never
+    average_from: int | None = None  # step from which parameters are averaged; the mean is the result; None: never
     coarse: list[list[int]] | None = None  # [[4, 3000]]: a quarter of the width until step 3,000
     penalties: PenaltiesConfig = field(default_factory=PenaltiesConfig)
     curve_points: int = 20  # measurements on val during the run

@@ -61,6 +61,7 @@ class Schedule:
         self.densify_stop = self.scaled(densify.stop)
         window, rounds = self.densify_stop - self.densify_start, densify.rounds or MOST_ROUNDS
         self.densify_every = max(densify.every, math.ceil(window / rounds))
+        self.average_start = None if config.average_from is None else self.scaled(config.average_from)
         every = self.reset_every = max(self.scaled(densify.reset_every), STEPS_BETWEEN_RESETS)
         # The numbers of finished steps after which opacities are reset, none close to the end of densification.
         self.resets_after = range(every, self.densify_stop - every // 2 + 1, every)

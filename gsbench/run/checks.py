@@ -42,6 +42,7 @@ RANGES = {  # the ranges of settings, both ends included
     "train.refine_from": (0, ENDLESS),
     "train.lambda_from": (0, ENDLESS),
     "train.cooldown_from": (0, ENDLESS),
+    "train.average_from": (0, ENDLESS),
     "train.densify.start": (0, ENDLESS),
     "train.densify.stop": (0, ENDLESS),
     "train.densify.every": (1, ENDLESS),

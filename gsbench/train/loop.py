@@ -18,6 +18,7 @@ from gsbench.measure.speed import Effort, StageClock
 from gsbench.models import GaussianModel
 from gsbench.scenes import Scene, View
 from gsbench.schedule import Schedule
+from gsbench.train.averaging import NO_AVERAGE, Average
 from gsbench.train.checkpoint import whole_number
 from gsbench.train.densify import densification
 from gsbench.train.densify.base import MOST_GAUSSIANS
@@ -76,6 +77,8 @@ class Trainer:
         self.density = densification(self.rows, train.densify, config.model.min_opacity, len(scene.train))
         self.minimum_scale = MinimumScale(model, [view.camera for view in scene.train])
         self.rows.add(self.minimum_scale)
+        self.average = Average(model, self.schedule.average_start)
+        self.rows.add(self.average)
         self.pyramid = Pyramid(scene.train)
         self.stages = StageClock(config.device)
         self.effort = Effort()
@@ -114,6 +117,9 @@ class Trainer:
                 camera, factor = self.scene.train[0].camera, self.schedule.resolution(self.step)
                 with self.effort, fitting_threads(len(self.model), camera.width * camera.height // factor**2):
                     self._descend()
+                    self.average.add(self.step)
+                    if self.step + 1 == train.iterations:
+                        self.average.take()
                 if self.schedule.measures(self.step):
                     self._measure()
                 if self.schedule.resets(self.step):  # after the measuring: opacities take hundreds of steps to recover
@@ -241,6 +247,7 @@ class Trainer:
             "density": self.density.state_dict(),
             "minimum_scale": self.minimum_scale.state_dict(),
             "gating": self.gating.state_dict(),
+            "average": self.average.state_dict(),
             "stages": self.stages.state_dict(),
             "effort": self.effort.state_dict(),
             "curve": self.curve.state_dict(),
@@ -260,6 +267,7 @@ class Trainer:
             self.density.load_state_dict(state["density"])
             self.minimum_scale.load_state_dict(state["minimum_scale"])
             self.gating.load_state_dict(state.get("gating", NO_GATES))
+            self.average.load_state_dict(state.get("average", NO_AVERAGE))
             self.stages.load_state_dict(state["stages"])
             self.effort.load_state_dict(state.get("effort"))
             self.curve.load_state_dict(state["curve"])

@@ -103,7 +103,7 @@ def test_every_key_is_of_training_or_of_measuring() -> None:
         "raster.antialias", "protocol.best_on_test", "model.name", "model.module", "model.published_with_agr",
         "model.agr", "model.agr_octaves", "model.sh_degree", "model.min_opacity", *(f"train.{name}" for name in (
             "iterations", "recipe_iterations", "batch_size", "ssim_weight", "sh_every", "refine_from",
-            "lambda_from", "cooldown_from", "curve_points", *(f"densify.{name}" for name in (
+            "lambda_from", "cooldown_from", "average_from", "curve_points", *(f"densify.{name}" for name in (
                 "start", "stop", "every", "rounds", "reset_every", "grad_threshold", "clone_below", "prune_above",
                 "max_gaussians", "thin_to", "noise", "kind")), "coarse",
                 "penalties.opacity.weight", "penalties.opacity.start", "penalties.opacity.stop",
