@@ -36,6 +36,8 @@ METRICS = (
     "lpips_vgg",
     "psnr_best_on_val",  # dB, at the iteration that was best on validation
     "psnr_best_on_test",  # dB, the best on test during training: it LEAKS, and is only for comparison with papers
+    "psnr_moving",  # dB, over the pixels that move: gsbench.measure.regions
+    "psnr_object",  # dB, over the pixels of objects
     "psnr_background_only",  # dB of an image of the background alone, which is what a model that learned nothing gets
 )
 
@@ -59,6 +61,16 @@ class ViewScore:
     ssim: float | None = None
     lpips_alex: float | None = None
     lpips_vgg: float | None = None
+
+
+@dataclass(frozen=True)
+class Region:
+    """The pixels over which `psnr_moving` or `psnr_object` was measured."""
+
+    source: str  # what they were found in: "images of one camera", "masks" or "alpha"
+    views: int  # number of views with such pixels
+    share: float  # mean share of the pixels of these views
+    digest: str  # SHA-256 of the masks
 
 
 @dataclass(frozen=True)
@@ -191,6 +203,7 @@ class Record:
     version: int = VERSION
     variant: str = ""  # settings of its training that differ from the experiment's, such as "iterations=10"
     overrides: list[str] = field(default_factory=list)  # `python -m gsbench` with these arguments repeats the run
+    regions: dict[str, Region] = field(default_factory=dict)  # by "moving" and "object", if there are such pixels
     on_demand: OnDemand | None = None  # None: no effect was removed from the model or its Gaussians
 
     @property

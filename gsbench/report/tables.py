@@ -31,7 +31,12 @@ COLUMNS = (  # their keys are columns of `tidy`
 OF_THE_MACHINE = ("train_min", "fps")  # columns that can be compared only between runs on one machine
 COSTS = ("fps", "num_gaussians", "bytes", "peak_memory", "train_cpu_s", "load")  # costs that are copied from a record
 TRAIN = QuantityColumn("psnr_train", "PSNR train", 2)  # shown on request
-EXTRA_COLUMNS = (QuantityColumn("lpips_vgg", "LPIPS-VGG", 3), QuantityColumn(LEAKS, LEAKS, 2))  # if a run has them
+EXTRA_COLUMNS = (  # if a run has them
+    QuantityColumn("psnr_moving", "PSNR moving", 2),
+    QuantityColumn("psnr_object", "PSNR object", 2),
+    QuantityColumn("lpips_vgg", "LPIPS-VGG", 3),
+    QuantityColumn(LEAKS, LEAKS, 2),
+)
 
 PAPER = (
     "Table 1 of the 7DGS paper (ICCV 2025): 30,000 iterations at half resolution (Technicolor: full), PSNR is the best "

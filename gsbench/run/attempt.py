@@ -76,7 +76,8 @@ class Attempt:
         record = self.describe("ok", None)
         return replace(
             record, protocol=record.protocol | found.frames, on_demand=on_demand, metrics=found.metrics,
-            missing=found.missing, per_view=found.per_view, cost=found.cost, curve=trainer.curve.points,
+            missing=found.missing, per_view=found.per_view, regions=found.regions,
+            cost=found.cost, curve=trainer.curve.points,
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:

@@ -12,7 +12,8 @@ from gsbench.effects import picture
 from gsbench.errors import one_line
 from gsbench.measure.images import Pixels, strip
 from gsbench.measure.quality import Quality, evaluate, evenly
-from gsbench.measure.record import Cost, ViewScore
+from gsbench.measure.record import Cost, Region, ViewScore
+from gsbench.measure.regions import RegionScores
 from gsbench.measure.speed import peak_memory, synchroniser, time_renders
 from gsbench.models.cuda_graph import GraphedFrames
 from gsbench.run.checks import lpips_weights
@@ -29,6 +30,7 @@ class Measured:
     metrics: dict[str, float | None]
     missing: dict[str, str]  # why a metric has no value
     per_view: list[ViewScore]
+    regions: dict[str, Region]  # the pixels of `psnr_moving` and `psnr_object`
     cost: Cost
     frames: dict[str, str]  # whether frames on a GPU are replayed from a CUDA graph, for the record
     images: dict[str, Pixels]  # images by file name
@@ -45,8 +47,9 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
     """
     views = trainer.views
     shown: Pairs = []
+    regions = RegionScores(views, config.protocol.quantise)
     quality = evaluate(
-        _rendered(trainer, config.protocol.pictures, shown),
+        regions.measured(_rendered(trainer, config.protocol.pictures, shown)),
         background=trainer.scene.background,
         quantised=config.protocol.quantise,
         weights=lpips_weights(config),
@@ -69,6 +72,8 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
         load=trainer.effort.load,
     )
     metrics, missing = with_best(quality, trainer, config)
+    metrics |= regions.metrics()
+    missing |= regions.missing()
     metrics["psnr_train"] = trainer.psnr(evenly(trainer.scene.train, len(views)))
     images = {"pictures.png": strip(shown)} if shown else {}
     if shown and with_effect_sets:
@@ -76,7 +81,7 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
         images["effect_sets.png"] = picture.draw(
             trainer.model, first.camera, first.time, renderer.background, renderer.antialias
         )
-    return Measured(metrics, missing, quality.per_view, cost, made, images)
+    return Measured(metrics, missing, quality.per_view, regions.found(), cost, made, images)
 
 
 def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[str, Tensor, Tensor]]:

@@ -1,0 +1,178 @@
+"""Find the pixels in which a scene moves, and those of its objects, so that PSNR can be measured there alone.
+
+Both are found in the ground truth, by integers only, so every machine finds the same pixels:
+
+- `moving`: needs at least three evaluated views with the same camera. Each image is averaged over 3 x 3 pixels. A pixel
+  moves if a channel differs from its median over these views by more than 16 of 255. Then a 3 x 3 opening drops single
+  pixels, and a dilation by a (2 r + 1)^2 square, r = height / 270 rounded, adds the border.
+- `object`: pixels with an object number in the scene's masks; without masks, pixels with an alpha of at least 0.5.
+"""
+
+import hashlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from gsbench.measure.quality import quantise
+from gsbench.measure.record import Region
+from gsbench.scenes import View
+
+LEAST_VIEWS = 3  # with one camera; the median of two images is one of them
+THRESHOLD = 16  # of 255, by which a moving pixel differs from the median
+PIXELS_OF_A_RADIUS = 270  # rows of the image for each pixel by which the region is dilated
+LEAST_PIXELS = 64  # views with a smaller region are not measured
+SAME = 1e-6  # largest difference of equal cameras
+STRIP = 128  # rows whose median is computed at once, to save memory
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Regions:
+    """The region of each view that has one of at least LEAST_PIXELS pixels, or the reason why there is none."""
+
+    masks: dict[str, Mask]  # [H, W] by the name of the view
+    source: str  # what the region was found in; empty if there is none
+    missing: str = ""
+
+    @property
+    def share(self) -> float:
+        """Return the mean share of the pixels that are in the region, over the views that have one."""
+        return float(np.mean([mask.mean() for mask in self.masks.values()])) if self.masks else 0.0
+
+    @property
+    def digest(self) -> str:
+        """Return the SHA-256 of all masks and of the names of their views."""
+        whole = hashlib.sha256()
+        for name, mask in sorted(self.masks.items()):
+            whole.update(f"{name}\n{mask.shape}\n".encode() + np.packbits(mask).tobytes())
+        return whole.hexdigest()
+
+
+def find_regions(views: Sequence[View]) -> dict[str, Regions]:
+    """Return the regions `moving` and `object` of the evaluated views."""
+    return {"moving": moving(views), "object": of_objects(views)}
+
+
+def moving(views: Sequence[View]) -> Regions:
+    """Find the moving pixels of views that share a camera; see the first lines of this module."""
+    groups = [group for group in _by_camera(views) if len(group) >= LEAST_VIEWS]
+    if not groups:
+        return Regions({}, "", f"needs {LEAST_VIEWS} evaluated views with the same camera")
+    masks = {}
+    for group in groups:
+        sums = np.stack([_sums(view) for view in group])  # [V, H, W, 3] of 3 x 3 pixels
+        median = np.empty_like(sums[0])
+        for row in range(0, sums.shape[1], STRIP):
+            strip = np.sort(sums[:, row : row + STRIP], axis=0)
+            median[row : row + STRIP] = strip[(len(group) - 1) // 2]
+        radius = round(sums.shape[1] / PIXELS_OF_A_RADIUS)
+        for view, own in zip(group, sums, strict=True):
+            moved = (np.abs(own.astype(np.int32) - median) > 9 * THRESHOLD).any(-1).astype(np.uint8)
+            moved = cv2.morphologyEx(moved, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+            masks[view.name] = cv2.dilate(moved, np.ones((2 * radius + 1,) * 2, np.uint8)).astype(bool)
+    return _large(masks, "images of one camera")
+
+
+def of_objects(views: Sequence[View]) -> Regions:
+    """Find the pixels of objects by the scene's masks, else by alpha; see the first lines of this module."""
+    if all(view.regions is not None for view in views):
+        return _large({view.name: _array(view.regions) > 0 for view in views}, "masks")
+    if all(view.alpha is not None for view in views):
+        return _large({view.name: _array(view.alpha) >= 128 for view in views}, "alpha")
+    return Regions({}, "", "needs masks, or images with alpha")
+
+
+def region_psnr(
+    render: Tensor,  # [H, W, 3]
+    truth: Tensor,  # [H, W, 3]
+    mask: Mask,
+) -> float:
+    """Compute PSNR over the pixels of a region: -10 log10 of the mean squared error of pixels x 3 channels, dB."""
+    inside = torch.from_numpy(mask).to(render.device)
+    error = render.detach().double().clamp(0, 1)[inside] - truth.detach().double().clamp(0, 1)[inside]
+    return float(-10 * error.square().mean().log10())
+
+
+class RegionScores:
+    """Measures PSNR over the moving pixels and over those of objects, while images are rendered one after the other."""
+
+    def __init__(self, views: Sequence[View], quantised: bool) -> None:
+        """Find the regions of the evaluated views.
+
+        Args:
+            views: the evaluated views.
+            quantised: whether renders are rounded to 8 bits first.
+        """
+        self.regions = find_regions(views)
+        self.quantised = quantised
+        self.scores: dict[str, list[float]] = {name: [] for name in self.regions}
+
+    def measured(self, images: Iterable[tuple[str, Tensor, Tensor]]) -> Iterator[tuple[str, Tensor, Tensor]]:
+        """Yield (name of the view, render, ground truth) again, and measure each over the regions of its view."""
+        for name, render, truth in images:
+            for region, scores in self.scores.items():
+                mask = self.regions[region].masks.get(name)
+                if mask is not None:
+                    scores.append(region_psnr(quantise(render) if self.quantised else render, truth, mask))
+            yield name, render, truth
+
+    def metrics(self) -> dict[str, float | None]:
+        """Return `psnr_moving` and `psnr_object`, means over the views that have such a region; None without one."""
+        return {f"psnr_{name}": fmean(scores) if scores else None for name, scores in self.scores.items()}
+
+    def missing(self) -> dict[str, str]:
+        """Return the reasons why a metric is None."""
+        return {f"psnr_{name}": regions.missing for name, regions in self.regions.items() if regions.missing}
+
+    def found(self) -> dict[str, Region]:
+        """Return the regions for the record of the run."""
+        return {name: Region(one.source, len(one.masks), one.share, one.digest)
+                for name, one in self.regions.items() if one.masks}  # fmt: skip
+
+
+def _large(masks: dict[str, Mask], source: str) -> Regions:
+    """Keep the masks of at least LEAST_PIXELS pixels."""
+    kept = {name: mask for name, mask in masks.items() if mask.sum() >= LEAST_PIXELS}
+    missing = "" if kept else f"no view has a region of {LEAST_PIXELS} pixels"
+    return Regions(kept, source if kept else "", missing)
+
+
+def _by_camera(views: Sequence[View]) -> list[list[View]]:
+    """Group the views by equal cameras and image sizes."""
+    groups: list[list[View]] = []
+    for view in views:
+        group = next((one for one in groups if _same_camera(one[0], view)), None)
+        if group is None:
+            groups.append([view])
+        else:
+            group.append(view)
+    return groups
+
+
+def _same_camera(a: View, b: View) -> bool:
+    one, other = a.camera, b.camera
+    return (one.width, one.height) == (other.width, other.height) and all(
+        bool((x - y).abs().max() <= SAME) for x, y in ((one.viewmat, other.viewmat), (one.K, other.K))
+    )
+
+
+def _sums(view: View) -> npt.NDArray[np.uint16]:
+    """Return the sums of an image of 8 bits over 3 x 3 pixels, [H, W, 3]; a pixel at the border is repeated."""
+    image = (view.image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge").astype(np.uint16)
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    sums: npt.NDArray[np.uint16] = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
+    return sums
+
+
+def _array(values: Tensor | None) -> npt.NDArray[np.uint8]:
+    assert values is not None
+    array: npt.NDArray[np.uint8] = values.cpu().numpy()
+    return array
