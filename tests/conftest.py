@@ -4,9 +4,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import composed
 import pytest
 
 import gsbench  # noqa: F401  before torch: how its threads wait is settled as it loads
+
+composed.keep()
 
 
 @pytest.fixture
