@@ -15,6 +15,16 @@ with contextlib.suppress(ModuleNotFoundError):  # the tests of kernels run witho
     composed.keep()
 
 
+# Files of many seconds and few tests: first, so that at the end no process waits for another's.
+LONGEST = ("test_adding_a_kernel.py", "test_audit.py", "test_adding_a_model.py", "test_command_line.py", "test_stop.py",
+           "test_resume.py", "test_install.py", "test_heap.py", "test_end_to_end.py", "test_changed_data.py")  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts the longest files first."""
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+
+
 @pytest.fixture
 def threads() -> Iterator[None]:
     """Puts the number of threads back."""
