@@ -16,8 +16,17 @@ with contextlib.suppress(ModuleNotFoundError):  # the tests of kernels run witho
 
 
 # Files of many seconds and few tests: first, so that at the end no process waits for another's.
-LONGEST = ("test_adding_a_kernel.py", "test_audit.py", "test_adding_a_model.py", "test_command_line.py", "test_stop.py",
-           "test_resume.py", "test_install.py", "test_heap.py", "test_end_to_end.py", "test_changed_data.py")  # fmt: skip
+LONGEST = (
+    "test_adding_a_kernel.py",
+    "test_audit.py",
+    "test_adding_a_model.py",
+    "test_command_line.py",
+    "test_resume.py",
+    "test_install.py",
+    "test_heap.py",
+    "test_end_to_end.py",
+    "test_changed_data.py",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
