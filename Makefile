@@ -78,9 +78,10 @@ frontier: setup  ## train seven models at five lengths and three capacities, and
 tables: setup  ## write Tables 1 and 2 of the paper from whatever is in results/, and say what is missing
 	$(BIN)/python -m gsbench.report --tables $(RESULTS)
 
-# Two processes, for CI has two cores; a file's tests stay together, since they share trainings.
+# Two processes, for CI has two cores; a file's tests stay together, since they share trainings. In the order
+# of tests/conftest.py: xdist would begin with the files of most tests, which are not the longest.
 test: lint  ## lint, types and all tests but the slow ones
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test-all: $(VENV)/levels-all lint $(VENV)/installed-docs  ## the slow tests too, in every instruction set
 	$(BIN)/python -m pytest -m 'slow or not slow'

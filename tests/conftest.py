@@ -1,5 +1,6 @@
 """Fixtures that every test folder may use."""
 
+import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,6 +8,30 @@ from pathlib import Path
 import pytest
 
 import gsbench  # noqa: F401  before torch: how its threads wait is settled as it loads
+
+with contextlib.suppress(ModuleNotFoundError):  # the tests of kernels run without Hydra too
+    import composed
+
+    composed.keep()
+
+
+# Files of many seconds and few tests: first, so that at the end no process waits for another's.
+LONGEST = (
+    "test_adding_a_kernel.py",
+    "test_audit.py",
+    "test_adding_a_model.py",
+    "test_command_line.py",
+    "test_resume.py",
+    "test_install.py",
+    "test_heap.py",
+    "test_end_to_end.py",
+    "test_changed_data.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts the longest files first."""
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
 
 
 @pytest.fixture

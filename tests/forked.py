@@ -9,11 +9,14 @@ import importlib
 import json
 import os
 import runpy
+import signal
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+
+import composed
 
 ROOT = Path(__file__).resolve().parents[1]
 # One thread: tests share the machine, and the sums of a run are those of its thread count.
@@ -33,6 +36,56 @@ _servers: list[subprocess.Popen[str]] = []  # one, from the first command on; it
 
 def python_m(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a module as a command to its end, in the root of the project and in this process's environment."""
+    with tempfile.TemporaryDirectory() as folder:
+        process = Forked(Path(folder), module, *arguments)
+        return subprocess.CompletedProcess([module, *arguments], process.wait(), process.out, process.err)
+
+
+class Forked:
+    """A module that runs as a command, in the root of the project and in this process's environment."""
+
+    def __init__(self, folder: Path, module: str, *arguments: str) -> None:
+        self.files = folder / "out", folder / "err"
+        self.returncode: int | None = None
+        asked = {
+            "argv": [module, *arguments],
+            "environment": os.environ | ENVIRONMENT,
+            "files": [*map(str, self.files)],
+        }
+        self.pid = _ask(asked)
+        assert self.pid is not None
+
+    @property
+    def out(self) -> str:
+        """What it has written so far."""
+        return self.files[0].read_text()
+
+    @property
+    def err(self) -> str:
+        """What it has written so far to its standard error."""
+        return self.files[1].read_text()
+
+    def poll(self) -> int | None:
+        """Return the exit status, or None while it runs."""
+        if self.returncode is None:
+            self.returncode = _ask({"pid": self.pid, "options": os.WNOHANG})
+        return self.returncode
+
+    def wait(self) -> int:
+        """Wait for the end and return the exit status."""
+        if self.returncode is None:
+            self.returncode = _ask({"pid": self.pid, "options": 0})
+        assert self.returncode is not None
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to it, unless it is known to have ended."""
+        if self.returncode is None:
+            os.kill(self.pid, number)
+
+
+def _ask(asked: dict[str, Any]) -> int | None:
+    """Ask the process that forks, which is started first if there is none."""
     if not _servers:
         _servers.append(
             subprocess.Popen([sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -41,30 +94,39 @@ def python_m(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     (server,) = _servers
     assert server.stdin is not None
     assert server.stdout is not None
-    with tempfile.TemporaryDirectory() as folder:
-        out, err = Path(folder, "out"), Path(folder, "err")
-        asked = {"argv": [module, *arguments], "environment": os.environ | ENVIRONMENT, "files": [str(out), str(err)]}
-        try:
-            print(json.dumps(asked), file=server.stdin, flush=True)
-            answer = server.stdout.readline()
-        except BaseException:  # a test's time is over: the answer to come is not the next command's
-            server.kill()
-            _servers.clear()
-            raise
-        assert answer, "the process that forks has ended"
-        return subprocess.CompletedProcess([module, *arguments], int(answer), out.read_text(), err.read_text())
+    try:
+        print(json.dumps(asked), file=server.stdin, flush=True)
+        answer = server.stdout.readline()
+    except BaseException:  # a test's time is over: the answer to come is not the next command's
+        server.kill()
+        _servers.clear()
+        raise
+    assert answer, "the process that forks has ended"
+    number: int | None = json.loads(answer)
+    return number
 
 
 def serve() -> None:
-    """Fork for each line of the input and answer with the exit status; a fork returns, as a new process would begin."""
+    """Answer each line of the input: with the number of a new fork, or with the exit status of one, None if it runs.
+
+    A fork returns, as a new process would begin.
+    """
     answers = os.fdopen(os.dup(1), "w")
     for line in sys.stdin:
-        child = os.fork()
-        if not child:
-            answers.close()
-            become(json.loads(line))
-            return
-        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), file=answers, flush=True)
+        asked = json.loads(line)
+        answer: int | None
+        if "pid" in asked:
+            pid, status = os.waitpid(asked["pid"], asked["options"])
+            answer = os.waitstatus_to_exitcode(status) if pid else None
+        else:
+            for path in asked["files"]:
+                Path(path).touch()
+            answer = os.fork()
+            if not answer:
+                answers.close()
+                become(asked)
+                return
+        print(json.dumps(answer), file=answers, flush=True)
     os._exit(0)
 
 
@@ -76,12 +138,14 @@ def become(asked: dict[str, Any]) -> None:
     os.environ.clear()
     os.environ.update(asked["environment"])
     sys.argv = asked["argv"]
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
 
 
 if __name__ == "__main__":
     sys.path[0] = str(ROOT)
     for name in IMPORTED:
         importlib.import_module(name)
+    composed.keep()
     gc.freeze()  # a collection would write to, and so copy, every page of what was imported
     serve()
     runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)

@@ -34,6 +34,9 @@ def methods_for_gates() -> str:
 # An editable install finds gsbench by a hook that goes before PYTHONPATH; the copy is what is to be run.
 START = (
     "import runpy, sys\n"
+    f"sys.path.append({os.fspath(ROOT / 'tests')!r})\n"
+    "import composed\n"
+    "composed.keep()\n"
     "sys.meta_path[:] = [finder for finder in sys.meta_path if 'Redirecting' not in type(finder).__name__]\n"
     "runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
 )
@@ -44,7 +47,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the project with the page's two files; `gated_balls`, which have the page's two methods for gates, and
     `blinks`, which are balls that are said to observe time."""
     project = tmp_path_factory.mktemp("project")
-    shutil.copytree(ROOT / "gsbench", project / "gsbench", ignore=shutil.ignore_patterns("__pycache__", "moving-matte"))
+    shutil.copytree(ROOT / "gsbench", project / "gsbench", ignore=shutil.ignore_patterns("moving-matte"))
     shutil.copytree(ROOT / "conf", project / "conf")
     for path, text in blocks().items():
         (project / path).write_text(text)

@@ -29,12 +29,13 @@ def gradient(function: Function, at: Sequence[float], weights: Sequence[float], 
     """
     with mp.workdps(DIGITS):
         x = [mpf(v) for v in at]
+        w = [mpf(v) for v in weights]
         out = []
         for i, value in enumerate(x[:first]):
             sides = []
             for moved in (value + STEP, value - STEP):
                 x[i] = moved
-                sides.append(mp.fdot(map(mpf, weights), function(x)))
+                sides.append(mp.fdot(w, function(x)))
             x[i] = value
             out.append((sides[0] - sides[1]) / (2 * STEP))
         return out
@@ -73,7 +74,8 @@ def slice_triangular(x: Vector, layout: dict[str, int], order: str, half: float,
         for j in range(i):
             in_space = (order[i] == "p") + (order[j] == "p")
             L[i][j] = next(kinds[in_space]) * (L[i][i] if relative and in_space == 2 else 1)
-    S = [[mp.fdot(L[i][: min(i, j) + 1], L[j][: min(i, j) + 1]) for j in range(n)] for i in range(n)]
+    lower = [[mp.fdot(L[i][: j + 1], L[j]) for j in range(i + 1)] for i in range(n)]
+    S = [[lower[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
     p, d, t = ([i for i in range(n) if order[i] == name] for name in "pdt")
     direction = unit([m - mpf(c) for m, c in zip(raw["means"], center, strict=True)])
     delta = [a - b for a, b in zip(direction, raw["directions"], strict=True)]
@@ -111,7 +113,7 @@ def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vecto
     Here p are the rows of position, q those of time and direction, and delta is the given q minus mu_q.
     """
     S_pq = _block(S, p, q)
-    K = [_solve(_block(S, q, q), row) for row in S_pq]
+    K = _solve(_block(S, q, q), S_pq)
     moved = [m + mp.fdot(k, delta) for m, k in zip(mean, K, strict=True)]
     return moved, [S[p[i]][p[j]] - mp.fdot(K[i], S_pq[j]) for i in range(3) for j in range(3)]
 
@@ -144,9 +146,10 @@ def alphas(x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[f
     J = [[fx / pz, mpf(0), -fx * tangents[0] / pz], [mpf(0), fy / pz, -fy * tangents[1] / pz]]
     M = [[mp.fsum(J[a][b] * W[b][c] * F[c][e] for b in range(3) for c in range(3)) for e in range(3)] for a in range(2)]
     xx, xy, yy = (mp.fdot(M[a], M[b]) + (mpf(eps2d) if a == b else 0) for a, b in ((0, 0), (0, 1), (1, 1)))
-    determinant = xx * yy - xy * xy
-    powers = (((i - u) ** 2 * yy - 2 * (i - u) * (j - v) * xy + (j - v) ** 2 * xx) / determinant / 2 for i, j in pixels)
-    return [opacity * mp.exp(-power) for power in powers]
+    twice = 2 * (xx * yy - xy * xy)
+    a, b, c = yy / twice, -2 * xy / twice, xx / twice
+    offsets = ((i - u, j - v) for i, j in pixels)
+    return [opacity * mp.exp(-(dx * (a * dx + b * dy) + c * dy * dy)) for dx, dy in offsets]
 
 
 # ---- colours
@@ -231,21 +234,24 @@ def _block(S: Matrix, rows: list[int], columns: list[int]) -> Matrix:
 
 
 def _mahalanobis(S: Matrix, delta: Vector) -> Any:
-    return mp.fdot(delta, _solve(S, delta))
+    return mp.fdot(delta, _solve(S, [delta])[0])
 
 
-def _solve(A: Matrix, b: Vector) -> Vector:
-    """Solve A x = b by Gaussian elimination, for a positive definite matrix A.
+def _solve(A: Matrix, B: Matrix) -> Matrix:
+    """Solve A x = b by Gaussian elimination for each row b of B, for a positive definite matrix A; return the rows x.
 
     No pivoting is needed, because the arithmetic has many digits.
     """
-    n = len(b)
-    rows = [[*row, value] for row, value in zip(A, b, strict=True)]
+    n = len(A)
+    rows = [[*row, *(b[i] for b in B)] for i, row in enumerate(A)]
     for i in range(n):
         for k in range(i + 1, n):
             factor = rows[k][i] / rows[i][i]
-            rows[k] = [x - factor * y for x, y in zip(rows[k], rows[i], strict=True)]
-    x: Vector = [mpf(0)] * n
-    for i in reversed(range(n)):
-        x[i] = (rows[i][n] - mp.fdot(rows[i][i + 1 : n], x[i + 1 :])) / rows[i][i]
-    return x
+            rows[k][i + 1 :] = [x - factor * y for x, y in zip(rows[k][i + 1 :], rows[i][i + 1 :], strict=True)]
+    found: Matrix = []
+    for column in range(n, n + len(B)):
+        x: Vector = [mpf(0)] * n
+        for i in reversed(range(n)):
+            x[i] = (rows[i][column] - mp.fdot(rows[i][i + 1 : n], x[i + 1 :])) / rows[i][i]
+        found.append(x)
+    return found

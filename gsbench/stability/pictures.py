@@ -77,13 +77,16 @@ def alone(arguments: Arguments) -> ImageTruth:
         return none, none, none[..., 0] == 0, {k: torch.zeros_like(arguments[k]).double() for k in brute.DIFFERENTIABLE}
     function = partial(
         oracle.alphas, viewmat=arguments["viewmats"][0].tolist(), K=arguments["Ks"][0].tolist(), size=size,
-        pixels=pixels, eps2d=float(torch.tensor(EPS2D)),
+        eps2d=float(torch.tensor(EPS2D)),
     )  # fmt: skip
-    free = torch.tensor([float(v) for v in oracle.evaluate(function, x)], dtype=torch.float64).view(shape)
+    seen = oracle.evaluate(partial(function, pixels=pixels), x)
+    free = torch.tensor([float(v) for v in seen], dtype=torch.float64).view(shape)
     decided = ((free / ALPHA_MIN - 1).abs() > UNDECIDED)[..., 0]
     shown = torch.where(free >= ALPHA_MIN, free, 0.0)
     weight = sum(weights(arguments)) * decided[..., None] * (shown > 0)
-    gradient = torch.tensor([float(v) for v in oracle.gradient(function, x, weight.flatten().tolist())])
+    counted = [(pixel, w) for pixel, w in zip(pixels, weight.flatten().tolist(), strict=True) if w]
+    loss = partial(function, pixels=[pixel for pixel, _ in counted])
+    gradient = torch.tensor([float(v) for v in oracle.gradient(loss, x, [w for _, w in counted])])
     gradients = {name: part.view_as(arguments[name]).double() for name, part in
                  zip(("means", "factors", "opacities"), gradient.split([3, 9, 1]), strict=True)}  # fmt: skip
     image_weight = weights(arguments)[0] * decided[..., None]

@@ -1,6 +1,8 @@
 // The scheduler of cuda_shim.h, and sort.h by the standard library.
+#undef _FORTIFY_SOURCE  // it takes a jump to another stack for a mistake
 #include "cuda_shim.h"
 
+#include <setjmp.h>
 #include <ucontext.h>
 
 #include <algorithm>
@@ -35,10 +37,29 @@ namespace {
 constexpr size_t STACK = 256 * 1024;
 enum class State { ready, at_warp, at_barrier, done };
 
+// Where a fiber or the scheduler goes on. Jumps cost no system call, as swapcontext does; sanitizers follow it alone.
+#if defined(__SANITIZE_ADDRESS__) || defined(GSB_SHIM_RACES)
+struct Place {
+    ucontext_t context;
+};
+void go(Place& from, Place& to) { swapcontext(&from.context, &to.context); }
+#else
+struct Place {
+    ucontext_t context;  // where it begins
+    jmp_buf left;
+    bool begun = true;
+};
+[[gnu::noinline]] void go(Place& from, Place& to) {
+    if (_setjmp(from.left)) return;
+    if (to.begun) _longjmp(to.left, 1);
+    to.begun = true;
+    setcontext(&to.context);
+}
+#endif
+
 struct Fiber {
     Thread thread;
-    ucontext_t context;
-    std::unique_ptr<char[]> stack{new char[STACK]};
+    Place place;
     State state = State::ready;
     uint32_t given = 0;
     unsigned block_syncs = 0, warp_syncs = 0;  // that it took part in
@@ -59,11 +80,12 @@ struct Block {
     Meetings met;
     std::vector<Meetings> warps_met;
     char begun, ended;
-    ucontext_t scheduler;
+    Place scheduler;
     void* sanitized = __tsan_get_current_fiber();
     const std::function<void()>* body = nullptr;
 };
 Block* block = nullptr;
+std::vector<std::unique_ptr<char[]>> stacks;  // of the fibers, kept for the next kernel
 constexpr unsigned UNORDERED = 1;  // switching alone makes nothing known: what races on a GPU, races here
 
 Fiber& current() { return block->fibers[thread->number]; }
@@ -72,7 +94,7 @@ void wait(State state) {
     Fiber& fiber = current();
     fiber.state = state;
     __tsan_switch_to_fiber(block->sanitized, UNORDERED);
-    swapcontext(&fiber.context, &block->scheduler);
+    go(fiber.place, block->scheduler);
 }
 
 void enter() {
@@ -80,8 +102,7 @@ void enter() {
     __tsan_acquire(&block->ended);  // blocks are taken to run one after the other
     (*block->body)();
     __tsan_release(&block->ended);
-    current().state = State::done;
-    __tsan_switch_to_fiber(block->sanitized, UNORDERED);
+    wait(State::done);
 }
 
 // Lets fibers [begin, end) go on if all that live wait in `state`. Returns whether any does.
@@ -111,7 +132,7 @@ void run_block() {
             if (fiber.state != State::ready) continue;
             thread = &fiber.thread;
             __tsan_switch_to_fiber(fiber.sanitized, UNORDERED);
-            swapcontext(&block->scheduler, &fiber.context);
+            go(block->scheduler, fiber.place);
         }
         bool progress = false;
         for (size_t warp = 0; warp < count; warp += 32) {
@@ -151,6 +172,7 @@ const uint32_t* exchange(uint32_t mine) {
 void run(dim3 grid, dim3 size, const std::function<void()>& body) {
     Block b;
     b.fibers = std::vector<Fiber>(size_t{size.x} * size.y * size.z);
+    while (stacks.size() < b.fibers.size()) stacks.emplace_back(new char[STACK]);
     b.exchanged.resize((b.fibers.size() + 31) / 32);
     b.warps_met.resize(b.exchanged.size());
     b.body = &body;
@@ -164,11 +186,15 @@ void run(dim3 grid, dim3 size, const std::function<void()>& body) {
             Fiber& fiber = b.fibers[n];
             fiber.thread = {{n % size.x, n / size.x % size.y, n / (size.x * size.y)}, n};
             fiber.state = State::ready;
-            getcontext(&fiber.context);
-            fiber.context.uc_stack.ss_sp = fiber.stack.get();
-            fiber.context.uc_stack.ss_size = STACK;
-            fiber.context.uc_link = &b.scheduler;
-            makecontext(&fiber.context, enter, 0);
+            ucontext_t& context = fiber.place.context;
+            getcontext(&context);
+            context.uc_stack.ss_sp = stacks[n].get();
+            context.uc_stack.ss_size = STACK;
+            context.uc_link = nullptr;
+            makecontext(&context, enter, 0);
+#if !defined(__SANITIZE_ADDRESS__) && !defined(GSB_SHIM_RACES)
+            fiber.place.begun = false;
+#endif
         }
         run_block();
     }

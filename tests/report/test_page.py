@@ -83,12 +83,17 @@ def page(records, tmp_path):
 SMALL = {"models": ("3dgs", "4dgs"), "scenes": ("suzanne",), "seeds": 2, "lengths": (1000,)}
 
 
+@pytest.fixture(scope="module")
+def small_page(tmp_path_factory):
+    return Page(page(frontier(**SMALL), tmp_path_factory.mktemp("small")))
+
+
 def lost(record):
     gone = {"metrics": None, "missing": {}, "cost": None, "per_view": [], "curve": []}
     return dataclasses.replace(record, status="failed", reason="out of memory", **gone)
 
 
-def test_the_first_screen_answers(tmp_path):
+def test_the_first_screen_answers(small_page):
     """Catches answers over the budget, without an interval, or from another model than the best that fits."""
     records = frontier()
     ten, minute, _, frames = answers(records)
@@ -98,7 +103,7 @@ def test_the_first_screen_answers(tmp_path):
     assert re.fullmatch(r"95 % [\d.]+ to [\d.]+ over seeds", minute.interval)
     assert "2,000 iterations" in minute.detail
     assert frames.budget == "60 frames a second"
-    text = Page(page(frontier(**SMALL), tmp_path)).text
+    text = small_page.text
     assert text.index("10 s of training") < text.index("What accuracy costs")
 
 
@@ -327,14 +332,14 @@ def test_a_point_names_its_run_and_its_command():
     assert messages.command([make()]) == ""
 
 
-def test_hostile_texts_stay_text(tmp_path):
+def test_hostile_texts_stay_text(small_page, tmp_path):
     """Catches markup, quotes, directions and length from a record that reach the page as anything but text."""
     text = page(hostile(), tmp_path)
     seen = Page(text)
     assert "alert(1)" in seen.text
     assert len(text) < 2_000_000
     assert not [name for name, _ in seen.attributes if name.startswith("on")]
-    assert seen.tags.count("script") == Page(page(frontier(**SMALL), tmp_path)).tags.count("script")
+    assert seen.tags.count("script") == small_page.tags.count("script")
     assert "x" * 800 not in seen.text
     assert "\u202e" not in text
     runs = re.search(r'id="runs">(.*?)</script>', text, re.S)[1]

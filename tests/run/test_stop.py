@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tiny_run import ROOT, command, environment, gsbench, overrides, write_moving_square
+from forked import Forked
+from tiny_run import gsbench, overrides, write_moving_square
 
 from gsbench.errors import InputError
 from gsbench.measure.atomic import HOST
@@ -24,15 +25,12 @@ def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
-def started(*arguments: str, results: Path) -> subprocess.Popen[str]:
-    """A run in a process of its own, once it trains."""
-    process = subprocess.Popen(
-        command(*arguments), cwd=ROOT, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests in the background ignore it
-    )  # fmt: skip
+def started(*arguments: str, results: Path, folder: Path) -> Forked:
+    """A run in a process of its own, once it trains; what it says goes to files in a folder."""
+    process = Forked(folder, "gsbench", *arguments)
     deadline = time.monotonic() + 120
     while not trains(results, process.pid) and time.monotonic() < deadline:
-        assert process.poll() is None, process.communicate()
+        assert process.poll() is None, process.err
         time.sleep(0.02)
     return process
 
@@ -48,31 +46,34 @@ def trains(results: Path, pid: int) -> bool:
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_saves_and_ends_in_one_line(number: signal.Signals, code: int, square: Path, tmp_path: Path) -> None:
     """Catches the minutes since the last checkpoint lost, a stack trace, and a run that looks as if it still ran."""
-    process = started(*overrides(square, tmp_path, *LONG), results=tmp_path)
+    results = tmp_path / "results"
+    process = started(*overrides(square, results, *LONG), results=results, folder=tmp_path)
     process.send_signal(number)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == code, said
+    assert process.wait() == code, process.err
+    said = process.err
     assert "Traceback" not in said
     found = re.search(r"stopped at step (\d+), saved in (.*): the same command continues from there", said)
     assert found, said
     assert checkpoint.read(Path(found[2])).state["step"] == int(found[1])
-    assert not list(tmp_path.rglob(progress.FILE_NAME))
-    assert not list(tmp_path.rglob("*.tmp"))
+    assert not list(results.rglob(progress.FILE_NAME))
+    assert not list(results.rglob("*.tmp"))
 
 
 def test_a_run_that_another_process_does_is_left_to_it(square: Path, tmp_path: Path) -> None:
     """Catches two sweeps on one folder that train the same run twice, and a dead process that is waited for."""
-    process = started(*overrides(square, tmp_path, *LONG), results=tmp_path)
-    second = gsbench(*overrides(square, tmp_path, *LONG))
+    results = tmp_path / "results"
+    process = started(*overrides(square, results, *LONG), results=results, folder=tmp_path)
+    second = gsbench(*overrides(square, results, *LONG))
     assert second.returncode == 0, second.stderr
     assert f"left to process {process.pid}" in second.stderr
-    process.kill()
+    process.send_signal(signal.SIGKILL)
     process.wait()
-    (path,) = tmp_path.rglob(progress.FILE_NAME)
+    (path,) = results.rglob(progress.FILE_NAME)
     assert not progress.is_alive(progress.read(path))
-    third = started(*overrides(square, tmp_path, *LONG), results=tmp_path)
+    third = started(*overrides(square, results, *LONG), results=results, folder=tmp_path)
     assert progress.read(path).pid == third.pid
-    third.kill()
+    third.send_signal(signal.SIGKILL)
+    third.wait()
 
 
 def test_the_handler_of_before_acts_once_the_run_has_saved() -> None:

@@ -5,13 +5,13 @@ import os
 import pickle
 import shutil
 import signal
-import subprocess
 import time
 from pathlib import Path
 
 import pytest
 import torch
-from tiny_run import ROOT, command, environment, gsbench, overrides, run_here, write_moving_square
+from forked import Forked
+from tiny_run import gsbench, overrides, run_here, write_moving_square
 
 from gsbench.errors import InputError
 from gsbench.measure import record
@@ -80,10 +80,7 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, whole:
 
     killed_at = []
     for _ in range(2):
-        process = subprocess.Popen(
-            command(*overrides(square, tmp_path / "broken", *RUN)),
-            cwd=ROOT, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+        process = Forked(tmp_path, "gsbench", *overrides(square, tmp_path / "broken", *RUN))
         start = killed_at[-1] if killed_at else 0
         deadline = time.monotonic() + 120
         step = start
@@ -92,7 +89,7 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, whole:
             time.sleep(0.01)
             found = list((tmp_path / "broken").rglob(checkpoint.FILE_NAME))
             step = checkpoint.read(found[0]).state["step"] if found else 0
-        os.kill(process.pid, signal.SIGKILL)
+        process.send_signal(signal.SIGKILL)
         process.wait()
         killed_at.append(step)
         spent = final_state(tmp_path / "broken")["effort"]["cpu_s"]

@@ -1,5 +1,6 @@
 """Build the HTML report of a folder of run records: collect its sections, render the template, write report.html."""
 
+import functools
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -83,15 +84,7 @@ def render(
     chapters = [_chapter(group, folder, canvas) for group, canvas in zip(found, canvases, strict=True)]
     for group, chapter in zip(found, chapters, strict=True):
         chapter.sections[-1:-1] = [other.against_section(against, group)] if against else []
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader(__package__, "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"safe_svg": Markup, "shorten": messages.shorten, "asdict": asdict}
-    return environment.get_template("page.html.j2").render(
+    return _template().render(
         title=messages.shorten(folder.resolve().name, 80) or "results",
         chapters=chapters,
         runs=runs.entries,
@@ -104,6 +97,20 @@ def render(
         js=_own("page.js"),
         marker=lambda style: Markup(marker(style.marker, style.colour)),
     )
+
+
+@functools.cache
+def _template() -> jinja2.Template:
+    """Return the report's template, compiled once in a process."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader(__package__, "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"safe_svg": Markup, "shorten": messages.shorten, "asdict": asdict}
+    return environment.get_template("page.html.j2")
 
 
 def _own(name: str) -> Markup:
