@@ -63,7 +63,7 @@ class Backbone:
 
     @property
     def trunk_sha256(self) -> tuple[str, ...]:
-        """Return the SHA-256 (or their first digits) of the weight files that are accepted for this backbone."""
+        """Return the SHA-256 (or its first digits) of each weight file that is accepted for this backbone."""
         return (Path(self.file).stem.rsplit("-", 1)[1], *self.other_sha256)
 
 

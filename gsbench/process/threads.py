@@ -13,7 +13,7 @@ RUNTIME = "libgomp.so.1"
 
 
 def sleep_when_idle() -> None:
-    """Make idle OpenMP threads sleep, before or after torch is imported, unless the environment sets a policy.
+    """Make idle OpenMP threads sleep, before or after torch is imported, unless the environment sets OMP_WAIT_POLICY.
 
     If libgomp is already loaded, its idle threads spin for 300,000 rounds, but only for 100 rounds while there are more
     OpenMP threads than processors (libgomp manual, GOMP_SPINCOUNT). In this case the function starts more threads than

@@ -57,7 +57,7 @@ class Configuration:
 
     @property
     def on_demand(self) -> bool:
-        """Tell whether a run chose the effects of its Gaussians automatically, so that some Gaussians may lack some.
+        """Tell whether a run chose the effects of its Gaussians automatically, so that some Gaussians may lack effects.
 
         The effects are time, view direction and the network AGR.
         """
@@ -119,8 +119,8 @@ class Group:
     def series(self) -> list[str]:
         """Return the names of the report's curves.
 
-        Each model has one curve. Its runs from which effects (time, view direction, the network AGR) were removed
-        have another one.
+        Each model has one curve. If effects (time, view direction, the network AGR) were removed from Gaussians in some
+        of its runs, these runs have a second curve.
         """
         return sorted({self.series_of(r) for r in self.records})
 
@@ -194,13 +194,13 @@ class Group:
 
     @cached_property
     def elsewhere(self) -> int:
-        """Return the number of finished runs that were made on another machine than most runs."""
+        """Return the number of finished runs that were not made on the machine of most runs."""
         return sum(r.provenance.machine != self.machine for r in self.finished)
 
     def value(self, record: Record, quantity: str) -> float:
         """Read a quantity, such as PSNR, from a run's record; NaN if it is missing.
 
-        A time is also NaN if it was measured on another machine than the one that most runs used.
+        A time is also NaN if it was not measured on the machine that most runs used.
         """
         if quantity in OF_THE_MACHINE and record.provenance.machine != self.machine:
             return math.nan

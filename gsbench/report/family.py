@@ -13,7 +13,7 @@ Key = tuple[tuple[str, str, float], ...]
 
 @dataclass(frozen=True)
 class Tested:
-    """The estimated difference between models, and its p-value after adjustment for all comparisons of the report."""
+    """An estimated difference between models, and its p-value after adjustment for all comparisons of the report."""
 
     difference: Estimate
     p: float  # adjusted with Holm's method for all comparisons; NaN if the spread is not known

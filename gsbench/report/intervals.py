@@ -37,7 +37,7 @@ class Spread:
     freedom: float
 
     def half_width(self, level: float) -> float:
-        """Return half the width of the confidence interval that this variance gives by itself, with Student's t."""
+        """Return half the width of the confidence interval that follows from this variance alone, with Student's t."""
         if self.variance <= 0:
             return 0.0
         return float(special.stdtrit(self.freedom, (1 + level) / 2)) * math.sqrt(self.variance)
@@ -56,17 +56,17 @@ class Estimate:
 
     @cached_property
     def half(self) -> float:
-        """Return half the width of the 95 % interval, or NaN if there is no interval."""
+        """Return half the width of the mean's 95 % interval, or NaN if there is no interval."""
         return self._half(LEVEL) if self.over else math.nan
 
     @property
     def low(self) -> float:
-        """Return the lower end of the 95 % interval."""
+        """Return the lower end of the mean's 95 % interval."""
         return self.mean - self.half
 
     @property
     def high(self) -> float:
-        """Return the upper end of the 95 % interval."""
+        """Return the upper end of the mean's 95 % interval."""
         return self.mean + self.half
 
     @cached_property

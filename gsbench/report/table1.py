@@ -76,7 +76,7 @@ def missing(dataset: str, records: list[Record]) -> str:
 
 
 def _left_out(pools: list[str]) -> list[str]:
-    """Return a footnote that names the runs which appear in no table; an empty list if there are none."""
+    """List a footnote that names the runs which appear in no table; the list is empty if there are none."""
     if not pools:
         return []
     shown = "; ".join(map(printable, pools[:5])) + (f"; and {len(pools) - 5} more" if len(pools) > 5 else "")

@@ -59,10 +59,10 @@ def release(folder: Path, mine: Progress) -> None:
 
 
 def _read(path: Path) -> Progress | str:
-    """Read a claim; return NOTHING if there is none, or DAMAGED if it cannot be read three times.
+    """Read a claim; return NOTHING if there is none, or DAMAGED if three attempts to read it fail.
 
-    Without file locks, another process may create the claim during the first read, so that the first failure proves
-    nothing.
+    Without file locks, another process may be writing the claim while it is read. Therefore one failure does not prove
+    that the claim is damaged.
     """
     for _ in range(3):
         try:

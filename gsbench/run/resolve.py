@@ -52,7 +52,7 @@ class Resolved:
 
 
 def before_scene(config: Config) -> Config:
-    """Return settings that can be checked before the scene is loaded: model=auto becomes its candidate with time."""
+    """Return settings to check before the scene is loaded: model=auto is replaced by its candidate with time."""
     return with_candidate(config, "moving") if is_auto(config) else config
 
 

@@ -69,7 +69,7 @@ def _sentence(one: Decided) -> str:
 
 
 def _screen_words(runs: list[Record]) -> str:
-    """Say whether the model depends on time, why the first run decided so, and whether other seeds agree."""
+    """Say whether the model depends on time, why the first run decided so, and if other seeds gave the same result."""
     screens = _screens(runs)
     if not screens:
         return ""
@@ -121,7 +121,7 @@ def _change(of: Estimate, unit: str, digits: int) -> str:
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
-    """List notes on the removal of time, direction and AGR (a network): what was undecided, what the numbers leave out.
+    """List notes on removing time, direction and AGR (a network): open decisions, and what the numbers leave out.
 
     Equal notes of several seeds are merged.
     """
