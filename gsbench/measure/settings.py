@@ -48,7 +48,7 @@ def training_part(plain: Plain) -> Plain:
 
 
 def training_hash(plain: Plain) -> str:
-    """Return the SHA-256 of all settings that change the training; a run can resume from a checkpoint with equal hash."""
+    """Return the SHA-256 of all settings that change the training; a checkpoint with an equal hash can be resumed."""
     return config_hash({old_key(key): value for key, value in given(training_part(plain)).items()})
 
 

@@ -133,7 +133,8 @@ def cube(group: Group, family: Family) -> Cube:
     AGR is the neural refinement of Gaussians. The gain of an effect is the difference of two models that differ only in
     this effect. It is computed with each of the other two effects on or off, which gives 12 differences. The
     interaction of two effects is the difference of two such gains, which gives 6 interactions. The interaction of all
-    three effects is the difference of two interactions. An effect's mean over the other effects needs all eight models.
+    three effects is the difference of two interactions. The mean gain of an effect over all on/off states of the other
+    two effects needs all eight models.
 
     Args:
         group: the run records of one experiment.

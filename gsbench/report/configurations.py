@@ -127,10 +127,10 @@ class Group:
     def series_of(self, record: Record) -> str:
         """Return the name of the report's curve that a run belongs to.
 
-        Runs of a model with different training lengths and sizes share a curve. The setting `effects.gate` says when
-        effects (time, view direction, the network AGR) are removed from Gaussians that do not need them. Runs whose
-        setting differs from the model's default have a curve of their own, unless all runs of the group have the same
-        setting.
+        Runs of a model that differ only in other settings, such as the training length, share a curve. The setting
+        `effects.gate` says when effects (time, view direction, the network AGR) are removed from Gaussians that do not
+        need them. Runs whose setting differs from the model's default have a curve of their own, unless all runs of the
+        group have the same setting.
         """
         own = gating(record)
         return f"{record.model}, {own}" if own and len(self._gatings) > 1 else record.model
@@ -180,8 +180,8 @@ class Group:
     def basis(self) -> list[str]:
         """Return the scenes over which the report averages its conclusions.
 
-        These are the scenes that every model finished. If there is no such scene, it is the one scene that most models
-        and settings finished.
+        These are the scenes that every model finished. If there is no such scene, the report uses the one scene that
+        most models and settings finished.
         """
         if self.covered or not self.configurations:
             return self.covered

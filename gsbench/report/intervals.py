@@ -1,4 +1,4 @@
-"""Estimate a mean over scenes, seeds and views, with a 95 % confidence interval that is valid from three seeds on.
+"""Estimate a mean over scenes, seeds and views, with a 95 % interval that is valid for three or more seeds.
 
 With three seeds, the interval of a percentile bootstrap is much too narrow. First, resampling three values gives only
 two thirds of their variance. Second, its quantiles are those of a normal distribution (about 2 standard errors), while
@@ -6,12 +6,12 @@ Student's t needs 4.3 for three values. This module therefore estimates the vari
 separately, and applies Student's t to each. The simulations are in docs/statistics.md.
 
 - With three or more scenes, the means of the scenes are a sample of similar scenes. Their variance includes that of
-  seeds and views. Student's t with (scenes - 1) degrees of freedom is exact if these means are normal.
-- With one or two scenes, the interval does not hold for other scenes. All seeds see the same views, so seeds and views
-  are crossed factors. Each factor has a half width by Student's t, and the squares of the half widths are added (MOVER:
-  Zou and Donner 2008). The residual variance is contained in both factors, so it is subtracted once from that of the
-  seeds. The interval is never narrower than that of the seeds alone.
-- With one seed, there is no interval, because the variance over seeds is not known.
+seeds and views. Student's t with (scenes - 1) degrees of freedom is exact if these means are normal. - With one or two
+scenes, the interval does not hold for other scenes. All seeds see the same views, so seeds and views are crossed
+factors. Each factor has a half width by Student's t, and the squares of the half widths are added (MOVER: Zou and
+Donner 2008). The residual variance is contained in both factors, so it is subtracted once from the variance over seeds.
+The interval is never narrower than that of the seeds alone. - With one seed, there is no interval, because the variance
+over seeds is not known.
 """
 
 import math
