@@ -105,7 +105,7 @@ def _published(experiment: str) -> str:
 
 
 def _trunk(backbone: str) -> Source:
-    """Return the source of the AlexNet or VGG16 weights for LPIPS; their folder is that of torch's downloads."""
+    """Return the source of the AlexNet or VGG16 weights for LPIPS; their folder is torch's download folder."""
     import torch  # it takes two seconds to load
 
     from gsbench.measure.perceptual import BACKBONES

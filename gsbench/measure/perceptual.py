@@ -1,9 +1,9 @@
 """Compute LPIPS 0.1, the distance between the features of two images in a pretrained network (Zhang et al. 2018).
 
-LPIPS multiplies the features of a backbone (AlexNet or VGG16) by the learned weights of linear layers. With the same
-backbone weights, results are bit-equal to those of the lpips package. That package is not imported, because it needs
-torchvision and does not verify weights; only its linear layers are read from its files. The backbone's weights come
-from a file whose SHA-256 is checked.
+LPIPS multiplies squared differences of the features of a backbone (AlexNet or VGG16) by the learned weights of linear
+layers. With the same backbone weights, results are bit-equal to those of the lpips package. That package is not
+imported, because it needs torchvision and does not verify weights; only its linear layers are read from its files. The
+backbone's weights come from a file whose SHA-256 is checked.
 """
 
 import hashlib

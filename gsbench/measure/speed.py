@@ -35,7 +35,7 @@ class RenderTimes:
 
         A frame is computed from a camera and a time, including slicing (conditioning on time and direction) and AGR,
         the neural refinement. The device is synchronised before and after each frame, and warm-up frames do not count.
-        Frames go through the evaluated views in turn.
+        The evaluated views are rendered in turn.
         """
         return 1000.0 / self.p50
 
@@ -212,7 +212,7 @@ class Effort:
     """Sums the CPU-seconds of this process in the blocks `with effort: ...`, and averages the load of the machine.
 
     Both values show whether the machine did other work: the load counts the running and waiting processes of the whole
-    machine, and CPU-seconds do not grow while another process runs. An unknown value is None.
+    machine, and CPU-seconds do not grow while this process waits for a processor. An unknown value is None.
     """
 
     def __init__(self) -> None:

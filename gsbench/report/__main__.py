@@ -65,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _compared(records: list[Record], folder: Path, other: Path) -> Comparison:
-    """Compare the records of one folder with those of another, and print which of the other records cannot be read."""
+    """Compare the records of two folders, and print which records of the second folder cannot be read."""
     theirs, faults = tables.load(other)
     for fault in faults:
         print(f"gsbench.report: left out: {fault}", file=sys.stderr)

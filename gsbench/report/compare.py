@@ -215,7 +215,7 @@ def _given(name: str, held: list[int], values: tuple[bool, ...]) -> str:
 def _weights(
     varied: tuple[int, ...], held: list[int], given: list[tuple[bool, ...]], share: float
 ) -> dict[Cell, float]:
-    """Return the weights of models, so that the weighted sum of their results is an effect or an interaction.
+    """Return weights of models whose weighted sum of results is the gain of an effect or an interaction of effects.
 
     For the effect of time alone, the model with time has weight 1 and the model without any effect has weight -1.
 

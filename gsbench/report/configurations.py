@@ -127,10 +127,10 @@ class Group:
     def series_of(self, record: Record) -> str:
         """Return the name of the report's curve that a run belongs to.
 
-        Runs of a model that differ only in other settings, such as the training length, share a curve. The setting
-        `effects.gate` says when effects (time, view direction, the network AGR) are removed from Gaussians that do not
-        need them. Runs whose setting differs from the model's default have a curve of their own, unless all runs of the
-        group have the same setting.
+        All runs of a model share one curve, with one exception: the setting `effects.gate`. It says when effects (time,
+        view direction, the network AGR) are removed from Gaussians that do not need them. Runs with a value of
+        `effects.gate` that is not the model's default have their own curve, unless all runs of the group have the same
+        value.
         """
         own = gating(record)
         return f"{record.model}, {own}" if own and len(self._gatings) > 1 else record.model

@@ -38,7 +38,8 @@ class Family:
         Args:
             group: the run records of one experiment.
             asked: for each quantity, the differences to test. A difference is a weighted sum of models' results, such
-                as one minus another. If a difference is given twice, or with the opposite sign, it counts once.
+                as the result of one model minus that of another. If a difference is given twice, or with the opposite
+                sign, it counts once.
         """
         self._found = {quantity: _tested(group, quantity, contrasts) for quantity, contrasts in asked.items()}
 

@@ -101,7 +101,7 @@ def _ends(gates: list[Gate]) -> bool:
 
 
 def _rows(gates: list[Gate], name: str) -> int:
-    """Count the Gaussians that have a certain set of effects at the end, such as time without view direction.
+    """Count the Gaussians that keep a certain set of effects to the end of a run, such as time without direction.
 
     For the name "removed", count all Gaussians that were removed.
     """

@@ -186,7 +186,7 @@ def _signed(column: QuantityColumn, difference: float) -> str:
 
 
 def _with_best(rows: list[Row]) -> list[Row]:
-    """Mark the measured rows that have the highest final PSNR after rounding as in the table."""
+    """Mark the measured rows whose final PSNR, rounded as the table shows it, is the highest."""
     shown = {row.cells["psnr"].partition(" ")[0] for row in rows if row.seeds} - {EMPTY}
     best = max(shown, key=float, default=None)
     return [

@@ -19,8 +19,8 @@ from gsbench.train.checkpoint import Checkpoint
 def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
     """Remove time, direction or AGR (a network) from a finished run's Gaussians that do not need them.
 
-    `effects.gate=end` does the same at the end of a training. This function may also remove only one of time and
-    direction from a Gaussian. Return the record and the folder of the new run.
+    The setting `effects.gate=end` does the same at the end of a training, but it never removes only one of time and
+    direction from a Gaussian. This function may do that. Return the record and the folder of the new run.
 
     Args:
         folder: the folder of the finished run, which is not changed.

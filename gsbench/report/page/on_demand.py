@@ -186,7 +186,7 @@ def _mean_degree(one: Decided) -> str:
 
 
 def _swatches() -> list[Swatch]:
-    """Return the legend of the colours for what Gaussians depend on, such as "static", and for SH degrees."""
+    """Return the colour legend: what Gaussians depend on, such as "static", and the degrees of their SH."""
     effect_sets = [Swatch(said, f"model-{MODELS.index(EFFECT_SET_LIKE[name])}") for name, said in EFFECT_SETS.items()]
     degrees = [Swatch(f"degree {i}", f"stage-{_stage(i)}") for i in range(DEGREES)]
     return [*effect_sets, Swatch(NAMES[REMOVED], "line"), *degrees]
