@@ -92,7 +92,7 @@ def fetch(source: Source) -> str:
 
 
 def scenes(found: dict[Path, list[str]]) -> str:
-    """Return a text that says which `data.root` setting belongs to which downloaded scenes."""
+    """Return a text that lists the folders of downloaded scenes, as values of `data.root`, with their scene names."""
     if not found:
         return "no scene with a transforms_train.json is in it"
     return printable("; ".join(f"data.root={root} has {', '.join(names)}" for root, names in found.items()))

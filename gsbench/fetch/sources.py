@@ -36,7 +36,7 @@ class Source:
         return self.folder if self.is_archive else self.folder / self.file
 
     def address(self) -> str:
-        """Return the URL of the download; if the environment sets a mirror, a URL on this mirror.
+        """Return the URL of the download; it is on a mirror if an environment variable names one.
 
         Raises:
             InputError: only a browser can download the file, or the mirror's URL is invalid.
@@ -100,12 +100,12 @@ def _is_address(text: str) -> bool:
 
 
 def _published(experiment: str) -> str:
-    """Return where the data of an experiment are published, as its config says."""
+    """Return the text in an experiment's config that says where its data are published."""
     return str(OmegaConf.load(CONF / "exp" / f"{experiment}.yaml").data.published)
 
 
 def _trunk(backbone: str) -> Source:
-    """Return the source of the AlexNet or VGG16 weights for LPIPS, which go to torch's own folder."""
+    """Return the source of the AlexNet or VGG16 weights for LPIPS; their folder is torch's download folder."""
     import torch  # it takes two seconds to load
 
     from gsbench.measure.perceptual import BACKBONES

@@ -14,8 +14,8 @@ HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
 def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
     """Write `data` to a temporary file in the folder of `path`, then rename the file to `path`.
 
-    If the folder does not exist, it is created. Readers of `path` see either the old file or the new file. If
-    `lasting`, the file is flushed to the disk before it is renamed, so that it survives a power cut.
+    If the folder does not exist, it is created. Readers of `path` see either the old file or the new file. If `lasting`
+    is true, the file is flushed to the disk before it is renamed, so that it survives a power cut.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)

@@ -28,7 +28,8 @@ class Curve:
         """Append an evaluation to the curve.
 
         Raises:
-            InputError: iteration or seconds are smaller than those of the last evaluation, as after a faulty resume.
+            InputError: iteration or seconds are smaller than those of the last evaluation, which happens after a faulty
+                resume.
         """
         if self.points and (iteration <= self.points[-1].iteration or seconds < self.points[-1].seconds):
             raise InputError(

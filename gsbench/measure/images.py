@@ -58,7 +58,7 @@ def error_image(render: npt.NDArray[np.float32], truth: npt.NDArray[np.float32])
 
 
 def to_bytes(image: npt.NDArray[np.float32]) -> Pixels:  # [H, W, 3]
-    """Convert an image from [0, 1] (clamped) to 8 bits; NaN pixels, as of a diverged model, become magenta."""
+    """Convert an image from [0, 1] (clamped) to 8 bits; pixels that are NaN become magenta."""
     shown = (np.clip(np.nan_to_num(image), 0, 1) * 255).round().astype(np.uint8)
     shown[np.isnan(image).any(-1)] = (255, 0, 255)
     return shown

@@ -1,9 +1,9 @@
 """Compute LPIPS 0.1, the distance between the features of two images in a pretrained network (Zhang et al. 2018).
 
-LPIPS weights the features of a backbone (AlexNet or VGG16) by linear layers. With the same backbone weights, results
-are bit-equal to those of the lpips package. That package is not imported, because it needs torchvision and does not
-verify weights; only its linear layers are read from its files. The backbone's weights come from a file whose SHA-256 is
-checked.
+LPIPS multiplies squared differences of the features of a backbone (AlexNet or VGG16) by the learned weights of linear
+layers. With the same backbone weights, results are bit-equal to those of the lpips package. That package is not
+imported, because it needs torchvision and does not verify weights; only its linear layers are read from its files. The
+backbone's weights come from a file whose SHA-256 is checked.
 """
 
 import hashlib
@@ -63,7 +63,7 @@ class Backbone:
 
     @property
     def trunk_sha256(self) -> tuple[str, ...]:
-        """Return the SHA-256 (or their first digits) of the weight files that are accepted for this backbone."""
+        """Return the SHA-256 (or its first digits) of each weight file that is accepted for this backbone."""
         return (Path(self.file).stem.rsplit("-", 1)[1], *self.other_sha256)
 
 

@@ -1,7 +1,7 @@
 """Measure image quality: PSNR, SSIM, LPIPS, and their means over the views of a split.
 
 Images are float tensors [H, W, 3] and are clamped to [0, 1]. If a pixel is NaN, the result is NaN. If published code
-uses several definitions of a metric, the function states which definition it uses.
+uses several definitions of a metric, the docstring of our function says which one is computed.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -28,7 +28,7 @@ SSIM_LEAST_SIDE = 11  # pixels: the width of a Gaussian window of sigma 1.5, cut
 
 
 def evenly(items: Sequence[T], count: int) -> list[T]:
-    """Return at most `count` items at even spacing, beginning with the first, such as a fixed subset of test views."""
+    """Return at most `count` evenly spaced items, beginning with the first, to select a fixed subset of test views."""
     count = min(count, len(items))
     return [items[i * len(items) // count] for i in range(count)]
 

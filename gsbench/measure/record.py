@@ -90,7 +90,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class TimeScreen:
-    """The result of the statistical test, before training, whether a scene changes with time."""
+    """The result of the statistical test that decides, before training, whether a scene changes with time."""
 
     decision: str  # on, off or undecided
     reason: str
@@ -106,7 +106,7 @@ RENAMED_EFFECT_SETS = {"sliced": "conditioned", "still": "static"}  # .. and nam
 
 @dataclass(frozen=True)
 class Gate:
-    """The savings and the lost PSNR by removing time, direction or AGR (a network) from Gaussians."""
+    """The savings from removing time, direction or AGR (a network) from Gaussians, and the PSNR that this loses."""
 
     share: float  # share of the squared error that the removal is predicted to add at most
     predicted_db: float
@@ -125,7 +125,7 @@ class Gate:
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return the JSON of a `Gate`, a part of a record, with the present names of the keys of earlier versions."""
+        """Return the JSON of a `Gate` (a part of a record), with old keys replaced by their present names."""
         plain = {RENAMED_KEYS.get(key, key): value for key, value in plain.items()}
         if isinstance(rows := plain.get("rows"), dict):
             plain["rows"] = {RENAMED_EFFECT_SETS.get(name, name): count for name, count in rows.items()}
@@ -168,7 +168,7 @@ class Provenance:
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:
-        """Return the JSON of a `Provenance`, in which config keys of earlier versions have their present names."""
+        """Return the JSON of a `Provenance` (a part of a record), with old config keys replaced by present names."""
         config = plain.get("config")
         return plain | {"config": with_present_keys(config)} if isinstance(config, dict) else plain
 
@@ -309,7 +309,7 @@ def _check_seed(seed: int, where: str) -> None:
 
 
 def check(record: Record, file: str) -> None:
-    """Check the rules of a record that types cannot express.
+    """Check the rules for records that types cannot express, such as that a successful run has metrics.
 
     Raises:
         InputError: the record breaks a rule; the message names `file` and the field.

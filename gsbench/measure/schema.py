@@ -1,4 +1,4 @@
-"""Parse plain JSON into typed dataclasses; unknown keys, other types and NaN are errors."""
+"""Parse plain JSON into typed dataclasses; unknown keys, wrong types and NaN are errors."""
 
 import dataclasses
 import math

@@ -48,14 +48,15 @@ def training_part(plain: Plain) -> Plain:
 
 
 def training_hash(plain: Plain) -> str:
-    """Return the SHA-256 of all settings that change the training; runs with equal hashes can exchange checkpoints."""
+    """Return the SHA-256 of all settings that change the training; a checkpoint with an equal hash can be resumed."""
     return config_hash({old_key(key): value for key, value in given(training_part(plain)).items()})
 
 
 def given(plain: Plain) -> Plain:
-    """Return a config as a flat dict with dotted keys, without keys that are null or have the value in ALWAYS.
+    """Return a config as a flat dict with dotted keys, without null values and without the values in ALWAYS.
 
-    So a new key with one of these values does not change the hash of earlier runs, which lack the key.
+    ALWAYS holds keys that older configs lack, with the value that all older runs used. Leaving these values out keeps
+    the hashes of old and new configs equal.
     """
     return {key: value for key, value in flat(plain) if value is not None and ALWAYS.get(key) != value}
 
@@ -103,5 +104,5 @@ def _shown(config: Plain, key: str) -> str:
 
 
 def _is_of(key: str, settings: Collection[str]) -> bool:
-    """Return whether a dotted key is in `settings`, or belongs to a group in `settings`."""
+    """Return whether `settings` contains a dotted key or a group of keys to which it belongs."""
     return any(key == one or key.startswith(f"{one}.") for one in settings)

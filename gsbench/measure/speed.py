@@ -35,13 +35,13 @@ class RenderTimes:
 
         A frame is computed from a camera and a time, including slicing (conditioning on time and direction) and AGR,
         the neural refinement. The device is synchronised before and after each frame, and warm-up frames do not count.
-        Frames go through the evaluated views in turn.
+        The evaluated views are rendered in turn.
         """
         return 1000.0 / self.p50
 
 
 def nothing_to_wait_for() -> None:
-    """Do nothing: this replaces the GPU synchronisation on the CPU, where calls return after their work is done."""
+    """Do nothing; this replaces GPU synchronisation on the CPU, where a call returns only after its work is done."""
 
 
 def synchroniser(device: str) -> Callable[[], None]:
@@ -146,7 +146,7 @@ class StageClock:
                 self._add_one()
 
     def share(self, workers: list[dict[str, float]], wall: float) -> None:
-        """Add `wall` seconds of parallel workers, divided among stages in proportion to the workers' own seconds."""
+        """Add `wall` seconds of parallel workers, divided among stages in proportion to the seconds in `workers`."""
         total = sum(sum(seconds.values()) for seconds in workers) or 1.0
         for seconds in workers:
             for name, own in seconds.items():
@@ -180,7 +180,7 @@ class StageClock:
 class Laps:
     """Measures the seconds of consecutive stages in a block of work; each stage begins where the previous one ended.
 
-    On a GPU, CUDA events mark the ends, so that the CPU waits for the GPU only when the seconds are read.
+    On a GPU, CUDA events mark the ends of stages, so that the CPU waits for the GPU only when the seconds are read.
     """
 
     def __init__(self, device: str = "cpu") -> None:
@@ -201,7 +201,7 @@ class Laps:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Return the seconds of each stage, in the order of their first end; on a GPU this waits for the device."""
+        """Return the seconds of each stage, ordered by when it first ended; on a GPU this waits for the device."""
         sums: dict[str, float] = {}
         for name, start, end in self._ended:
             sums[name] = sums.get(name, 0.0) + self._clock.seconds(start, end)
@@ -209,10 +209,10 @@ class Laps:
 
 
 class Effort:
-    """Sums the CPU-seconds of this process over blocks, `with effort: ...`, and averages the load of the machine.
+    """Sums the CPU-seconds of this process in the blocks `with effort: ...`, and averages the load of the machine.
 
     Both values show whether the machine did other work: the load counts the running and waiting processes of the whole
-    machine, and CPU-seconds do not grow while another process runs. An unknown value is None.
+    machine, and CPU-seconds do not grow while this process waits for a processor. An unknown value is None.
     """
 
     def __init__(self) -> None:
@@ -230,7 +230,7 @@ class Effort:
         self._load_s += load() * seconds
 
     def add(self, other: "Effort") -> None:
-        """Add the measurements of another `Effort`."""
+        """Add the CPU-seconds and the load of another `Effort` to this one."""
         self._seconds += other._seconds
         self._cpu_s += other._cpu_s
         self._load_s += other._load_s
@@ -247,11 +247,11 @@ class Effort:
         return mean if math.isfinite(mean) else None
 
     def state_dict(self) -> dict[str, float]:
-        """Return the measurements so far, for a checkpoint."""
+        """Return the CPU-seconds and the load measured so far, for a checkpoint."""
         return {"seconds": self._seconds, "cpu_s": self._cpu_s, "load_s": self._load_s}
 
     def load_state_dict(self, state: dict[str, float] | None) -> None:
-        """Replace the measurements by those of a checkpoint; if an old checkpoint has none, both values become None."""
+        """Replace CPU-seconds and load by those of a checkpoint; both become None if an old checkpoint has none."""
         state = state or dict.fromkeys(("seconds", "cpu_s", "load_s"), math.nan)
         self._seconds, self._cpu_s, self._load_s = (float(state[name]) for name in ("seconds", "cpu_s", "load_s"))
 
@@ -287,7 +287,7 @@ class _HostClock:
 
 
 class _DeviceClock:
-    """A clock whose marks are CUDA events: the moments at which a GPU has finished the work enqueued before."""
+    """A clock whose marks are CUDA events; each is the moment at which the GPU has finished all earlier work."""
 
     def __init__(self, device: str) -> None:
         self.device = device

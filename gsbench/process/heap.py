@@ -16,9 +16,9 @@ OPTIONS = {
 def keep_freed_memory() -> None:
     """Make glibc's malloc keep large freed blocks, for all threads; call this before other threads start.
 
-    A training step frees several hundred megabytes of gradients and allocates them again, which took a quarter of a
-    step of 4DGS at 150,000 Gaussians. All threads share one heap (arena), because glibc's heaps of further threads
-    return large blocks to the system. Without glibc this function does nothing.
+    A training step frees several hundred megabytes of gradients and allocates them again, which took a quarter of the
+    time of a training step of 4DGS with 150,000 Gaussians. All threads share one heap (arena), because glibc's heaps of
+    further threads return large blocks to the system. Without glibc this function does nothing.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None  # musl has none
     if mallopt is None:

@@ -24,7 +24,7 @@ def require(size: int, what: str, instead: str) -> None:
     Args:
         size: bytes.
         what: the objects that need the memory, in the plural.
-        instead: the advice in the message.
+        instead: advice on what to do instead, for the error message.
     """
     if size < SMALL:
         return

@@ -13,11 +13,12 @@ RUNTIME = "libgomp.so.1"
 
 
 def sleep_when_idle() -> None:
-    """Make idle OpenMP threads sleep, before or after torch is imported, unless the environment sets a policy.
+    """Make idle OpenMP threads sleep, unless the environment sets OMP_WAIT_POLICY or GOMP_SPINCOUNT.
 
-    If libgomp is already loaded, its idle threads spin for 300,000 rounds, but only for 100 rounds while there are more
-    OpenMP threads than processors (libgomp manual, GOMP_SPINCOUNT). In this case the function starts more threads than
-    processors, which do nothing. It does not affect a copy of libgomp that a library ships under another name.
+    The function works before and after torch is imported. If libgomp is already loaded, its idle threads spin for
+    300,000 rounds, but only for 100 rounds while there are more OpenMP threads than processors (libgomp manual,
+    GOMP_SPINCOUNT). Therefore this function then starts threads that do nothing, until there are more threads than
+    processors. It does not affect a copy of libgomp that a library ships under another name.
     """
     if "OMP_WAIT_POLICY" in os.environ or "GOMP_SPINCOUNT" in os.environ:
         return

@@ -36,7 +36,7 @@ def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], workers:
 
 @functools.cache
 def _pool(workers: int, threads: int) -> ThreadPoolExecutor:
-    """Return a pool of worker threads, in each of which kernels and torch use `threads` threads."""
+    """Return a pool of worker threads; in each worker, kernels and torch use `threads` threads."""
     before = torch.get_num_threads()
 
     def settle() -> None:

@@ -1,4 +1,4 @@
-"""Print the result table of a folder of run records and write it there (``python -m gsbench.report RESULTS_DIR``)."""
+"""Print the result table of a folder of run records, and save it there (``python -m gsbench.report RESULTS_DIR``)."""
 
 import argparse
 import sys
@@ -18,8 +18,8 @@ def main(arguments: list[str] | None = None) -> int:
     A record is left out, and the reason is printed, if it is damaged or if another record describes the same run.
 
     Returns:
-        1 if a record is left out or if --against finds that PSNR differs, 2 if there is no record or a file cannot be
-        read or written, otherwise 0.
+        1 if a record is left out or if the option --against finds that PSNR differs, 2 if there is no record or a file
+        cannot be read or written, otherwise 0.
     """
     parser = argparse.ArgumentParser(prog="python -m gsbench.report", description=__doc__)
     parser.add_argument("results", type=Path, metavar="RESULTS_DIR", help="a folder with records, at any depth")
@@ -65,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _compared(records: list[Record], folder: Path, other: Path) -> Comparison:
-    """Compare the records of one folder with those of another, and print which of the other records cannot be read."""
+    """Compare the records of two folders, and print which records of the second folder cannot be read."""
     theirs, faults = tables.load(other)
     for fault in faults:
         print(f"gsbench.report: left out: {fault}", file=sys.stderr)

@@ -8,7 +8,7 @@ method adjusts the p-values for all models and scenes.
 
 A few seeds do not give a reliable variance. Therefore the variance over seeds is pooled over the models and scenes of
 an experiment. If the variance of the compared runs themselves is larger, it is used instead. With the pooled variance,
-even one run can be compared with three.
+even one run in one folder can be compared with three runs in the other.
 """
 
 import math
@@ -32,8 +32,8 @@ class Limit:
     """Two limits for the comparison of two means: `equal` and `widest`.
 
     Means whose difference is at most `equal` count as equal. A larger difference that is not significant also counts as
-    equal, but only if the 95 % interval is no wider than ± `widest`. If `relative` is true, both limits are fractions
-    of the mean in the second folder.
+    equal, but only if the 95 % interval of the difference is no wider than ± `widest`. If `relative` is true, both
+    limits are fractions of the mean in the second folder.
     """
 
     equal: float
@@ -180,7 +180,7 @@ def _missing(of: RunsByConfiguration, other: RunsByConfiguration) -> list[str]:
 
 
 def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> ComparedRuns:
-    """Collect the values of a model on a scene from both folders, and the reasons why some cannot be compared."""
+    """Collect the values of a model on a scene from both folders, and why some of these values are not comparable."""
     first = next(iter(ours.values()))
     mine, other = ([r for r in runs.values() if r.status == "ok"] for runs in (ours, theirs))
     why = _incomparable(mine, other)

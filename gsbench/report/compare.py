@@ -45,7 +45,7 @@ def paired(group: Group) -> list[Weights]:
 
 
 def pairs(group: Group, family: Family) -> list[Pair]:
-    """Compare every two models on the scenes that both have finished; return the pairs by falling difference.
+    """Compare every two models on the scenes that both have finished; pairs with the largest difference come first.
 
     Args:
         group: the run records of one experiment.
@@ -81,7 +81,7 @@ def improvement(group: Group, a: Configuration, b: Configuration) -> float:
 
 
 def _views(group: Group, configuration: Configuration, scene: str) -> dict[str, Values]:
-    """Return the PSNR of a model on a scene: for each view an array over the seeds, without views that a seed lacks."""
+    """Return for each view of a scene the PSNR of a model with every seed, without views that a seed lacks."""
     runs = [group.scores(r, "psnr") for r in configuration.runs[scene]]
     common = set.intersection(*map(set, runs))
     return {view: np.array([scores[view] for scores in runs]) for view in common}
@@ -91,7 +91,8 @@ def _views(group: Group, configuration: Configuration, scene: str) -> dict[str, 
 class Price:
     """The gain of an effect (time, view direction or the network AGR) in PSNR, and its cost in time and memory.
 
-    An interaction of effects is stored in the same way: it is the change of one effect's gain when another is added.
+    An interaction of effects is stored in the same way: it is the change of one effect's gain when another effect is
+    added.
     """
 
     name: str
@@ -103,7 +104,7 @@ class Price:
 
 @dataclass(frozen=True)
 class Cube:
-    """The eight models with each combination of three effects, and what these effects gain and cost.
+    """Eight models, one for each combination of three effects, and what these effects gain and cost.
 
     The effects are time, view direction and AGR (neural refinement). Models that were not run are missing.
     """
@@ -132,7 +133,8 @@ def cube(group: Group, family: Family) -> Cube:
     AGR is the neural refinement of Gaussians. The gain of an effect is the difference of two models that differ only in
     this effect. It is computed with each of the other two effects on or off, which gives 12 differences. The
     interaction of two effects is the difference of two such gains, which gives 6 interactions. The interaction of all
-    three effects is the difference of two interactions. An effect's mean over the other effects needs all eight models.
+    three effects is the difference of two interactions. The mean gain of an effect over all on/off states of the other
+    two effects needs all eight models.
 
     Args:
         group: the run records of one experiment.
@@ -156,8 +158,9 @@ def _filled(group: Group) -> tuple[dict[Cell, Configuration], dict[Cell, Configu
     """Find the model that was run for each combination of time, view direction and AGR (neural refinement).
 
     Returns:
-        The model of each combination. The same, but with the models in NESTED (7dgs without view direction) instead of
-        others. The names of the models left out because another model has the same combination.
+        Three values: the model of each combination; the same dictionary, in which 7dgs without view direction (NESTED)
+        replaces other models with its combination; the names of models that are left out because another model has the
+        same combination.
     """
     cells: dict[Cell, Configuration] = {}
     left_out = []
@@ -186,7 +189,7 @@ def _words(cell: Cell) -> str:
 
 
 def _contrasts() -> list[tuple[str, dict[Cell, float]]]:
-    """Return the name of every effect and interaction, and the weights of models' results whose sum it is.
+    """Return the name of every effect and interaction, and the weighted sum of models' results that measures it.
 
     The effects are time, view direction and AGR (neural refinement). Single effects come before interactions.
     """
@@ -212,7 +215,7 @@ def _given(name: str, held: list[int], values: tuple[bool, ...]) -> str:
 def _weights(
     varied: tuple[int, ...], held: list[int], given: list[tuple[bool, ...]], share: float
 ) -> dict[Cell, float]:
-    """Return the weights of models, so that the weighted sum of their results is an effect or an interaction.
+    """Return weights of models whose weighted sum of results is the gain of an effect or an interaction of effects.
 
     For the effect of time alone, the model with time has weight 1 and the model without any effect has weight -1.
 

@@ -6,7 +6,7 @@ from gsbench.report.family import Family
 
 
 def comparisons(group: Group) -> Family:
-    """Return all comparisons: pairs of models, gains by time, direction and AGR (a network), best models in budgets."""
+    """Return all comparisons: pairs of models, models with and without one effect, and the best models in budgets."""
     prices = compare.priced(group)
     contested = frontier.contested(frontier.points(group, group.basis))
     psnr = [*compare.paired(group), *prices, *contested]

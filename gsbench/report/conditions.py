@@ -23,7 +23,7 @@ Get = Callable[[Record], str]
 
 
 def conditions(records: list[Record], spread: str = SPREAD) -> list[str]:
-    """List the footnotes of a table on protocol, data, machine, commit, versions and seeds; warnings come first.
+    """List a table's footnotes, which state protocol, data, machine, commit, versions and seeds; warnings come first.
 
     The footnotes describe the finished runs, because only these have results. If no run finished, they describe the
     failed runs and contain no warning. A failed run may have stopped before its backend or its data was known.
@@ -84,7 +84,7 @@ def _machine(record: Record) -> str:
 
 
 def _load(records: list[Record]) -> list[str]:
-    """Return a footnote on the load of the machine that most runs used; an empty list if no record has the load."""
+    """List a footnote on the load of the machine that most runs used; the list is empty if no record has the load."""
     machine = Counter(r.provenance.machine for r in records).most_common(1)[0][0]
     costs = [r.cost for r in records if r.cost and r.provenance.machine == machine]
     loads = [cost.load for cost in costs if cost.load is not None]

@@ -57,7 +57,7 @@ class Configuration:
 
     @property
     def on_demand(self) -> bool:
-        """Tell whether a run chose the effects of its Gaussians automatically, so that some Gaussians may lack some.
+        """Tell whether a run chose the effects of its Gaussians automatically, so that some Gaussians may lack effects.
 
         The effects are time, view direction and the network AGR.
         """
@@ -119,18 +119,18 @@ class Group:
     def series(self) -> list[str]:
         """Return the names of the report's curves.
 
-        Each model has one curve. Its runs from which effects (time, view direction, the network AGR) were removed
-        have another one.
+        Each model has one curve. If effects (time, view direction, the network AGR) were removed from Gaussians in some
+        of its runs, these runs have a second curve.
         """
         return sorted({self.series_of(r) for r in self.records})
 
     def series_of(self, record: Record) -> str:
         """Return the name of the report's curve that a run belongs to.
 
-        Runs of a model with different training lengths and sizes share a curve. The setting `effects.gate` says when
-        effects (time, view direction, the network AGR) are removed from Gaussians that do not need them. Runs whose
-        setting differs from the model's default have a curve of their own, unless all runs of the group have the same
-        setting.
+        All runs of a model share one curve, with one exception: the setting `effects.gate`. It says when effects (time,
+        view direction, the network AGR) are removed from Gaussians that do not need them. Runs with a value of
+        `effects.gate` that is not the model's default have their own curve, unless all runs of the group have the same
+        value.
         """
         own = gating(record)
         return f"{record.model}, {own}" if own and len(self._gatings) > 1 else record.model
@@ -180,8 +180,8 @@ class Group:
     def basis(self) -> list[str]:
         """Return the scenes over which the report averages its conclusions.
 
-        These are the scenes that every model finished. If there is no such scene, it is the one scene that most models
-        and settings finished.
+        These are the scenes that every model finished. If there is no such scene, the report uses the one scene that
+        most models and settings finished.
         """
         if self.covered or not self.configurations:
             return self.covered
@@ -194,13 +194,13 @@ class Group:
 
     @cached_property
     def elsewhere(self) -> int:
-        """Return the number of finished runs that were made on another machine than most runs."""
+        """Return the number of finished runs that were not made on the machine of most runs."""
         return sum(r.provenance.machine != self.machine for r in self.finished)
 
     def value(self, record: Record, quantity: str) -> float:
         """Read a quantity, such as PSNR, from a run's record; NaN if it is missing.
 
-        A time is also NaN if it was measured on another machine than the one that most runs used.
+        A time is also NaN if it was not measured on the machine that most runs used.
         """
         if quantity in OF_THE_MACHINE and record.provenance.machine != self.machine:
             return math.nan

@@ -13,7 +13,7 @@ Key = tuple[tuple[str, str, float], ...]
 
 @dataclass(frozen=True)
 class Tested:
-    """The estimated difference between models, and its p-value after adjustment for all comparisons of the report."""
+    """An estimated difference between models, and its p-value after adjustment for all comparisons of the report."""
 
     difference: Estimate
     p: float  # adjusted with Holm's method for all comparisons; NaN if the spread is not known
@@ -38,7 +38,8 @@ class Family:
         Args:
             group: the run records of one experiment.
             asked: for each quantity, the differences to test. A difference is a weighted sum of models' results, such
-                as one minus another. If a difference is given twice, or with the opposite sign, it counts once.
+                as the result of one model minus that of another. If a difference is given twice, or with the opposite
+                sign, it counts once.
         """
         self._found = {quantity: _tested(group, quantity, contrasts) for quantity, contrasts in asked.items()}
 

@@ -63,7 +63,7 @@ def frontier(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
 
 
 def beaten(of: Sequence[FrontierPoint], cost: str) -> list[FrontierPoint]:
-    """Return the points that another point dominates: it is no worse in mean PSNR and in cost, and better in one."""
+    """Return the dominated points: another point is no worse in mean PSNR and cost, and better in at least one."""
     known = [p for p in of if not math.isnan(p.cost[cost])]
     return [p for p in known if any(beats(q, p, cost) for q in known)]
 
@@ -174,7 +174,7 @@ def targets(group: Group) -> list[Target]:
 
 
 def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, float]]:
-    """Return the PSNR targets of a scene: round values between the worst and the best result, and the paper's PSNR."""
+    """Return a scene's PSNR targets: round values between the lowest and highest result, and the paper's 7dgs value."""
     if not reached:
         return []
     rules = [(f"{psnr:g} dB", psnr) for psnr in round_numbers(min(reached), max(reached))]
@@ -215,5 +215,5 @@ def _ratio(seconds: float, fastest: float) -> float:
 
 
 def _mean(scenes: list[Values]) -> float:
-    """Return the mean over scenes of the mean over seeds; NaN if a scene has no value."""
+    """Average a quantity over the seeds of each scene, then over scenes; return NaN if a scene has no value."""
     return float(np.mean([s.mean() for s in scenes])) if all(map(len, scenes)) else math.nan

@@ -1,4 +1,4 @@
-"""Estimate a mean over scenes, seeds and views, with a 95 % confidence interval that is valid from three seeds on.
+"""Estimate a mean over scenes, seeds and views, with a 95 % interval that is valid for three or more seeds.
 
 With three seeds, the interval of a percentile bootstrap is much too narrow. First, resampling three values gives only
 two thirds of their variance. Second, its quantiles are those of a normal distribution (about 2 standard errors), while
@@ -6,12 +6,12 @@ Student's t needs 4.3 for three values. This module therefore estimates the vari
 separately, and applies Student's t to each. The simulations are in docs/statistics.md.
 
 - With three or more scenes, the means of the scenes are a sample of similar scenes. Their variance includes that of
-  seeds and views. Student's t with (scenes - 1) degrees of freedom is exact if these means are normal.
-- With one or two scenes, the interval does not hold for other scenes. All seeds see the same views, so seeds and views
-  are crossed factors. Each factor has a half width by Student's t, and the squares of the half widths are added (MOVER:
-  Zou and Donner 2008). The residual variance is contained in both factors, so it is subtracted once from that of the
-  seeds. The interval is never narrower than that of the seeds alone.
-- With one seed, there is no interval, because the variance over seeds is not known.
+seeds and views. Student's t with (scenes - 1) degrees of freedom is exact if these means are normal. - With one or two
+scenes, the interval does not hold for other scenes. All seeds see the same views, so seeds and views are crossed
+factors. Each factor has a half width by Student's t, and the squares of the half widths are added (MOVER: Zou and
+Donner 2008). The residual variance is contained in both factors, so it is subtracted once from the variance over seeds.
+The interval is never narrower than that of the seeds alone. - With one seed, there is no interval, because the variance
+over seeds is not known.
 """
 
 import math
@@ -37,7 +37,7 @@ class Spread:
     freedom: float
 
     def half_width(self, level: float) -> float:
-        """Return half the width of the confidence interval that this variance gives by itself, with Student's t."""
+        """Return half the width of the confidence interval that follows from this variance alone, with Student's t."""
         if self.variance <= 0:
             return 0.0
         return float(special.stdtrit(self.freedom, (1 + level) / 2)) * math.sqrt(self.variance)
@@ -56,17 +56,17 @@ class Estimate:
 
     @cached_property
     def half(self) -> float:
-        """Return half the width of the 95 % interval, or NaN if there is no interval."""
+        """Return half the width of the mean's 95 % interval, or NaN if there is no interval."""
         return self._half(LEVEL) if self.over else math.nan
 
     @property
     def low(self) -> float:
-        """Return the lower end of the 95 % interval."""
+        """Return the lower end of the mean's 95 % interval."""
         return self.mean - self.half
 
     @property
     def high(self) -> float:
-        """Return the upper end of the 95 % interval."""
+        """Return the upper end of the mean's 95 % interval."""
         return self.mean + self.half
 
     @cached_property

@@ -28,7 +28,7 @@ class QuantityColumn:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a result table: a model's mean over seeds, a run that did not finish, or the numbers of the paper."""
+    """A row of a result table: a model's mean over seeds, a run that did not finish, or the 7DGS paper's numbers."""
 
     label: str
     cells: dict[str, str]  # by QuantityColumn.key

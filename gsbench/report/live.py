@@ -22,7 +22,7 @@ def watch(folder: Path, *, train: bool = False, every: float = EVERY) -> int:
     Args:
         folder: the folder where records are or will be.
         train: whether to show PSNR on training views too.
-        every: seconds between two looks at the folder.
+        every: seconds between two checks of the folder.
     """
     seen, said = State(), ""
     try:

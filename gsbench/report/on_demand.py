@@ -101,7 +101,7 @@ def _ends(gates: list[Gate]) -> bool:
 
 
 def _rows(gates: list[Gate], name: str) -> int:
-    """Count the Gaussians that have a certain set of effects at the end, such as time without view direction.
+    """Count the Gaussians that keep a certain set of effects to the end of a run, such as time without direction.
 
     For the name "removed", count all Gaussians that were removed.
     """
@@ -110,7 +110,7 @@ def _rows(gates: list[Gate], name: str) -> int:
 
 
 def _of_degree(gate: Gate, degree: int) -> int:
-    """Count the Gaussians whose colours have spherical harmonics of the given degree, with any time dependence."""
+    """Count the Gaussians whose colours have SH of the given degree, whether or not the colours change with time."""
     return sum(max(0, n) for name, n in gate.orders.items() if re.match(rf"degree {degree}\b", name))
 
 

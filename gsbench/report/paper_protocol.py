@@ -126,9 +126,9 @@ def model_recipes(records: list[Record]) -> list[ModelRecipe]:
 
 
 def finished(records: list[Record], one: ModelRecipe, scenes: Sequence[str]) -> dict[str, list[Record]]:
-    """Return the finished runs of a model with its training settings: for each scene one run for each seed.
+    """Return the finished runs of a model with the given training settings: for each scene one run for each seed.
 
-    If a seed has two runs, the run that also measured the best PSNR on test during training is taken.
+    If a seed has two runs, the run that also records the best test PSNR during training is taken.
     """
     found: dict[str, dict[int, Record]] = {}
     for r in sorted(records, key=lambda r: (r.metrics or {}).get("psnr_best_on_test") is not None):

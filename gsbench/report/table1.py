@@ -76,7 +76,7 @@ def missing(dataset: str, records: list[Record]) -> str:
 
 
 def _left_out(pools: list[str]) -> list[str]:
-    """Return a footnote that names the runs which appear in no table; an empty list if there are none."""
+    """List a footnote that names the runs which appear in no table; the list is empty if there are none."""
     if not pools:
         return []
     shown = "; ".join(map(printable, pools[:5])) + (f"; and {len(pools) - 5} more" if len(pools) > 5 else "")
@@ -186,7 +186,7 @@ def _signed(column: QuantityColumn, difference: float) -> str:
 
 
 def _with_best(rows: list[Row]) -> list[Row]:
-    """Mark the measured rows that have the highest final PSNR after rounding as in the table."""
+    """Mark the measured rows whose final PSNR, rounded as the table shows it, is the highest."""
     shown = {row.cells["psnr"].partition(" ")[0] for row in rows if row.seeds} - {EMPTY}
     best = max(shown, key=float, default=None)
     return [

@@ -114,7 +114,7 @@ def build(records: list[Record], *, train: bool = False, machine: str | None = N
 
 
 def of_one_machine(records: list[Record], machine: str) -> list[str]:
-    """Return a footnote that names the machine whose times a table shows, and the machines whose times are left out.
+    """List a footnote that names the machine whose times a table shows, and the machines whose times are left out.
 
     The list is empty if all runs were on one machine.
 
@@ -157,7 +157,7 @@ class _TableBuilder:
     def _values(self, column: QuantityColumn, seeds: list[dict[str, Any]]) -> list[float]:
         """Return the values of a column for the runs of a model, or NaN if there are none.
 
-        Training times and FPS are only taken from runs on the table's machine.
+        Training times and FPS are only taken from runs on the machine whose times the table shows.
         """
         counted = [q for q in seeds if column.key not in OF_THE_MACHINE or q["machine"] == self.machine]
         return [math.nan if q[column.key] is None else float(q[column.key]) for q in counted] or [math.nan]
@@ -178,7 +178,7 @@ class _TableBuilder:
         return Table(title, self.columns, sections, self.marks, said)
 
     def _no_vgg(self) -> list[str]:
-        """Return a footnote that says why the table has no column for LPIPS-VGG; an empty list if it has one."""
+        """List a footnote that says why the table has no column for LPIPS-VGG; the list is empty if it has one."""
         shown = any(c.key == "lpips_vgg" for c in self.columns)
         why = {printable(r.missing["lpips_vgg"]) for r in self.records if "lpips_vgg" in r.missing}
         return [f"LPIPS-VGG has no column: {'; '.join(sorted(why))}."] if why and not shown else []
@@ -246,7 +246,7 @@ class _TableBuilder:
         return Section(f"{title}: {', '.join(covered)}", rows, notes)
 
     def _paper_row(self, scenes: list[str], model: str) -> list[Row]:
-        """Make the row with the paper's results for `model`, averaged over `scenes`; no row if the paper lacks one."""
+        """List the row of the paper's results for `model`, averaged over `scenes`; empty if the paper lacks a scene."""
         runs = [r for r in self.records if self._name(r) == model and r.scene in scenes]
         if any(r.effects.refinement != paper.MODELS.get(r.model) for r in runs):
             return []  # the model has the same name as one of the paper but differs in AGR

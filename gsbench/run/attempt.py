@@ -53,9 +53,9 @@ class Attempt:
         return self.model, scene
 
     def fit(self, model: GaussianModel, scene: Scene) -> Trainer:
-        """Train to the last step; for model=auto, first choose a model with or without time by a test of the scene.
+        """Train to the last step; for model=auto, a test of the scene first chooses a model with or without time.
 
-        Raises as `gsbench.run.fitting.fit`.
+        It raises the same errors as `gsbench.run.fitting.fit`.
         """
         if is_auto(self.this.config):
             self.resolved = resolve(self.this, scene)
@@ -81,7 +81,7 @@ class Attempt:
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:
-        """Return the decisions to remove time, direction or AGR (a network); None if the settings ask for none."""
+        """Return the decisions on removing time, direction or AGR (a network); None if the settings ask for none."""
         screen, gating = self.resolved.screen, trainer.gating
         if screen is None and self.resolved.config.effects.gate == "off":
             return None

@@ -243,7 +243,8 @@ def check_gates(model: GaussianModel, config: Config) -> None:
 def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
     """Raise InputError if the scene cannot train the model.
 
-    Reasons are a model with time and a scene without, cameras that are all at one place, and images that are too small.
+    Reasons are a model with time for a scene without time, cameras that are all at one place, and images that are too
+    small.
     """
     if ("time" in model.observes or config.agr) and not scene.has_time:
         what = "agr=true" if config.agr else config.model.name

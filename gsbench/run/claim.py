@@ -59,10 +59,10 @@ def release(folder: Path, mine: Progress) -> None:
 
 
 def _read(path: Path) -> Progress | str:
-    """Read a claim; return NOTHING if there is none, or DAMAGED if it cannot be read three times.
+    """Read a claim; return NOTHING if there is none, or DAMAGED if three attempts to read it fail.
 
-    Without file locks, another process may create the claim during the first read, so that the first failure proves
-    nothing.
+    Without file locks, another process may be writing the claim while it is read. Therefore one failure does not prove
+    that the claim is damaged.
     """
     for _ in range(3):
         try:
@@ -80,8 +80,8 @@ def _is_one(other: Progress, mine: Progress) -> bool:
 def _may_be_taken(other: Progress, mine: Progress) -> bool:
     """Return whether this process may take an existing claim.
 
-    It may if the claim is its own, if the process of the claim has ended, or if Slurm has requeued the job after a node
-    failed. Two live processes of one Slurm job on one node respect each other's claims.
+    The process may take the claim if the claim is its own, if the process of the claim has ended, or if Slurm has
+    requeued the job after a node failed. Two live processes of one Slurm job on one node respect each other's claims.
     """
     requeued = other.job is not None and other.job == mine.job and other.host != mine.host
     return _is_one(other, mine) or requeued or not progress.is_alive(other)

@@ -85,7 +85,7 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
 
 
 def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[str, Tensor, Tensor]]:
-    """Yield (name, render, ground truth) of each evaluated view, and append a few evenly spaced pairs to `shown`."""
+    """Yield (name, render, ground truth) of each evaluated view, and append a few of these image pairs to `shown`."""
     views = trainer.views
     chosen = range(0, len(views), max(1, len(views) // max(1, pictures)))[:pictures]
     for i, view in enumerate(views):  # one view at a time, because fifty views of 2048 x 1088 take 3 GB

@@ -109,6 +109,6 @@ def born(pid: int) -> int | None:
 
 
 def slurm_job() -> str | None:
-    """Return the id of the Slurm job of this process as in squeue (`12` or `12_3`), or None outside of Slurm."""
+    """Return the id of this process's Slurm job as squeue prints it (`12` or `12_3`), or None outside of Slurm."""
     array, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
     return f"{array}_{task}" if array and task else os.environ.get("SLURM_JOB_ID")

@@ -1,4 +1,4 @@
-"""Remove time, direction or AGR (a network) from Gaussians of a finished run that do not need them, as a new run."""
+"""Remove time, direction or AGR (a network) from a finished run's Gaussians that do not need them; store a new run."""
 
 import copy
 from pathlib import Path
@@ -17,10 +17,10 @@ from gsbench.train.checkpoint import Checkpoint
 
 
 def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
-    """Remove time, direction or AGR (a network) from those Gaussians of a finished run that do not need them.
+    """Remove time, direction or AGR (a network) from a finished run's Gaussians that do not need them.
 
-    `effects.gate=end` does the same at the end of a training, except that this function may also remove time or
-    direction alone. Return the record and the folder of the new run.
+    The setting `effects.gate=end` does the same at the end of a training, but it never removes only one of time and
+    direction from a Gaussian. This function may do that. Return the record and the folder of the new run.
 
     Args:
         folder: the folder of the finished run, which is not changed.

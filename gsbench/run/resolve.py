@@ -52,15 +52,15 @@ class Resolved:
 
 
 def before_scene(config: Config) -> Config:
-    """Return settings that can be checked before the scene is loaded: model=auto becomes its candidate with time."""
+    """Return settings to check before the scene is loaded: model=auto is replaced by its candidate with time."""
     return with_candidate(config, "moving") if is_auto(config) else config
 
 
 def resolve(this: Run, scene: Scene) -> Resolved:
     """Replace model=auto by a model with or without time, after a test whether the training views change with time.
 
-    The reason is printed. If the test is undecided, the model has time: 7DGS on a static scene costs a few seconds, but
-    6DGS on a moving scene loses the motion. Other settings are returned unchanged.
+    The reason is printed. If the test is undecided, the model has time: training 7DGS on a static scene costs a few
+    seconds, but 6DGS on a moving scene loses the motion. Other settings are returned unchanged.
 
     Raises:
         InputError: the settings lack a candidate of model=auto.

@@ -24,7 +24,7 @@ NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{
 def expand(words: Sequence[str]) -> list[str]:
     """Return the words of a command line with `--multirun` first, and with all scene names instead of scene=all.
 
-    Config keys that were renamed are replaced by their present names. Otherwise, a command line stays as it is if it
+    Config keys that were renamed are replaced by their present names. Nothing else is changed in a command line that
     names one scene, asks for information or has an error; Hydra explains the error.
 
     Raises:

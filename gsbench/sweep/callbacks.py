@@ -1,7 +1,7 @@
 """Write the plan of a sweep when Hydra starts it, and the outcome of each run when the run ends.
 
-Hydra calls `WritePlan`, which conf/config.yaml lists under hydra.callbacks. With Slurm and joblib it is pickled into
-every job.
+Hydra calls `WritePlan`, which conf/config.yaml lists under hydra.callbacks. With Slurm and joblib, the `WritePlan`
+object is pickled into every job.
 """
 
 import copy

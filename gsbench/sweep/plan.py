@@ -87,7 +87,7 @@ def read_ended(folder: Path) -> dict[int, Ended]:
 def jobs(folder: Path) -> dict[int, str]:
     """Return the Slurm jobs of the sweep whose plan is in `folder`, by run number.
 
-    The names of the jobs are those of the folders that submitit makes. A job array has a folder `<array>`, and a folder
+    A job has the name of a folder that submitit makes. A job array has a folder `<array>`, and a folder
     `<array>_<task>` for each task. A single run has one folder `<job>`.
     """
     names = [path.name for path in (folder / JOBS).glob("[0-9]*")]

@@ -1,4 +1,4 @@
-"""Ask Slurm for the states of jobs in its queue, and how jobs ended that have left the queue."""
+"""Ask Slurm for the states of the jobs in its queue, and for the outcomes of jobs that have left the queue."""
 
 import shutil
 import subprocess

@@ -166,7 +166,7 @@ def _launching(requested: RequestedRun, queue: Queue) -> bool:
 
 
 def _explained(experiment: Experiment, one: Identity, run: RunStatus, endings: dict[str, str]) -> RunStatus:
-    """Add to a failed or lost Slurm run how its job ended, and the line of its log that names the cause.
+    """Add the outcome of its Slurm job, and the log line that names the cause, to a failed or lost run.
 
     Other runs, and runs with a record, are returned unchanged.
     """

@@ -37,7 +37,7 @@ class Traces:
 
 
 def read(folders: list[Path]) -> Traces:
-    """Read all run records and progress files in some folders; if a run has two of a kind, the newer one counts."""
+    """Read all run records and progress files in some folders; of each kind, the newest file of a run counts."""
     found = Traces()
     for path in _files(folders):
         if path.name == RECORD:

@@ -183,7 +183,7 @@ class Controls:
         ]
 
     def request(self, colours: str) -> FrameRequest:
-        """Return the request for a frame at the present time, with the settings of the controls and these colours."""
+        """Return the request for a frame at the present time, with the settings of the controls and with `colours`."""
         return self._request_at(self.now, colours)
 
     def request_of(self, view: View) -> FrameRequest:

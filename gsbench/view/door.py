@@ -1,6 +1,7 @@
 """Guard the port of the viewer: refuse requests from other web sites, and drop messages that its page never sends.
 
-viser listens with the library `websockets` but cannot pass on the options that this needs. `Door.guard` sets them.
+viser listens through the library `websockets`, but has no parameters for the options that this protection needs.
+`Door.guard` sets these options.
 """
 
 import asyncio
@@ -182,7 +183,7 @@ class Door:
         return all(origin.lower() in (f"http://{own}", f"https://{own}") for origin in origins)
 
     def _is_ours(self, host: str) -> bool:
-        """Tell whether `host`, with or without a port, is a name of this server; the port may be that of a tunnel."""
+        """Tell whether `host`, with or without a port, is a name of this server; a tunnel may change the port."""
         try:
             parts = urlsplit(f"//{host}")
             name = parts.hostname or ""

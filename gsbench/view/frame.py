@@ -38,7 +38,7 @@ class FrameCost(NamedTuple):
     ms: dict[str, float]  # by stage, in their order
 
     def of(self, part: str) -> float:
-        """Return the milliseconds to compute the conditional 3D Gaussians, or to rasterize them."""
+        """Return the milliseconds of one part of a frame: to compute conditional 3D Gaussians, or to rasterize them."""
         return sum(ms for stage, ms in self.ms.items() if part_of(stage) == part)
 
 
@@ -49,7 +49,7 @@ class Frame(NamedTuple):
     costs: tuple[FrameCost, ...]  # of each model in it
 
     def ms(self, part: str) -> float:
-        """Return the milliseconds to compute or to rasterize 3D Gaussians, summed over the models in the image."""
+        """Return the milliseconds of one part of a frame, summed over its models; see `FrameCost.of`."""
         return sum(cost.of(part) for cost in self.costs)
 
 

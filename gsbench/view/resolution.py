@@ -16,7 +16,7 @@ class Resolution:
         self._slice_ms = 0.0
 
     def took(self, pixels: int, slice_ms: float, raster_ms: float) -> None:
-        """Store the milliseconds of the last frame; those to compute 3D Gaussians do not depend on the resolution."""
+        """Store the milliseconds of the last frame; those for computing 3D Gaussians do not depend on resolution."""
         self._ms_per_pixel, self._slice_ms = raster_ms / max(1, pixels), slice_ms
 
     def size(self, width: int, height: int, moving: bool) -> tuple[int, int]:

@@ -19,11 +19,12 @@ _FOLLOWS = {"show_colors": "conditioning", "blend": "binning"}
 
 
 class StageWatch(Tape):
-    """Times how long a frame's 3D Gaussians are computed (slicing) and rasterized, and the stages of both.
+    """Times the two parts of a frame, slicing (computing its 3D Gaussians) and rasterization, and their stages.
 
     Usage: ``with StageWatch(device) as watch: ...; watch.end(SLICE); ...; watch.end(RASTER)``. The watch replaces the
-    tape that records kernel calls for the backward pass. Thus it sees when each kernel begins and ends; it records
-    none, so there are no gradients. If torch computes or rasterizes the Gaussians, this is timed as a single stage.
+    tape that records kernel calls for the backward pass. Thus it sees when each kernel begins and ends. It records no
+    kernel calls, so there are no gradients. If torch computes or rasterizes the Gaussians, this is timed as a single
+    stage.
     """
 
     def __init__(self, device: str) -> None:
@@ -32,7 +33,7 @@ class StageWatch(Tape):
         self._laps = Laps(device)
 
     def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
-        """Run a kernel, and stop the time of the stages that end before or after it."""
+        """Run a kernel; if a stage of the frame ends just before or just after this kernel, store the stage's time."""
         if operation.name in _FOLLOWS:
             self._laps.end(_FOLLOWS[operation.name])
         outputs, _ = operation.run(tensors, numbers)
@@ -43,7 +44,8 @@ class StageWatch(Tape):
     def end(self, part: str) -> None:
         """End one of the two parts of a frame: computing its 3D Gaussians, or rasterizing them.
 
-        The time since its last stage is added to that stage. If no stage was measured, the whole part is one stage.
+        The time since the last stage of this part ended is added to that stage. If no stage was measured, the whole
+        part is one stage.
         """
         last = STAGES[part][-1]
         self._laps.end(last if self._laps.has(last) else part)

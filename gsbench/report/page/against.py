@@ -1,4 +1,4 @@
-"""Write the section of the HTML report that compares its runs with those of another folder, such as published runs."""
+"""Write the section of the HTML report that compares the report's runs with runs of another folder."""
 
 from gsbench.report.against import AGREES, DIFFERS, RULE, UNTOLD, Comparison
 from gsbench.report.against_table import COLUMNS, lines

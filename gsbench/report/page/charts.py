@@ -17,7 +17,7 @@ ROW = 38  # height in pixels of a row with its label above it
 
 @dataclass(frozen=True)
 class Mark:
-    """A point of a figure, with a confidence interval along y and the number of the run that it shows."""
+    """A point of a figure, with a confidence interval along y and its run's number in the report's list of runs."""
 
     x: float
     y: float
@@ -40,7 +40,8 @@ class FrontierCurve:
 def frontier(curves: list[FrontierCurve], x: str, y: str = "PSNR, dB") -> Panel:
     """Draw PSNR against a cost for several models.
 
-    The means have intervals and are joined along each model's Pareto frontier. Single runs are pale points.
+    Means are drawn with their intervals, and a line joins the means on the Pareto frontier of each model. Single runs
+    are pale points.
     """
     panel = Panel(270)
     axes = panel.axes
@@ -89,7 +90,7 @@ class Anytime:
 
 
 def anytime(curves: list[Anytime]) -> Panel:
-    """Draw PSNR on the validation views against training seconds, with the training events of each curve below."""
+    """Draw PSNR on the validation views against training seconds; rows below the axes show training events."""
     panel = Panel(290 + LANE * len(curves), lanes=len(curves))
     axes = panel.axes
     for lane, curve in enumerate(curves):
@@ -143,7 +144,7 @@ class Difference:
 
 
 def differences(rows: list[Difference], x: str) -> Panel:
-    """Draw differences and their intervals on an axis that contains zero, with the label of each above it."""
+    """Draw differences and their intervals on an axis that contains zero, with a label above each difference."""
     panel = Panel(66 + ROW * len(rows), left=2, top=4)
     axes = panel.axes
     for i, row in enumerate(rows):
@@ -175,7 +176,7 @@ class Bar:
 
 
 def bars(rows: list[Bar], colours: list[str], x: str) -> Panel:
-    """Draw stacked bars with the label of each above it; `colours` has one colour for each part of a bar."""
+    """Draw stacked bars with a label above each bar; `colours` has one colour for each part of a bar."""
     panel = Panel(66 + ROW * len(rows), left=2, top=4)
     axes = panel.axes
     for i, row in enumerate(rows):

@@ -91,7 +91,7 @@ def _image(caption: str, image: Pixels, quality: int) -> Image:
 
 
 def cut_strip(path: Path) -> list[StripRow]:
-    """Cut an image file into rows of (render, truth, error) at their own resolution.
+    """Cut an image file into rows of (render, ground truth, error image), and undo the enlargement of small images.
 
     The list is empty if the file has another layout.
     """

@@ -73,7 +73,7 @@ def budget(seconds: float) -> str:
 
 
 def interval(of: Estimate, digits: int = 2, *, sign: bool = False) -> str:
-    """Format a 95 % interval and say for what it holds, such as other seeds; return NO_SPREAD if there is none."""
+    """Format a 95 % interval and say whether it is over seeds, views or scenes; return NO_SPREAD if there is none."""
     write = signed if sign else plain
     return f"95 % {write(of.low, digits)} to {write(of.high, digits)} over {of.over}" if of.over else NO_SPREAD
 

@@ -69,7 +69,7 @@ def _sentence(one: Decided) -> str:
 
 
 def _screen_words(runs: list[Record]) -> str:
-    """Say whether the model depends on time, why the first run decided so, and whether other seeds agree."""
+    """Say whether the model depends on time, why the first run decided so, and if other seeds gave the same result."""
     screens = _screens(runs)
     if not screens:
         return ""
@@ -121,7 +121,7 @@ def _change(of: Estimate, unit: str, digits: int) -> str:
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
-    """List notes on the removal of time, direction and AGR (a network): what was undecided, what the numbers leave out.
+    """List notes on removing time, direction and AGR (a network): open decisions, and what the numbers leave out.
 
     Equal notes of several seeds are merged.
     """
@@ -186,7 +186,7 @@ def _mean_degree(one: Decided) -> str:
 
 
 def _swatches() -> list[Swatch]:
-    """Return the legend of the colours for what Gaussians depend on, such as "static", and for SH degrees."""
+    """Return the colour legend: what Gaussians depend on, such as "static", and the degrees of their SH."""
     effect_sets = [Swatch(said, f"model-{MODELS.index(EFFECT_SET_LIKE[name])}") for name, said in EFFECT_SETS.items()]
     degrees = [Swatch(f"degree {i}", f"stage-{_stage(i)}") for i in range(DEGREES)]
     return [*effect_sets, Swatch(NAMES[REMOVED], "line"), *degrees]

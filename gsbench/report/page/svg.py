@@ -58,7 +58,7 @@ def stage_colour(index: int) -> str:
 
 @dataclass
 class Panel:
-    """A figure with one pair of axes; `hits` are the points that show the name of a run under the pointer."""
+    """A figure with one pair of axes; `hits` are the points that show their run's name at the mouse pointer."""
 
     height: int
     left: int = 38  # pixels left of the axes
@@ -83,7 +83,7 @@ class Panel:
             FigureCanvasSVG(self.figure)
 
     def _axes(self, bottom: float, height: float, **options: Any) -> Axes:
-        """Add axes to the figure, with their distance from its bottom and their height in pixels."""
+        """Add axes to the figure, at a distance in pixels from its bottom and with a height in pixels."""
         across = self.left / self.width, (self.width - self.left - 12) / self.width
         box = across[0], bottom / self.height, across[1], height / self.height
         return self.figure.add_axes(box, facecolor="none", **options)
@@ -95,7 +95,7 @@ class Panel:
         self.figure.text(0, 1 - 2 / self.height, y, ha="left", va="top", **style)
 
     def above(self, row: float, left: str, right: str) -> None:
-        """Write a text at each end of a row, on the background colour so that no line runs through the texts."""
+        """Write one text at each end of a row; a box in the background colour keeps lines from crossing the texts."""
         box = {"facecolor": PAPER, "edgecolor": "none", "pad": 1.0}
         for x, side, text, colour in ((0, "left", left, INK), (1, "right", right, MUTED)):
             place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "va": "top", "ha": side}

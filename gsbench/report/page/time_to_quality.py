@@ -10,7 +10,7 @@ from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, P
 
 
 def quality_section(group: Group, canvas: Canvas) -> PageSection:
-    """Make the section on how long each model trains to reach PSNR targets, with their performance profile."""
+    """Make the section on how long each model trains to reach PSNR targets, with the models' performance profiles."""
     targets = f.targets(group)
     if not targets:
         text = "No target: no finished run has PSNR on val and training seconds, or all reach the same."

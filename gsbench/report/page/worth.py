@@ -185,7 +185,7 @@ def _slowest_words(parts: dict[str, dict[str, float]], names: list[str]) -> str:
 
 
 def _stage_seconds(group: Group, model: str) -> dict[str, float]:
-    """Return the mean seconds of a model in each stage of training, over scenes and seeds, and in all other work."""
+    """Return the seconds of a model in each stage of training and in all other work, averaged over scenes and seeds."""
     (configuration,) = (c for c in group.main_configurations if c.model == model)
     scenes = [s for s in group.covered or configuration.runs if s in configuration.runs]
     runs = [[r for r in configuration.runs[s] if r.cost and not math.isnan(group.value(r, "seconds"))] for s in scenes]
