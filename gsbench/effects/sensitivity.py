@@ -81,7 +81,7 @@ def probe(
         model: the model, trained or in training.
         views: the training views.
         background: the background colour, [3].
-        seed: the seed of the random signs g (formula in the module).
+        seed: the seed of the random images g, which have the values 1 and -1.
         most: the largest number of views that are used, evenly spaced.
         draws: the number of random images g for each view; more draws reduce the variance.
         antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
@@ -136,7 +136,10 @@ class Drawn(NamedTuple):
         return self.images[0].detach()
 
     def products(self, vectors: list[Tensor]) -> Tensor:
-        """Return gradients of K products <image, vector> with respect to 16 numbers of each Gaussian, [K, N, 16]."""
+        """Return gradients of K products <image, vector> with respect to the Gaussians, [K, N, 16].
+
+        The 16 numbers of a Gaussian are mean, covariance factor, opacity and colour.
+        """
         found = []
         for vector in vectors:
             sums: dict[int, Tensor] = {}

@@ -129,7 +129,7 @@ def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewpo
 
 @contextmanager
 def backward_by_splat() -> Iterator[None]:
-    """Inside this context, compute gradients of blending on a GPU with one thread per Gaussian, not per pixel.
+    """In a `with` block, compute gradients of blending on a GPU with one thread per Gaussian, not per pixel.
 
     The gradients are the same. docs/gpu.md says why one thread per pixel is the default.
     """

@@ -43,7 +43,7 @@ class Gaussians3D(NamedTuple):
 
 
 class Conditioned(NamedTuple):
-    """Hold means and factors of conditional 3D Gaussians, and the numbers in [0, 1] that multiply opacities."""
+    """Hold means and covariance factors of conditional 3D Gaussians, and the factors in [0, 1] of their opacities."""
 
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
@@ -150,26 +150,26 @@ class GaussianModel(nn.Module, ABC):
         """
 
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
-        """Multiply the spatial standard deviations of slices by factors in (0, 1]; by default do nothing.
+        """Multiply the standard deviations of conditional 3D Gaussians by factors in (0, 1]; by default do nothing.
 
-        Positions, velocities and lifetimes do not change. Relocation needs this (`gsbench.train.densify.mcmc`).
+        Positions, velocities and lifetimes do not change. The relocation of 3DGS-MCMC calls this method.
 
         Args:
             rows: the indices of the Gaussians, [M].
-            factors: the factor of each of them, [M].
+            factors: the factor of each of these Gaussians, [M].
         """
         return
 
     def spread(self) -> Tensor:
-        """Return factors F [N, 3, 3] of the spatial covariances F F^T of slices; by default of balls of the largest."""
+        """Return factors F [N, 3, 3] of conditional covariances F F^T; by default those of spheres of size `scales`."""
         return torch.diag_embed(self.scales()[:, None].expand(-1, 3))
 
     def log_sizes(self, index: int) -> Tensor:
-        """Return the logarithms of the sizes of one Gaussian in its n dimensions, [n]; by default only the largest."""
+        """Return the log sizes of one Gaussian in its n dimensions, [n]; by default only the largest size, [1]."""
         return self.scales()[index : index + 1].log()
 
     def log_duration(self, index: int) -> float | None:
-        """Return the logarithm of a Gaussian's size in time (1 = the length of the scene); None if it has none."""
+        """Return the log size of a Gaussian in time (1 = the length of the scene); None for a model without time."""
         return None
 
     def durations(self) -> Tensor | None:
@@ -179,7 +179,8 @@ class GaussianModel(nn.Module, ABC):
     def lifetimes(self) -> tuple[Tensor, Tensor] | None:
         """Return the mean time mu_t [N] and the lifetime s [N] of each Gaussian; None without time.
 
-        The opacity is proportional to exp(-1/2 ((t - mu_t) / s)^2), so s is the standard deviation over sqrt(lambda_t).
+        The opacity is proportional to exp(-1/2 ((t - mu_t) / s)^2), so s is the standard deviation in time divided by
+        sqrt(lambda_t).
         """
         deviations = self.durations()
         return None if deviations is None else (self.splats["times"][:, 0], deviations / self.lambda_of("time").sqrt())

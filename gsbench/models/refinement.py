@@ -1,4 +1,4 @@
-"""Change the parameters of Gaussians with time by AGR, the adaptive Gaussian refinement of 7DGS (section 4.3)."""
+"""Change the parameters of Gaussians over time by AGR, the adaptive Gaussian refinement of 7DGS (section 4.3)."""
 
 import functools
 import math
@@ -71,7 +71,8 @@ class Refinement(nn.Module):
         """Return the raw parameters plus the outputs of AGR's networks at a time.
 
         Args:
-            values: raw parameters, [N, c] each: first the means, which are the input, then those of the covariance.
+            values: raw parameters, [N, c] each: first the means, which are the input, then the parameters of the
+                covariance.
             time: the time in [0, 1], [].
             by_kernel: whether the backend's kernel (float32) computes it, which stores no hidden layer in memory.
             rows: only the first `rows` Gaussians change; None: all.

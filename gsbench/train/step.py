@@ -48,8 +48,8 @@ def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
     """Assign to each view of a batch the dictionary to which its gradients are added.
 
     Views share a dictionary if one thread renders them and they are in the same half of the batch. If a thread begins
-    inside a half, its views there have a dictionary each. `add_up` adds all dictionaries in the order of the views, so
-    the total has the same bits for any number of threads.
+    inside a half, each of the thread's views in this half has its own dictionary. `add_up` adds all dictionaries in the
+    order of the views, so the total has the same bits for any number of threads.
 
     Args:
         views: the number of views in the batch.
