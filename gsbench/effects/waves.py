@@ -50,7 +50,7 @@ def evidence(
     random = np.random.default_rng(seed)
 
     def share(rows: NDArray[np.int64]) -> float:
-        """Return the share of the gradients that permuted cosines of time explain and the camera does not."""
+        """Return the share of the gradients that cosines of time, permuted by `rows`, explain beyond the camera."""
         turned = np.concatenate([slow, known], 1)[rows]
         energies = np.einsum("vk,vk->k", turned, gram @ turned)
         left = total - energies[slow.shape[1] :].sum()
