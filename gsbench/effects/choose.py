@@ -64,7 +64,7 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
 def import_compiler() -> None:
     """Create a torch optimizer so that torch imports its compiler now, before the run time of the test is measured.
 
-    The import takes a second. Otherwise the first optimizer of the test would trigger it.
+    The import takes a second. Otherwise the first optimizer of the test would trigger the import.
     """
     torch.optim.Adam([torch.zeros(1)])
 
@@ -134,7 +134,7 @@ def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> ScreenRe
 
 
 def _dummies(places: list[list[int]]) -> Array:  # [V, P]
-    """Return indicator variables [V, P] of P camera positions: 1 for a view from this position, 0 for the others."""
+    """Return indicator variables [V, P] of P camera positions: 1 for a view from the position, 0 for other views."""
     columns = np.zeros((sum(map(len, places)), len(places)))
     for number, place in enumerate(places):
         columns[place, number] = 1

@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 def changes(
     images: Array,  # [n, H, W, 3] of one camera place, in [0, 1]
 ) -> Array:  # [n, H, W, 3]
-    """Return the difference of each image from the mean image, after its gain and offset of exposure were removed.
+    """Return the difference of each image from the mean image, after gain and offset of the exposure were removed.
 
     The images come from the same camera position. A difference of at most three standard deviations of the noise is set
     to zero if the value that gain and offset predict is saturated.

@@ -222,8 +222,8 @@ def _grown(*changes: Tensor) -> Tensor:
     """Compute the growth of the squared error, max(0, 2 <r, x>) + |x|^2, [N].
 
     The change x of the image is a sum of changes that do not overlap. There is one argument [K, N] for each of these
-    changes. It has the scalar products of the change with the residual r, and with K - 1 images of random signs g,
-    which estimate |x|^2.
+    changes: the scalar products of the change with the residual r, and with K - 1 images of random signs g, which
+    estimate |x|^2.
     """
     products = torch.stack(changes)
     return (2 * products[:, 0].sum(0)).clamp(min=0) + products[:, 1:].square().mean(1).sum(0)

@@ -1,7 +1,7 @@
 """Declare a differentiable operation by its kernels; checks, calls and the gradient follow from the declaration.
 
-An operation is a pair of compiled kernels, forward and backward. If a tape is active (a list of kernel calls, see
-`gsbench.kernels.tape`), it records each call for the backward pass. Otherwise torch's autograd records the call,
+An operation is a pair of compiled kernels, forward and backward. An active tape, which is a list of kernel calls
+(`gsbench.kernels.tape`), records each call for the backward pass. Without a tape torch's autograd records the call,
 because the operation is registered as `torch.ops.gsbench.NAME`.
 """
 

@@ -96,7 +96,7 @@ class GaussianModel(nn.Module, ABC):
         """Make a model without Gaussians; `initialise` or `load_state` adds them.
 
         Args:
-            agr: whether AGR, the adaptive Gaussian refinement of 7DGS, changes the Gaussians with time.
+            agr: whether AGR, the adaptive Gaussian refinement of 7DGS, changes the Gaussians over time.
             agr_octaves: the number of frequencies of AGR's time encoding.
             sh_degree: the SH degree of the colours, 0 to 3.
             backend: the implementation that computes conditional 3D Gaussians, colours and AGR.
@@ -222,7 +222,8 @@ class GaussianModel(nn.Module, ABC):
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
         """Compute the SH colours [N, 3] of 3D Gaussians as seen from `query.center`, the camera's centre.
 
-        The kernel skips Gaussians that are culled because of their opacity. A model with other colours overrides this.
+        The kernel skips Gaussians that are culled because of their opacity. A model with other colours overrides this
+        method.
         """
         degree = self.active.sh_degree
         if self.backend.serves(means):
@@ -278,7 +279,7 @@ class GaussianModel(nn.Module, ABC):
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
         """Compute means, covariance factors and opacities of the 3D Gaussians for a camera and a time.
 
-        A subclass that has a kernel for this overrides it.
+        A subclass that has a kernel for this overrides the method.
         """
         means, factors, opacity_factor, shapes = self.condition(raw, query)
         return Geometry(means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor, shapes)
@@ -292,7 +293,7 @@ class GaussianModel(nn.Module, ABC):
         return None if self.effect_sets is None else self.effect_sets.orders
 
     def count_by_effects(self) -> dict[str, int]:
-        """Count Gaussians by what they depend on: AGR (a network), time and direction, one of the two, or nothing."""
+        """Count Gaussians by what they depend on: AGR (a network), time and direction, only one of them, nothing."""
         N, effect_sets = len(self), self.effect_sets
         if effect_sets is not None:
             return effect_sets.by_name(N)
@@ -302,7 +303,7 @@ class GaussianModel(nn.Module, ABC):
 
     @property
     def refines(self) -> bool:
-        """Whether the model has AGR, the neural refinement, and it is switched on."""
+        """Whether the model has AGR, the neural refinement, and AGR is switched on."""
         return self.refinement is not None and self.active.refine
 
     def refined(self, query: Query) -> Raw:
@@ -385,7 +386,7 @@ class GaussianModel(nn.Module, ABC):
         """Replace copies of split Gaussians by their children.
 
         Args:
-            rows: the indices of the copies, [M]; the two copies of a Gaussian follow each other.
+            rows: the indices of the copies, [M]; the two copies of a Gaussian are next to each other.
             generator: the source of all random numbers.
         """
         raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.geometry)}

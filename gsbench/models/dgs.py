@@ -1,6 +1,7 @@
 """Model moving, view-dependent scenes by dGS: 3D Gaussians that move and fade with time and view direction (2026).
 
-The equations are those of "direct conditioning", a text under review for NeurIPS 2026, with the constants of its code.
+The equations are those of "direct conditioning", a text under review for NeurIPS 2026, with the constants of the
+authors' code.
 """
 
 import math

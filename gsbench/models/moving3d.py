@@ -22,7 +22,7 @@ from gsbench.models.query import Query
 class MovingGaussians3D(Gaussians3DModel):
     """3D Gaussians of 3DGS (rotation and scales) whose means and opacities depend on time or direction.
 
-    Density control is that of 3DGS: a split makes two children that are 1.6 times smaller and move as their parent.
+    Density control is that of 3DGS: a split makes two children that are 1.6 times smaller and move like their parent.
     """
 
     moving: ClassVar[tuple[str, ...]]  # names of the raw parameters that a static Gaussian does not use
@@ -36,7 +36,7 @@ class MovingGaussians3D(Gaussians3DModel):
         """Return the mean [N] and the standard deviation [N] of each opacity, which is a Gaussian function of time."""
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Return the Gaussians at a camera centre and time: moved, with factors R S and their opacity factors."""
+        """Return the moved means, the covariance factors R S and the opacity factors for a camera centre and a time."""
         shift, opacity_factor = self.change(raw, query)
         return Conditioned(raw["means"] + shift, self.factors(raw), opacity_factor)
 

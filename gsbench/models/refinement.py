@@ -29,8 +29,8 @@ class Refinement(nn.Module):
     """The networks of AGR, the adaptive Gaussian refinement (7DGS, eq. 14 and 15).
 
     Each network has one hidden layer of 64 units. Its input is the means of a Gaussian and an encoding of the time, its
-    output is added to raw parameters. One network changes each mean (position, time, direction), one more changes all
-    parameters of the covariance. Output layers start at zero, so AGR changes nothing at first.
+    output is added to raw parameters. Each mean (position, time, direction) has its own network. One more network
+    changes all parameters of the covariance. Output layers start at zero, so AGR changes nothing at first.
     """
 
     units: Tensor  # [sum of outputs]

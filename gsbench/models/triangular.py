@@ -1,4 +1,4 @@
-"""Define 6DGS and 7DGS: Gaussians over position and direction, time or both, with the Cholesky factor as parameter."""
+"""Define 6DGS and 7DGS: Gaussians over position, direction and (in 7DGS) time, with a Cholesky factor as parameter."""
 
 import math
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ TIME_SCALE = 0.25  # .. and sqrt(S_t) is above this part of the scene's length (
 
 
 class TriangularModel(GatedModel):
-    """The base class of 6DGS and 7DGS: Gaussians over position p and direction d, time t or both.
+    """The base class of 6DGS and 7DGS: Gaussians over position p, and over direction d, time t, or d and t.
 
     The parameters are those of a lower triangular factor of the covariance. Before conditioning on d and t, its rows
     are sorted to (p, d, t).

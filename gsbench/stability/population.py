@@ -90,7 +90,7 @@ def factor(hard: Hard) -> Floats:
 
 
 def conditioned(order: str) -> list[int]:
-    """Return the rows of direction and then of time in the triangular factor, for a given row order of this factor."""
+    """Return the indices of those rows of the triangular factor that belong to direction (first) and time (last)."""
     return [4, 5, 6, 3] if order == "paper" else [0, 1, 2, 3]
 
 

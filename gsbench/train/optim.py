@@ -113,7 +113,7 @@ class Optimizer:
             self.torch_adam.zero_grad(set_to_none=True)
 
     def rates_at(self, step: int, slowed: float = 1.0) -> dict[str, float]:
-        """Return the learning rate of each group at a step; that of AGR (a network) is multiplied by `slowed`."""
+        """Return the learning rate of each group at a step; the rate of AGR (a network) is multiplied by `slowed`."""
         rates = {name: rate_at(rate, step, self.train, self.extent) for name, rate in self.rates.items()}
         return {name: rate * slowed if name == "refinement" else rate for name, rate in rates.items()}
 

@@ -34,7 +34,7 @@ PIXELS_OF_A_GAUSSIAN = 12
 
 @contextmanager
 def fitting_threads(gaussians: int, pixels: int) -> Iterator[None]:
-    """Run the enclosed training step on one thread if it has few Gaussians and pixels; results have the same bits."""
+    """Run the training step in a `with` block on one thread if it has few Gaussians and pixels; results are equal."""
     threads = torch.get_num_threads()
     if gaussians + pixels / PIXELS_OF_A_GAUSSIAN < WORTH_A_THREAD:
         torch.set_num_threads(1)
