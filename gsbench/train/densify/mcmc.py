@@ -20,7 +20,8 @@ class MCMCDensification(Densification):
       its opacity is at most the model's `min_opacity`. Each dead Gaussian moves to a living one, which is drawn with a
       probability proportional to its opacity.
     - Then 5 % more Gaussians are added in the same way, up to `train.densify.max_gaussians`.
-    - The n Gaussians that are now at one place get opacities and sizes with which they look like the one before.
+    - The n Gaussians that are now at one place get opacities and sizes such that together they look like the single
+      Gaussian that was there before.
     - After every step each mean moves by normal noise with the covariance of its Gaussian. The noise is multiplied by
       `train.densify.noise`, by the learning rate of means and by sigmoid(-100 (opacity - 0.005)), so only transparent
       Gaussians move.
