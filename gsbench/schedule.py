@@ -1,7 +1,7 @@
 """Compute at which steps of a training something happens (densification, opacity resets, SH degree, resolution).
 
-The settings name steps of a run of 30,000 iterations. They are scaled to the length of the run. This module does not
-import torch, because reports use it too.
+The settings give step numbers for a training of 30,000 iterations. They are scaled to the length of the actual
+training. This module does not import torch, because reports use it too.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class ActiveComponents:
 class Schedule:
     """Tell what happens at each step of a training.
 
-    The settings name steps of a run of `recipe_iterations` (30,000) iterations. A run of another length multiplies them
-    by iterations / recipe_iterations.
+    The settings give step numbers for a training of `recipe_iterations` (30,000) iterations. For a training of another
+    length, they are multiplied by iterations / recipe_iterations.
     """
 
     def __init__(self, config: TrainConfig, sh_degree: int, agr: bool) -> None:
@@ -67,7 +67,7 @@ class Schedule:
         self.resets_after = range(every, self.densify_stop - every // 2 + 1, every)
 
     def scaled(self, step: int) -> int:
-        """Convert a step of a run of `recipe_iterations` iterations to a step of this run, at least 1."""
+        """Scale a step number, given for `recipe_iterations` iterations, to the length of this run; at least 1."""
         return max(1, round(step * self.config.iterations / self.config.recipe_iterations))
 
     def active(self, step: int) -> ActiveComponents:
@@ -88,7 +88,7 @@ class Schedule:
         return step + 1 in self.resets_after
 
     def has_reset(self, step: int) -> bool:
-        """Return whether opacities were reset before; from then on Gaussians that are too large are pruned."""
+        """Return whether opacities were reset before a step; from then on Gaussians that are too large are pruned."""
         return step + 1 > self.reset_every
 
     def resolution(self, step: int) -> int:
@@ -97,9 +97,10 @@ class Schedule:
         return next((factor for factor, until in coarse if step < self.scaled(until)), 1)
 
     def within(self, step: int, start: int, stop: int | None) -> bool:
-        """Return whether a step of this run lies between `start` and `stop`, steps of a run of `recipe_iterations`.
+        """Return whether a step of this run lies between `start` and `stop`.
 
-        A `stop` of None is the end of the run.
+        `start` and `stop` are given for `recipe_iterations` iterations, and are scaled to the length of this run. A
+        `stop` of None is the end of the run.
         """
         return self.scaled(start) <= step + 1 and (stop is None or step + 1 <= self.scaled(stop))
 

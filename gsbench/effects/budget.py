@@ -21,9 +21,9 @@ MOST_PREDICTED = 2.0  # the predicted loss of PSNR is at most this times the all
 
 @dataclass(frozen=True)
 class Gated:
-    """Hold a model with Gaussians that were made independent of time, direction or AGR, and the loss of PSNR.
+    """Hold a simplified model, and by how much its PSNR is lower than that of the model before.
 
-    AGR is the neural refinement of Gaussians with time.
+    Some of its Gaussians were made independent of time, direction or AGR, a network that changes Gaussians over time.
     """
 
     model: GatedModel
@@ -51,7 +51,8 @@ def gate_within(
         sensitivity: the predicted error of each simplification of each Gaussian.
         budget_db: the largest allowed loss of PSNR, dB.
         measure: a function that returns the PSNR of a model in dB, on views that were not used for `sensitivity`.
-        intervals: the first and the last time at which AGR changes each Gaussian, because it is visible.
+        intervals: the first and the last time at which each Gaussian is visible; AGR changes it only between these
+            times.
     """
     before = measure(model)
     for share in SHARES:
@@ -76,7 +77,7 @@ def gate_within(
 
 
 def orders_of(model: GaussianModel) -> dict[str, int]:
-    """Count the Gaussians by the SH degree of their colour, and in 4DGS also by its number of frequencies in time."""
+    """Count the Gaussians by the SH degree of the colour, and in 4DGS by the colour's number of frequencies in time."""
     if model.effect_sets is None or model.effect_sets.orders is None:
         return {}
     values, counts = torch.unique(model.effect_sets.orders, return_counts=True)

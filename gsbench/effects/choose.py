@@ -43,7 +43,7 @@ class ScreenResult:
 
 
 def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
-    """Decide from its training views, reduced to a small size, whether a scene changes with time.
+    """Decide whether a scene changes with time, from its training views, which are reduced to a small size.
 
     Args:
         scene: the scene.
@@ -62,15 +62,15 @@ def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
 
 
 def import_compiler() -> None:
-    """Create a torch optimizer so that torch imports its compiler now, before the time of the test is measured.
+    """Create a torch optimizer so that torch imports its compiler now, before the run time of the test is measured.
 
-    The import takes a second. Otherwise the first optimizer of the test would trigger it.
+    The import takes a second. Otherwise the first optimizer of the test would trigger the import.
     """
     torch.optim.Adam([torch.zeros(1)])
 
 
 def _answer(scene: Scene, seed: int, backend: str) -> ScreenResult:
-    """Test whether the scene changes with time, by views from the same camera position, by other views, or by both."""
+    """Test whether the scene changes with time, on views that share a camera position, on other views, or on all."""
     views = scene.train
     if not scene.has_time:
         return ScreenResult(OFF, "the views have no times")
@@ -134,7 +134,7 @@ def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> ScreenRe
 
 
 def _dummies(places: list[list[int]]) -> Array:  # [V, P]
-    """Return indicator variables [V, P] of P camera positions: 1 for a view from this position, 0 for the others."""
+    """Return indicator variables [V, P] of P camera positions: 1 for a view from the position, 0 for other views."""
     columns = np.zeros((sum(map(len, places)), len(places)))
     for number, place in enumerate(places):
         columns[place, number] = 1
@@ -145,7 +145,7 @@ def _both(fixed: ScreenResult, loose: ScreenResult) -> ScreenResult:
     """Combine the p-values of two tests whether a scene changes with time, by Fisher's method.
 
     One test has the views from repeated camera positions, the other has all other views. The combined p-value is q (1 -
-    ln q), where q is the product of both.
+    ln q), where q is the product of the two p-values.
     """
     reason = f"{fixed.reason}; of the other views, {loose.reason}"
     if OFF == fixed.decision == loose.decision:

@@ -25,10 +25,10 @@ Mask = NDArray[np.bool_]
 def changes(
     images: Array,  # [n, H, W, 3] of one camera place, in [0, 1]
 ) -> Array:  # [n, H, W, 3]
-    """Return the difference of each image from the mean image, after its gain and offset of exposure were removed.
+    """Return the difference of each image from the mean image, after gain and offset of the exposure were removed.
 
     The images come from the same camera position. A difference of at most three standard deviations of the noise is set
-    to zero if the expected value is saturated.
+    to zero if the value that gain and offset predict is saturated.
     """
     n, height, width, channels = images.shape
     y = np.ascontiguousarray(images.transpose(0, 3, 1, 2), np.float32).reshape(n, channels, -1)
@@ -55,7 +55,7 @@ def changes(
 def _telling(
     saturated: Mask,  # [n, 3, P]
 ) -> NDArray[np.int64]:
-    """Choose the pixels for the fit of exposure: up to FIT_PIXELS that no image saturates, and FIT_PIXELS of all."""
+    """Choose the pixels for the fit of exposure: FIT_PIXELS of all, and up to FIT_PIXELS that no image saturates."""
     inside = np.flatnonzero((~saturated.any(0)).any(0))
     spaced = [every[:: max(1, -(-len(every) // FIT_PIXELS))] for every in (inside, np.arange(saturated.shape[2]))]
     return np.unique(np.concatenate(spaced))
@@ -91,7 +91,7 @@ def _shared(
     enough: Mask,  # [n, 3, 1]
     otherwise: float,
 ) -> Array:
-    """Replace a gain or offset that has too few pixels by the mean of the other channels of the image."""
+    """Replace a gain or offset that was fitted to too few pixels by the mean over the image's other channels."""
     number = enough.sum(1, keepdims=True)
     mean = (values * enough).sum(1, keepdims=True) / np.maximum(number, 1)
     return np.where(enough, values, np.where(number > 0, mean, otherwise)).astype(np.float32)

@@ -45,9 +45,9 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
     removed.
 
-    For Gaussian i, the simplification s minimises cost(i, s) + lambda error(i, s). The cost is its time in a frame
-    (COSTS, COLORING), and the error is the predicted squared error. Bisection finds the smallest lambda for which the
-    errors stay within the bound.
+    For Gaussian i, the simplification s minimises cost(i, s) + lambda error(i, s). The cost is the Gaussian's rendering
+    time in a frame (COSTS, COLORING), and the error is the predicted growth of the images' squared error. Bisection
+    finds the smallest lambda for which the errors stay within the bound.
 
     Args:
         sensitivity: the predicted error of each simplification of each Gaussian.
@@ -69,7 +69,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     shading = _shading(orders)
 
     def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return each Gaussian's best simplification (such as without time) and its error, for one weight lambda."""
+        """Return each Gaussian's best simplification (such as no time) and its error, if lambda weights the errors."""
         shade, hue = (shading + price * hues).min(0)
         _, form = (costs + price * forms + torch.where(removes, 0.0, shade)).min(0)  # argmin takes 8 to 30 times longer
         error = forms.gather(0, form[None])[0] + hues.gather(0, hue[None])[0] * ~removes[form, 0]

@@ -89,7 +89,7 @@ def smaller(view: View) -> View:
 
 
 def scene_points(views: Sequence[View], scene: Scene, random: torch.Generator) -> Points:
-    """Return POINTS initial points for a fit: a random subset of the scene's points, or random points at its centre."""
+    """Return POINTS initial points for a fit: a random subset of the scene's points, or points around its centre."""
     if scene.points is not None:
         chosen = torch.randperm(len(scene.points.means), generator=random)[:POINTS]
         return Points(scene.points.means[chosen], scene.points.colors[chosen])

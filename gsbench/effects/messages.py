@@ -28,7 +28,7 @@ def of_decision(screen: TimeScreen) -> str:
 
 
 def of_screen(screen: TimeScreen) -> str:
-    """Return a message with the answer of the test whether the scene changes with time, and its reason."""
+    """Return a message with the answer of the test whether the scene changes with time, and why it is the answer."""
     return f"{of_decision(screen)}: {screen.reason}"
 
 

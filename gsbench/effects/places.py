@@ -53,7 +53,7 @@ def find_places(views: Sequence[View], extent: float) -> Places:
 
 
 def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
-    """Return a vector for each camera, such that the distance of two vectors approximates the shift of their images.
+    """Return a vector for each camera, such that vectors differ by about the shift between the images of the cameras.
 
     The unit of the shift is the longer side of the image.
     """

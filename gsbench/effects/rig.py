@@ -5,10 +5,10 @@ Differences of exposure are removed first (gsbench.effects.exposure). Then there
 - Does anything change? Each block of pixels is divided into two halves by a chess-board pattern. Noise is independent
   in the two halves, so the product of their means is zero on average. For a change of the scene it is positive. The
   scene changes if this product is far above the noise in at least one block.
-- Does it change slowly with time? Let M hold the block means of the images from one position, and W four slow cosines
-  of time. The statistic is |W^T M|^2 / |M|^2, summed over positions. It is compared with its values after random
-  permutations of the images within each position (Gretton et al. 2005). Images of the same time are permuted together,
-  so that a light which flickers for all cameras does not count as slow change.
+- Does it change slowly with time? Let M hold the block means of the images from one position, and W the slow cosines
+  cos(pi k t), k = 1 .. 4, at their times t. The statistic is |W^T M|^2 / |M|^2, summed over positions. It is compared
+  with its values after random permutations of the images within each position (Gretton et al. 2005). Images of the same
+  time are permuted together, so that a light which flickers for all cameras does not count as slow change.
 """
 
 from collections.abc import Sequence
@@ -112,7 +112,7 @@ def _is_changed(
 
 
 def _slow(means: list[Array], times: list[Array], seed: int) -> tuple[float, float]:
-    """Return the p-value and z-score of the test whether block means follow slow cosines of time.
+    """Return the p-value and z-score of the test whether block means follow slow cosines of time, cos(pi k t).
 
     Args:
         means: the block means of the images from each camera position, [n, ..] each.

@@ -81,7 +81,7 @@ def probe(
         model: the model, trained or in training.
         views: the training views.
         background: the background colour, [3].
-        seed: the seed of the random signs g (formula in the module).
+        seed: the seed of the random images g, which have the values 1 and -1.
         most: the largest number of views that are used, evenly spaced.
         draws: the number of random images g for each view; more draws reduce the variance.
         antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
@@ -136,7 +136,10 @@ class Drawn(NamedTuple):
         return self.images[0].detach()
 
     def products(self, vectors: list[Tensor]) -> Tensor:
-        """Return gradients of K products <image, vector> with respect to 16 numbers of each Gaussian, [K, N, 16]."""
+        """Return gradients of K products <image, vector> with respect to the Gaussians, [K, N, 16].
+
+        The 16 numbers of a Gaussian are mean, covariance factor, opacity and colour.
+        """
         found = []
         for vector in vectors:
             sums: dict[int, Tensor] = {}
@@ -219,8 +222,8 @@ def _grown(*changes: Tensor) -> Tensor:
     """Compute the growth of the squared error, max(0, 2 <r, x>) + |x|^2, [N].
 
     The change x of the image is a sum of changes that do not overlap. There is one argument [K, N] for each of these
-    changes. It has the scalar products of the change with the residual r, and with K - 1 images of random signs g,
-    which estimate |x|^2.
+    changes: the scalar products of the change with the residual r, and with K - 1 images of random signs g, which
+    estimate |x|^2.
     """
     products = torch.stack(changes)
     return (2 * products[:, 0].sum(0)).clamp(min=0) + products[:, 1:].square().mean(1).sum(0)

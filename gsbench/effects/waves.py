@@ -50,7 +50,7 @@ def evidence(
     random = np.random.default_rng(seed)
 
     def share(rows: NDArray[np.int64]) -> float:
-        """Return the share of gradients, permuted by `rows`, that cosines of time explain and the camera does not."""
+        """Return the share of the gradients that cosines of time, permuted by `rows`, explain beyond the camera."""
         turned = np.concatenate([slow, known], 1)[rows]
         energies = np.einsum("vk,vk->k", turned, gram @ turned)
         left = total - energies[slow.shape[1] :].sum()
@@ -75,7 +75,8 @@ def compare(
 ) -> tuple[float, float]:
     """Return the p-value and the z-score of a permutation test.
 
-    The p-value is (1 + number of permutations that reach the actual value) / (1 + number of permutations).
+    The p-value is (1 + number of permutations whose statistic reaches that of the actual order) / (1 + number of
+    permutations).
     """
     p = (1 + int((null >= actual - TIE * abs(actual)).sum())) / (1 + len(null))
     spread = float(null.std())

@@ -44,7 +44,7 @@ def use_instruction_set(name: str) -> None:
     The default is the best one that the processor supports. The environment variable GSBENCH_ISA has the same effect.
 
     Raises:
-        InputError: the kernels are not built for it, or the processor does not support it.
+        InputError: the kernels are not built for this instruction set, or the processor does not support it.
     """
     known = native().instruction_sets()
     if name not in known:

@@ -86,7 +86,7 @@ def adam_all(
     """Update several parameters on the CPU by Adam, each with its own learning rate, as `torch.optim.Adam` does.
 
     All parameters are updated in one call: a small model has about twelve, and the overhead of a torch call costs as
-    much as the update of one.
+    much as the update of one parameter.
 
     Args:
         parameters: the tensors to update, of any shape.

@@ -97,8 +97,8 @@ def allocate(what: str, like: Tensor, shape: tuple[int, ...], dtype: torch.dtype
     """Allocate an uninitialised tensor on the device of `like`.
 
     Raises:
-        torch.OutOfMemoryError: the memory is not sufficient; the message says what needs it (`what`) and what to
-            reduce.
+        torch.OutOfMemoryError: the memory is not sufficient; the message says what needs the memory (`what`) and what
+            to reduce.
     """
     try:
         return like.new_empty(shape, dtype=dtype)

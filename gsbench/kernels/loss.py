@@ -16,7 +16,7 @@ from gsbench.kernels.tensors import check_number, check_tensor
 class _Similarity(Operation):
     """The loss as a differentiable operation; the forward pass also computes the gradient with respect to the image.
 
-    So the backward pass only multiplies this gradient by that of the loss.
+    So the backward pass only multiplies this gradient by the gradient that it gets for the loss.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,8 @@
 """Declare a differentiable operation by its kernels; checks, calls and the gradient follow from the declaration.
 
-An operation is a pair of compiled kernels, forward and backward. If a tape is active (a list of kernel calls, see
-`gsbench.kernels.tape`), it records each call for the backward pass. Otherwise torch's autograd does, for which the
-operation is registered as `torch.ops.gsbench.NAME`.
+An operation is a pair of compiled kernels, forward and backward. An active tape, which is a list of kernel calls
+(`gsbench.kernels.tape`), records each call for the backward pass. Without a tape torch's autograd records the call,
+because the operation is registered as `torch.ops.gsbench.NAME`.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,7 +53,7 @@ class Operation:
             numbers: the type of each argument that is not a tensor; an int may also be a dimension of a tensor.
             derive: computes dimensions that are not dimensions of an input, from the given tensors and numbers.
             scratch: the shape of memory, initialised to zero, that the backward kernel needs on a GPU.
-            memory: what the outputs are called in a message about too little memory.
+            memory: the name of the outputs in the error message if memory does not suffice.
         """
         self.name = name
         self.inputs, self.outputs = inputs, outputs
@@ -167,8 +167,10 @@ class Operation:
             slots: the kernel arguments that `run` returned.
             outputs: the outputs that `run` returned.
             given: the gradient of each output; None for zero.
-            wanted: whether the caller needs the gradient of each input; others are left out if declared ON_REQUEST.
-            sums: tensors to which gradients that are declared ADDED are added, by the index of the input.
+            wanted: whether the caller needs the gradient of each input; a gradient that is declared ON_REQUEST is
+                computed only if the caller needs it.
+            sums: for the index of each input whose gradient is declared ADDED, the tensor to which this gradient is
+                added.
         """
         like = tensors[0]
         library = library_of(like.device.type)

@@ -129,7 +129,7 @@ def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewpo
 
 @contextmanager
 def backward_by_splat() -> Iterator[None]:
-    """Inside this context, compute gradients of blending on a GPU with one thread per Gaussian, not per pixel.
+    """In a `with` block, compute gradients of blending on a GPU with one thread per Gaussian, not per pixel.
 
     The gradients are the same. docs/gpu.md says why one thread per pixel is the default.
     """
@@ -175,7 +175,7 @@ def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, 
 
 @torch.no_grad()
 def bin_within(splats: Splats, viewport: Viewport, flags: Tensor, room: int) -> tuple[Bins, Tensor]:
-    """List the projected Gaussians that touch each tile, as `bin_tiles`, on a GPU and without waiting for it.
+    """List the projected Gaussians that touch each tile, as `bin_tiles` does, but without waiting for the GPU.
 
     Memory is allocated for `room` tile intersections, and further ones are left out. Also return an int64 tensor [2]:
     the number of intersections, and `flags`, which is not zero if an input is invalid. Without Gaussians the tensor has
@@ -247,7 +247,7 @@ def _room(splats: Splats, pairs: int) -> tuple[Tensor, ...]:
 def _list_on_gpu(
     library: Library, splats: Splats, viewport: Viewport, by_depth: tuple[Tensor, Tensor], lists: tuple[Tensor, ...]
 ) -> Bins:
-    """List the tile intersections on a GPU and sort them by tile, as many as fit into `lists`."""
+    """List as many tile intersections as fit into `lists`, on a GPU, and sort them by tile."""
     like, ids = splats.depths, lists[-1]
     tiles = len(like) * count_tiles(viewport.width, viewport.height)
     offsets = allocate("lists of tiles", like, (tiles + 1,), torch.int32)

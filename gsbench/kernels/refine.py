@@ -1,4 +1,4 @@
-"""Apply AGR, the neural refinement of 7DGS: small MLPs that change the parameters of Gaussians with time.
+"""Apply AGR, the neural refinement of 7DGS: small MLPs that change the parameters of Gaussians over time.
 
 The kernels keep hidden layers in cache only, and the backward pass computes them again.
 """

@@ -97,7 +97,9 @@ class Tape:
         return outputs
 
     def backward(self, loss: Tensor, seed: Tensor, sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
-        """Compute the gradients of `loss` with respect to `sources`, and add them to `sums` by the id of each source.
+        """Compute the gradients of `loss` with respect to the tensors `sources`, and add them to `sums`.
+
+        The keys of `sums` are the ids of the tensors in `sources`.
 
         `seed` is the gradient of the loss itself, by which all gradients are multiplied. The added gradients are
         bitwise the same whether `sums` is empty or not. A tape may run backwards several times, with different seeds.

@@ -1,4 +1,4 @@
-"""Compute the colours of Gaussians by spherical harmonics (3DGS), in 4DGS times a Fourier series in time."""
+"""Compute the colours of Gaussians by spherical harmonics (3DGS), which 4DGS multiplies by a Fourier series in time."""
 
 import math
 

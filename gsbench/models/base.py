@@ -43,7 +43,7 @@ class Gaussians3D(NamedTuple):
 
 
 class Conditioned(NamedTuple):
-    """Hold means and factors of conditional 3D Gaussians, and the numbers in [0, 1] that multiply opacities."""
+    """Hold means and covariance factors of conditional 3D Gaussians, and the factors in [0, 1] of their opacities."""
 
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
@@ -96,7 +96,7 @@ class GaussianModel(nn.Module, ABC):
         """Make a model without Gaussians; `initialise` or `load_state` adds them.
 
         Args:
-            agr: whether AGR, the adaptive Gaussian refinement of 7DGS, changes the Gaussians with time.
+            agr: whether AGR, the adaptive Gaussian refinement of 7DGS, changes the Gaussians over time.
             agr_octaves: the number of frequencies of AGR's time encoding.
             sh_degree: the SH degree of the colours, 0 to 3.
             backend: the implementation that computes conditional 3D Gaussians, colours and AGR.
@@ -150,26 +150,26 @@ class GaussianModel(nn.Module, ABC):
         """
 
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
-        """Multiply the spatial standard deviations of slices by factors in (0, 1]; by default do nothing.
+        """Multiply the standard deviations of conditional 3D Gaussians by factors in (0, 1]; by default do nothing.
 
-        Positions, velocities and lifetimes do not change. Relocation needs this (`gsbench.train.densify.mcmc`).
+        Positions, velocities and lifetimes do not change. The relocation of 3DGS-MCMC calls this method.
 
         Args:
             rows: the indices of the Gaussians, [M].
-            factors: the factor of each of them, [M].
+            factors: the factor of each of these Gaussians, [M].
         """
         return
 
     def spread(self) -> Tensor:
-        """Return factors F [N, 3, 3] of the spatial covariances F F^T of slices; by default of balls of the largest."""
+        """Return factors F [N, 3, 3] of conditional covariances F F^T; by default those of spheres of size `scales`."""
         return torch.diag_embed(self.scales()[:, None].expand(-1, 3))
 
     def log_sizes(self, index: int) -> Tensor:
-        """Return the logarithms of the sizes of one Gaussian in its n dimensions, [n]; by default only the largest."""
+        """Return the log sizes of one Gaussian in its n dimensions, [n]; by default only the largest size, [1]."""
         return self.scales()[index : index + 1].log()
 
     def log_duration(self, index: int) -> float | None:
-        """Return the logarithm of a Gaussian's size in time (1 = the length of the scene); None if it has none."""
+        """Return the log size of a Gaussian in time (1 = the length of the scene); None for a model without time."""
         return None
 
     def durations(self) -> Tensor | None:
@@ -179,7 +179,8 @@ class GaussianModel(nn.Module, ABC):
     def lifetimes(self) -> tuple[Tensor, Tensor] | None:
         """Return the mean time mu_t [N] and the lifetime s [N] of each Gaussian; None without time.
 
-        The opacity is proportional to exp(-1/2 ((t - mu_t) / s)^2), so s is the standard deviation over sqrt(lambda_t).
+        The opacity is proportional to exp(-1/2 ((t - mu_t) / s)^2), so s is the standard deviation in time divided by
+        sqrt(lambda_t).
         """
         deviations = self.durations()
         return None if deviations is None else (self.splats["times"][:, 0], deviations / self.lambda_of("time").sqrt())
@@ -221,7 +222,8 @@ class GaussianModel(nn.Module, ABC):
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
         """Compute the SH colours [N, 3] of 3D Gaussians as seen from `query.center`, the camera's centre.
 
-        The kernel skips Gaussians that are culled because of their opacity. A model with other colours overrides this.
+        The kernel skips Gaussians that are culled because of their opacity. A model with other colours overrides this
+        method.
         """
         degree = self.active.sh_degree
         if self.backend.serves(means):
@@ -277,7 +279,7 @@ class GaussianModel(nn.Module, ABC):
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
         """Compute means, covariance factors and opacities of the 3D Gaussians for a camera and a time.
 
-        A subclass that has a kernel for this overrides it.
+        A subclass that has a kernel for this overrides the method.
         """
         means, factors, opacity_factor, shapes = self.condition(raw, query)
         return Geometry(means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor, shapes)
@@ -291,7 +293,7 @@ class GaussianModel(nn.Module, ABC):
         return None if self.effect_sets is None else self.effect_sets.orders
 
     def count_by_effects(self) -> dict[str, int]:
-        """Count Gaussians by what they depend on: AGR (a network), time and direction, one of the two, or nothing."""
+        """Count Gaussians by what they depend on: AGR (a network), time and direction, only one of them, nothing."""
         N, effect_sets = len(self), self.effect_sets
         if effect_sets is not None:
             return effect_sets.by_name(N)
@@ -301,7 +303,7 @@ class GaussianModel(nn.Module, ABC):
 
     @property
     def refines(self) -> bool:
-        """Whether the model has AGR, the neural refinement, and it is switched on."""
+        """Whether the model has AGR, the neural refinement, and AGR is switched on."""
         return self.refinement is not None and self.active.refine
 
     def refined(self, query: Query) -> Raw:
@@ -384,7 +386,7 @@ class GaussianModel(nn.Module, ABC):
         """Replace copies of split Gaussians by their children.
 
         Args:
-            rows: the indices of the copies, [M]; the two copies of a Gaussian follow each other.
+            rows: the indices of the copies, [M]; the two copies of a Gaussian are next to each other.
             generator: the source of all random numbers.
         """
         raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.geometry)}

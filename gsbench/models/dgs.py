@@ -1,6 +1,7 @@
-"""Model moving, view-dependent scenes by dGS: Gaussians that a precision in time and direction moves and fades (2026).
+"""Model moving, view-dependent scenes by dGS: 3D Gaussians that move and fade with time and view direction (2026).
 
-The equations are those of "direct conditioning", a text under review for NeurIPS 2026, with the constants of its code.
+The equations are those of "direct conditioning", a text under review for NeurIPS 2026, with the constants of the
+authors' code.
 """
 
 import math
@@ -29,14 +30,17 @@ TIME_MARGIN = 1e-6  # least distance of an initial mean time from 0 and 1, whose
 
 @register("dgs")
 class DirectModel(MovingGaussians3D):
-    """dGS: with q = (d, t), delta = q - mu_q and the precision V_qq = L L^T over direction and time,
+    """dGS: 3D Gaussians that move and fade with the direction d from the camera and the time t.
+
+    Let q = (d, t), delta = q - mu_q with the mean mu_q, and V_qq = L L^T the precision over direction and time. Then
 
         mean    = mu_p + V_pq diag(Lam) V_qq delta        V_pq = s Theta / |Theta|, s: mean of the three scales
         opacity = sigmoid(o) exp(-lambda_o |L^T delta|^2)   lambda_o = 0.35
-        cov     = R S S^T R^T, the same for every query
+        cov     = R S S^T R^T, for all times and directions
 
-    L is lower triangular over direction and has one entry for time. Lam in [0, 1] has one number for the three columns
-    of direction and one for time. The direction d of a query has no gradient.
+    The learned parameters of motion are Theta [3, 4] and Lam. L is lower triangular over direction and has one entry
+    for time. Lam has one number in [0, 1] for the three columns of direction and one for time. No gradient flows
+    through d.
     """  # fmt: skip
 
     observes = ("time", "direction")
@@ -48,8 +52,8 @@ class DirectModel(MovingGaussians3D):
         """Make a model without Gaussians.
 
         Args:
-            coupling: how the mean moves. `text`: as above. `interpolated`: by V_pq ((1 - Lam) delta + Lam V_qq delta),
-                as the comments of the authors' code say. `none`: not at all (the authors' dGS-O).
+            coupling: how the mean moves. `text`: by the formula of the class. `interpolated`: by V_pq ((1 - Lam) delta
+                + Lam V_qq delta), as the comments of the authors' code say. `none`: not at all (the authors' dGS-O).
             view_precision: the initial diagonal of L over direction. The authors use 0.02 for D-NeRF, 2.5 for the cloud
                 of 7DGS-PBR, 0.4 for its other scenes, and 1.0 elsewhere.
             options: the options of `GatedModel`.
@@ -79,7 +83,7 @@ class DirectModel(MovingGaussians3D):
         }
 
     def change(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor]:
-        """Return V_pq diag(Lam) V_qq delta [N, 3] and exp(-lambda_o |L^T delta|^2) [N]."""
+        """Return how far the means move [N, 3] and the factors of the opacities [N], by the formulas of the class."""
         assert query.time is not None
         direction = unit(raw["means"] - query.center).detach()
         delta = torch.cat([direction - unit(raw["directions"]), query.time - torch.sigmoid(raw["times"])], -1)
@@ -98,20 +102,26 @@ class DirectModel(MovingGaussians3D):
 
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
-        """Multiply the scales by factors, and divide Lam by them so that the mean moves as before, up to Lam = 1."""
+        """Multiply the scales of Gaussians by factors, and keep the motion of their means.
+
+        The motion is proportional to the scales times Lam, so Lam is divided by the factors, up to LARGEST_SHARE.
+        """
         super().shrink_rows(rows, factors)
         shares = torch.sigmoid(self.splats["shares"].data[rows])
         larger = (shares / factors[:, None].to(shares.dtype)).clamp(max=LARGEST_SHARE)
         self.splats["shares"].data[rows] = larger.logit()
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
-        """Return mu_t [N] and 1 / (sqrt(2 lambda_o) L_tt) [N]."""
+        """Return the mean time [N] of each Gaussian, and the standard deviation [N] of its opacity over time."""
         L_tt = sizes(self.splats["precision"].detach()[:, 6])
         return torch.sigmoid(self.splats["times"].detach()[:, 0]), 1 / (math.sqrt(2 * FADING) * L_tt)
 
 
 def precision_factor(raw: Tensor) -> Tensor:
-    """Compute L [N, 4, 4] of V_qq = L L^T: its lower triangle over direction row by row, then time, [N, 7]."""
+    """Compute the factor L [N, 4, 4] of the precision V_qq = L L^T over direction and time, from parameters [N, 7].
+
+    The parameters are the lower triangle over direction, row by row, and then the entry of time.
+    """
     zero = torch.zeros_like(raw[:, 0])
     xx, yx, yy, zx, zy, zz, tt = raw.unbind(-1)
     xx, yy, zz, tt = (sizes(log) for log in (xx, yy, zz, tt))

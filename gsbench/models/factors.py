@@ -67,7 +67,8 @@ class Triangle:
         """Compute the lower triangular factors L [N, n, n] from their parameters (7DGS, section 4.1).
 
         Args:
-            log_diagonal: the logarithms of the diagonal, [N, n] with n = 3 + k.
+            log_diagonal: the logarithms of the diagonal, [N, n] with n = 3 + k: position, and k variables of time and
+                direction.
             kinds: the parameters below the diagonal: `shape` (within position) [N, 3], `motion` (position with time or
                 direction) [N, 3 k], `coupling` (within time and direction) [N, k (k - 1) / 2].
         """  # [N, n, n]
@@ -122,18 +123,18 @@ def rotation(quaternions: Tensor) -> Tensor:
 
 
 def turn_of_space(quaternions: Tensor) -> Tensor:
-    """Convert the left quaternions l of 4D rotations that leave the time axis fixed to 3D quaternions, [N, 4].
+    """Convert left quaternions l of 4D rotations that turn only space to 3D quaternions, [N, 4] -> [N, 4].
 
-    A 4D rotation M_left(l) M_right(r) of 4DGS leaves the time axis fixed only for r = (l0, -l1, -l2, l3), up to its
-    length. It is then the 3D rotation with the quaternion wxyz = (l0, l3, -l2, l1). This function is its own inverse,
-    so it also converts a 3D quaternion to l.
+    A 4D rotation M_left(l) M_right(r) of 4DGS turns only space if r is a positive multiple of (l0, -l1, -l2, l3), and
+    only then. It is then the 3D rotation with the quaternion wxyz = (l0, l3, -l2, l1). This function is its own
+    inverse, so it also converts a 3D quaternion to l.
     """
     w, x, y, z = quaternions.unbind(-1)
     return torch.stack([w, z, -y, x], -1)
 
 
 def partner(left: Tensor) -> Tensor:
-    """Return the right quaternions r for which M_left(l) M_right(r) leaves the time axis fixed, [N, 4] -> [N, 4]."""
+    """Return right quaternions r, such that the 4D rotations M_left(l) M_right(r) turn only space, [N, 4] -> [N, 4]."""
     return left * left.new_tensor([1, -1, -1, 1])
 
 
@@ -153,9 +154,10 @@ def rotation4d(left: Tensor, right: Tensor) -> Tensor:
 
 
 def quaternions_in_space(quats: Tensor) -> tuple[Tensor, Tensor]:  # [N, 4] wxyz
-    """Return the left and right quaternions of the 4D rotation that rotates space by a quaternion wxyz and fixes t.
+    """Return the left and right quaternions of the 4D rotation that rotates space by a quaternion wxyz.
 
-    Derivation: `rotation4d(l, r)` maps v = x + y i + z j + t k to l v r*. It fixes k if r = k* l k. It then maps
+    Derivation: `rotation4d(l, r)` maps v = x + y i + z j + t k to l v r*. It maps the axis k of time to itself if
+    r = k* l k. It then maps
     u = v k* = t - z i + y j - x k to l u l*, a 3D rotation in which (z, -y, x) stands for the axis (x, y, z).
     """
     w, x, y, z = quats.unbind(-1)

@@ -1,4 +1,4 @@
-"""Model a moving scene by FreeTimeGS: 3D Gaussians with a velocity that appear around a time of their own (2025).
+"""Model a moving scene by FreeTimeGS: 3D Gaussians with a velocity, each visible around its mean time (2025).
 
 Wang et al., "FreeTimeGS: Free Gaussian Primitives at Anytime and Anywhere", arXiv 2506.05348.
 """
@@ -58,12 +58,12 @@ class FreeTimeModel(MovingGaussians3D):
         }
 
     def change(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor]:
-        """Return v (t - mu_t) [N, 3] and exp(-1/2 ((t - mu_t) / s)^2) [N]."""
+        """Return the shifts v (t - mu_t) of means [N, 3] and opacity factors exp(-1/2 ((t - mu_t) / s)^2) [N]."""
         assert query.time is not None
         delta = query.time - raw["times"]
         opacity_factor = torch.exp(-0.5 * (delta / sizes(raw["durations"])).square())[:, 0]
         return raw["velocities"] * delta, opacity_factor
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
-        """Return mu_t [N] and s [N]."""
+        """Return the mean times mu_t [N] and the standard deviations s [N] in time."""
         return self.splats["times"].detach()[:, 0], sizes(self.splats["durations"].detach()[:, 0])

@@ -31,7 +31,7 @@ class GatedModel(GaussianModel):
 
     @abstractmethod
     def static(self, raw: Raw) -> Conditioned:
-        """Return the 3D Gaussians of Gaussians that do not depend on time or direction; f_temp and f_dir are 1.
+        """Return the 3D Gaussians of Gaussians that do not depend on time or direction; opacity factors are 1.
 
         They are the limit of `condition` for standard deviations of time and direction that go to infinity, and means
         that do not move.
@@ -41,8 +41,9 @@ class GatedModel(GaussianModel):
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
         """Return raw parameters of Gaussians in which time, direction or both are replaced by a mean over views.
 
-        The result has a dictionary of changed raw parameters for each variable that is replaced, and as the last one
-        `static`, where all variables are replaced. It is empty if the model depends on neither time nor direction.
+        The result has a dictionary of changed raw parameters for each variable that is replaced, and a last dictionary
+        `static`, in which all variables are replaced. The result is empty if the model depends on neither time nor
+        direction.
 
         Args:
             raw: the raw parameters, without AGR.
@@ -65,7 +66,7 @@ class GatedModel(GaussianModel):
         return {"shN": coefficients_within(effect_sets.orders, self.sh_degree).flatten(1)[:, 1:, None]}
 
     def constant(self, name: str) -> float:
-        """Return the constant to which `fill` sets the entries of a parameter that change no image."""
+        """Return the constant to which `fill` sets the unused entries of a parameter, which change no image."""
         return 0.0
 
     @torch.no_grad()

@@ -69,7 +69,7 @@ class Gaussians3DModel(GatedModel):
 
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
-        """Multiply the three scales of Gaussians by factors; see `GaussianModel.shrink_rows`."""
+        """Multiply the three scales of each Gaussian in `rows` by the factor of this Gaussian."""
         self.splats["scales"].data[rows] += factors.log()[:, None].to(self.splats["scales"].dtype)
 
     def spread(self) -> Tensor:

@@ -162,14 +162,14 @@ class Gaussians4DModel(GatedModel):
         return masks
 
     def constant(self, name: str) -> float:
-        """Return the constant for entries that change no image: the largest log size for `scales`, else 0."""
+        """Return the value to which unused parameter entries are set: the largest log size for `scales`, else 0."""
         return LOG_SIZE_MAX if name == "scales" else 0.0
 
     @torch.no_grad()
     def fill(self, effect_sets: EffectSets) -> None:
         """Set parameter entries of static Gaussians that change no image to constants.
 
-        The right quaternions are set such that the 4D rotations leave the time axis fixed.
+        The right quaternions are set such that the 4D rotations turn only space.
         """
         super().fill(effect_sets)
         left = self.splats["left_quats"].data[effect_sets.conditioned :]
@@ -233,11 +233,11 @@ class Gaussians4DModel(GatedModel):
 
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
-        """Multiply the three spatial scales by factors. This is exact if the 4D rotation does not mix in time."""
+        """Multiply the three spatial scales by factors. This is exact if the 4D rotation turns only space."""
         self.splats["scales"].data[rows, :3] += factors.log()[:, None].to(self.splats["scales"].dtype)
 
     def spread(self) -> Tensor:
-        """Return the factors of the covariances of slices, [N, 3, 3], which are the same at all times."""
+        """Return factors of the conditional 3D covariances, [N, 3, 3], which are the same at all times."""
         return reduce(self.factors({name: value.detach() for name, value in self.splats.items()})).T_pp
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:

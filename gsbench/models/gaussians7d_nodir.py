@@ -1,4 +1,4 @@
-"""Model a moving scene by 7DGS without direction: Gaussians over position and time, to measure the gain by direction.
+"""Model a moving scene by 7DGS without direction: Gaussians over position and time, to test direction.
 
 4DGS also has position and time, but another covariance factor, colours that change with time, and other learning rates.
 This model differs from 7DGS only in direction.

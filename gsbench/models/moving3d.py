@@ -1,6 +1,7 @@
-"""Define the base of models whose 3D Gaussians keep one shape, while their means and opacities change with the query.
+"""Define the base of models whose 3D Gaussians keep one shape, while means and opacities change.
 
-dGS and FreeTimeGS are such models. 4DGS and 7DGS get their slices from a covariance over more dimensions instead.
+Means and opacities change with time, in dGS also with the view direction. Such models are dGS and FreeTimeGS. 4DGS and
+7DGS get their slices from a covariance over more dimensions instead.
 """
 
 import math
@@ -21,26 +22,26 @@ from gsbench.models.query import Query
 class MovingGaussians3D(Gaussians3DModel):
     """3D Gaussians of 3DGS (rotation and scales) whose means and opacities depend on time or direction.
 
-    Density control is that of 3DGS: a split makes two children that are 1.6 times smaller and move as their parent.
+    Density control is that of 3DGS: a split makes two children that are 1.6 times smaller and move like their parent.
     """
 
     moving: ClassVar[tuple[str, ...]]  # names of the raw parameters that a static Gaussian does not use
 
     @abstractmethod
     def change(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor]:
-        """Return by how much the means move [N, 3] and the factors of the opacities [N] at a query."""
+        """Return how far the means move [N, 3] and the factors of the opacities [N], for a camera centre and a time."""
 
     @abstractmethod
     def lifetimes(self) -> tuple[Tensor, Tensor]:
-        """Return mean times [N] and standard deviations [N] of the opacities as Gaussian functions of time."""
+        """Return the mean [N] and the standard deviation [N] of each opacity, which is a Gaussian function of time."""
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
-        """Return the Gaussians at a camera centre and time: moved, with factors R S and their opacity factors."""
+        """Return the moved means, the covariance factors R S and the opacity factors for a camera centre and a time."""
         shift, opacity_factor = self.change(raw, query)
         return Conditioned(raw["means"] + shift, self.factors(raw), opacity_factor)
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Compute the geometry of a slice in torch."""
+        """Compute means, covariance factors and opacities of the 3D Gaussians for a camera and a time, in torch."""
         return GatedModel.slice_geometry(self, raw, query)
 
     @torch.no_grad()
@@ -57,7 +58,7 @@ class MovingGaussians3D(Gaussians3DModel):
         return {"static": {name: value.to(raw[name].dtype) for name, value in new.items()}}
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Return masks of the parameter entries that are used: a static Gaussian does not use those in `moving`."""
+        """Return masks of the parameter entries that are used: a static Gaussian uses no parameter in `moving`."""
         masks = super().kept(effect_sets)
         if effect_sets.frozen is not None:
             rows = torch.arange(len(effect_sets.frozen), device=effect_sets.frozen.device)[:, None]
@@ -65,7 +66,7 @@ class MovingGaussians3D(Gaussians3DModel):
         return masks
 
     def durations(self) -> Tensor:
-        """Return the standard deviation of each opacity as a function of time, [N] (1 = the length of the scene)."""
+        """Return the standard deviation in time of each Gaussian's opacity, [N] (1 = the length of the scene)."""
         return self.lifetimes()[1]
 
     def log_duration(self, index: int) -> float:

@@ -1,4 +1,4 @@
-"""Change the parameters of Gaussians with time by AGR, the adaptive Gaussian refinement of 7DGS (section 4.3)."""
+"""Change the parameters of Gaussians over time by AGR, the adaptive Gaussian refinement of 7DGS (section 4.3)."""
 
 import functools
 import math
@@ -29,8 +29,8 @@ class Refinement(nn.Module):
     """The networks of AGR, the adaptive Gaussian refinement (7DGS, eq. 14 and 15).
 
     Each network has one hidden layer of 64 units. Its input is the means of a Gaussian and an encoding of the time, its
-    output is added to raw parameters. One network changes each mean (position, time, direction), one more changes all
-    parameters of the covariance. Output layers start at zero, so AGR changes nothing at first.
+    output is added to raw parameters. Each mean (position, time, direction) has its own network. One more network
+    changes all parameters of the covariance. Output layers start at zero, so AGR changes nothing at first.
     """
 
     units: Tensor  # [sum of outputs]
@@ -71,7 +71,8 @@ class Refinement(nn.Module):
         """Return the raw parameters plus the outputs of AGR's networks at a time.
 
         Args:
-            values: raw parameters, [N, c] each: first the means, which are the input, then those of the covariance.
+            values: raw parameters, [N, c] each: first the means, which are the input, then the parameters of the
+                covariance.
             time: the time in [0, 1], [].
             by_kernel: whether the backend's kernel (float32) computes it, which stores no hidden layer in memory.
             rows: only the first `rows` Gaussians change; None: all.

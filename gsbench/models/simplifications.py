@@ -1,7 +1,8 @@
 """Simplify Gaussians: make them independent of time, direction or AGR (neural refinement), or lower the SH degree.
 
-What changes with these is replaced by its mean over views, weighted by the opacity of the Gaussian in each view. A
-simplified Gaussian is an ordinary row of the model's parameters, so rendering and checkpoints need no change.
+Parameters that change with time, direction or AGR are replaced by their means over views, weighted by the opacity of
+the Gaussian in each view. A simplified Gaussian is an ordinary row of the model's parameters, so rendering and
+checkpoints need no change.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""Define 6DGS and 7DGS: Gaussians over position and direction, time or both, with the Cholesky factor as parameter."""
+"""Define 6DGS and 7DGS: Gaussians over position, direction and (in 7DGS) time, with a Cholesky factor as parameter."""
 
 import math
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ TIME_SCALE = 0.25  # .. and sqrt(S_t) is above this part of the scene's length (
 
 
 class TriangularModel(GatedModel):
-    """The base class of 6DGS and 7DGS: Gaussians over position p and direction d, time t or both.
+    """The base class of 6DGS and 7DGS: Gaussians over position p, and over direction d, time t, or d and t.
 
     The parameters are those of a lower triangular factor of the covariance. Before conditioning on d and t, its rows
     are sorted to (p, d, t).
@@ -200,22 +200,22 @@ class TriangularModel(GatedModel):
 
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
-        """Multiply the block T_pp of Gaussians by factors; T_qq and T_pq, and so the gain K, do not change."""
+        """Multiply factors T_pp of conditional covariances by a number for each Gaussian; motion does not change."""
         raw = {name: value.detach()[rows].double() for name, value in self.splats.items()}
         T_qq, T_pq, T_pp = reduce(self.factors(raw))
         for name, value in self._parameters_of(T_qq, T_pq, T_pp * factors[:, None, None]).items():
             self.splats[name].data[rows] = value.to(self.splats[name].dtype)
 
     def spread(self) -> Tensor:
-        """Return the factors T_pp of the covariances of slices, [N, 3, 3], which are the same for all queries."""
+        """Return factors T_pp of the conditional covariances, [N, 3, 3], which depend on neither time nor direction."""
         return reduce(self.factors({name: value.detach() for name, value in self.splats.items()})).T_pp
 
     def _parameters_of(self, T_qq: Tensor, T_pq: Tensor, T_pp: Tensor) -> dict[str, Tensor]:
-        """Compute the parameters of the factors with the given blocks; see `_assembled`."""
+        """Compute the parameters of covariance factors from the blocks of [T_qq 0; T_pq T_pp]."""
         return self.triangle.parameters(self._assembled(T_qq, T_pq, T_pp))
 
     def _assembled(self, T_qq: Tensor, T_pq: Tensor, T_pp: Tensor) -> Tensor:
-        """Put factors [N, n, n] together from their blocks [T_qq 0; T_pq T_pp] of query q and position p."""
+        """Assemble covariance factors [N, n, n] from blocks [T_qq 0; T_pq T_pp] of position p and other variables q."""
         q_rows = torch.cat([T_qq, T_qq.new_zeros(*T_qq.shape[:2], 3)], -1)
         return torch.cat([torch.cat([T_pq, T_pp], -1), q_rows], 1)[:, self.own_order()]
 
@@ -241,7 +241,7 @@ class TriangularModel(GatedModel):
         return masks
 
     def constant(self, name: str) -> float:
-        """Return the constant for entries that change no image: the largest log size for `log_diagonal`, else 0."""
+        """Return the value of unused parameter entries: the largest log size for `log_diagonal`, else 0."""
         return LOG_SIZE_MAX if name == "log_diagonal" else 0.0
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:

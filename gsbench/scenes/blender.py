@@ -27,7 +27,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # as instant-ngp and nerfstu
 
 @dataclass(frozen=True)
 class _Intrinsics:
-    """Hold the camera intrinsics of a JSON file, in pixels of the full image; missing values follow from its size."""
+    """Hold the camera intrinsics of a JSON file, in pixels of the full image; missing ones follow from the size."""
 
     angle_x: float | None  # horizontal field of view in radians; None if the focal length is given
     focal: tuple[float, float] | None
@@ -264,7 +264,7 @@ def _read_mask(root: Path, frame: _Frame, size: tuple[int, int], downscale: int)
 
 
 def _check_size(size: tuple[int, int], expected: tuple[int, int], split: _Split, frame: _Frame) -> None:
-    """Raise InputError if the size of an image is not that of the first image or not that in its JSON file."""
+    """Raise InputError if an image has another size than the first image, or than its JSON file states."""
     if size != expected:
         raise InputError(
             f"{frame.where}: expected {expected[0]}x{expected[1]} as the first training image, got {size[0]}x{size[1]}"

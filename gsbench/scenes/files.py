@@ -39,7 +39,7 @@ def fingerprint(
 ) -> str:
     """Return one SHA-256 for a set of files: the hash of the output of `sha256sum` for the files, sorted by name.
 
-    Names are relative to the scene's folder, so the hash does not depend on its place. To compute the hash of a Blender
+    Names are relative to the scene's folder, so moving the folder keeps the hash. To compute the hash of a Blender
     scene, run in its folder: ``LC_ALL=C; sha256sum $(printf '%s\\n' transforms_*.json */*.png | sort) | sha256sum``.
     """
     lines = "".join(f"{digests[name]}  {name}\n" for name in sorted(digests))

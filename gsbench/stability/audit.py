@@ -64,9 +64,8 @@ def run(million: int = MILLION, *, long: bool = False, short: bool = False) -> A
 
     Args:
         million: the number of random Gaussians with ill-conditioned factors to slice, by default a million.
-        long: train for 2,000 steps instead of 150, and slice this many Gaussians in both factor orders (by default,
-            only in
-            the default order).
+        long: train for 2,000 steps instead of 150, and slice the `million` Gaussians with both row orders of the factor
+            (otherwise only with the default order).
         short: test only default settings, with fewer Gaussians and training steps, one seed and no timings.
     """
     began = time.perf_counter()
@@ -137,8 +136,8 @@ def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Step]]:
 def hard_slices(audit: Audit, order: str, N: int) -> None:
     """Measure the errors of conditional 3D Gaussians for N random 7D Gaussians with ill-conditioned factors.
 
-    The diagonal entries of their covariances' Cholesky factors go down to 1e-5. An error is the 99.9th percentile over
-    the Gaussians.
+    The diagonal entries of their covariances' Cholesky factors go down to 1e-5. The result is the 99.9th percentile of
+    the errors over the Gaussians.
     """
     hard = population.draw(torch.Generator().manual_seed(SEED), N, order)
     known = population.truth(hard, order)

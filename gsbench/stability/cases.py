@@ -72,7 +72,7 @@ class Cell:
 
     @property
     def holds(self) -> bool:
-        """Return whether both errors are within their bounds, all values finite and all covariances definite."""
+        """Return whether errors of result and gradient are within bounds, values finite and covariances definite."""
         gradient = math.isnan(self.bound.gradient) or self.gradient <= self.bound.gradient
         return self.bad == 0 and self.forward <= self.bound.forward and gradient
 

@@ -46,7 +46,7 @@ def ordinary_colors(g: Generator, severity: float, model: str) -> ColorInputs:  
 
 @case("colour", "3dgs", "4dgs")
 def seen_from_within(g: Generator, severity: float, model: str) -> ColorInputs:
-    """Put the camera on a mean, or 10^-12 or 10^-6 away: the view direction is 0/0, and must be 0 with gradient 0."""
+    """Put the camera on a mean or up to 10^-6 away: a view direction of 0/0 must become 0, with gradient 0."""
     shown = ordinary(g, model)
     aside = torch.tensor([0.0, 1e-12, 1e-6])[:, None] + 1 - severity
     shown.center, shown.means = torch.zeros(3), aside * torch.tensor([[1.0, -2.0, 0.5]])

@@ -51,9 +51,10 @@ class ConditionCurve:
 
 @dataclass(frozen=True)
 class SliceTime:
-    """The milliseconds that one method takes to condition `TIMED` 7D Gaussians on time and direction, and backward.
+    """The milliseconds of the forward and the backward pass of conditioning `TIMED` 7D Gaussians, for one method.
 
-    For kernels this is the median of several calls (`REPEATS`), for torch one call.
+    The Gaussians are conditioned on time and direction. Kernels are timed by the median of several calls (`REPEATS`),
+    torch by one call.
     """
 
     order: str
@@ -74,7 +75,8 @@ class AccuracyPoint:
 
 
 def accuracy_for_time(backends: list[str]) -> Iterator[AccuracyPoint]:
-    """Yield error and time of conditioning (each algorithm, precision) and of rendering (each CPU instruction set).
+    """Yield error and time of conditioning, for each algorithm and precision, and of rendering, for each instruction
+    set.
 
     Conditioning computes the 3D Gaussians of `SLICED` 7D Gaussians with ill-conditioned covariance factors. Rendering
     draws `DRAWN` 3D Gaussians.
@@ -171,7 +173,7 @@ def by_condition() -> Iterator[ConditionCurve]:
 
 
 def safety(backends: list[str]) -> Iterator[SliceTime]:
-    """Yield the time of each algorithm for conditional Gaussians on each backend that has it, forward and backward."""
+    """Yield the times of the forward and the backward pass of each conditioning algorithm on each backend."""
     for order in FACTOR_ORDERS:
         hard = population.draw(torch.Generator().manual_seed(3), TIMED, order, 1.0)
         for scheme in SCHEMES:

@@ -65,7 +65,7 @@ def at_the_near_plane(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def far_off_axis(g: Generator, severity: float) -> list[Arguments]:
-    """Put means at x/z up to 100, of Gaussians that still reach into the image; EWA's Jacobian is large there.
+    """Put means outside the image (x/z up to 100) of Gaussians that reach into it; EWA's Jacobian is large there.
 
     Met in practice: diff-gaussian-rasterization issue 75.
     """

@@ -90,7 +90,7 @@ def factor(hard: Hard) -> Floats:
 
 
 def conditioned(order: str) -> list[int]:
-    """Return the rows of direction and then of time in the triangular factor, for a given row order of this factor."""
+    """Return the indices of those rows of the triangular factor that belong to direction (first) and time (last)."""
     return [4, 5, 6, 3] if order == "paper" else [0, 1, 2, 3]
 
 
@@ -115,7 +115,7 @@ def truth(hard: Hard, order: str) -> PopulationTruth:
 
 
 def _truth(hard: Hard, order: str, w: Floats, W: Floats) -> tuple[Floats, Floats, Floats]:
-    """Compute `truth` (exact conditional Gaussians and gradients) for arrays whose last axis counts the Gaussians."""
+    """Compute the result of `truth` (exact conditional Gaussians and gradients) from arrays with the Gaussians last."""
     L, q = np.ascontiguousarray(factor(hard).transpose(1, 2, 0)), conditioned(order)
     p = [i for i in range(7) if i not in q]
     Q, R = gram_schmidt(L[q + p])  # L = R^T Q^T

@@ -51,8 +51,8 @@ def judge(case: Case, backends: list[str], schemes: Sequence[str] = SCHEMES) -> 
 def truth(observed: Observed) -> SliceTruth:
     """Compute exact conditional Gaussians in mpmath, and the exact gradient of a loss.
 
-    The loss is a random weighted sum of mean, covariance and opacity, each divided by its size. If a Gaussian is too
-    faint to be rendered, only its opacity counts.
+    The loss is a random weighted sum of mean, covariance and opacity; mean and covariance are divided by their size. If
+    a Gaussian is too faint to be rendered, only its opacity counts.
     """
     outputs, scales, gradients = [], [], []
     weights = torch.randn(COUNT, 13, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

@@ -56,7 +56,7 @@ def ordinary(g: Generator, model: str) -> Observed:
 
 
 def sizes(observed: Observed, variable: str) -> Tensor:
-    """Return the log sizes (log diagonal entries) [COUNT, width] of one variable, as a writable view."""
+    """Return the log sizes (log diagonal entries) [COUNT, width] of position, time or direction, as a view."""
     if observed.model == "4dgs":
         return observed.raw["scales"][:, 3:] if variable == "t" else observed.raw["scales"][:, :3]
     rows = [i for i, name in enumerate(variables(observed.model)) if name == variable]
@@ -131,9 +131,9 @@ def narrow_in_direction(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def nearly_certain(g: Generator, severity: float, model: str) -> Observed:
-    """Correlate position with time or direction to 1 - 1e-12, so that S_pp and K S_qp are nearly equal.
+    """Correlate position with time or direction to 1 - 1e-12, so that the subtraction S_pp - K S_qp cancels.
 
-    Their difference is the conditional covariance, and its subtraction cancels.
+    The difference of these nearly equal matrices is the conditional covariance.
     """
     observed = ordinary(g, model)
     thin = -severity * 0.5 * math.log(5e11)  # sqrt(1 - rho^2) = sqrt(2e-12)
@@ -170,7 +170,7 @@ def instant(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *TIME_LIKE)
 def static(g: Generator, severity: float, model: str) -> Observed:
-    """Use Gaussians with nearly infinite extent in time (log sigma_t = 80), which training makes of static ones."""
+    """Use Gaussians with nearly infinite extent in time (log sigma_t = 80); training makes static ones so long."""
     observed = ordinary(g, model)
     if model == "4dgs":
         upright(observed)
@@ -226,7 +226,7 @@ def oversensitive(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def camera_on_a_mean(g: Generator, severity: float, model: str) -> Observed:
-    """Put the camera on a mean, or 1e-12, 1e-6 and 1e-3 away: the view direction is 0/0, and must be 0.
+    """Put the camera on a mean or up to 1e-3 away: a view direction of 0/0 must become 0.
 
     This happens in walk-throughs and in SLAM.
     """

@@ -77,7 +77,7 @@ def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | 
 
 
 def read(path: Path, device: str = "cpu") -> Checkpoint:
-    """Read the checkpoint at `path`, whatever training wrote it.
+    """Read the checkpoint at `path`, which may come from any training.
 
     Raises:
         InputError: the file is missing, is not a checkpoint, or was changed after it was written.

@@ -63,7 +63,7 @@ class Gating:
     """Simplify Gaussians in a training: make them independent of time, direction or AGR (the neural refinement)."""
 
     def __init__(self, rows: Rows, scene: Scene, renderer: Renderer, config: Config) -> None:
-        """Choose the views from which errors are predicted (e.g. of removing time from a Gaussian), and those for PSNR.
+        """Choose the views from which the errors of simplified Gaussians are predicted, and the views for PSNR.
 
         Args:
             rows: the model, together with the per-Gaussian state of the training, which must change with it.
@@ -155,7 +155,7 @@ class Gating:
             self.direction = Direction(share_with_direction(self.model), loss, *times)
 
     def _beside(self, one: GaussianModel, other: GaussianModel, views: list[View]) -> tuple[float, list[float]]:
-        """Return how much lower the PSNR of `other` is than that of `one`, dB, and both median frame times, ms."""
+        """Return by how many dB the PSNR of `other` is below that of `one`, and the models' median frame times, ms."""
         count = max(self.config.protocol.renders, len(views))
         frames = [lambda i, model=model: self.renderer.image(model, views[i % len(views)]) for model in (one, other)]
         times = time_in_turns(frames, count, synchroniser(self.config.device))

@@ -39,7 +39,7 @@ from gsbench.train.thinning import blend_weights, heaviest
 class Best:
     """Hold the best PSNR on val so far, and two PSNRs of the evaluated split, which is test or val.
 
-    One is its PSNR at the iteration that was best on val, the other its own best PSNR.
+    One is measured at the iteration with the best PSNR on val, the other is the highest PSNR on the evaluated split.
     """
 
     val: float = -math.inf  # best PSNR on val so far, dB
@@ -198,7 +198,7 @@ class Trainer:
                     self.minimum_scale.update()
 
     def _thin(self) -> None:
-        """Keep the Gaussians with the largest blend weights, summed over all views: a share `train.densify.thin_to`."""
+        """Keep a share (`train.densify.thin_to`) of the Gaussians: those with the largest sums of blend weights."""
         share = self.config.train.densify.thin_to
         assert share is not None
         self.rows.select(heaviest(blend_weights(self.model, self.scene.train, self.renderer.antialias), share))

@@ -40,7 +40,8 @@ def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
 def _blur(planes: Tensor) -> Tensor:  # [P, H, W]
     """Convolve images [P, H, W] with the zero-padded Gaussian window, by a banded matrix on the left and on the right.
 
-    For small images on a CPU this is many times faster than torch's convolutions, forward and backward.
+    For small images on a CPU this is many times faster than torch's convolutions, in the forward and in the backward
+    pass.
     """
     height, width = planes.shape[-2:]
     return _band(height, planes.device, planes.dtype) @ planes @ _band(width, planes.device, planes.dtype)

@@ -113,7 +113,7 @@ class Optimizer:
             self.torch_adam.zero_grad(set_to_none=True)
 
     def rates_at(self, step: int, slowed: float = 1.0) -> dict[str, float]:
-        """Return the learning rate of each group at a step; that of AGR (a network) is multiplied by `slowed`."""
+        """Return the learning rate of each group at a step; the rate of AGR (a network) is multiplied by `slowed`."""
         rates = {name: rate_at(rate, step, self.train, self.extent) for name, rate in self.rates.items()}
         return {name: rate * slowed if name == "refinement" else rate for name, rate in rates.items()}
 
@@ -130,7 +130,7 @@ class Optimizer:
         return state
 
     def _step_all(self, rated: list[tuple[nn.Parameter, float]]) -> None:
-        """Update all given parameters by one call of the CPU kernel; `rated` pairs each with its learning rate."""
+        """Update several parameters by one call of the CPU kernel; `rated` pairs parameters with learning rates."""
         parameters, rates = [p.data for p, _ in rated], [rate for _, rate in rated]
         gradients = [p.grad for p, _ in rated if p.grad is not None]
         states = [self._state_of(p) for p, _ in rated]
@@ -158,7 +158,8 @@ class Optimizer:
         """Reorder Adam's moments after Gaussians were pruned, cloned or split.
 
         Args:
-            rows: for each Gaussian now, the index of the Gaussian before whose moments it takes, [M].
+            rows: for each Gaussian after the change, the index (before the change) of the Gaussian whose moments it
+                takes, [M].
             fresh: which Gaussians are new, [M] bool; their moments become zero.
         """
         for parameter in self.model.splats.values():
@@ -209,8 +210,8 @@ def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) ->
 
     A rate with `per_extent` is multiplied by the radius of the scene. A rate with `per_run` is multiplied by
     sqrt(recipe_iterations / iterations), so a short run takes larger steps; this improved every model (docs/tuning.md).
-    From step `cooldown_from` of the recipe on, every rate is also multiplied by a factor that falls linearly from 1 to
-    COOLED.
+    From a step on (`cooldown_from`, scaled by iterations / recipe_iterations), every rate is also multiplied by a
+    factor that falls linearly from 1 to COOLED.
     """
     scale = extent if rate.per_extent else 1.0
     if rate.per_run:

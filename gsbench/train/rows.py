@@ -23,7 +23,7 @@ class Follower(Protocol):
         """Reorder the per-Gaussian state after Gaussians were added or removed.
 
         Args:
-            rows: for each Gaussian now, its index before the change, or that of its parent, [M].
+            rows: for each Gaussian after the change, its index before the change, or that of its parent, [M].
             fresh: which Gaussians are new, [M] bool; their state is reset.
         """
 
@@ -67,10 +67,10 @@ class Rows:
     def sort_by_time(self) -> None:
         """Sort the Gaussians by the time interval in which each can be visible, which makes the CPU kernels faster.
 
-        The kernels process 16 rows at once, and skip 16 rows of which none is visible. On trex after a quarter of the
-        iterations, 36 % of the Gaussians of 4DGS are visible in a view; sorting reduces the processed groups of 16 from
-        96 % to 42 %. If some Gaussians were made independent of time, direction or AGR, all are sorted by this instead,
-        and nothing is done here.
+        The kernels process 16 rows at once, and skip 16 rows of which none is visible. On the scene trex after a
+        quarter of the iterations, 36 % of the Gaussians of 4DGS are visible in a view. Sorting reduces the share of
+        groups of 16 that are processed from 96 % to 42 %. If some Gaussians were made independent of time, direction or
+        AGR (a network), this function does nothing, because Gaussians are then sorted by what they depend on.
         """
         intervals = None if self.model.effect_sets is not None else self.model.visible_intervals()
         if intervals is not None:
@@ -85,7 +85,7 @@ class Rows:
         """Update the per-Gaussian state after Gaussians of the model were added, removed or reordered.
 
         Args:
-            rows: for each Gaussian now, its index before the change, [M].
+            rows: for each Gaussian after the change, its index before the change, [M].
             fresh: which Gaussians are new, [M] bool; by default none.
         """
         fresh = torch.zeros(len(rows), dtype=torch.bool, device=rows.device) if fresh is None else fresh

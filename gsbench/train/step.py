@@ -34,7 +34,7 @@ PIXELS_OF_A_GAUSSIAN = 12
 
 @contextmanager
 def fitting_threads(gaussians: int, pixels: int) -> Iterator[None]:
-    """Run the enclosed training step on one thread if it has few Gaussians and pixels; results have the same bits."""
+    """Run the training step in a `with` block on one thread if it has few Gaussians and pixels; results are equal."""
     threads = torch.get_num_threads()
     if gaussians + pixels / PIXELS_OF_A_GAUSSIAN < WORTH_A_THREAD:
         torch.set_num_threads(1)
@@ -48,8 +48,8 @@ def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
     """Assign to each view of a batch the dictionary to which its gradients are added.
 
     Views share a dictionary if one thread renders them and they are in the same half of the batch. If a thread begins
-    inside a half, its views there have a dictionary each. `add_up` adds all dictionaries in the order of the views, so
-    the total has the same bits for any number of threads.
+    inside a half, each of the thread's views in this half has its own dictionary. `add_up` adds all dictionaries in the
+    order of the views, so the total has the same bits for any number of threads.
 
     Args:
         views: the number of views in the batch.

@@ -72,7 +72,7 @@ class Densification(ABC):
         """
 
     def add_noise(self, rate: float, generator: torch.Generator) -> None:
-        """Move means by noise after a step, if `adds_noise`; by default do nothing.
+        """Move means by noise after a step, if the rule's `adds_noise` is true; by default do nothing.
 
         Args:
             rate: the learning rate of the means in this step, world units.
@@ -89,7 +89,7 @@ class Densification(ABC):
         """Reorder the accumulated gradients and counts after Gaussians were added or removed.
 
         Args:
-            rows: for each Gaussian now, its index before the change, [M].
+            rows: for each Gaussian after the change, its index before the change, [M].
             fresh: which Gaussians are new, [M] bool.
         """
 

@@ -14,15 +14,17 @@ LARGEST_OPACITY = 1 - 1.2e-7  # the largest float32 below 1
 
 
 class MCMCDensification(Densification):
-    """The relocation of 3DGS-MCMC (section 4). No Gaussian is cloned, split or pruned, and no opacity reset.
+    """The relocation of 3DGS-MCMC (section 4). No Gaussian is cloned, split or pruned, and no opacity is reset.
 
     - A round takes place every 100 iterations or more, between `train.densify.start` and `stop`. A Gaussian is dead if
       its opacity is at most the model's `min_opacity`. Each dead Gaussian moves to a living one, which is drawn with a
       probability proportional to its opacity.
     - Then 5 % more Gaussians are added in the same way, up to `train.densify.max_gaussians`.
-    - The n Gaussians that are now at one place get opacities and sizes with which they look as the one before.
-    - After every step each mean moves by normal noise with the covariance of its Gaussian, times `train.densify.noise`,
-      the learning rate of means and sigmoid(-100 (opacity - 0.005)): only transparent Gaussians move.
+    - The n Gaussians that are now at one place get opacities and sizes such that together they look like the single
+      Gaussian that was there before.
+    - After every step each mean moves by normal noise with the covariance of its Gaussian. The noise is multiplied by
+      `train.densify.noise`, by the learning rate of means and by sigmoid(-100 (opacity - 0.005)), so only transparent
+      Gaussians move.
     """
 
     kind = "mcmc"
@@ -32,7 +34,7 @@ class MCMCDensification(Densification):
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator, has_reset: bool) -> int:
-        """Relocate dead Gaussians, then add Gaussians; see the class. Returns 0: the limit is part of the rule."""
+        """Relocate dead Gaussians, then add Gaussians up to the limit; return 0, because none is refused."""
         N = len(self.model)
         opacities = self._opacities()
         dead = opacities <= self.min_opacity
@@ -48,7 +50,7 @@ class MCMCDensification(Densification):
         return torch.sigmoid(self.model.splats["opacities"].detach())
 
     def _copy(self, sources: Tensor, places: Tensor) -> None:
-        """Copy Gaussians to other rows, and change all copies such that together they look as the source did.
+        """Copy Gaussians to other rows, and change all copies such that together they look like the source.
 
         Args:
             sources: the row of the source of each copy, [M]; a row may occur several times.
@@ -70,7 +72,7 @@ class MCMCDensification(Densification):
 
     @property
     def adds_noise(self) -> bool:  # type: ignore[override]
-        """Whether noise is added: until a gate has removed effects from Gaussians."""
+        """Whether noise is added: not after Gaussians were made independent of time, direction or AGR (a network)."""
         return self.config.noise > 0 and self.model.effect_sets is None
 
     @torch.no_grad()
@@ -85,7 +87,7 @@ class MCMCDensification(Densification):
         """Do nothing: opacities are not reset."""
 
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Do nothing: the rule keeps no sums of single Gaussians."""
+        """Do nothing: the rule stores no numbers of single Gaussians."""
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return an empty dictionary: all random numbers come from the seed and the step."""
@@ -96,7 +98,7 @@ class MCMCDensification(Densification):
 
 
 def drawn(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Draw `count` rows with replacement, with probabilities proportional to `weights` [N].
+    """Draw the indices of `count` Gaussians with replacement, with probabilities proportional to `weights` [N].
 
     The sums are in float64 on the CPU, so that the same seed draws the same rows everywhere.
     """
@@ -110,7 +112,7 @@ def relocated(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
 
         o' = 1 - (1 - o)^(1/n)      c = o / sum_{k=1..n} binom(n, k) (-1)^(k-1) o'^k / sqrt(k)
 
-    The binomials are those of the paper's double sum over i and k, added over i.
+    The paper has a double sum over i and k; here the binomials are already added over i.
 
     Args:
         opacities: the opacity o of each Gaussian before, [M].

@@ -1,4 +1,4 @@
-"""Keep the scale of each Gaussian above 0.05 pixels in the training camera that sees the Gaussian largest."""
+"""Keep the scale of each Gaussian above 0.05 pixels in the training camera in which it appears largest."""
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ LEAST_PIXELS = 0.05
 
 
 class MinimumScale:
-    """Keep each Gaussian's scale above a minimum: LEAST_PIXELS pixels in the training camera that sees it largest."""
+    """Keep each Gaussian's scale above a minimum: LEAST_PIXELS pixels in the camera in which it appears largest."""
 
     def __init__(self, model: GaussianModel, cameras: list[Camera]) -> None:
         """Compute the minimum scales of the Gaussians of an initialised model for the training cameras."""
