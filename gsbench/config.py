@@ -16,17 +16,17 @@ CONF = HERE / "conf" if (HERE / "conf").is_dir() else HERE.parent / "conf"  # in
 
 @dataclass
 class DataConfig:
-    """Say where the files of a data set are and how they are read; an experiment (`+exp=`) sets these keys."""
+    """Describe a data set; an experiment (`+exp=`) sets these keys."""
 
     dataset: str = MISSING  # name in tables
     paper_dataset: str | None = None  # name in the paper's tables
-    root: str = MISSING  # folder with a folder for each scene, or pkg://MODULE
+    root: str = MISSING  # folder of the scenes' folders, or pkg://MODULE
     published: str = ""  # where to get the data
     scenes: list[str] = field(default_factory=list)  # scenes of scene=all
     background: str = "black"  # or white: background of images
     initial_lambda: float = 0.5  # initial lambda_t and lambda_d of 7DGS
     initial_points: int = 100_000  # random points, if the data have none
-    initial_half_width: float | None = 1.3  # random points fill [-w, w]^3; None: the frustum that all cameras share
+    initial_half_width: float | None = 1.3  # random points fill [-w, w]^3; None: the cameras' common frustum
 
 
 @dataclass
@@ -34,15 +34,15 @@ class SceneConfig:
     """Choose one scene of the data set."""
 
     name: str = MISSING  # folder in data.root
-    released_as: str | None = None  # the folder's name in the published data, if another
+    released_as: str | None = None  # folder in the published data, if another
     downscale: int = 1  # divisor of the image size (area filter)
-    eval_split: str = "test"  # or val (D-NeRF lego, whose test split is wrong)
-    frames: list[int] | None = None  # first and last frame of a Technicolor scene; None: all
+    eval_split: str = "test"  # or val (D-NeRF lego)
+    frames: list[int] | None = None  # first and last frame (Technicolor); None: all
 
 
 @dataclass
 class InitConfig:
-    """Start the training from the Gaussians of a PLY file instead of points: `+init.ply=FILE`."""
+    """Start the training from the Gaussians of a PLY file: `+init.ply=FILE`."""
 
     ply: str | None = None  # trained 3D Gaussians in the format of 3DGS
     ply_sha256: str | None = None  # hash of that file; computed if not given
@@ -70,7 +70,7 @@ class ModelConfig:
     sh_degree: int = 3  # SH degree, 0 to 3
     min_opacity: float = 0.005  # Gaussians of lower opacity are pruned
     gate: str = "off"  # default of effects.gate
-    candidates: dict[str, Any] = field(default_factory=dict)  # models from which model=auto chooses
+    candidates: dict[str, Any] = field(default_factory=dict)  # choices of model=auto
     lr: dict[str, LearningRate] = field(default_factory=dict)  # learning rate of each parameter group
     options: dict[str, Any] = field(default_factory=dict)  # arguments of the model's class
 
@@ -79,27 +79,27 @@ class ModelConfig:
 class DensifyConfig:
     """Set the adaptive density control of 3DGS (section 5.2). All steps but `every` scale with `train.iterations`."""
 
-    kind: str = "gradient"  # rule of density control: gradient (3DGS) or mcmc (relocation)
-    start: int = 500  # step after which Gaussians are cloned, split and pruned
+    kind: str = "gradient"  # gradient (3DGS) or mcmc (relocation)
+    start: int = 500  # step after which densification starts
     stop: int = 15_000  # step at which densification ends
     every: int = 100  # least number of steps between two rounds
     rounds: int | None = None  # most rounds of a run; None: 36
-    reset_every: int = 3_000  # steps between two resets of the opacities
+    reset_every: int = 3_000  # steps between two opacity resets
     grad_threshold: float = 2e-4  # least mean gradient of a 2D mean, in units of half the image
     clone_below: float = 0.01  # clone if the largest scale is below this share of the extent, else split
-    prune_above: float = 0.1  # prune if the largest scale is above this share, after the first opacity reset
+    prune_above: float = 0.1  # prune if the largest scale is above this share of the extent, after an opacity reset
     thin_to: float | None = None  # share of Gaussians that stay after `stop`, by blend weight; None: all
     max_gaussians: int | None = None  # most Gaussians; None: 2,000,000
-    noise: float = 5e5  # of mcmc: noise on the means of transparent Gaussians, times their learning rate; 0: none
+    noise: float = 5e5  # mcmc: noise on means of transparent Gaussians, times the learning rate; 0: none
 
 
 @dataclass
 class PenaltyConfig:
-    """Set one term that is added to the loss of every view."""
+    """Set the weight and the steps of one loss term."""
 
-    weight: float = 0.0  # factor of the term; 0: none
+    weight: float = 0.0  # 0: no term
     start: int = 0  # first step
-    stop: int | None = None  # step at which it ends; None: with the run
+    stop: int | None = None  # step at which it ends; None: never
 
 
 @dataclass
@@ -118,7 +118,7 @@ class TrainConfig:
     recipe_iterations: int = 30_000  # length of the run that other steps refer to
     batch_size: int = 4  # views in a step
     ssim_weight: float = 0.2  # loss = (1 - w) L1 + w (1 - SSIM)
-    sh_every: int = 1_000  # steps after which the SH degree rises by one
+    sh_every: int = 1_000  # steps until the SH degree rises by one
     refine_from: int = 3_000  # step from which AGR acts and learns
     lambda_from: int = 15_000  # step from which lambda_t and lambda_d learn
     densify: DensifyConfig = field(default_factory=DensifyConfig)
@@ -135,7 +135,7 @@ class RasterConfig:
     """Choose how images are rendered."""
 
     backend: str = "auto"  # or reference, cpu, cuda (docs/glossary.md)
-    antialias: bool = False  # Mip-Splatting: scale opacities for the area that the 2D filter adds
+    antialias: bool = False  # Mip-Splatting: scale opacities for the 2D filter
 
 
 @dataclass
@@ -156,7 +156,7 @@ class EffectsConfig:
     """Remove time, direction and AGR (a network) from Gaussians that do not need them (docs/effects.md)."""
 
     gate: str = "${model.gate}"  # off; end: after the training; both: also during it
-    budget_db: float = 0.05  # PSNR on val that this may cost after the training
+    budget_db: float = 0.05  # dB of PSNR on val that the removal at the end may cost
 
 
 @dataclass
