@@ -73,6 +73,8 @@ def main_here(*arguments: str) -> int:
 
     argv, handler = sys.argv, signal.getsignal(signal.SIGTERM)
     GlobalHydra.instance().clear()
+    entry._problems.clear()  # a test may have called `do` itself
+    entry.started.clear()
     sys.argv = ["gsbench", *arguments]
     try:
         entry.main()

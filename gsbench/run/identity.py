@@ -56,8 +56,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
 
     Raises:
         InputError: a name is not a valid folder name, or the file of trained Gaussians does not exist. Hydra has
-            already
-            refused unknown keys and wrong types.
+            already refused unknown keys and wrong types.
     """
     for name in (one.name for one in fields(Config)):
         if name not in composed:
