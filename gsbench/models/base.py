@@ -160,9 +160,12 @@ class GaussianModel(nn.Module, ABC):
         """
         return
 
-    def spread(self) -> Tensor:
-        """Return factors F [N, 3, 3] of conditional covariances F F^T; by default those of spheres of size `scales`."""
-        return torch.diag_embed(self.scales()[:, None].expand(-1, 3))
+    def spread(self, rows: Tensor) -> Tensor:
+        """Return factors F of the conditional covariances F F^T of the Gaussians `rows` [M], [M, 3, 3].
+
+        By default they are those of spheres of size `scales`.
+        """
+        return torch.diag_embed(self.scales()[rows, None].expand(-1, 3))
 
     def log_sizes(self, index: int) -> Tensor:
         """Return the log sizes of one Gaussian in its n dimensions, [n]; by default only the largest size, [1]."""

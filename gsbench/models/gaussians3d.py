@@ -72,9 +72,10 @@ class Gaussians3DModel(GatedModel):
         """Multiply the three scales of each Gaussian in `rows` by the factor of this Gaussian."""
         self.splats["scales"].data[rows] += factors.log()[:, None].to(self.splats["scales"].dtype)
 
-    def spread(self) -> Tensor:
-        """Return the factors R S of the covariances, [N, 3, 3]."""
-        return self.factors({name: value.detach() for name, value in self.splats.items()})
+    def spread(self, rows: Tensor) -> Tensor:
+        """Return the factors R S of the covariances of the Gaussians `rows`, [M, 3, 3]."""
+        raw = {name: value.detach()[rows] for name, value in self.splats.items()}
+        return self.factors(raw)
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Sample the means of children from the parent Gaussian, with scales 1.6 times smaller (3DGS, section 5.2)."""

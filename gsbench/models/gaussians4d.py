@@ -236,9 +236,10 @@ class Gaussians4DModel(GatedModel):
         """Multiply the three spatial scales by factors. This is exact if the 4D rotation turns only space."""
         self.splats["scales"].data[rows, :3] += factors.log()[:, None].to(self.splats["scales"].dtype)
 
-    def spread(self) -> Tensor:
-        """Return factors of the conditional 3D covariances, [N, 3, 3], which are the same at all times."""
-        return reduce(self.factors({name: value.detach() for name, value in self.splats.items()})).T_pp
+    def spread(self, rows: Tensor) -> Tensor:
+        """Return factors of the conditional 3D covariances, [M, 3, 3], which are the same at all times."""
+        raw = {name: value.detach()[rows] for name, value in self.splats.items()}
+        return reduce(self.factors(raw)).T_pp
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Sample means and times of children from the parent Gaussian; all four scales are 1.6 times smaller."""

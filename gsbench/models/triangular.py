@@ -206,9 +206,10 @@ class TriangularModel(GatedModel):
         for name, value in self._parameters_of(T_qq, T_pq, T_pp * factors[:, None, None]).items():
             self.splats[name].data[rows] = value.to(self.splats[name].dtype)
 
-    def spread(self) -> Tensor:
-        """Return factors T_pp of the conditional covariances, [N, 3, 3], which depend on neither time nor direction."""
-        return reduce(self.factors({name: value.detach() for name, value in self.splats.items()})).T_pp
+    def spread(self, rows: Tensor) -> Tensor:
+        """Return factors T_pp of the conditional covariances, [M, 3, 3], which depend on neither time nor direction."""
+        raw = {name: value.detach()[rows] for name, value in self.splats.items()}
+        return reduce(self.factors(raw)).T_pp
 
     def _parameters_of(self, T_qq: Tensor, T_pq: Tensor, T_pp: Tensor) -> dict[str, Tensor]:
         """Compute the parameters of covariance factors from the blocks of [T_qq 0; T_pq T_pp]."""

@@ -10,6 +10,7 @@ from gsbench.train.densify.base import MOST_GAUSSIANS, Densification
 
 GROWTH = 0.05  # share of Gaussians that a round adds, until there are `max_gaussians`
 MOST_COPIES = 51  # equal Gaussians that one Gaussian becomes in a round, at most
+STILL_FROM = 0.2  # opacity from which the noise, below 4e-9 of that on a transparent Gaussian, is left out
 LARGEST_OPACITY = 1 - 1.2e-7  # the largest float32 below 1
 
 
@@ -78,10 +79,12 @@ class MCMCDensification(Densification):
     @torch.no_grad()
     def add_noise(self, rate: float, generator: torch.Generator) -> None:
         """Move the means of transparent Gaussians by noise; `rate` is the learning rate of means, world units."""
-        spread = self.model.spread()
-        noise = torch.randn(len(spread), 3, 1, generator=generator).to(spread)
-        weight = torch.sigmoid(-100 * (self._opacities() - 0.005)) * (self.config.noise * rate)
-        self.model.splats["means"].data += weight[:, None] * (spread @ (spread.mT @ noise))[..., 0]
+        opacities = self._opacities()
+        noise = torch.randn(len(opacities), 3, 1, generator=generator).to(opacities)
+        rows = (opacities < STILL_FROM).nonzero()[:, 0]
+        spread = self.model.spread(rows)
+        weight = torch.sigmoid(-100 * (opacities[rows] - 0.005)) * (self.config.noise * rate)
+        self.model.splats["means"].data[rows] += weight[:, None] * (spread @ (spread.mT @ noise[rows]))[..., 0]
 
     def reset_opacities(self) -> None:
         """Do nothing: opacities are not reset."""
