@@ -90,7 +90,7 @@ class DensifyConfig:
     prune_above: float = 0.1  # prune if the largest scale is above this share of the extent, after an opacity reset
     thin_to: float | None = None  # share of Gaussians that stay after `stop`, by blend weight; None: all
     max_gaussians: int | None = None  # most Gaussians; None: 2,000,000
-    noise: float = 5e5  # mcmc: noise on means of transparent Gaussians, times the learning rate; 0: none
+    noise: float = 5e5  # of mcmc: factor of the noise on means; 0: none
 
 
 @dataclass
@@ -122,8 +122,8 @@ class TrainConfig:
     refine_from: int = 3_000  # step from which AGR acts and learns
     lambda_from: int = 15_000  # step from which lambda_t and lambda_d learn
     densify: DensifyConfig = field(default_factory=DensifyConfig)
-    cooldown_from: int | None = None  # step from which all learning rates fall, to a tenth at the end; None: never
-    average_from: int | None = None  # step from which parameters are averaged; the mean is the result; None: never
+    cooldown_from: int | None = None  # step from which learning rates fall to a tenth; None: never
+    average_from: int | None = None  # step from which parameters are averaged; None: never
     coarse: list[list[int]] | None = None  # [[4, 3000]]: a quarter of the width until step 3,000
     penalties: PenaltiesConfig = field(default_factory=PenaltiesConfig)
     curve_points: int = 20  # measurements on val during the run
