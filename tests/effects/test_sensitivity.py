@@ -13,7 +13,7 @@ from gsbench.models.simplifications import Simplification, simplifications_of
 from gsbench.scenes.scene import Points, View
 from gsbench.schedule import ActiveComponents
 
-N, SIZE, VIEWS = 60, 24, 15
+N, SIZE, VIEWS = 60, 24, 30
 BLACK = torch.zeros(3)
 OPTIONS = {
     "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3, "agr": True},
