@@ -1,5 +1,6 @@
 """The trainer's wiring: which gradient, which views, which rows and which rate go where, asked of a real trainer."""
 
+import copy
 import math
 import re
 from dataclasses import fields, replace
@@ -381,3 +382,24 @@ def test_faulty_schedules_are_refused(word: str, said: str) -> None:
 def test_every_penalty_has_its_settings() -> None:
     """Catches a penalty without a weight in the config, and a weight that nothing reads."""
     assert {field.name for field in fields(PenaltiesConfig)} == set(PENALTIES)
+
+
+def test_relocation_and_averages_continue_from_a_checkpoint() -> None:
+    """Catches random numbers or sums of relocation and of averages that a checkpoint does not have."""
+    words = ("train.iterations=60", "train.recipe_iterations=60", "train.densify.kind=mcmc", "train.densify.start=0",
+             "train.densify.stop=50", "train.densify.every=10", "train.average_from=40", "train.refine_from=0")  # fmt: skip
+    whole, part = trainer("7dgs", *words), trainer("7dgs", *words)
+    before = len(whole.model)
+    whole.run(lambda _: None, "whole")
+    stops = iter([True] * 54 + [False])
+    part.run(lambda _: None, "part", lambda: next(stops))
+    assert part.step == 55
+    assert part.average.count == 1  # of step 50: it started anew with the round before
+    state = copy.deepcopy(part.state_dict())
+    resumed = trainer("7dgs", *words)
+    resumed.load_state_dict(state)
+    resumed.run(lambda _: None, "resumed")
+    assert len(whole.model) > before
+    assert whole.average.count == 0  # its means are the model's now
+    for name, value in whole.model.pack().items():
+        assert torch.equal(value, resumed.model.pack()[name]), name
