@@ -386,8 +386,9 @@ def test_every_penalty_has_its_settings() -> None:
 
 def test_relocation_and_averages_continue_from_a_checkpoint() -> None:
     """Catches random numbers or sums of relocation and of averages that a checkpoint does not have."""
-    words = ("train.iterations=60", "train.recipe_iterations=60", "train.densify.kind=mcmc", "train.densify.start=0",
-             "train.densify.stop=50", "train.densify.every=10", "train.average_from=40", "train.refine_from=0")  # fmt: skip
+    densify = ("train.densify.kind=mcmc", "train.densify.start=0", "train.densify.stop=50", "train.densify.every=10")
+    lengths = ("train.iterations=60", "train.recipe_iterations=60", "train.average_from=40", "train.refine_from=0")
+    words = (*densify, *lengths)
     whole, part = trainer("7dgs", *words), trainer("7dgs", *words)
     before = len(whole.model)
     whole.run(lambda _: None, "whole")
