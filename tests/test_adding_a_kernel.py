@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 from tiny_run import ROOT, environment
 
+from benchmarks.against import WITHOUT_EDITABLE
 from gsbench import kernels
 
-CHECK = """
-import sys
-sys.meta_path[:] = [finder for finder in sys.meta_path if 'Redirecting' not in type(finder).__name__]
+CHECK = (
+    f"{WITHOUT_EDITABLE}\n"
+    + """
 import torch
 from gsbench.kernels.balls import slice_ball
 from gsbench.kernels.tape import Tape
@@ -35,6 +36,7 @@ for x, a, b in zip(raw, got, want, strict=True):
     torch.testing.assert_close(a.double(), b, rtol=1e-4, atol=1e-6)
     assert torch.equal(sums[id(x)], a)
 """
+)
 
 
 def blocks() -> list[tuple[str, str | None, str]]:

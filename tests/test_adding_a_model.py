@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from tiny_run import ROOT, environment, overrides, write_moving_square
 
+from benchmarks.against import WITHOUT_EDITABLE
 from gsbench.measure import record
 from gsbench.measure.record import Record
 from gsbench.scenes.trained import ply_of, read_trained
@@ -37,7 +38,7 @@ START = (
     f"sys.path.append({os.fspath(ROOT / 'tests')!r})\n"
     "import composed\n"
     "composed.keep()\n"
-    "sys.meta_path[:] = [finder for finder in sys.meta_path if 'Redirecting' not in type(finder).__name__]\n"
+    f"{WITHOUT_EDITABLE}\n"
     "runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
 )
 

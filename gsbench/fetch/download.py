@@ -23,8 +23,7 @@ def download(source: Source, folder: Path) -> Path:
 
     Raises:
         InputError: the server cannot be reached, does not have the file, closes the connection, or sends other bytes
-            than
-            expected.
+            than expected.
     """
     url, path = source.address(), folder / source.file
     if path.is_file():

@@ -74,8 +74,8 @@ def show_colors(
         time: the time at which to compute colours; 1 is the length of the sequence.
         waves: the number of frequencies in time, including frequency 0.
         orders: the degree and number of frequencies of each Gaussian, packed as degree + 4 (waves - 1). Its
-            coefficients
-            above them are not read, and their gradient is zero. None: all Gaussians have `degree` and `waves`.
+            coefficients above them are not read, and their gradient is zero. None: all Gaussians have `degree` and
+            `waves`.
 
     Raises:
         InputError: tensors are not float32 on one device, or their shapes do not match.

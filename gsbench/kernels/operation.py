@@ -88,8 +88,7 @@ class Operation:
 
         Raises:
             InputError: shapes do not match, tensors are not float32 on one device, or an input requires a gradient that
-                the
-                operation does not compute.
+                the operation does not compute.
         """
         tensors, numbers = self.split(arguments)
         for (key, declared), x in zip(self.inputs.items(), tensors, strict=False):

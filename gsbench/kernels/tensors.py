@@ -1,5 +1,7 @@
 """Check tensors and numbers that are passed to public functions."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -27,6 +29,12 @@ def check_number(x: object, name: str, low: float = -LARGEST, high: float = LARG
     """Raise InputError unless `x` is a finite number from `low` to `high`; the message contains `name`."""
     if isinstance(x, bool) or not isinstance(x, int | float) or not low <= x <= high:
         raise InputError(f"{name}: expected a number in [{low:g}, {high:g}], got {x!r:.80}")
+
+
+def check_positive(x: object, name: str) -> None:
+    """Raise InputError unless `x` is a positive finite number; the message contains `name`."""
+    if not isinstance(x, int | float) or not 0 < x < math.inf:
+        raise InputError(f"{name}: expected a positive number, got {x}")
 
 
 def _brief(kind: object) -> str:

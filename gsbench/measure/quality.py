@@ -126,8 +126,7 @@ def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = N
     Raises:
         gsbench.measure.perceptual.BackboneMissing: `weights` is None, and torchvision's file does not exist.
         InputError: `a` and `b` are not images of the same size, they are too small, the backbone is unknown, or the
-            file
-            `weights` does not exist or has the wrong SHA-256.
+            file `weights` does not exist or has the wrong SHA-256.
 
     Example:
         This is the output without the weights; with the weights the result is 0.0.

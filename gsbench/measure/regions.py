@@ -19,7 +19,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gsbench.measure.quality import quantise
+from gsbench.measure.quality import psnr, quantise
 from gsbench.measure.record import Region
 from gsbench.scenes import View
 
@@ -96,8 +96,7 @@ def region_psnr(
 ) -> float:
     """Compute PSNR over the pixels of a region: -10 log10 of the mean squared error of pixels x 3 channels, dB."""
     inside = torch.from_numpy(mask).to(render.device)
-    error = render.detach().double().clamp(0, 1)[inside] - truth.detach().double().clamp(0, 1)[inside]
-    return float(-10 * error.square().mean().log10())
+    return psnr(render[inside][None], truth[inside][None])  # as an image of one row
 
 
 class RegionScores:
@@ -117,10 +116,11 @@ class RegionScores:
     def measured(self, images: Iterable[tuple[str, Tensor, Tensor]]) -> Iterator[tuple[str, Tensor, Tensor]]:
         """Yield (name of the view, render, ground truth) again, and measure each over the regions of its view."""
         for name, render, truth in images:
+            shown = quantise(render) if self.quantised else render
             for region, scores in self.scores.items():
                 mask = self.regions[region].masks.get(name)
                 if mask is not None:
-                    scores.append(region_psnr(quantise(render) if self.quantised else render, truth, mask))
+                    scores.append(region_psnr(shown, truth, mask))
             yield name, render, truth
 
     def metrics(self) -> dict[str, float | None]:
@@ -146,21 +146,15 @@ def _large(masks: dict[str, Mask], source: str) -> Regions:
 
 def _by_camera(views: Sequence[View]) -> list[list[View]]:
     """Group the views by equal cameras and image sizes."""
-    groups: list[list[View]] = []
-    for view in views:
-        group = next((one for one in groups if _same_camera(one[0], view)), None)
-        if group is None:
-            groups.append([view])
-        else:
-            group.append(view)
+    cameras = [view.camera for view in views]
+    keys = np.array([[one.width, one.height, *one.viewmat.flatten().tolist(), *one.K.flatten().tolist()]
+                     for one in cameras])  # fmt: skip
+    groups, left = [], np.arange(len(views))
+    while len(left):
+        same = (np.abs(keys[left] - keys[left[0]]) <= SAME).all(1)
+        groups.append([views[i] for i in left[same]])
+        left = left[~same]
     return groups
-
-
-def _same_camera(a: View, b: View) -> bool:
-    one, other = a.camera, b.camera
-    return (one.width, one.height) == (other.width, other.height) and all(
-        bool((x - y).abs().max() <= SAME) for x, y in ((one.viewmat, other.viewmat), (one.K, other.K))
-    )
 
 
 def _sums(view: View) -> npt.NDArray[np.uint16]:

@@ -16,6 +16,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import ALPHA_MIN
+from gsbench.kernels.tensors import check_positive
 from gsbench.models.appearance import sh_colors
 from gsbench.models.color_order import ColorOrder
 from gsbench.models.effect_sets import NAMES, EffectSets
@@ -332,8 +333,7 @@ class GaussianModel(nn.Module, ABC):
         Raises:
             InputError: `value` is not a positive number.
         """
-        if not isinstance(value, int | float) or not 0 < value < math.inf:
-            raise InputError(f"lambda_{name[0]}: expected a positive number, got {value}")
+        check_positive(value, f"lambda_{name[0]}")
         self.log_lambda[name] = nn.Parameter(torch.tensor(math.log(value)))
 
     def lambda_of(self, name: str) -> Tensor:

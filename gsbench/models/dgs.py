@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
+from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
 from gsbench.models.factors import sizes
 from gsbench.models.moving3d import MovingGaussians3D
@@ -64,8 +65,7 @@ class DirectModel(MovingGaussians3D):
         super().__init__(**options)
         if coupling not in COUPLINGS:
             raise InputError(f"coupling '{coupling}' is not known. {did_you_mean(coupling, COUPLINGS)}")
-        if not isinstance(view_precision, int | float) or not 0 < view_precision < math.inf:
-            raise InputError(f"view_precision: expected a positive number, got {view_precision}")
+        check_positive(view_precision, "view_precision")
         self.coupling = coupling
         self.view_precision = view_precision
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsbench.errors import InputError
+from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
 from gsbench.models.factors import sizes
 from gsbench.models.moving3d import MovingGaussians3D
@@ -44,8 +44,7 @@ class FreeTimeModel(MovingGaussians3D):
             InputError: an option is out of its range.
         """
         super().__init__(**options)
-        if not isinstance(duration, int | float) or not 0 < duration < math.inf:
-            raise InputError(f"duration: expected a positive number, got {duration}")
+        check_positive(duration, "duration")
         self.duration = duration
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:

@@ -65,10 +65,6 @@ class MovingGaussians3D(Gaussians3DModel):
             masks |= dict.fromkeys(self.moving, rows < effect_sets.conditioned)
         return masks
 
-    def durations(self) -> Tensor:
-        """Return the standard deviation in time of each Gaussian's opacity, [N] (1 = the length of the scene)."""
-        return self.lifetimes()[1]
-
     def log_duration(self, index: int) -> float:
         """Return the logarithm of the standard deviation in time of the Gaussian `index`."""
-        return math.log(float(self.durations()[index]))
+        return math.log(float(self.lifetimes()[1][index]))

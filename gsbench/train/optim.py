@@ -114,8 +114,8 @@ class Optimizer:
 
     def rates_at(self, step: int, slowed: float = 1.0) -> dict[str, float]:
         """Return the learning rate of each group at a step; the rate of AGR (a network) is multiplied by `slowed`."""
-        rates = {name: rate_at(rate, step, self.train, self.extent) for name, rate in self.rates.items()}
-        return {name: rate * slowed if name == "refinement" else rate for name, rate in rates.items()}
+        return {name: rate_at(rate, step, self.train, self.extent) * (slowed if name == "refinement" else 1.0)
+                for name, rate in self.rates.items()}  # fmt: skip
 
     def _is_native(self, parameter: Tensor) -> bool:
         """Return whether the CPU kernel, not torch, updates a parameter."""

@@ -8,7 +8,7 @@ import pytest
 import test_tape
 import torch
 from test_prefixes import SHARES, gradients, intervals_around, kept
-from test_slices import VARIANTS, assert_same, color_inputs, model_and_raw, rotated, static
+from test_slices import VARIANTS, assert_same, color_inputs, model_and_raw, refined_exactly, rotated, static
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -130,14 +130,7 @@ def test_colors(degree: int, waves: int, move: Move) -> None:
 )
 def test_refinement(N: int, widths: list[int], move: Move) -> None:
     """Catches a batch's edge that is lost, a network that reads another's weights, and any wrong gradient."""
-    g = torch.Generator().manual_seed(N)
-    exact = Refinement(widths, g, units=0.5 + torch.rand(sum(widths), generator=g)).double()
-    with torch.no_grad():
-        for parameter in exact.parameters():
-            parameter.add_(0.2 * torch.randn(parameter.shape, generator=g))
-    parts = [*widths[:-1], 2, widths[-1] - 2]  # the last network moves two arrays
-    values = [torch.randn(N, c, generator=g, dtype=torch.float64).requires_grad_() for c in parts]
-    expected = exact(values, torch.tensor(0.37, dtype=torch.float64))
+    exact, values, expected = refined_exactly(N, widths)
     single = deepcopy(exact).to(move(values[0]))
     inputs = [move(x) for x in values]
     actual = single(inputs, move(torch.tensor(0.37)), by_kernel=True)

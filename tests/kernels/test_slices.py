@@ -226,11 +226,8 @@ def test_gradients_of_views_add_up(share: float, degree: int) -> None:
         assert torch.equal(x.grad, sum(gradients[1:], gradients[0]))
 
 
-@pytest.mark.usefixtures("instruction_set")
-@pytest.mark.parametrize("N", [1, 127, 300])
-@pytest.mark.parametrize("widths", [[3, 1, 3, 28], [3, 7], [3, 3, 21]])
-def test_refinement(N: int, widths: list[int]) -> None:
-    """Catches a block's edge that is lost, a network that reads another's weights, and any wrong gradient."""
+def refined_exactly(N: int, widths: list[int]) -> tuple[Refinement, list[Tensor], list[Tensor]]:
+    """A network of AGR in float64, the values of N Gaussians that it moves, and what it makes of them at 0.37."""
     g = torch.Generator().manual_seed(N)
     exact = Refinement(widths, g, units=0.5 + torch.rand(sum(widths), generator=g)).double()
     with torch.no_grad():
@@ -239,8 +236,17 @@ def test_refinement(N: int, widths: list[int]) -> None:
     parts = [*widths[:-1], 2, widths[-1] - 2]  # the last network moves two arrays
     values = [torch.randn(N, c, generator=g, dtype=torch.float64).requires_grad_() for c in parts]
     expected = exact(values, torch.tensor(0.37, dtype=torch.float64))
+    return exact, values, expected
 
-    single = Refinement(widths, g)
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("N", [1, 127, 300])
+@pytest.mark.parametrize("widths", [[3, 1, 3, 28], [3, 7], [3, 3, 21]])
+def test_refinement(N: int, widths: list[int]) -> None:
+    """Catches a block's edge that is lost, a network that reads another's weights, and any wrong gradient."""
+    exact, values, expected = refined_exactly(N, widths)
+
+    single = Refinement(widths, torch.Generator())
     single.load_state_dict(exact.state_dict())
     inputs = [x.detach().float().requires_grad_() for x in values]
     actual = single(inputs, torch.tensor(0.37), by_kernel=True)

@@ -5,7 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsbench.models import GaussianModel, build
+from gsbench.kernels.headers import ALPHA_MIN
+from gsbench.models import GaussianModel, Query, build
 from gsbench.scenes.scene import Points
 
 N = 24
@@ -64,6 +65,22 @@ def fresh(variant: str, count: int = N, seed: int = 0, **options: Any) -> Gaussi
 def lively(variant: str, count: int = N, seed: int = 0, **options: Any) -> GaussianModel:
     """A model in the midst of a training, in float64."""
     return moved(fresh(variant, count, seed, **options), seed)
+
+
+def assert_culled_outside_its_intervals(model: GaussianModel, times: Tensor, exact: bool) -> None:
+    """A Gaussian has too low an opacity outside its visible interval and, if `exact`, only there."""
+    intervals = model.visible_intervals()
+    assert intervals is not None
+    first, last = intervals.unbind(1)
+    hidden = 0
+    for time in times:
+        opacities = model.slice(Query.at(CAMERA, time)).opacities
+        outside = (time < first) | (time > last)
+        assert (opacities[outside] < ALPHA_MIN * (1 + 1e-9)).all()
+        hidden += int(outside.sum())
+        if exact:
+            assert (opacities[~outside] > ALPHA_MIN * (1 - 1e-9)).all()
+    assert 0 < hidden < len(times) * len(model)
 
 
 def raw(model: GaussianModel) -> dict[str, Tensor]:

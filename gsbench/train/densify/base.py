@@ -22,7 +22,6 @@ class Densification(ABC):
     """The base class of densification rules, which add and remove Gaussians during a training."""
 
     kind: ClassVar[str]  # its name in train.densify.kind
-    adds_noise: bool = False  # whether `add_noise` is called after every step
 
     def __init__(self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int) -> None:
         """Prepare the rule for a training.
@@ -70,6 +69,11 @@ class Densification(ABC):
         Returns:
             The number of Gaussians that were not added, because the model would have more than allowed.
         """
+
+    @property
+    def adds_noise(self) -> bool:
+        """Whether the training calls `add_noise` after every step; by default it does not."""
+        return False
 
     def add_noise(self, rate: float, generator: torch.Generator) -> None:
         """Move means by noise after a step, if the rule's `adds_noise` is true; by default do nothing.

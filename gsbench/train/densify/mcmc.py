@@ -72,7 +72,7 @@ class MCMCDensification(Densification):
         self.rows.select(rows, fresh)
 
     @property
-    def adds_noise(self) -> bool:  # type: ignore[override]
+    def adds_noise(self) -> bool:
         """Whether noise is added: not after Gaussians were made independent of time, direction or AGR (a network)."""
         return self.config.noise > 0 and self.model.effect_sets is None
 
