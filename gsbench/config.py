@@ -89,7 +89,7 @@ class DensifyConfig:
     clone_below: float = 0.01  # clone if the largest scale is below this share of the extent, else split
     prune_above: float = 0.1  # prune if the largest scale is above this share of the extent, after an opacity reset
     thin_to: float | None = None  # share of Gaussians that stay after `stop`, by blend weight; None: all
-    max_gaussians: int | None = None  # most Gaussians; None: 2,000,000
+    max_gaussians: int | None = None  # most Gaussians at full resolution; None: 2,000,000
     noise: float = 5e5  # of mcmc: factor of the noise on means; 0: none
 
 
@@ -104,7 +104,7 @@ class PenaltyConfig:
 
 @dataclass
 class PenaltiesConfig:
-    """Add terms to the loss of every view."""
+    """Add terms to every view's loss."""
 
     opacity: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean opacity
     size: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean largest scale, in parts of the scene's extent

@@ -21,7 +21,6 @@ from gsbench.schedule import Schedule
 from gsbench.train.averaging import NO_AVERAGE, Average
 from gsbench.train.checkpoint import whole_number
 from gsbench.train.densify import densification
-from gsbench.train.densify.base import MOST_GAUSSIANS
 from gsbench.train.densify.minimum_scale import MinimumScale
 from gsbench.train.finite_check import DivergedError, FiniteCheck
 from gsbench.train.gating import NO_GATES, Gating
@@ -182,8 +181,10 @@ class Trainer:
                 rate = self.optimizer.rates_at(step)["means"]
                 self.density.add_noise(rate, generator(self.config.seed, step, 1))  # 1: not the numbers of `densify`
             if schedule.densifies(step):
-                refused = self.density.densify(generator(self.config.seed, step), schedule.has_reset(step))
-                self._tell_full(refused)
+                most = schedule.most_gaussians(step)
+                refused = self.density.densify(generator(self.config.seed, step), schedule.has_reset(step), most)
+                if factor == 1:
+                    self._tell_full(refused, most)
             if schedule.thins(step):
                 self._thin()
             if schedule.densifies(step) or schedule.thins(step):
@@ -203,11 +204,10 @@ class Trainer:
         assert share is not None
         self.rows.select(heaviest(blend_weights(self.model, self.scene.train, self.renderer.antialias), share))
 
-    def _tell_full(self, refused: int) -> None:
+    def _tell_full(self, refused: int, most: int) -> None:
         """Print once that the limit `train.densify.max_gaussians` is reached; `refused` Gaussians were not added."""
         if refused and not self._is_full:
             self._is_full = True
-            most = self.config.train.densify.max_gaussians or MOST_GAUSSIANS
             tqdm.write(f"step {self.step + 1}: {most} Gaussians are the most that train.densify.max_gaussians allows: "
                        f"{refused} of smaller gradients are not cloned or split", file=sys.stderr)  # fmt: skip
 

@@ -28,9 +28,9 @@ class Moments:
         raise AssertionError(parameter)
 
 
-def rule(model: GaussianModel, **config: float) -> tuple[MCMCDensification, Moments]:
+def rule(model: GaussianModel, noise: float = 0.0) -> tuple[MCMCDensification, Moments]:
     moments = Moments()
-    return MCMCDensification(Rows(model, moments), DensifyConfig(**config), 0.005, 10), moments  # type: ignore[arg-type]
+    return MCMCDensification(Rows(model, moments), DensifyConfig(noise=noise), 0.005, 10), moments
 
 
 @pytest.mark.parametrize(
@@ -70,8 +70,8 @@ def test_dead_gaussians_move_to_living_ones(name: str) -> None:
         model.splats["opacities"][:] = 1.0
         model.splats["opacities"][30:] = -8.0  # dead
     before = copy.deepcopy(model.splats.state_dict())
-    density, moments = rule(model, max_gaussians=41)
-    assert density.densify(generator(1), has_reset=False) == 0
+    density, moments = rule(model)
+    assert density.densify(generator(1), has_reset=False, most=41) == 0
     assert len(model) == 41  # 42 by growth
     assert (torch.sigmoid(model.splats["opacities"]) > 0.005).all()
     sources = [int((model.splats["means"][i] == before["means"]).all(1).nonzero()[0]) for i in range(41)]

@@ -118,7 +118,7 @@ def test_density_control_clones_small_splits_large_prunes_faint() -> None:
     gradients[[0, 3]] = torch.tensor([0.03, 0.0])  # x 100 / 2 pixels x 1 view = 1.5 > 1
     gradients[1] = torch.tensor([0.0, 0.03])  # x 50 / 2 = 0.75 < 1
     control.accumulate(*drawn_with(gradients), width=100, height=50, views=1)
-    control.densify(torch.Generator().manual_seed(1), has_reset=False)
+    control.densify(torch.Generator().manual_seed(1), has_reset=False, most=100)
     means = model.splats["means"].detach()[:, 0]
     assert len(model) == 7  # 1, 2, 4 kept; 0 cloned to two; 3 split in two; 5 pruned
     assert means[:5].tolist() == [0, 1, 2, 4, 0]
@@ -136,7 +136,7 @@ def test_no_more_gaussians_than_the_cap_and_the_largest_gradients_first() -> Non
     """Catches a threshold of 0 that makes 3.3 million Gaussians in 21 steps, and a cap that depends on the rows' order
     in a sort that is not stable, or takes the first rows whatever their gradients."""
     model, optimizer = fitted(6)
-    config = DensifyConfig(grad_threshold=0.0, max_gaussians=9)
+    config = DensifyConfig(grad_threshold=0.0)
     control = GradientDensification(Rows(model, optimizer), config, 0.01, views=3)
     with torch.no_grad():
         model.splats["scales"].fill_(math.log(0.001))
@@ -145,13 +145,13 @@ def test_no_more_gaussians_than_the_cap_and_the_largest_gradients_first() -> Non
     gradients = torch.zeros(6, 2)
     gradients[:, 0] = torch.tensor([0.0, 0.2, 0.1, 0.3, 0.2, 0.2])
     control.accumulate(*drawn_with(gradients), width=10, height=10, views=1)
-    assert control.densify(torch.Generator(), has_reset=False) == 2
+    assert control.densify(torch.Generator(), has_reset=False, most=9) == 2
     assert model.splats["means"].detach()[:, 0].tolist() == [0, 1, 2, 3, 4, 5, 1, 3, 4]
     control.accumulate(*drawn_with(torch.ones(9, 2)), width=10, height=10, views=1)
-    assert control.densify(torch.Generator(), has_reset=False) == 9
-    control.config = DensifyConfig(grad_threshold=0.0, max_gaussians=5)  # fewer than a file to start from has
+    assert control.densify(torch.Generator(), has_reset=False, most=9) == 9
     control.accumulate(*drawn_with(torch.ones(9, 2)), width=10, height=10, views=1)
-    assert control.densify(torch.Generator(), has_reset=False) == 9
+    # A file to start from may have more Gaussians than allowed.
+    assert control.densify(torch.Generator(), has_reset=False, most=5) == 9
     assert len(model) == 9
 
 
@@ -166,7 +166,7 @@ def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
     def look(drawn: torch.Tensor, times: int) -> list[float]:
         for _ in range(times):
             control.accumulate(*drawn_with(torch.zeros(4, 2)[: len(model)], drawn), 10, 10, views=1)
-        control.densify(torch.Generator(), has_reset=False)
+        control.densify(torch.Generator(), has_reset=False, most=100)
         return model.splats["means"].detach()[:, 0].tolist()
 
     assert look(never, 4) == [0, 1, 2, 3]  # four views in a row may miss one of three
@@ -195,9 +195,9 @@ def test_large_gaussians_are_pruned_only_when_asked() -> None:
         model.splats["scales"].fill_(math.log(0.1))
         model.splats["scales"][0] = math.log(0.3)  # above 0.1 x extent 2
     control = GradientDensification(Rows(model, optimizer), DensifyConfig(), 0.01, views=3)
-    control.densify(torch.Generator(), has_reset=False)
+    control.densify(torch.Generator(), has_reset=False, most=100)
     assert len(model) == 4
-    control.densify(torch.Generator(), has_reset=True)
+    control.densify(torch.Generator(), has_reset=True, most=100)
     assert len(model) == 3
 
 

@@ -59,6 +59,16 @@ def test_agr_never_acts_where_it_is_off() -> None:
     assert not any(s.active(step).refine for step in range(100))
 
 
+def test_growth_follows_the_resolution() -> None:
+    """Catches a limit that a quarter of the width fills with Gaussians, and one that full resolution does not have."""
+    config = TrainConfig(coarse=[[4, 3_000], [2, 14_900]], densify=DensifyConfig(max_gaussians=48_000))
+    s = Schedule(config, sh_degree=3, agr=True)
+    assert s.most_gaussians(0) == 3_000  # 48,000 / 4^2
+    assert s.most_gaussians(7_500) == 16_971  # 48,000 / 2^1.5
+    assert s.most_gaussians(14_999) == 48_000
+    assert schedule(30_000).most_gaussians(0) == 2_000_000
+
+
 @pytest.mark.parametrize(("iterations", "points"), [(1_000, 10), (7, 3), (5, 20), (100, 1)])
 def test_curve_has_its_points_and_ends_at_the_last_step(iterations: int, points: int) -> None:
     """Catches a curve that misses the final iteration or has another number of points than asked for."""

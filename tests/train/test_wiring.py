@@ -153,7 +153,7 @@ def test_large_gaussians_go_once_opacities_were_reset() -> None:
     """Catches pruning by size that is never asked for, or asked for from the start."""
     fitted = trainer()
     asked = []
-    fitted.density.densify = lambda _, has_reset: asked.append(has_reset)  # type: ignore[method-assign]
+    fitted.density.densify = lambda _, has_reset, __: asked.append(has_reset)  # type: ignore[method-assign]
     fitted.schedule.densifies = lambda _: True  # type: ignore[method-assign]
     fitted.schedule.resets = lambda _: False  # type: ignore[method-assign]
     for step in (0, fitted.schedule.reset_every - 1, fitted.schedule.reset_every):
@@ -166,7 +166,7 @@ def test_children_of_every_densification_are_drawn_anew() -> None:
     """Catches children that are scattered alike in every densification, and draws that are not those of the seed."""
     fitted = trainer("3dgs")
     drawn: list[float] = []
-    fitted.density.densify = lambda random, _: drawn.append(torch.rand(1, generator=random).item())  # type: ignore[method-assign]
+    fitted.density.densify = lambda random, *_: drawn.append(torch.rand(1, generator=random).item())  # type: ignore[method-assign]
     fitted.schedule.densifies = lambda _: True  # type: ignore[method-assign]
     for fitted.config.seed, fitted.step in ((0, 3), (0, 4), (1, 3), (0, 3)):
         fitted._descend()
@@ -203,7 +203,7 @@ def test_what_is_long_in_time_is_split_along_its_path() -> None:
     density.gradient[:2], density.seen[:2] = 1.0, 1.0
     times = model.splats["times"].detach()[:2].clone()
     N = len(model)
-    density.densify(generator(0), has_reset=False)
+    density.densify(generator(0), has_reset=False, most=100)
     assert len(model) == N + 2
     children, clone = model.splats["times"].detach()[-2:], model.splats["times"].detach()[-3]
     assert (children != times[0]).all()

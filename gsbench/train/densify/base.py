@@ -13,10 +13,6 @@ from torch import Tensor
 from gsbench.config import DensifyConfig
 from gsbench.train.rows import Rows
 
-# The largest model of the 7DGS paper has 1.41 million Gaussians, the largest here 0.55 million. A Gaussian of 7DGS has
-# 84 numbers, with gradient and moments four times as many: 2.7 GB for 2 million Gaussians.
-MOST_GAUSSIANS = 2_000_000
-
 
 class Densification(ABC):
     """The base class of densification rules, which add and remove Gaussians during a training."""
@@ -59,12 +55,13 @@ class Densification(ABC):
         """
 
     @abstractmethod
-    def densify(self, generator: torch.Generator, has_reset: bool) -> int:
+    def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
         """Do one round of densification: add and remove Gaussians.
 
         Args:
             generator: the source of all random numbers of this round.
             has_reset: whether opacities were reset earlier in the training.
+            most: the number of Gaussians that the model may have after this round (`Schedule.most_gaussians`).
 
         Returns:
             The number of Gaussians that were not added, because the model would have more than allowed.

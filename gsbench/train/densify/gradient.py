@@ -6,7 +6,7 @@ from torch import Tensor
 from gsbench.config import DensifyConfig
 from gsbench.models.base import CHILDREN
 from gsbench.train.checkpoint import tensor
-from gsbench.train.densify.base import MOST_GAUSSIANS, Densification
+from gsbench.train.densify.base import Densification
 from gsbench.train.rows import Rows
 
 
@@ -56,19 +56,20 @@ class GradientDensification(Densification):
         self.unseen = (self.unseen + len(drawn)).masked_fill_(drawn.any(0), 0)
 
     @torch.no_grad()
-    def densify(self, generator: torch.Generator, has_reset: bool) -> int:
+    def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
         """Clone and split Gaussians with a large gradient, then prune.
 
         Args:
             generator: the source of random numbers for the children of split Gaussians.
             has_reset: whether opacities were reset before; only then are large Gaussians pruned.
+            most: the number of Gaussians that the model may have after this round.
 
         Returns:
-            The number of Gaussians with a large gradient that were not cloned or split, because of the allowed maximum.
+            The number of Gaussians with a large gradient that were not cloned or split, because of `most`.
         """
         model, config = self.model, self.config
         scales = model.scales()
-        wanted, refused = self._wanted()
+        wanted, refused = self._wanted(most)
         small = scales <= config.clone_below * model.extent
         split = wanted & (~small | model.long_in_time())
         clone = wanted & ~split
@@ -87,15 +88,15 @@ class GradientDensification(Densification):
         self.rows.select(keep.nonzero()[:, 0])
         return refused
 
-    def _wanted(self) -> tuple[Tensor, int]:
-        """Return which Gaussians to clone or split, [N] bool, and how many more were left out because of the maximum.
+    def _wanted(self, most: int) -> tuple[Tensor, int]:
+        """Return which Gaussians to clone or split, [N] bool, and how many more were left out because of `most`.
 
-        If the model would have more Gaussians than allowed, those with the largest gradients are chosen.
+        If the model would have more Gaussians than `most`, those with the largest gradients are chosen.
         """
         gradient = self.gradient / self.seen.clamp(min=1)
         wanted = gradient > self.config.grad_threshold
         rows = wanted.nonzero()[:, 0]
-        room = max(0, (self.config.max_gaussians or MOST_GAUSSIANS) - len(self.model))
+        room = max(0, most - len(self.model))
         if len(rows) > room:
             refused = gradient[rows].argsort(descending=True, stable=True)[room:]
             wanted[rows[refused]] = False

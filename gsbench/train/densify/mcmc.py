@@ -6,7 +6,7 @@ Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", arXiv 24
 import torch
 from torch import Tensor
 
-from gsbench.train.densify.base import MOST_GAUSSIANS, Densification
+from gsbench.train.densify.base import Densification
 
 GROWTH = 0.05  # share of Gaussians that a round adds, until there are `max_gaussians`
 MOST_COPIES = 51  # equal Gaussians that one Gaussian becomes in a round, at most
@@ -34,14 +34,13 @@ class MCMCDensification(Densification):
         """Do nothing: relocation does not use gradients of 2D means."""
 
     @torch.no_grad()
-    def densify(self, generator: torch.Generator, has_reset: bool) -> int:
-        """Relocate dead Gaussians, then add Gaussians up to the limit; return 0, because none is refused."""
+    def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
+        """Relocate dead Gaussians, then add Gaussians up to `most`; return 0, because none is refused."""
         N = len(self.model)
         opacities = self._opacities()
         dead = opacities <= self.min_opacity
         if dead.all():
             return 0
-        most = self.config.max_gaussians or MOST_GAUSSIANS
         self._copy(drawn(opacities.masked_fill(dead, 0), int(dead.sum()), generator), dead.nonzero()[:, 0])
         added = max(0, min(most, int(N * (1 + GROWTH))) - N)
         self._copy(drawn(self._opacities(), added, generator), torch.arange(N, N + added, device=dead.device))
