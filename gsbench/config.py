@@ -79,7 +79,7 @@ class ModelConfig:
 class DensifyConfig:
     """Set the adaptive density control of 3DGS (section 5.2). All steps but `every` scale with `train.iterations`."""
 
-    kind: str = "gradient"  # gradient (3DGS) or mcmc (relocation)
+    kind: str = "gradient"  # gradient (3DGS), mcmc (relocation) or multiview (FastGS)
     start: int = 500  # step after which densification starts
     stop: int = 15_000  # step at which densification ends
     every: int = 100  # least number of steps between two rounds

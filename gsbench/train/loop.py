@@ -22,6 +22,7 @@ from gsbench.train.averaging import NO_AVERAGE, Average
 from gsbench.train.checkpoint import whole_number
 from gsbench.train.densify import densification
 from gsbench.train.densify.minimum_scale import MinimumScale
+from gsbench.train.densify.scores import ErrorScore
 from gsbench.train.finite_check import DivergedError, FiniteCheck
 from gsbench.train.gating import NO_GATES, Gating
 from gsbench.train.optim import Optimizer
@@ -73,7 +74,8 @@ class Trainer:
         self.schedule = Schedule(train, config.model.sh_degree, config.agr)
         self.optimizer = Optimizer(model, config.model, train, scene.extent, config.optim)
         self.rows = Rows(model, self.optimizer)
-        self.density = densification(self.rows, train.densify, config.model.min_opacity, len(scene.train))
+        score = ErrorScore(model, scene.train, self.renderer, train.ssim_weight)
+        self.density = densification(self.rows, train.densify, config.model.min_opacity, len(scene.train), score)
         self.minimum_scale = MinimumScale(model, [view.camera for view in scene.train])
         self.rows.add(self.minimum_scale)
         self.average = Average(model, self.schedule.average_start)

@@ -9,27 +9,45 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gsbench.kernels.tape import Tape
 from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes import View
 
 
 def blend_weights(model: GaussianModel, views: Sequence[View], antialias: bool) -> Tensor:
-    """Return for each Gaussian the sum of its blend weights over all pixels of the views, [N].
-
-    The sum is computed as a gradient: a pixel is linear in the colours, so the derivative of the sum of all pixels with
-    respect to the colour of a Gaussian is the sum of its blend weights.
-    """
+    """Return for each Gaussian the sum of its blend weights over all pixels of the views, [N]."""
     total = torch.zeros_like(model.splats["opacities"].detach())
+    black = total.new_zeros(3)
     for view in views:
+        rendered = WeighedImage(model, view, black, antialias)
+        total += rendered.weights(torch.ones_like(rendered.image[..., 0]))
+    return total
+
+
+class WeighedImage:
+    """The image of a view, from which the blend weights of all Gaussians are computed.
+
+    The weights are computed as a gradient: a pixel is linear in the colours, so the derivative of a sum of pixels with
+    respect to the colour of a Gaussian is the sum of its blend weights on them.
+    """
+
+    def __init__(self, model: GaussianModel, view: View, background: Tensor, antialias: bool) -> None:
+        """Render the view; `background` is its colour, [3]."""
         with torch.no_grad():
             seen = model.slice(Query.of(view.camera, view.time))
-        ones = torch.ones_like(seen.colors).requires_grad_()
-        black = torch.zeros(3, device=ones.device)
-        image = rasterize_slice(seen._replace(colors=ones), view.camera, black, model.backend, antialias).image
-        (weights,) = torch.autograd.grad(image.sum(), ones)
-        total += weights[:, 0]
-    return total
+        self._colors = seen.colors.detach().requires_grad_()  # [N, 3]
+        gaussians = seen._replace(colors=self._colors)
+        with torch.enable_grad(), Tape() as self._tape:
+            self._output = rasterize_slice(gaussians, view.camera, background, model.backend, antialias).image
+        self.image = self._output.detach()[0]  # [H, W, 3]
+
+    def weights(self, pixels: Tensor) -> Tensor:
+        """Return for each Gaussian the sum of its blend weights times the factors `pixels` [H, W], [N]."""
+        sums: dict[int, Tensor] = {}
+        factors = pixels[None, ..., None].expand_as(self._output).contiguous()
+        self._tape.backward(self._output, factors, [self._colors], sums)
+        return sums.get(id(self._colors), torch.zeros_like(self._colors))[:, 0]
 
 
 def heaviest(weights: Tensor, share: float) -> Tensor:

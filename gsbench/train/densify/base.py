@@ -5,7 +5,8 @@ steps (`densify`). It works with all models, because it calls the model's own me
 """
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,12 +15,25 @@ from gsbench.config import DensifyConfig
 from gsbench.train.rows import Rows
 
 
+class Scores(NamedTuple):
+    """Hold how much each Gaussian contributes to the pixels with large errors in some training views."""
+
+    importance: Tensor  # [N] mean over the views of its summed blend weight on these pixels, pixels
+    badness: Tensor  # [N] in [0, 1]: the same sums, weighted by the losses of the views; 1: the largest
+
+
+# Draws training views by a generator, renders them and returns the scores of all present Gaussians.
+Score = Callable[[torch.Generator], Scores]
+
+
 class Densification(ABC):
     """The base class of densification rules, which add and remove Gaussians during a training."""
 
     kind: ClassVar[str]  # its name in train.densify.kind
 
-    def __init__(self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int) -> None:
+    def __init__(
+        self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
+    ) -> None:
         """Prepare the rule for a training.
 
         Args:
@@ -27,12 +41,15 @@ class Densification(ABC):
             config: the thresholds of densification.
             min_opacity: the opacity below which a Gaussian may be pruned.
             views: the number of training views, which is the length of an epoch.
+            score: renders training views to score the Gaussians, for rules that call it in `densify`. It is their only
+                access to the views.
         """
         self.rows = rows
         self.model = rows.model
         self.config = config
         self.min_opacity = min_opacity
         self.views = views
+        self.score = score
         rows.add(self)
 
     @abstractmethod

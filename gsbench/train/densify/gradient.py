@@ -6,7 +6,7 @@ from torch import Tensor
 from gsbench.config import DensifyConfig
 from gsbench.models.base import CHILDREN
 from gsbench.train.checkpoint import tensor
-from gsbench.train.densify.base import Densification
+from gsbench.train.densify.base import Densification, Score
 from gsbench.train.rows import Rows
 
 
@@ -26,9 +26,11 @@ class GradientDensification(Densification):
 
     kind = "gradient"
 
-    def __init__(self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int) -> None:
+    def __init__(
+        self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
+    ) -> None:
         """Start the density control with gradient sums of zero; see `Densification` for the arguments."""
-        super().__init__(rows, config, min_opacity, views)
+        super().__init__(rows, config, min_opacity, views, score)
         self.patience = 2 * views - 1  # so many consecutive views always contain a whole epoch
         self.unseen = torch.zeros(len(rows), dtype=torch.int32, device=self.model.splats["means"].device)
         self.forget()
@@ -67,10 +69,25 @@ class GradientDensification(Densification):
         Returns:
             The number of Gaussians with a large gradient that were not cloned or split, because of `most`.
         """
-        model, config = self.model, self.config
-        scales = model.scales()
-        wanted, refused = self._wanted(most)
-        small = scales <= config.clone_below * model.extent
+        _, refused = self._add(generator, most)
+        self.rows.select((~(self._unseen() | self._faint_or_large(has_reset))).nonzero()[:, 0])
+        return refused
+
+    def _add(self, generator: torch.Generator, most: int, allowed: Tensor | None = None) -> tuple[Tensor, int]:
+        """Clone and split Gaussians with a large gradient.
+
+        Args:
+            generator: the source of random numbers for the children of split Gaussians.
+            most: the number of Gaussians that the model may have after this round.
+            allowed: which Gaussians may be cloned or split, [N] bool; None: all.
+
+        Returns:
+            The index before the change of each Gaussian or of its parent, [M], and the number of Gaussians that were
+            not cloned or split because of `most`.
+        """
+        model = self.model
+        wanted, refused = self._wanted(most, allowed)
+        small = model.scales() <= self.config.clone_below * model.extent
         split = wanted & (~small | model.long_in_time())
         clone = wanted & ~split
 
@@ -80,21 +97,33 @@ class GradientDensification(Densification):
         self.rows.select(chosen, fresh=torch.arange(len(chosen), device=chosen.device) >= len(kept))
         children = torch.arange(len(model) - len(parents), len(model), device=parents.device)
         model.split_rows(children, generator)
+        return chosen, refused
 
-        # A Gaussian that no view sees has no gradient, so it never becomes visible again, but it costs as much time.
-        keep = (torch.sigmoid(model.splats["opacities"]) >= self.min_opacity) & (self.unseen < self.patience)
-        if has_reset:  # from then on Gaussians that are too large are pruned
-            keep &= model.scales() <= config.prune_above * model.extent
-        self.rows.select(keep.nonzero()[:, 0])
-        return refused
+    def _unseen(self) -> Tensor:
+        """Return which Gaussians no view of an epoch saw, [N] bool.
 
-    def _wanted(self, most: int) -> tuple[Tensor, int]:
+        Such a Gaussian has no gradient, so it never becomes visible again, but it costs as much time.
+        """
+        return self.unseen >= self.patience
+
+    def _faint_or_large(self, has_reset: bool) -> Tensor:
+        """Return which Gaussians are too transparent or, after the first reset of opacities, too large, [N] bool."""
+        model = self.model
+        found = torch.sigmoid(model.splats["opacities"]) < self.min_opacity
+        if has_reset:
+            found |= model.scales() > self.config.prune_above * model.extent
+        return found
+
+    def _wanted(self, most: int, allowed: Tensor | None) -> tuple[Tensor, int]:
         """Return which Gaussians to clone or split, [N] bool, and how many more were left out because of `most`.
 
-        If the model would have more Gaussians than `most`, those with the largest gradients are chosen.
+        Only Gaussians in `allowed`, [N] bool, are chosen. If the model would have more Gaussians than `most`,
+        those with the largest gradients are chosen.
         """
         gradient = self.gradient / self.seen.clamp(min=1)
         wanted = gradient > self.config.grad_threshold
+        if allowed is not None:
+            wanted &= allowed
         rows = wanted.nonzero()[:, 0]
         room = max(0, most - len(self.model))
         if len(rows) > room:

@@ -1,0 +1,243 @@
+"""Densification by scores of several views: the scores themselves, who is cloned or pruned by them, and resuming."""
+
+import copy
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from small import started
+
+from gsbench.config import DensifyConfig
+from gsbench.kernels.backends import REFERENCE
+from gsbench.models import GaussianModel, Query, build
+from gsbench.models.render import rasterize_slice, render
+from gsbench.run.setup import build as build_for
+from gsbench.scenes.scene import Points, View
+from gsbench.stability.training_cases import compose, moving_square
+from gsbench.train.densify.base import Scores
+from gsbench.train.densify.multiview import LEAST_IMPORTANCE, MultiviewDensification, drawn_once
+from gsbench.train.densify.scores import VIEWS, ErrorScore
+from gsbench.train.loop import Trainer
+from gsbench.train.losses import photometric
+from gsbench.train.renderer import Renderer
+from gsbench.train.rows import Rows
+from gsbench.train.seeding import generator
+
+GREY = torch.tensor([0.2, 0.3, 0.4])
+NAMES = ("3dgs", "4dgs", "6dgs", "7dgs", "dgs", "freetime")
+OPTIONS = {"6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3}}
+ROUNDS = ("train.densify.kind=multiview", "train.densify.start=0", "train.densify.stop=50", "train.densify.every=10",
+          "train.densify.grad_threshold=1e-6", "train.iterations=60", "train.recipe_iterations=60",
+          "train.refine_from=0")  # fmt: skip
+
+
+def four_gaussians() -> GaussianModel:
+    """3DGS with two pairs of Gaussians, of which one hides the other in part, that all views see."""
+    model = build("3dgs")
+    means = torch.tensor([[-0.5, 0.0, 0.0], [-0.4, 0.1, 0.3], [0.5, 0.2, 0.0], [0.4, -0.2, -0.3]])
+    model.initialise(Points(means, torch.rand(4, 3, generator=generator(3))), 4.4, generator(0))
+    with torch.no_grad():
+        model.splats["scales"].fill_(math.log(0.15))
+        model.splats["opacities"].copy_(torch.tensor([2.0, 1.0, 0.5, -1.0]))
+    return model
+
+
+def weights_of_pixels(model: GaussianModel, view: View) -> torch.Tensor:
+    """The blend weight of each Gaussian in each pixel, [H, W, N]: an image whose channels are the Gaussians."""
+    seen = model.slice(Query.of(view.camera, view.time))
+    channels = seen._replace(colors=torch.eye(len(model)))
+    return rasterize_slice(channels, view.camera, torch.zeros(len(model)), REFERENCE).image[0].detach()
+
+
+def wrong_on_the_left(model: GaussianModel, view: View, by: float) -> View:
+    """The view with the model's own image, to which noise is added, and more in its left third."""
+    image = render(model, view.camera, view.time, GREY).detach()
+    image += 0.05 * by * torch.randn(image.shape, generator=generator(7))
+    image[:, :6] += by * torch.randn(16, 6, 3, generator=generator(8))
+    return replace(view, pixels=image)
+
+
+def test_scores_are_the_sums_by_hand() -> None:
+    """Catches weights of pixels that are not flagged, errors of another range, losses of other views, and a mean that
+    is a sum."""
+    model = four_gaussians()
+    views = [
+        wrong_on_the_left(model, view, by) for view, by in zip(moving_square().train, (0.2, 0.5, 1.0), strict=False)
+    ]
+    importance, badness = ErrorScore(model, views, Renderer(GREY, antialias=False), 0.2)(generator(5))
+    counts, weighed = torch.zeros(4), torch.zeros(4)
+    for view in views:
+        image = render(model, view.camera, view.time, GREY).detach()
+        differences = (image - view.image).reshape(-1, 3).tolist()
+        errors = [(abs(r) + abs(g) + abs(b)) / 3 for r, g, b in differences]
+        least, most = min(errors), max(errors)
+        weights = weights_of_pixels(model, view).reshape(-1, 4)
+        c = sum(w for w, error in zip(weights, errors, strict=True) if (error - least) / (most - least) > 0.1)
+        assert isinstance(c, torch.Tensor)
+        assert 0.1 * weights.sum() < c.sum() < 0.9 * weights.sum()
+        counts += c / 3
+        weighed += photometric(image[None], view.image[None], 0.2) * c
+    torch.testing.assert_close(importance, counts, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(badness, (weighed - weighed.min()) / (weighed.max() - weighed.min()), rtol=0, atol=1e-4)
+    assert 0.05 < badness.sort().values[-2] < 0.95
+
+
+def test_a_perfect_image_flags_nothing() -> None:
+    """Catches a division by the range of errors that are all equal."""
+    model = four_gaussians()
+    exact = [replace(view, pixels=render(model, view.camera, view.time, GREY).detach())
+             for view in moving_square().train[:2]]  # fmt: skip
+    importance, badness = ErrorScore(model, exact, Renderer(GREY, antialias=False), 0.2)(generator(0))
+    assert not importance.any()
+    assert not badness.any()
+
+
+def test_a_model_without_gaussians_is_scored() -> None:
+    """Catches the least of no numbers: all Gaussians of a training may have been pruned."""
+    model = four_gaussians()
+    Rows(model, Moments()).select(torch.arange(0))
+    score = ErrorScore(model, moving_square().train, Renderer(GREY, antialias=False), 0.2)
+    density = MultiviewDensification(Rows(model, Moments()), DensifyConfig(), 0.005, 10, score)
+    assert density.densify(generator(0), has_reset=True, most=100) == 0
+    assert len(model) == 0
+
+
+def test_ten_different_views_are_drawn_anew() -> None:
+    """Catches a view that is drawn twice, more views than ten, and the same ones in every round."""
+    score = ErrorScore(four_gaussians(), moving_square().train, Renderer(GREY, antialias=False), 0.2)
+    see, drawn = score._see, []
+    score._see = lambda view: drawn.append(view.name) or see(view)  # type: ignore[assignment,func-returns-value]
+    for seed in (0, 1, 0):
+        score(generator(seed))
+    rounds = [sorted(drawn[i * VIEWS : (i + 1) * VIEWS]) for i in range(3)]
+    assert len(drawn) == 30
+    assert all(len(set(names)) == 10 for names in rounds)
+    assert rounds[0] == rounds[2] != rounds[1]
+
+
+class Moments:
+    """The optimizer of a model that is not trained."""
+
+    def follow(self, rows: torch.Tensor, fresh: torch.Tensor) -> None:
+        """Nothing to move."""
+
+    def forget(self, parameter: torch.Tensor) -> None:
+        raise AssertionError(parameter)
+
+
+def rule(model: GaussianModel, importance: torch.Tensor, badness: torch.Tensor) -> MultiviewDensification:
+    """The rule with scores that are given, views that saw every Gaussian, and no gradients."""
+    config = DensifyConfig(grad_threshold=1.0)
+    return MultiviewDensification(Rows(model, Moments()), config, 0.005, 10, lambda _: Scores(importance, badness))
+
+
+def of_eight(name: str, opacities: list[float], badness: list[float]) -> tuple[MultiviewDensification, torch.Tensor]:
+    """The rule for a model of eight Gaussians, of which 2 to 5 are important; and their means."""
+    model = started(build(name, **OPTIONS.get(name, {})), 8)
+    with torch.no_grad():
+        model.splats["opacities"].copy_(torch.tensor(opacities))
+    importance = torch.full((8,), LEAST_IMPORTANCE)
+    importance[2:6] = 10.0
+    return rule(model, importance, torch.tensor(badness)), model.splats["means"].detach().clone()
+
+
+def copies(model: GaussianModel, means: torch.Tensor) -> list[int]:
+    """How many Gaussians of the model have each of the means."""
+    found: list[int] = (model.splats["means"].detach()[:, None] == means).all(-1).sum(0).tolist()
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_only_important_gaussians_of_large_gradient_are_cloned(name: str) -> None:
+    """Catches a rule that asks for one of the two, a threshold that is not above, and opacities left above 0.8."""
+    density, means = of_eight(name, [3.0, 1.0, 3.0, 1.0, 0.0, 0.0, 0.0, 0.0], [0.0] * 8)
+    density.gradient[:4], density.seen[:] = 5.0, 1.0
+    assert density.densify(generator(1), has_reset=False, most=100) == 0
+    assert len(density.model) == len(density.unseen) == 10
+    found = copies(density.model, means)
+    assert [found[i] for i in (0, 1, 4, 5, 6, 7)] == [1] * 6
+    assert set(found[2:4]) <= {0, 2}  # split or cloned
+    opacities = density.model.splats["opacities"].detach()
+    assert opacities[:2].tolist() == pytest.approx([math.log(4), 1.0])
+    assert opacities.max().item() == pytest.approx(math.log(4))
+
+
+@pytest.mark.parametrize(("has_reset", "left"), [(False, [0, 1, 1, 1, 1, 1, 1, 0]), (True, [0, 1, 1, 1, 1, 0, 1, 0])])
+def test_half_as_many_as_candidates_are_drawn_from_all(has_reset: bool, left: list[int]) -> None:
+    """Catches candidates that all go, Gaussians that go without being one, draws of the good ones, large Gaussians that
+    are never candidates, and unseen ones that have to be drawn."""
+    density, means = of_eight("3dgs", [-8.0] * 4 + [0.0] * 4, [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    with torch.no_grad():
+        density.model.splats["scales"].fill_(math.log(0.1))
+        density.model.splats["scales"][5] = math.log(0.3)  # above 0.1 x extent 2: a candidate after a reset
+    density.unseen[7] = density.patience
+    density.densify(generator(1), has_reset, most=100)  # two are drawn: 0 and 5
+    assert copies(density.model, means) == left
+
+
+def test_children_are_drawn_as_their_parent() -> None:
+    """Catches scores of the rows before the split that are given to other rows after it."""
+    density, means = of_eight("3dgs", [0.0, 0.0, -8.0, 0.0, 0.0, 0.0, 0.0, -8.0], [0.0, 0.0, 1.0] + [0.0] * 5)
+    with torch.no_grad():
+        density.model.splats["scales"].fill_(math.log(0.1))  # large: split
+    density.gradient[2], density.seen[:] = 5.0, 1.0
+    density.densify(generator(1), has_reset=False, most=100)  # three are faint, so one is drawn: a child
+    assert copies(density.model, means) == [1, 1, 0, 1, 1, 1, 1, 1]
+    assert len(density.model) == 8
+
+
+def test_rows_are_drawn_once_in_proportion() -> None:
+    """Catches a row that is drawn twice, and weights that are not proportions."""
+    assert sorted(drawn_once(torch.tensor([1.0, 1e6, 1e-6]), 3, generator(0)).tolist()) == [0, 1, 2]
+    firsts = [int(drawn_once(torch.tensor([1.0, 3.0]), 1, generator(seed))) for seed in range(1000)]
+    assert 0.71 < sum(firsts) / 1000 < 0.79
+
+
+@pytest.mark.usefixtures("threads")
+def test_scores_have_the_same_bits_for_any_number_of_threads() -> None:
+    """Catches views whose weights are added in the order that threads come by."""
+    model = started(build("7dgs", **OPTIONS["7dgs"]), 300)
+    score, found = ErrorScore(model, moving_square().train, Renderer(GREY, antialias=False), 0.2), []
+    for count in (1, 2, 3, 8):
+        torch.set_num_threads(count)
+        found.append(score(generator(0)))
+    assert found[0].importance.any()
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+
+
+def trainer(name: str, *overrides: str) -> Trainer:
+    """A trainer at its step 0 of a training by this rule, with rounds every 10 steps until step 50 of 60."""
+    config, scene = compose(name, 60, *ROUNDS, *overrides), moving_square()
+    scene = replace(scene, val=scene.train[:1])
+    made = build_for(config)
+    assert scene.points is not None
+    made.initialise(scene.points, scene.extent, generator(config.seed))
+    return Trainer(made, scene, scene.test, config)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_model_trains_by_it(name: str) -> None:
+    """Catches a model whose slices give no blend weights, and state of the training that does not follow the rows."""
+    fitted = trainer(name)
+    before, stops = len(fitted.model), iter([True] * 20 + [False])
+    fitted.run(lambda _: None, name, lambda: next(stops))
+    model = fitted.model
+    assert len(model) > before
+    assert len(model) == len(fitted.minimum_scale.least) == len(fitted.density.unseen)  # type: ignore[attr-defined]
+    assert all(parameter.isfinite().all() for parameter in model.parameters())
+
+
+def test_a_training_continues_from_a_checkpoint() -> None:
+    """Catches random numbers, scores or counts of this rule that a checkpoint does not have."""
+    whole, part, resumed = (trainer("7dgs", "model.min_opacity=0.09") for _ in range(3))  # some are pruned
+    whole.run(lambda _: None, "whole")
+    stops = iter([True] * 24 + [False])
+    part.run(lambda _: None, "part", lambda: next(stops))
+    assert part.step == 25
+    resumed.load_state_dict(copy.deepcopy(part.state_dict()))
+    resumed.run(lambda _: None, "resumed")
+    assert len(whole.model) > len(part.model)
+    for name, value in whole.model.pack().items():
+        assert torch.equal(value, resumed.model.pack()[name]), name
