@@ -8,6 +8,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from gsbench.config import CONF, Config, register_schema
+from gsbench.errors import InputError
+from gsbench.run.checks import scene_folder
 from gsbench.run.setup import build
 from gsbench.scenes.points import random_points
 from gsbench.schedule import Schedule
@@ -97,3 +99,23 @@ def test_every_model_has_the_same_number_of_trials() -> None:
     own = {folder.name: sorted(path.name for path in folder.glob("*.yaml")) for folder in folders}
     assert own.keys() == {"3dgs", "4dgs", "6dgs", "7dgs"}
     assert len({tuple(names) for names in own.values()}) == 1
+
+
+def test_the_suite_names_every_scene_once() -> None:
+    """Catches a scene that `scene=all` leaves out, one of no kind, and one that overrides the experiment."""
+    register_schema()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        listed = list(compose("config", ["+exp=suite", "scene=suite/trex100"]).data.scenes)
+        assert sorted(listed) == sorted(f"suite/{path.stem}" for path in (CONF / "scene" / "suite").glob("*.yaml"))
+        for name in listed:
+            one = compose("config", ["+exp=suite", f"scene={name}"])
+            assert f"suite/{one.scene.name}" == name
+            assert one.data.dataset in ("monocular", "rig", "array", "static")
+            assert (one.experiment, one.train.iterations, one.train.batch_size) == ("suite", 1000, 2)
+
+
+@pytest.mark.parametrize("folder", ["../other", "/etc", "a/../../b"])
+def test_a_published_name_stays_below_the_data_root(folder: str) -> None:
+    """Catches a config that reads files outside of data.root."""
+    with pytest.raises(InputError, match="scene: expected a name"):
+        scene_folder(composed(f"scene.released_as={folder}"))

@@ -15,7 +15,7 @@ from gsbench.errors import InputError, did_you_mean, one_line
 from gsbench.kernels.backends import resolve
 from gsbench.measure import perceptual
 from gsbench.measure.atomic import write_atomically
-from gsbench.measure.record import MAX_POINTS
+from gsbench.measure.record import MAX_POINTS, run_path
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
 from gsbench.models.gated import as_gated
@@ -202,11 +202,13 @@ def scene_folder(config: Config) -> Path:
     """Return the folder of the scene, found under `data.root` by the scene's name or by its name in the published data.
 
     Raises:
-        InputError: there is no such folder; the message lists the names that were tried.
+        InputError: there is no such folder, and the message lists the names that were tried; or a name leads out of
+            `data.root`.
     """
     data, scene = config.data, config.scene
+    check_scene_names(config)
     names = [scene.name, *([scene.released_as] if scene.released_as else [])]
-    folders = [data_root(data.root) / name for name in names]  # names have no slash (checked by run_path)
+    folders = [data_root(data.root) / name for name in names]
     for folder in folders:
         if folder.is_dir():
             return folder
@@ -216,6 +218,12 @@ def scene_folder(config: Config) -> Path:
         f"transforms_{{train,val,test}}.json and the images they name, looked for {' and '.join(map(str, folders))}"
         f"{published}"
     )
+
+
+def check_scene_names(config: Config) -> None:
+    """Raise InputError unless the scene's name, and every folder in its published name, is a name of a folder."""
+    for name in (config.scene.name, *(config.scene.released_as or config.scene.name).split("/")):
+        run_path(Path(), config.experiment, name, config.model.name, config.seed)
 
 
 def data_root(root: str) -> Path:

@@ -9,11 +9,10 @@ from omegaconf import OmegaConf
 
 from gsbench.config import Config
 from gsbench.errors import InputError, one_line
-from gsbench.measure import record as records
 from gsbench.measure.schema import parse
 from gsbench.models import GaussianModel
 from gsbench.models.registry import is_registered
-from gsbench.run.checks import PACKAGE, check_values
+from gsbench.run.checks import PACKAGE, check_scene_names, check_values
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Scene
 from gsbench.scenes.scene import Points
@@ -173,11 +172,9 @@ def typed_config(plain: dict[str, Any], path: Path) -> Config:
         config: Config = OmegaConf.to_object(typed)  # type: ignore[assignment]
     except Exception as error:  # OmegaConf raises many types of exceptions
         raise InputError(f"{path}: expected the config of a run: {one_line(error)[:200]}") from None
-    names = [config.scene.name] + ([config.scene.released_as] if config.scene.released_as else [])
     try:
         check_values(config)
-        for name in names:
-            records.run_path(Path(), config.experiment, name, config.model.name, config.seed)
+        check_scene_names(config)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     module, config.model.module = config.model.module, None
