@@ -12,13 +12,14 @@ from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import LOG_SIZE_MAX, MAX_WAVES, TIME_OPACITY_FACTOR_MIN
 from gsbench.kernels.slices import slice_rotated
 from gsbench.models.appearance import sh_time_colors
-from gsbench.models.base import SHRINK, Conditioned, Geometry, Raw
+from gsbench.models.base import SHRINK, Raw
 from gsbench.models.color_order import ColorOrder, coefficients_within, order_of
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
 from gsbench.models.gated import OPACITY_MARGIN, GatedModel
 from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
+from gsbench.models.sliced import Conditioned, Geometry
 from gsbench.models.slicing import check_scheme, gain_of, mahalanobis, reduce, slice_gaussians
 from gsbench.scenes.points import size_of
 from gsbench.scenes.scene import Points

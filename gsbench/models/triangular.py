@@ -11,11 +11,12 @@ from torch import Tensor
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.kernels.slices import slice_triangular
-from gsbench.models.base import SHRINK, Conditioned, Geometry, Raw
+from gsbench.models.base import SHRINK, Raw
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle, rotation, sizes
 from gsbench.models.gated import OPACITY_MARGIN, GatedModel
 from gsbench.models.query import Query, unit
+from gsbench.models.sliced import Conditioned, Geometry
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians

@@ -8,9 +8,10 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.headers import ALPHA_MIN
-from gsbench.models.base import GaussianModel, tensors_of
+from gsbench.models.base import GaussianModel
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.query import Query
+from gsbench.models.sliced import tensors_of
 from gsbench.scenes.points import SH_C0
 from gsbench.scenes.trained import TrainedGaussians
 

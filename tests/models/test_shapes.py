@@ -10,11 +10,12 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.backends import REFERENCE
 from gsbench.models import Query
-from gsbench.models.base import Conditioned, GaussianModel, Raw, joined_shapes, tensors_of
+from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.render import render
+from gsbench.models.sliced import Conditioned, joined_shapes, tensors_of
 from gsbench.scenes.scene import Camera, Points
 from gsbench.view.gaussians import trained_of
 
