@@ -129,8 +129,8 @@ class RegionScores:
 
     def with_scores(self, per_view: Sequence[ViewScore]) -> list[ViewScore]:
         """Return the scores of single views with those over their regions added."""
-        return [replace(one, **{f"psnr_{name}": found.get(one.name) for name, found in self.scores.items()})
-                for one in per_view]  # fmt: skip
+        moving, objects = self.scores["moving"], self.scores["object"]
+        return [replace(one, psnr_moving=moving.get(one.name), psnr_object=objects.get(one.name)) for one in per_view]
 
     def missing(self) -> dict[str, str]:
         """Return the reasons why a metric is None."""

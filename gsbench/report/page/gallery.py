@@ -163,12 +163,13 @@ def _shown_views(record: Record, rows: int) -> list[ViewScore]:
 def _score(record: Record, rows: int, i: int) -> str:
     """Return the PSNR of row `i` of an image file as text; a region is left out if no view of the run has it."""
     views = _shown_views(record, rows)
-    if i >= len(views) or views[i].psnr is None:
+    view = views[i] if i < len(views) else None
+    if view is None or view.psnr is None:
         return ""
-    values = {"moving": views[i].psnr_moving, "object": views[i].psnr_object}
+    values = {"moving": view.psnr_moving, "object": view.psnr_object}
     found = {name: value for name, value in values.items() if name in record.regions}
     said = [f"{name} {EMPTY if value is None else plain(value)}" for name, value in found.items()]
-    return ", ".join([f"PSNR {plain(views[i].psnr)} dB", *said])
+    return ", ".join([f"PSNR {plain(view.psnr)} dB", *said])
 
 
 def _names(record: Record, rows: int) -> list[str]:
