@@ -9,7 +9,7 @@ from gsbench.kernels.adam import adam
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.raster import Viewport, backward_by_splat
 from gsbench.models import Query
-from gsbench.models.base import tensors_of
+from gsbench.models.sliced import tensors_of
 from gsbench.raster import EPS2D, FAR, NEAR, rasterize
 from gsbench.raster.native import draw_within
 

@@ -13,7 +13,7 @@ from gsbench import kernels
 from gsbench.kernels.backends import BACKENDS, CPU, REFERENCE
 from gsbench.kernels.loss import l1_ssim
 from gsbench.models import Query
-from gsbench.models.base import tensors_of
+from gsbench.models.sliced import tensors_of
 from gsbench.raster import rasterize
 from gsbench.train.losses import photometric
 

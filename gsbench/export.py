@@ -17,7 +17,7 @@ from gsbench.run.load import LoadedRun, load_run, scene_of
 from gsbench.scenes import Scene, View
 from gsbench.scenes.trained import ply_of
 from gsbench.view import film, paths
-from gsbench.view.gaussians import trained_of
+from gsbench.view.gaussians import has_profiles, trained_of
 
 PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
 MOST_FRAMES = 100_000
@@ -108,6 +108,9 @@ def write_ply(asked: ExportRequest, path: Path) -> None:
     colours = f"harmonics of degree {run.model.active.sh_degree}" if keep else f"as seen from {whence}"
     print(f"{path}: {len(trained)} Gaussians{when}, colours {colours}; {culled} of {len(run.model)} are left out, as "
           f"their opacity there is below 1/255")  # fmt: skip
+    if has_profiles(run.model, query):
+        print(f"{path}: their alpha profiles (1 - r^2)^b are left out, as a PLY of 3DGS has no field for them: other "
+              f"programs draw Gaussians; --images and --video keep the profiles")  # fmt: skip
 
 
 def slice_place(asked: ExportRequest) -> tuple[Query, bool]:

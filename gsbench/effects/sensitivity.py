@@ -31,10 +31,10 @@ from torch import Tensor
 from gsbench.kernels.tape import Tape
 from gsbench.measure.quality import evenly
 from gsbench.models import GaussianModel, Query
-from gsbench.models.base import Gaussians3D, tensors_of
 from gsbench.models.gated import GatedModel
 from gsbench.models.render import rasterize_slice
 from gsbench.models.simplifications import REMOVED, Simplification, simplifications_of
+from gsbench.models.sliced import Gaussians3D, tensors_of
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import Camera, View
 

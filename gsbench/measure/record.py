@@ -61,6 +61,8 @@ class ViewScore:
     ssim: float | None = None
     lpips_alex: float | None = None
     lpips_vgg: float | None = None
+    psnr_moving: float | None = None  # over the pixels of `Record.regions`, if the view has such pixels
+    psnr_object: float | None = None
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ Both are found in the ground truth, by integers only, so every machine finds the
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 
 import cv2
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gsbench.measure.quality import psnr, quantise
-from gsbench.measure.record import Region
+from gsbench.measure.record import Region, ViewScore
 from gsbench.scenes import View
 
 LEAST_VIEWS = 3  # with one camera; the median of two images is one of them
@@ -111,7 +111,7 @@ class RegionScores:
         """
         self.regions = find_regions(views)
         self.quantised = quantised
-        self.scores: dict[str, list[float]] = {name: [] for name in self.regions}
+        self.scores: dict[str, dict[str, float]] = {name: {} for name in self.regions}  # dB by region, then by view
 
     def measured(self, images: Iterable[tuple[str, Tensor, Tensor]]) -> Iterator[tuple[str, Tensor, Tensor]]:
         """Yield (name of the view, render, ground truth) again, and measure each over the regions of its view."""
@@ -120,12 +120,17 @@ class RegionScores:
             for region, scores in self.scores.items():
                 mask = self.regions[region].masks.get(name)
                 if mask is not None:
-                    scores.append(region_psnr(shown, truth, mask))
+                    scores[name] = region_psnr(shown, truth, mask)
             yield name, render, truth
 
     def metrics(self) -> dict[str, float | None]:
         """Return `psnr_moving` and `psnr_object`, means over the views that have such a region; None without one."""
-        return {f"psnr_{name}": fmean(scores) if scores else None for name, scores in self.scores.items()}
+        return {f"psnr_{name}": fmean(found.values()) if found else None for name, found in self.scores.items()}
+
+    def with_scores(self, per_view: Sequence[ViewScore]) -> list[ViewScore]:
+        """Return the scores of single views with those over their regions added."""
+        moving, objects = self.scores["moving"], self.scores["object"]
+        return [replace(one, psnr_moving=moving.get(one.name), psnr_object=objects.get(one.name)) for one in per_view]
 
     def missing(self) -> dict[str, str]:
         """Return the reasons why a metric is None."""

@@ -6,8 +6,7 @@ neural refinement).
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +21,7 @@ from gsbench.models.color_order import ColorOrder
 from gsbench.models.effect_sets import NAMES, EffectSets
 from gsbench.models.query import Query, unit
 from gsbench.models.refinement import OCTAVES, Refinement
+from gsbench.models.sliced import Conditioned, Gaussians3D, Geometry
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
@@ -31,53 +31,6 @@ Raw = dict[str, Tensor]  # raw parameters (before exp, sigmoid and normalisation
 CHILDREN = 2  # a split replaces a Gaussian by two ..
 SHRINK = 0.8 * CHILDREN  # .. that are 1.6 times smaller (3DGS, gaussian_model.py)
 INITIAL_OPACITY = 0.1
-
-
-class Gaussians3D(NamedTuple):
-    """Hold the 3D Gaussians that the rasterizer renders: the slice of a model for one camera centre and time."""
-
-    means: Tensor  # [N, 3]
-    factors: Tensor  # [N, 3, 3]
-    opacities: Tensor  # [N]
-    colors: Tensor  # [N, 3]
-    shapes: Tensor | None = None  # [N] b of the alpha profile (1 - r^2)^b; None: the profile is a Gaussian
-
-
-class Conditioned(NamedTuple):
-    """Hold means and covariance factors of conditional 3D Gaussians, and the factors in [0, 1] of their opacities."""
-
-    means: Tensor  # [N, 3]
-    factors: Tensor  # [N, 3, 3]
-    opacity_factor: Tensor  # [N] f_temp f_dir in [0, 1]
-    shapes: Tensor | None = None  # [N], as in `Gaussians3D`
-
-
-class Geometry(NamedTuple):
-    """Hold means, covariance factors and opacities of the 3D Gaussians at a camera and time, without colours."""
-
-    means: Tensor  # [N, 3]
-    factors: Tensor  # [N, 3, 3]
-    opacities: Tensor  # [N]
-    shapes: Tensor | None = None  # [N], as in `Gaussians3D`
-
-
-def tensors_of(parts: Iterable[Tensor | None]) -> list[Tensor]:
-    """Return the tensors of 3D Gaussians (means, covariance factors, ...) in order, without fields that are None."""
-    return [part for part in parts if part is not None]
-
-
-def joined_shapes(first: Tensor | None, second: Tensor | None) -> Tensor | None:
-    """Concatenate the exponents b of the alpha profiles (1 - r^2)^b of two groups of Gaussians; None if both are None.
-
-    Raises:
-        InputError: only one of the groups has exponents.
-    """
-    if first is None and second is None:
-        return None
-    if first is None or second is None:
-        raise InputError("shapes: expected every row of a slice to have one or none to have one, got some of them: "
-                         "let `condition` and `static` of the model agree")  # fmt: skip
-    return torch.cat([first, second])
 
 
 class GaussianModel(nn.Module, ABC):

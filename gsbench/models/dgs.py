@@ -16,7 +16,7 @@ from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
 from gsbench.models.factors import sizes
 from gsbench.models.moving3d import MovingGaussians3D
-from gsbench.models.query import Query, unit
+from gsbench.models.query import Query, times_inside, unit
 from gsbench.models.registry import register
 from gsbench.scenes.scene import Points
 
@@ -26,7 +26,6 @@ TIME_PRECISION = math.sqrt(10)  # initial L_tt
 SHARES = -1.2  # initial logits of Lam
 LARGEST_SHARE = 0.999  # of Lam after `shrink_rows`: the logit of 1 is infinite
 COUPLING_SPREAD = 0.01  # initial standard deviation of the entries of Theta
-TIME_MARGIN = 1e-6  # least distance of an initial mean time from 0 and 1, whose logits are infinite
 
 
 @register("dgs")
@@ -72,7 +71,7 @@ class DirectModel(MovingGaussians3D):
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Return spheres with random mean directions, and mean times uniform in [-0.1, 1.1], clipped to [0, 1]."""
         N = len(distances)
-        times = (torch.rand(N, 1, generator=generator) * 1.2 - 0.1).clamp(TIME_MARGIN, 1 - TIME_MARGIN)
+        times = times_inside(torch.rand(N, 1, generator=generator) * 1.2 - 0.1)
         view, time = math.log(self.view_precision), math.log(TIME_PRECISION)
         return super().initial_geometry(points, distances, generator) | {
             "times": times.logit(),

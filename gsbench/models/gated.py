@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models.base import Conditioned, GaussianModel, Geometry, Raw, joined_shapes
+from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.color_order import MOST_PACKED, ColorOrder, coefficients_within
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
 from gsbench.models.query import Query
+from gsbench.models.sliced import Conditioned, Geometry, joined_shapes
 
 OPACITY_MARGIN = 1e-6  # least distance of a frozen Gaussian's opacity from 0 and 1, whose logits are infinite
 _STATE = "effect_sets."  # prefix of the names of these tensors in a checkpoint

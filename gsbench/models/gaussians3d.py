@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.slices import slice_static
-from gsbench.models.base import SHRINK, Conditioned, Geometry, Raw
+from gsbench.models.base import SHRINK, Raw
 from gsbench.models.factors import rotation, sizes
 from gsbench.models.gated import GatedModel
 from gsbench.models.query import Query
 from gsbench.models.registry import register
+from gsbench.models.sliced import Conditioned, Geometry
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
 

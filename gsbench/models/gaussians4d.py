@@ -12,13 +12,15 @@ from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import LOG_SIZE_MAX, MAX_WAVES, TIME_OPACITY_FACTOR_MIN
 from gsbench.kernels.slices import slice_rotated
 from gsbench.models.appearance import sh_time_colors
-from gsbench.models.base import SHRINK, Conditioned, Geometry, Raw
+from gsbench.models.base import SHRINK, Raw
 from gsbench.models.color_order import ColorOrder, coefficients_within, order_of
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
-from gsbench.models.gated import OPACITY_MARGIN, GatedModel
+from gsbench.models.gated import OPACITY_MARGIN
+from gsbench.models.joint import JointModel
 from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
+from gsbench.models.sliced import Conditioned, Geometry
 from gsbench.models.slicing import check_scheme, gain_of, mahalanobis, reduce, slice_gaussians
 from gsbench.scenes.points import size_of
 from gsbench.scenes.scene import Points
@@ -28,7 +30,7 @@ MAX_DEGREE = 32  # largest degree of the Fourier series; the frames of a scene d
 
 
 @register("4dgs")
-class Gaussians4DModel(GatedModel):
+class Gaussians4DModel(JointModel):
     """4DGS: the factor of the covariance over (x, y, z, t) is a 4D rotation M_left(l) M_right(r) times four scales.
 
     A 4D rotation needs the same unit for space and time. The model uses the size of the scene as the length of its time
@@ -223,10 +225,6 @@ class Gaussians4DModel(GatedModel):
         """Return the log scale in time of the Gaussian `index`, in units of the length of the scene."""
         return float(self.splats["scales"].detach()[index, 3] - self.clock.log())
 
-    def durations(self) -> Tensor:
-        """Return the standard deviation in time of each Gaussian, [N]: the norm of its covariance factor's row of t."""
-        return self.factors(dict(self.splats.items())).detach()[:, 3].norm(dim=-1)
-
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the three spatial scales of each Gaussian to at least `least` [N]."""
         self.splats["scales"].data[:, :3].clamp_(min=least.log()[:, None])
@@ -235,11 +233,6 @@ class Gaussians4DModel(GatedModel):
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
         """Multiply the three spatial scales by factors. This is exact if the 4D rotation turns only space."""
         self.splats["scales"].data[rows, :3] += factors.log()[:, None].to(self.splats["scales"].dtype)
-
-    def spread(self, rows: Tensor) -> Tensor:
-        """Return factors of the conditional 3D covariances, [M, 3, 3], which are the same at all times."""
-        raw = {name: value.detach()[rows] for name, value in self.splats.items()}
-        return reduce(self.factors(raw)).T_pp
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Sample means and times of children from the parent Gaussian; all four scales are 1.6 times smaller."""

@@ -1,7 +1,7 @@
 """Model view-dependent effects by 6DGS: Gaussians over position and direction (Gao et al. 2024)."""
 
+from gsbench.models.observing import DirectionalModel
 from gsbench.models.registry import register
-from gsbench.models.triangular import DirectionalModel
 
 
 @register("6dgs")

@@ -4,8 +4,8 @@
 This model differs from 7DGS only in direction.
 """
 
+from gsbench.models.observing import TimedModel
 from gsbench.models.registry import register
-from gsbench.models.triangular import TimedModel
 
 
 @register("7dgs_nodir")

@@ -12,11 +12,12 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gsbench.models.base import Conditioned, Geometry, Raw
+from gsbench.models.base import Raw
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import OPACITY_MARGIN, GatedModel
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.query import Query
+from gsbench.models.sliced import Conditioned, Geometry
 
 
 class MovingGaussians3D(Gaussians3DModel):

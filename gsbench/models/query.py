@@ -11,6 +11,8 @@ from gsbench.errors import InputError
 from gsbench.kernels.tensors import check_number, check_tensor
 from gsbench.scenes.scene import Camera
 
+TIME_MARGIN = 1e-6  # least distance from 0 and 1 of a time that is stored as its logit
+
 
 class Query(NamedTuple):
     """The camera centre and the time for which a model returns 3D Gaussians with colours.
@@ -70,3 +72,8 @@ def unit(vectors: Tensor) -> Tensor:
     square = vectors.square().sum(-1, keepdim=True)
     defined = square > 1e-20
     return torch.where(defined, vectors * torch.where(defined, square, 1.0).rsqrt(), 0.0)
+
+
+def times_inside(times: Tensor) -> Tensor:
+    """Clip times to [TIME_MARGIN, 1 - TIME_MARGIN], where their logits are finite."""
+    return times.clamp(TIME_MARGIN, 1 - TIME_MARGIN)

@@ -3,8 +3,9 @@
 from torch import Tensor
 
 from gsbench.kernels.backends import Backend
-from gsbench.models.base import GaussianModel, Gaussians3D
+from gsbench.models.base import GaussianModel
 from gsbench.models.query import Query
+from gsbench.models.sliced import Gaussians3D
 from gsbench.raster import RasterOutput, rasterize
 from gsbench.scenes.scene import Camera
 

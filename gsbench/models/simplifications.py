@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsbench.models.base import GaussianModel, Gaussians3D, Raw
+from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel
 from gsbench.models.query import Query
+from gsbench.models.sliced import Gaussians3D
 from gsbench.process.workers import side_by_side
 from gsbench.scenes.points import SH_C0
 

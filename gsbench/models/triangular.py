@@ -11,11 +11,13 @@ from torch import Tensor
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.kernels.slices import slice_triangular
-from gsbench.models.base import SHRINK, Conditioned, Geometry, Raw
+from gsbench.models.base import SHRINK, Raw
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle, rotation, sizes
-from gsbench.models.gated import OPACITY_MARGIN, GatedModel
-from gsbench.models.query import Query, unit
+from gsbench.models.gated import OPACITY_MARGIN
+from gsbench.models.joint import JointModel
+from gsbench.models.query import Query, times_inside, unit
+from gsbench.models.sliced import Conditioned, Geometry
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
@@ -30,7 +32,7 @@ TIME_CORRELATION = 0.05  # a Gaussian is split in time if |S_pt| is above this p
 TIME_SCALE = 0.25  # .. and sqrt(S_t) is above this part of the scene's length (7DGS, section 4.4)
 
 
-class TriangularModel(GatedModel):
+class TriangularModel(JointModel):
     """The base class of 6DGS and 7DGS: Gaussians over position p, and over direction d, time t, or d and t.
 
     The parameters are those of a lower triangular factor of the covariance. Before conditioning on d and t, its rows
@@ -40,6 +42,8 @@ class TriangularModel(GatedModel):
     geometry: ClassVar[tuple[str, ...]] = ("log_diagonal", *KINDS)
     lengths = ("means", "motion")
     directional_half = True  # whether f_dir has the 1/2 of 7DGS eq. 12
+    unit_directions = False  # whether mean directions are normalised when a Gaussian is sliced
+    bounded_times = False  # whether mean times are sigmoids of their parameters
 
     def __init__(
         self,
@@ -82,8 +86,8 @@ class TriangularModel(GatedModel):
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Return spheres with random mean times and directions.
 
-        The standard deviation is sqrt(1/10) in time and 1 in direction. Mean times are uniform in [-0.1, 1.1], mean
-        directions uniform on the unit sphere.
+        The standard deviation is sqrt(1/10) in time and 1 in direction. Mean times are uniform in [-0.1, 1.1], and with
+        `bounded_times` then clipped to [0, 1]. Mean directions are uniform on the unit sphere.
         """
         N = len(distances)
         log_diagonal = torch.zeros(N, sum(map(len, self.rows.values())))
@@ -94,7 +98,8 @@ class TriangularModel(GatedModel):
         if "direction" in self.observes:
             raw["directions"] = F.normalize(torch.randn(N, 3, generator=generator), dim=-1)
         if "time" in self.observes:
-            raw["times"] = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
+            times = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
+            raw["times"] = times_inside(times).logit() if self.bounded_times else times
         return raw
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
@@ -132,8 +137,8 @@ class TriangularModel(GatedModel):
             return super().slice_geometry(raw, query)
         geometry = slice_triangular(
             raw["means"],
-            raw["directions"] if "direction" in self.observes else None,
-            raw["times"] if "time" in self.observes else None,
+            self.mean_directions(raw) if "direction" in self.observes else None,
+            self.mean_times(raw) if "time" in self.observes else None,
             raw["log_diagonal"],
             raw["shape"],
             raw["motion"],
@@ -164,10 +169,6 @@ class TriangularModel(GatedModel):
         """Return the log diagonal entry of time in one Gaussian's Cholesky factor; None for a model without time."""
         return float(self.log_sizes(index)[self.rows["t"][0]]) if "time" in self.observes else None
 
-    def durations(self) -> Tensor | None:
-        """Return the standard deviation in time of each Gaussian, [N]; None for a model without time."""
-        return self.factors(dict(self.splats.items())).detach()[:, -1].norm(dim=-1) if "time" in self.observes else None
-
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the diagonal entries of position in each Cholesky factor to at least `least` [N], world units."""
         space = self.rows["p"]
@@ -192,9 +193,8 @@ class TriangularModel(GatedModel):
             # The mean time of a child differs by dt = z sigma from its parent's. At any (t, d) its slice has the mean
             # of the parent's slice, since K (q - mu_q) changes by -K_t dt and mu_p by K_t dt.
             sigma = factor[:, -1].norm(dim=-1, keepdim=True).clamp(max=1)
-            dt = torch.where(in_time, z[:, :1] * sigma, 0)
+            children["times"], dt = self.shifted_times(raw, torch.where(in_time, z[:, :1] * sigma, 0))
             children["means"] = children["means"] + gain[..., -1] * dt
-            children["times"] = raw["times"] + dt
             T_qq = torch.cat([T_qq[:, :-1], torch.where(in_time[..., None], T_qq[:, -1:] / SHRINK, T_qq[:, -1:])], 1)
         return children | self._parameters_of(T_qq, gain @ T_qq, T_pp)
 
@@ -205,11 +205,6 @@ class TriangularModel(GatedModel):
         T_qq, T_pq, T_pp = reduce(self.factors(raw))
         for name, value in self._parameters_of(T_qq, T_pq, T_pp * factors[:, None, None]).items():
             self.splats[name].data[rows] = value.to(self.splats[name].dtype)
-
-    def spread(self, rows: Tensor) -> Tensor:
-        """Return factors T_pp of the conditional covariances, [M, 3, 3], which depend on neither time nor direction."""
-        raw = {name: value.detach()[rows] for name, value in self.splats.items()}
-        return reduce(self.factors(raw)).T_pp
 
     def _parameters_of(self, T_qq: Tensor, T_pq: Tensor, T_pp: Tensor) -> dict[str, Tensor]:
         """Compute the parameters of covariance factors from the blocks of [T_qq 0; T_pq T_pp]."""
@@ -275,8 +270,8 @@ class TriangularModel(GatedModel):
             delta = self.offset(raw, query).double()
             shift += weight[:, None] * delta
             exponents = self.exponents(blocks.T_qq, delta, whiten(blocks.T_qq, delta))
-            for name, variables in by_name.items():
-                opacity_factors[name] += weight * torch.exp(-torch.stack([exponents[x] for x in variables]).sum(0))
+            for name, factor in opacity_factors.items():
+                factor += weight * torch.exp(-exponents[name])
         changed = {}
         for name, variables in by_name.items():
             columns = [column for x in variables for column in self.columns[x]]
@@ -317,13 +312,31 @@ class TriangularModel(GatedModel):
         """Compute the offset q - mu_q of direction and time from their means, [N, k], ordered (direction, time)."""
         parts = []
         if "direction" in self.observes:
-            parts.append(unit(raw["means"] - query.center) - raw["directions"])
+            parts.append(unit(raw["means"] - query.center) - self.mean_directions(raw))
         if query.time is not None and "time" in self.observes:
-            parts.append(query.time - raw["times"])
+            parts.append(query.time - self.mean_times(raw))
         return torch.cat(parts, -1)
 
+    def mean_directions(self, raw: Raw) -> Tensor:
+        """Return the mean directions [N, 3], normalised if the option `unit_directions` is set."""
+        return unit(raw["directions"]) if self.unit_directions else raw["directions"]
+
+    def mean_times(self, raw: Raw) -> Tensor:
+        """Return the mean times [N, 1]; with the option `bounded_times` they are sigmoids of the parameters."""
+        return torch.sigmoid(raw["times"]) if self.bounded_times else raw["times"]
+
+    def shifted_times(self, raw: Raw, shift: Tensor) -> tuple[Tensor, Tensor]:
+        """Return raw times of means later by `shift` [N, 1], and the shift; bounded times stay in (0, 1)."""
+        if not self.bounded_times:
+            return raw["times"] + shift, shift
+        times = self.mean_times(raw)
+        inside = torch.where(shift == 0, times, times_inside(times + shift))
+        return torch.where(shift == 0, raw["times"], inside.logit()), inside - times
+
     def exponents(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> dict[str, Tensor]:
-        """Compute -ln of the opacity factors f_dir and f_temp (7DGS, eq. 11 and 12), [N] for each variable.
+        """Compute -ln of the factor by which each variable dims a Gaussian, and of both (`static`), [N] each.
+
+        For `direction` and `time` the factors are f_dir and f_temp (7DGS, eq. 11 and 12).
 
         Args:
             T_qq: the triangular factor of the covariance of q, which is direction and time.
@@ -337,11 +350,11 @@ class TriangularModel(GatedModel):
         if "time" in self.observes:
             distance = delta[:, -1] / T_qq[:, -1].norm(dim=-1)  # in standard deviations, sqrt(S_t)
             found["time"] = 0.5 * self.lambda_of("time") * distance.square()
-        return found
+        return found | {"static": torch.stack(list(found.values())).sum(0)}
 
     def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
-        """Compute -ln of the product of the opacity factors f_dir and f_temp (7DGS, eq. 11 and 12), [N]."""
-        return torch.stack(list(self.exponents(T_qq, delta, white).values())).sum(0)
+        """Compute -ln of the factor by which time and direction dim a Gaussian, [N]."""
+        return self.exponents(T_qq, delta, white)["static"]
 
     def _blocks(self, factor: Tensor) -> Reduced:
         """Split triangular factors into the blocks T_qq, T_pq, T_pp; q is direction and time, p is position."""
@@ -368,39 +381,3 @@ class TriangularModel(GatedModel):
         the variance S_t of time.
         """
         return self.moves_long(self.factors(dict(self.splats.items())))
-
-
-class TimedModel(TriangularModel):
-    """The base class of models whose Gaussians depend on time, such as 7DGS with or without direction."""
-
-    def __init__(self, *, lambda_t: float, **options: Any) -> None:
-        """Make a model without Gaussians.
-
-        Args:
-            lambda_t: the initial coefficient in the exponent of f_temp, the factor of the opacity at a time.
-            options: the options of `TriangularModel`.
-
-        Raises:
-            InputError: an option is out of its range.
-        """
-        super().__init__(**options)
-        self.add_lambda("time", lambda_t)
-
-
-class DirectionalModel(TriangularModel):
-    """The base class of models whose Gaussians depend on view direction: 6DGS, and together with time 7DGS."""
-
-    def __init__(self, *, lambda_d: float, directional_half: bool = True, **options: Any) -> None:
-        """Make a model without Gaussians.
-
-        Args:
-            lambda_d: the initial coefficient in the exponent of f_dir, the factor of the opacity in a direction.
-            directional_half: whether the exponent of f_dir has the factor 1/2 of 7DGS eq. 12; 6DGS does not have it.
-            options: the options of `TriangularModel`.
-
-        Raises:
-            InputError: an option is out of its range.
-        """
-        super().__init__(**options)
-        self.add_lambda("direction", lambda_d)
-        self.directional_half = directional_half

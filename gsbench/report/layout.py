@@ -42,7 +42,7 @@ class Section:
 
     title: str
     rows: list[Row]
-    notes: list[str] = field(default_factory=list)  # reasons why a row is not ok or is left out of the average
+    notes: list[str] = field(default_factory=list)  # why a row is not ok or left out; the pixels of regions
 
 
 @dataclass(frozen=True)

@@ -31,9 +31,11 @@ COLUMNS = (  # their keys are columns of `tidy`
 OF_THE_MACHINE = ("train_min", "fps")  # columns that can be compared only between runs on one machine
 COSTS = ("fps", "num_gaussians", "bytes", "peak_memory", "train_cpu_s", "load")  # costs that are copied from a record
 TRAIN = QuantityColumn("psnr_train", "PSNR train", 2)  # shown on request
+REGIONS = {  # beside PSNR, if a run has them; by the names of `Record.regions`
+    "moving": QuantityColumn("psnr_moving", "PSNR moving", 2),
+    "object": QuantityColumn("psnr_object", "PSNR object", 2),
+}
 EXTRA_COLUMNS = (  # if a run has them
-    QuantityColumn("psnr_moving", "PSNR moving", 2),
-    QuantityColumn("psnr_object", "PSNR object", 2),
     QuantityColumn("lpips_vgg", "LPIPS-VGG", 3),
     QuantityColumn(LEAKS, LEAKS, 2),
 )
@@ -143,8 +145,10 @@ class _TableBuilder:
         self.common = variants.pop() if len(variants) == 1 else ""  # the settings of all runs; stated below the table
         self.models = sorted({self._name(r) for r in records})
         flat = [quantities(r) for r in records]
-        shown = [COLUMNS[0], *([TRAIN] if train else []), *COLUMNS[1:]]
-        self.columns = [*shown, *(c for c in EXTRA_COLUMNS if any(q[c.key] is not None for q in flat))]
+        regions, extra = (
+            [c for c in some if any(q[c.key] is not None for q in flat)] for some in (REGIONS.values(), EXTRA_COLUMNS)
+        )
+        self.columns = [COLUMNS[0], *([TRAIN] if train else []), *regions, *COLUMNS[1:], *extra]
         finished: dict[tuple[str, str], list[dict[str, Any]]] = {}
         for q, name in zip(flat, map(self._name, records), strict=True):
             if q["status"] == "ok":
@@ -207,7 +211,23 @@ class _TableBuilder:
                     notes.append(f"{model} seed {run.seed} {run.status}: {printable(run.reason)}")
             if runs:
                 rows += self._paper_row([scene], model)
-        return Section(scene, rows, notes)
+        return Section(scene, rows, notes + self._regions([r for r in self.records if r.scene == scene]))
+
+    def _regions(self, runs: list[Record]) -> list[str]:
+        """List a note on the pixels of `psnr_moving` and `psnr_object` in a scene, and why there are none.
+
+        The note is left out for old runs, which did not look for such pixels.
+        """
+        said = []
+        for name, column in REGIONS.items():
+            found = {f"{one.share:.1%} of the image, in {one.views} of {len(r.per_view)} views, found by {one.source}"
+                     for r in runs if (one := r.regions.get(name))}  # fmt: skip
+            why = {r.missing[column.key] for r in runs if column.key in r.missing}
+            if found:
+                said.append(f"{column.title} is over {' or over '.join(sorted(found))}")
+            elif why and column not in self.columns:  # otherwise a mark in a cell says it
+                said.append(f"{column.title} is not measured: {'; '.join(sorted(why))}")
+        return [printable(f"{'. '.join(said)}.")] if said else []
 
     def _cell(self, column: QuantityColumn, finished: list[Record]) -> str:
         """Format the mean and the interval over seeds; if a run lacks the number, return a dash with a footnote."""

@@ -81,7 +81,7 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
         images["effect_sets.png"] = picture.draw(
             trainer.model, first.camera, first.time, renderer.background, renderer.antialias
         )
-    return Measured(metrics, missing, quality.per_view, regions.found(), cost, made, images)
+    return Measured(metrics, missing, regions.with_scores(quality.per_view), regions.found(), cost, made, images)
 
 
 def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[str, Tensor, Tensor]]:

@@ -16,7 +16,7 @@ from gsbench import kernels
 from gsbench.kernels.backends import BACKENDS
 from gsbench.measure.speed import synchroniser
 from gsbench.models import Query, build
-from gsbench.models.base import tensors_of
+from gsbench.models.sliced import tensors_of
 from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS, TriangularModel
 from gsbench.stability import picture_cases, pictures, population, slices

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gsbench.kernels.backends import BACKENDS
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import GaussianModel, Query, build
-from gsbench.models.base import tensors_of
+from gsbench.models.sliced import tensors_of
 from gsbench.models.slicing import SCHEMES
 from gsbench.stability import oracle
 from gsbench.stability.cases import Case, Cell, backends_with, device_of

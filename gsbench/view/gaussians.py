@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.headers import ALPHA_MIN
-from gsbench.models.base import GaussianModel, tensors_of
+from gsbench.models.base import GaussianModel
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.query import Query
 from gsbench.scenes.points import SH_C0
@@ -29,16 +29,13 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
 
     Raises:
         InputError: spherical harmonics are requested from a model whose geometry or colours depend on the viewpoint in
-            another way, the slice has shapes other than Gaussians, no Gaussian is drawn, or one is not finite.
+            another way, no Gaussian is drawn, or one is not finite.
     """
     if keep_harmonics and not has_harmonics(model):
         raise InputError(f"expected --camera I or --direction X,Y,Z: a slice of {type(model).__name__} depends on it")
     with torch.no_grad():
         seen = model.slice(query)
-        if seen.shapes is not None:
-            raise InputError(f"PLY: expected a slice without shapes, got one of {type(model).__name__} that has them: "
-                             f"3DGS' PLY has no field for them; export images or a video")  # fmt: skip
-        means, factors, opacities, colors = (part.detach().cpu() for part in tensors_of(seen))
+        means, factors, opacities, colors = (part.detach().cpu() for part in seen[:4])
         drawn = opacities >= ALPHA_MIN  # the rasterizer skips smaller alphas, and alpha is at most the opacity
         if not drawn.any():
             raise InputError("no Gaussian can be seen at this time and from this place: choose others")
@@ -48,6 +45,12 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
     log_scales, quats = decompose(factors[drawn])
     logits = torch.logit(opacities[drawn].double().clamp(max=LARGEST_OPACITY)).float()
     return TrainedGaussians(means[drawn], log_scales, quats, logits, sh[:, 0], sh[:, 1:])
+
+
+def has_profiles(model: GaussianModel, query: Query) -> bool:
+    """Tell whether the slice at a camera and time has alpha profiles other than Gaussians, which no PLY can carry."""
+    with torch.no_grad():
+        return model.slice(query).shapes is not None
 
 
 def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:

@@ -18,10 +18,10 @@ from gsbench.errors import InputError
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.measure.quality import psnr
 from gsbench.models import GaussianModel, Query
-from gsbench.models.base import Gaussians3D, tensors_of
 from gsbench.models.effect_sets import DIRECTION, EffectSets
 from gsbench.models.render import render
 from gsbench.models.simplifications import simplifications_of
+from gsbench.models.sliced import Gaussians3D, tensors_of
 
 VIEWS = 10
 

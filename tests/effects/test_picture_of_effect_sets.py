@@ -15,9 +15,9 @@ from gsbench.effects.messages import EFFECT_SETS
 from gsbench.measure import record
 from gsbench.measure.images import Pixels
 from gsbench.models import GaussianModel, build
-from gsbench.models.base import Gaussians3D
 from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, EffectSets
 from gsbench.models.simplifications import STATIC
+from gsbench.models.sliced import Gaussians3D
 from gsbench.report.page.palette import EFFECT_SET_LIKE, LIGHT, MODELS
 from gsbench.scenes import Camera, Points
 from gsbench.schedule import ActiveComponents

@@ -7,9 +7,9 @@ from worlds import camera
 
 from gsbench.effects.sensitivity import probe
 from gsbench.models import GaussianModel, Query, build
-from gsbench.models.base import Gaussians3D, tensors_of
 from gsbench.models.render import rasterize_slice
 from gsbench.models.simplifications import Simplification, simplifications_of
+from gsbench.models.sliced import Gaussians3D, tensors_of
 from gsbench.scenes.scene import Points, View
 from gsbench.schedule import ActiveComponents
 

@@ -17,10 +17,11 @@ from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.appearance import sh_colors, sh_time_colors
-from gsbench.models.base import EffectSets, tensors_of
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement
+from gsbench.models.sliced import tensors_of
 from gsbench.train.step import Step
 
 Move = Callable[[Tensor], Tensor]

@@ -12,7 +12,7 @@ from benchmarks.scene import camera, gaussians, model
 from gsbench import kernels
 from gsbench.kernels.loss import l1_ssim
 from gsbench.models import GaussianModel, Query
-from gsbench.models.base import tensors_of
+from gsbench.models.sliced import tensors_of
 from gsbench.raster import rasterize
 
 N = 5_000

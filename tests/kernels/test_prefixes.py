@@ -18,9 +18,11 @@ from gsbench.kernels.colors import show_colors
 from gsbench.kernels.slices import slice_rotated
 from gsbench.models import Query
 from gsbench.models.appearance import sh_time_colors
-from gsbench.models.base import EffectSets, GaussianModel, Raw, tensors_of
+from gsbench.models.base import GaussianModel, Raw
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement
+from gsbench.models.sliced import tensors_of
 
 CENTER, TIME = torch.tensor([0.3, -0.2, -3.0]), torch.tensor(0.4)
 SHARES = (0.0, 0.03, 0.5, 0.98, 1.0)  # of the rows that change: of 37 rows 0, 1, 18, 36 and all

@@ -14,8 +14,9 @@ from gsbench.kernels.slices import slice_static
 from gsbench.kernels.tape import Tape
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
-from gsbench.models.base import EffectSets, tensors_of
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.render import rasterize_slice
+from gsbench.models.sliced import tensors_of
 from gsbench.scenes.scene import Camera, View
 from gsbench.train.step import Step, fitting_threads
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsbench.measure.record import ViewScore
 from gsbench.measure.regions import RegionScores, find_regions, moving, of_objects, region_psnr
 from gsbench.scenes import Camera, View
 
@@ -83,7 +84,7 @@ def test_psnr_is_of_the_region_alone() -> None:
 
 
 def test_scores_are_means_over_the_views_that_have_a_region() -> None:
-    """Catches a view without a region that counts as perfect, and a metric without a value or a reason."""
+    """Catches a view without a region that counts, a metric without a value or a reason, and another view's score."""
     views = [view("0", (10, 10), alpha=True), view("1", None, alpha=True)]
     scores = RegionScores(views, quantised=False)
     images = [(v.name, v.image + 0.1, v.image) for v in views]
@@ -97,3 +98,7 @@ def test_scores_are_means_over_the_views_that_have_a_region() -> None:
     assert (found["object"].views, found["object"].source) == (1, "alpha")
     assert math.isclose(found["object"].share, 144 / SIZE**2)
     assert set(find_regions(views)) == {"moving", "object"}
+    one, other = scores.with_scores([ViewScore("0", 30.0), ViewScore("1", 31.0)])
+    assert (one.name, one.psnr, one.psnr_moving) == ("0", 30.0, None)
+    assert one.psnr_object == pytest.approx(20.0, abs=1e-3)
+    assert other == ViewScore("1", 31.0)

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models import GaussianModel, Query
-from gsbench.models.base import EffectSets, tensors_of
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import rotation, rotation4d, turn_of_space
+from gsbench.models.sliced import tensors_of
 from gsbench.models.triangular import TriangularModel
 from gsbench.schedule import ActiveComponents
 

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query, build, registry
-from gsbench.models.base import tensors_of
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel, as_gated
 from gsbench.models.simplifications import simplifications_of
+from gsbench.models.sliced import tensors_of
 from gsbench.scenes.trained import ply_of, read_trained
 from gsbench.schedule import ActiveComponents
 from gsbench.view.gaussians import has_harmonics, trained_of

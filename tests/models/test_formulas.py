@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from small import CAMERA, MODELS, TRIANGULAR, N, fresh, joint, lively, raw, seeded
 
 from gsbench.models import GaussianModel, Gaussians3D, Query
-from gsbench.models.base import tensors_of
 from gsbench.models.gaussians4d import TIME_OPACITY_FACTOR_MIN
+from gsbench.models.sliced import tensors_of
 
 TIME = 0.45
 ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}

@@ -9,10 +9,11 @@ from torch import Tensor
 from gsbench import models
 from gsbench.errors import InputError
 from gsbench.models import registry
-from gsbench.models.base import SHRINK, Conditioned, GaussianModel, Raw
+from gsbench.models.base import SHRINK, GaussianModel, Raw
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel, as_gated
 from gsbench.models.gaussians3d import Gaussians3DModel
+from gsbench.models.sliced import Conditioned
 from gsbench.scenes.scene import Points
 
 

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from gsbench.errors import InputError
 from gsbench.models import Query, build
 from gsbench.models.appearance import sh_colors, sh_time_colors
-from gsbench.models.base import tensors_of
 from gsbench.models.factors import KINDS
 from gsbench.models.query import unit
+from gsbench.models.sliced import tensors_of
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
 from gsbench.schedule import ActiveComponents

@@ -15,7 +15,7 @@ from gsbench.train.rows import Rows
 from gsbench.train.seeding import generator
 
 NAMES = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
-         "dgs": {}, "freetime": {}}  # fmt: skip
+         "ndgs": {"lambda_t": 0.5, "lambda_d": 0.5}, "dgs": {}, "freetime": {}}  # fmt: skip
 
 
 class Moments:

@@ -10,13 +10,14 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.backends import REFERENCE
 from gsbench.models import Query
-from gsbench.models.base import Conditioned, GaussianModel, Raw, joined_shapes, tensors_of
+from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.render import render
+from gsbench.models.sliced import Conditioned, joined_shapes, tensors_of
 from gsbench.scenes.scene import Camera, Points
-from gsbench.view.gaussians import trained_of
+from gsbench.view.gaussians import has_profiles, trained_of
 
 N = 6
 SEEN = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
@@ -87,7 +88,9 @@ def test_a_slice_without_shapes_is_as_before() -> None:
         assert render(model, SEEN, None, torch.zeros(3)).any()
 
 
-def test_a_ply_of_shapes_is_refused() -> None:
-    """Catches a PLY whose Gaussians are not what the model draws."""
-    with pytest.raises(InputError, match="PLY: expected a slice without shapes, got one of Shaped"):
-        trained_of(made(Shaped), HERE)
+def test_a_ply_leaves_the_shapes_out() -> None:
+    """Catches shapes that are taken for colours, and a model whose shapes are lost without being told."""
+    model = made(Shaped)
+    assert len(trained_of(model, HERE)) == N
+    assert has_profiles(model, HERE)
+    assert not has_profiles(made(Gaussians3DModel), HERE)

@@ -8,8 +8,9 @@ from models.small import CAMERA, MODELS, VARIANTS, seeded
 from torch import Tensor
 
 from gsbench.models import GaussianModel, Query, build
-from gsbench.models.base import Conditioned, Raw
+from gsbench.models.base import Raw
 from gsbench.models.factors import quaternions_in_space, rotation, rotation4d
+from gsbench.models.sliced import Conditioned
 from gsbench.models.start import start_from
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians

@@ -16,7 +16,7 @@ from many_records import EFFECTS, HOSTILE, frontier, hostile, on_demand, write_a
 from gsbench.config import TrainConfig
 from gsbench.measure.curve import Point
 from gsbench.measure.images import strip, write_png
-from gsbench.measure.record import Effects, OnDemand, ViewScore
+from gsbench.measure.record import Effects, OnDemand, Region, ViewScore
 from gsbench.measure.speed import RenderTimes
 from gsbench.report import compare, live
 from gsbench.report.__main__ import main
@@ -444,6 +444,20 @@ def test_the_gallery_has_every_model_on_the_same_view(tmp_path):
     data = base64.b64decode(views[0].truth.partition(",")[2])
     assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == (40, 60, 3)
     assert gallery.gallery(records, tmp_path / "nothing") == []
+
+
+def test_the_gallery_has_the_scores_of_its_views(tmp_path):
+    """Catches the score of another view or of the whole run, and regions that are shown where there are none."""
+    records = frontier(("3dgs", "7dgs"), ("suzanne",), 1, (1000,))
+    scored = [dataclasses.replace(view, psnr_moving=None if i == 3 else 20.0 + i)
+              for i, view in enumerate(records[1].per_view)]  # fmt: skip
+    regions = {"moving": Region("masks", 9, 0.1, "0" * 64)}
+    records[1] = dataclasses.replace(records[1], per_view=scored, regions=regions)
+    views = gallery.gallery(records, write_all(records, tmp_path, pictures=3))
+    plain, moving = ([f"PSNR {record.per_view[i].psnr:.2f} dB" for i in (0, 3, 6)] for record in records)
+    assert [view.scores["3dgs"] for view in views] == plain
+    assert [view.scores["7dgs"] for view in views] == [f"{moving[0]}, moving 20.00", f"{moving[1]}, moving –",
+                                                       f"{moving[2]}, moving 26.00"]  # fmt: skip
 
 
 def test_the_gallery_fits(tmp_path, monkeypatch):

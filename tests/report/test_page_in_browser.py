@@ -1,5 +1,7 @@
 """The page in Chromium: it opens from disk in silence, answers to mouse and keyboard, and can be read by everyone."""
 
+import re
+
 import pytest
 from chromium import launched
 from many_records import frontier, hostile, on_demand, write_all
@@ -126,7 +128,8 @@ def test_the_slider_by_mouse_and_keyboard(visit):
     page.locator(".left").select_option(label="3dgs, error")
     assert over.get_attribute("src") != before
     assert over.get_attribute("alt").startswith("3dgs, error of ")
-    assert page.locator(".left-name").inner_text() == "3dgs, error"
+    assert re.fullmatch(r"3dgs, error: PSNR \d\d\.\d\d dB", page.locator(".left-name").inner_text())
+    assert page.locator(".right-name").inner_text() == "ground truth"
     under = page.locator(".stage .under").get_attribute("src")
     page.locator(".view").select_option(index=1)
     assert page.locator(".stage .under").get_attribute("src") != under

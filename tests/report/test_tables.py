@@ -7,7 +7,7 @@ import sys
 
 import pandas as pd
 import pytest
-from make_golden import GOLDEN, GOLDEN_TERMINAL, make, records
+from make_golden import GOLDEN, GOLDEN_TERMINAL, NO_REGIONS, make, moving, records
 
 from gsbench.measure import record as files
 from gsbench.report import layout, tables
@@ -249,6 +249,19 @@ def test_columns_that_leak_or_are_rare_say_so():
     assert "LPIPS-VGG | psnr_best_on_test (leaks) |" in text
     assert "| 0.250 | 26.50 |" in text
     assert "LPIPS-VGG has no column: no trunk weights" in page(make())
+
+
+def test_regions_are_beside_psnr_with_their_share_or_the_reason():
+    """Catches a PSNR of moving pixels that stands apart, without its pixels, and one that is missing mutely."""
+    text = page(moving(make(), 21.5), dataclasses.replace(make(scene="other"), missing=NO_REGIONS))
+    assert "| model | PSNR | PSNR moving | SSIM |" in text
+    assert "| 25.00 | 21.50 | 0.900 |" in text.replace("**", "")
+    assert "- PSNR moving is over 12.3% of the image, in 1 of 1 views, found by images of one camera." in text
+    assert "PSNR moving is empty: needs 3 evaluated views with the same camera" in text  # of the other scene
+    assert text.count("PSNR object is not measured: needs masks, or images with alpha.") == 2
+    alone = page(dataclasses.replace(make(), missing=NO_REGIONS))
+    assert "- PSNR moving is not measured: needs 3 evaluated views with the same camera. PSNR object is not" in alone
+    assert "PSNR moving" not in page(make())  # a record of before
 
 
 def test_training_views_are_shown_on_request():

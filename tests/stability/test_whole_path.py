@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsbench.kernels.backends import BACKENDS
 from gsbench.models import GaussianModel, Query
-from gsbench.models.base import tensors_of
+from gsbench.models.sliced import tensors_of
 from gsbench.raster import rasterize
 from gsbench.stability import colors, picture_cases, slices  # noqa: F401  # their cases enter the list
 from gsbench.stability.audit import present

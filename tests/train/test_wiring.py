@@ -16,8 +16,8 @@ from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
 from gsbench.models import Query
-from gsbench.models.base import tensors_of
 from gsbench.models.render import rasterize_slice
+from gsbench.models.sliced import tensors_of
 from gsbench.raster import RasterInfo
 from gsbench.run.checks import check_values
 from gsbench.run.setup import build

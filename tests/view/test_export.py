@@ -10,7 +10,7 @@ import torch
 
 from gsbench.export import direction, main
 from gsbench.measure.images import to_bytes
-from gsbench.models import build
+from gsbench.models import GaussianModel, Gaussians3D, Query, build
 from gsbench.models.render import render
 from gsbench.run.load import load_run
 from gsbench.run.setup import load_scene
@@ -31,6 +31,25 @@ def test_a_ply_says_what_it_holds(
     said = capsys.readouterr().out
     assert f": {kept} Gaussians at time" in said
     assert f"{total - kept} of {total} are left out" in said
+
+
+def test_a_ply_says_that_it_has_no_profiles(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches Beta profiles that are lost without a word, and a word about them where there are none."""
+    plain, asked = GaussianModel.slice, [str(folder), "--ply", str(tmp_path / "a.ply"), "--camera", "2"]
+    assert main(asked) == 0
+    assert "profiles" not in capsys.readouterr().out
+
+    def shaped(self: GaussianModel, query: Query) -> Gaussians3D:
+        seen = plain(self, query)
+        return seen._replace(shapes=torch.full_like(seen.opacities, 2.0))
+
+    monkeypatch.setattr(GaussianModel, "slice", shaped)
+    assert main(asked) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 2
+    assert "a.ply: their alpha profiles (1 - r^2)^b are left out" in said[1]
 
 
 def test_a_video_has_its_frames(folder: Path, tmp_path: Path) -> None:

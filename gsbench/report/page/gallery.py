@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 
 from gsbench.measure.images import GAP, HEADER, Pixels
-from gsbench.measure.record import Record
+from gsbench.measure.record import Record, ViewScore
+from gsbench.report.layout import EMPTY
 from gsbench.report.page.content import Image
-from gsbench.report.page.messages import shorten
+from gsbench.report.page.messages import plain, shorten
 
 FILE_NAME = "pictures.png"
 BUDGET = 900_000  # bytes of all images as text, which leaves the page below 2 MB
@@ -28,6 +29,7 @@ class GalleryView:
     truth: str
     render: dict[str, str]
     error: dict[str, str]
+    scores: dict[str, str]  # PSNR of each model in this view, and over its moving pixels and those of objects
     width: int
     height: int
 
@@ -148,15 +150,31 @@ def _views(
         }
         render, error = ({m: pair[k] for m, pair in encoded.items()} for k in (0, 1))
         height, width = truth.shape[:2]
-        shown.append(GalleryView(scene, names[i], _encode(truth, side, quality), render, error, width, height))
+        scores = {m: _score(record, len(rows), i) for m, (record, rows) in models.items()}
+        shown.append(GalleryView(scene, names[i], _encode(truth, side, quality), render, error, scores, width, height))
     return shown
 
 
+def _shown_views(record: Record, rows: int) -> list[ViewScore]:
+    """Return the views in an image file, which are evenly spaced among the evaluated views."""
+    return record.per_view[:: max(1, len(record.per_view) // max(1, rows))][:rows]
+
+
+def _score(record: Record, rows: int, i: int) -> str:
+    """Return the PSNR of row `i` of an image file as text; a region is left out if no view of the run has it."""
+    views = _shown_views(record, rows)
+    view = views[i] if i < len(views) else None
+    if view is None or view.psnr is None:
+        return ""
+    values = {"moving": view.psnr_moving, "object": view.psnr_object}
+    found = {name: value for name, value in values.items() if name in record.regions}
+    said = [f"{name} {EMPTY if value is None else plain(value)}" for name, value in found.items()]
+    return ", ".join([f"PSNR {plain(view.psnr)} dB", *said])
+
+
 def _names(record: Record, rows: int) -> list[str]:
-    """Return the names of the views in an image file, which are evenly spaced among the evaluated views."""
-    views = [view.name for view in record.per_view]
-    step = max(1, len(views) // max(1, rows))
-    spaced = [shorten(name, 60) for name in views[::step][:rows]]
+    """Return the names of the views in an image file."""
+    spaced = [shorten(view.name, 60) for view in _shown_views(record, rows)]
     return [*spaced, *(f"view {i + 1}" for i in range(len(spaced), rows))]
 
 

@@ -83,7 +83,8 @@ each(".compare", (root) => {
     root.querySelector(".stage").style.aspectRatio = `${view.width} / ${view.height}`;
     for (const [side, image] of [["left", "over"], ["right", "under"]]) {
       const text = part(side).selectedOptions[0].textContent;
-      part(side + "-name").textContent = text;
+      const score = view.scores[part(side).value.split(":")[1]];
+      part(side + "-name").textContent = score ? `${text}: ${score}` : text;
       part(image).alt = `${text} of ${view.scene}, ${view.name}`;
     }
   };

@@ -1,0 +1,56 @@
+"""Define the tuples of 3D Gaussians that a model gives for a camera and a time, and how they are joined."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+
+
+class Gaussians3D(NamedTuple):
+    """Hold the 3D Gaussians that the rasterizer renders: the slice of a model for one camera centre and time."""
+
+    means: Tensor  # [N, 3]
+    factors: Tensor  # [N, 3, 3]
+    opacities: Tensor  # [N]
+    colors: Tensor  # [N, 3]
+    shapes: Tensor | None = None  # [N] b of the alpha profile (1 - r^2)^b; None: the profile is a Gaussian
+
+
+class Conditioned(NamedTuple):
+    """Hold means and covariance factors of conditional 3D Gaussians, and the factors in [0, 1] of their opacities."""
+
+    means: Tensor  # [N, 3]
+    factors: Tensor  # [N, 3, 3]
+    opacity_factor: Tensor  # [N] f_temp f_dir in [0, 1]
+    shapes: Tensor | None = None  # [N], as in `Gaussians3D`
+
+
+class Geometry(NamedTuple):
+    """Hold means, covariance factors and opacities of the 3D Gaussians at a camera and time, without colours."""
+
+    means: Tensor  # [N, 3]
+    factors: Tensor  # [N, 3, 3]
+    opacities: Tensor  # [N]
+    shapes: Tensor | None = None  # [N], as in `Gaussians3D`
+
+
+def tensors_of(parts: Iterable[Tensor | None]) -> list[Tensor]:
+    """Return the tensors of 3D Gaussians (means, covariance factors, ...) in order, without fields that are None."""
+    return [part for part in parts if part is not None]
+
+
+def joined_shapes(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    """Concatenate the exponents b of the alpha profiles (1 - r^2)^b of two groups of Gaussians; None if both are None.
+
+    Raises:
+        InputError: only one of the groups has exponents.
+    """
+    if first is None and second is None:
+        return None
+    if first is None or second is None:
+        raise InputError("shapes: expected every row of a slice to have one or none to have one, got some of them: "
+                         "let `condition` and `static` of the model agree")  # fmt: skip
+    return torch.cat([first, second])
