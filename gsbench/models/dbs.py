@@ -1,4 +1,4 @@
-"""Model scenes by dBS: dGS with Beta profiles of alpha and an exponent for each of direction and time (2026).
+"""Model scenes by dBS: dGS with Beta profiles (2026).
 
 The equations are those of "direct conditioning", a text under review for NeurIPS 2026, with the constants of the
 authors' code.

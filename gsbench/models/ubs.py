@@ -1,4 +1,4 @@
-"""Model scenes by Universal Beta Splatting (UBS, eq. 3 to 8): Beta profiles over position, direction and time (2026).
+"""Model scenes by UBS, Universal Beta Splatting: Beta profiles over position, direction and time (2026).
 
 Liu et al., "Universal Beta Splatting", ICLR 2026, with the constants of the authors' code.
 """
