@@ -38,8 +38,8 @@ def test_the_tables_name_every_model_and_key(tables: ModuleType) -> None:
     models = [row.split("`")[1] for row in tables.models().splitlines()[2:]]
     assert models == sorted(path.stem for path in (ROOT / "conf" / "model").glob("*.yaml"))
     config = tables.config()
-    assert "| `train.densify.every` | int | `100` | least number of steps between two rounds" in config
-    assert "| `init.ply` | str or None | `null` | trained 3D Gaussians in the format of 3DGS |" in config
+    assert "| `train.densify.every` | `100` | least number of steps between two rounds" in config
+    assert "| `init.ply` | `null`, str | trained 3D Gaussians in the format of 3DGS |" in config
 
 
 class Page(HTMLParser):

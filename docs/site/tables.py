@@ -32,8 +32,8 @@ def models() -> str:
     """Return a row for each choice of model=, as it is composed for the embedded scenes."""
     register_schema()
     rows = [
-        "| `model=` | what it does | observes | AGR | raw geometry | numbers a Gaussian |",
-        "| --- | --- | --- | --- | --- | ---: |",
+        "| `model=` | what it does | observes | AGR | numbers a Gaussian |",
+        "| --- | --- | --- | --- | ---: |",
     ]
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         rows += [row_of(path) for path in sorted((CONF / "model").glob("*.yaml"))]
@@ -47,13 +47,12 @@ def row_of(path: Path) -> str:
     about = " ".join(re.findall("^# (.*)", path.read_text(), re.MULTILINE))
     if composed.model.candidates:
         chosen = " or ".join(f"`{one.name}`" for one in composed.model.candidates.values())
-        return f"| {name} | {about} | what the chosen one does: {chosen} | | | |"
+        return f"| {name} | {about} | what the chosen one does: {chosen} | | |"
     model = find(composed.model.name)
     if path.stem == composed.model.name:
         about = (inspect.getdoc(inspect.getmodule(model)) or "").partition("\n")[0]
     observes = " and ".join(model.observes) or "neither"
-    raw = ", ".join(f"`{one}`" for one in dict.fromkeys([*model.centers, *model.geometry]))
-    return f"| {name} | {about} | {observes} | {'yes' if composed.agr else 'no'} | {raw} | {numbers(composed)} |"
+    return f"| {name} | {about} | {observes} | {'yes' if composed.agr else 'no'} | {numbers(composed)} |"
 
 
 def numbers(composed: DictConfig) -> int:
@@ -72,13 +71,13 @@ def config() -> str:
 def part(kind: Any, prefix: str, title: str) -> Iterator[str]:
     """Yield the heading, the words and the table of a part of the config, then those of the parts below it."""
     comments = dict(re.findall(r"^    (\w+): .*  # (?!type:)(.*)$", inspect.getsource(kind), re.MULTILINE))
-    rows, below = ["| key | type | default | |", "| --- | --- | --- | --- |"], []
+    rows, below = ["| key | default | |", "| --- | --- | --- |"], []
     for field in dataclasses.fields(kind):
         key = f"{prefix}{field.name}"
         if dataclasses.is_dataclass(field.type):
             below.append((field.type, key))
         else:
-            rows.append(f"| `{key}` | {type_of(field)} | {default_of(field)} | {comments.get(field.name, '')} |")
+            rows.append(f"| `{key}` | {default_of(field)} | {comments.get(field.name, '')} |")
     yield f"## {title}"
     yield inspect.getdoc(kind) or ""
     yield "\n".join(rows)
@@ -93,13 +92,15 @@ def type_of(field: "dataclasses.Field[Any]") -> str:
 
 
 def default_of(field: "dataclasses.Field[Any]") -> str:
-    """Show the default of a key as YAML has it; nothing where a choice or an experiment gives it."""
+    """Show the default of a key as YAML has it, or its type where the default does not tell it."""
     factory = field.default_factory
     value = field.default if factory is dataclasses.MISSING else factory()
     if value == MISSING:
-        return ""
-    words = {None: "null", True: "true", False: "false", "": "''"}
-    return f"`{words[value] if isinstance(value, bool | str | None) and value in words else value}`"
+        return type_of(field)
+    if value is None:
+        return f"`null`, {type_of(field).removesuffix(' or None')}"
+    words = {True: "true", False: "false", "": "''"}
+    return f"`{words[value] if isinstance(value, bool | str) and value in words else value}`"
 
 
 def table1() -> str:

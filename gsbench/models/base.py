@@ -30,7 +30,6 @@ from gsbench.schedule import ActiveComponents
 Raw = dict[str, Tensor]  # raw parameters (before exp, sigmoid and normalisation) by name, N rows each
 CHILDREN = 2  # a split replaces a Gaussian by two ..
 SHRINK = 0.8 * CHILDREN  # .. that are 1.6 times smaller (3DGS, gaussian_model.py)
-INITIAL_OPACITY = 0.1
 
 
 class GaussianModel(nn.Module, ABC):
@@ -43,6 +42,7 @@ class GaussianModel(nn.Module, ABC):
     centers: ClassVar[tuple[str, ...]] = ("means",)  # the raw parameters that are means: AGR reads and changes them
     geometry: ClassVar[tuple[str, ...]]  # the raw parameters of the covariance: AGR changes them
     lengths: ClassVar[tuple[str, ...]] = ("means",)  # the raw parameters of both kinds that are in world units
+    initial_opacity: ClassVar[float] = 0.1
 
     def __init__(
         self, *, agr: bool = False, agr_octaves: int = OCTAVES, sh_degree: int = 3, backend: Backend = AUTO
@@ -194,7 +194,7 @@ class GaussianModel(nn.Module, ABC):
 
     @torch.no_grad()
     def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
-        """Place an isotropic Gaussian of opacity 0.1 at each point (3DGS, section 5.1).
+        """Place an isotropic Gaussian of opacity 0.1, or `initial_opacity`, at each point (3DGS, section 5.1).
 
         The standard deviation of a Gaussian is the root mean square distance to its three nearest neighbours.
 
@@ -206,7 +206,7 @@ class GaussianModel(nn.Module, ABC):
         self.extent = extent
         distances = nearest_distances(points.means)
         raw = {"means": points.means, **self.initial_geometry(points, distances, generator)}
-        raw["opacities"] = torch.full((len(points.means),), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)))
+        raw["opacities"] = torch.full((len(points.means),), math.log(self.initial_opacity / (1 - self.initial_opacity)))
         raw |= self.initial_colors((points.colors - 0.5) / SH_C0)
         self.splats = nn.ParameterDict({name: nn.Parameter(value.clone()) for name, value in raw.items()})
         if self.agr:

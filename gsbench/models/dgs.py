@@ -91,8 +91,7 @@ class DirectModel(MovingGaussians3D):
         opacity_factor = torch.exp(-FADING * white.square().sum(-1))
         if self.coupling == "none":
             return torch.zeros_like(raw["means"]), opacity_factor
-        size = sizes(raw["scales"]).mean(-1)[:, None, None]
-        V_pq = size * F.normalize(raw["coupling"], dim=-1).unflatten(-1, (3, 4))
+        V_pq = coupling_matrix(raw["coupling"], sizes(raw["scales"]))
         shares = torch.sigmoid(raw["shares"])[:, [0, 0, 0, 1]]
         shift = shares * (L @ white[..., None])[..., 0]
         if self.coupling == "interpolated":
@@ -116,13 +115,22 @@ class DirectModel(MovingGaussians3D):
         return torch.sigmoid(self.splats["times"].detach()[:, 0]), 1 / (math.sqrt(2 * FADING) * L_tt)
 
 
-def precision_factor(raw: Tensor) -> Tensor:
-    """Compute the factor L [N, 4, 4] of the precision V_qq = L L^T over direction and time, from parameters [N, 7].
+def coupling_matrix(coupling: Tensor, scales: Tensor) -> Tensor:
+    """Compute V_pq = s Theta / |Theta| from Theta [N, 3 C] and scales [N, 3] with the mean s, [N, 3, C]."""
+    size = scales.mean(-1)[:, None, None]
+    return size * F.normalize(coupling, dim=-1).unflatten(-1, (3, -1))
 
-    The parameters are the lower triangle over direction, row by row, and then the entry of time.
+
+def precision_factor(raw: Tensor) -> Tensor:
+    """Compute the factor L [N, C, C] of the precision V_qq = L L^T over direction and, if C = 4, time.
+
+    The parameters, [N, 6] or [N, 7], are the lower triangle over direction, row by row, and then the entry of time.
     """
     zero = torch.zeros_like(raw[:, 0])
-    xx, yx, yy, zx, zy, zz, tt = raw.unbind(-1)
-    xx, yy, zz, tt = (sizes(log) for log in (xx, yy, zz, tt))
-    rows = [xx, zero, zero, zero, yx, yy, zero, zero, zx, zy, zz, zero, zero, zero, zero, tt]
-    return torch.stack(rows, -1).unflatten(-1, (4, 4))
+    xx, yx, yy, zx, zy, zz, *time = raw.unbind(-1)
+    xx, yy, zz = (sizes(log) for log in (xx, yy, zz))
+    L = torch.stack([xx, zero, zero, yx, yy, zero, zx, zy, zz], -1).unflatten(-1, (3, 3))
+    if not time:
+        return L
+    L = F.pad(L, (0, 1, 0, 1))
+    return L + F.pad(sizes(time[0])[:, None, None], (3, 0, 3, 0))

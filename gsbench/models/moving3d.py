@@ -1,7 +1,7 @@
 """Define the base of models whose 3D Gaussians keep one shape, while means and opacities change.
 
-Means and opacities change with time, in dGS also with the view direction. Such models are dGS and FreeTimeGS. 4DGS and
-7DGS get their slices from a covariance over more dimensions instead.
+Means and opacities change with time, in dGS and dBS also with the view direction; FreeTimeGS is another such model.
+4DGS and 7DGS get their slices from a covariance over more dimensions instead.
 """
 
 import math
@@ -33,8 +33,8 @@ class MovingGaussians3D(Gaussians3DModel):
         """Return how far the means move [N, 3] and the factors of the opacities [N], for a camera centre and a time."""
 
     @abstractmethod
-    def lifetimes(self) -> tuple[Tensor, Tensor]:
-        """Return the mean [N] and the standard deviation [N] of each opacity, which is a Gaussian function of time."""
+    def lifetimes(self) -> tuple[Tensor, Tensor] | None:
+        """Return mean [N] and standard deviation [N] of each opacity as a function of time; None without time."""
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Return the moved means, the covariance factors R S and the opacity factors for a camera centre and a time."""
@@ -66,6 +66,7 @@ class MovingGaussians3D(Gaussians3DModel):
             masks |= dict.fromkeys(self.moving, rows < effect_sets.conditioned)
         return masks
 
-    def log_duration(self, index: int) -> float:
-        """Return the logarithm of the standard deviation in time of the Gaussian `index`."""
-        return math.log(float(self.lifetimes()[1][index]))
+    def log_duration(self, index: int) -> float | None:
+        """Return the logarithm of the standard deviation in time of the Gaussian `index`; None without time."""
+        lifetimes = self.lifetimes()
+        return None if lifetimes is None else math.log(float(lifetimes[1][index]))

@@ -95,7 +95,7 @@ def slice_gaussians(
         return slice_reduced(mean, reduce(factor), query)
     gain, cov = subtract(factor, scheme)
     moved = mean[:, :3] + (gain @ (query - mean[:, 3:])[..., None])[..., 0]
-    return Slice(moved, _cholesky3(cov), gain)
+    return Slice(moved, cholesky3(cov), gain)
 
 
 def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
@@ -199,7 +199,7 @@ def gain_of(T_pq: Tensor, T_qq: Tensor) -> Tensor:
     return torch.stack(solved[::-1], -1) if solved else T_pq
 
 
-def _cholesky3(S: Tensor) -> Tensor:
+def cholesky3(S: Tensor) -> Tensor:
     """Compute the Cholesky factor of S [N, 3, 3]; if S is indefinite, negative pivots are replaced by zero."""
 
     def root(x: Tensor) -> Tensor:
