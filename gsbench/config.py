@@ -107,7 +107,7 @@ class PenaltiesConfig:
     """Add terms to the loss of every view."""
 
     opacity: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean opacity
-    size: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean largest scale, in parts of the scene's extent
+    size: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean scale in space, in parts of the scene's extent
 
 
 @dataclass

@@ -30,8 +30,8 @@ def mean_opacity(model: GaussianModel, _query: Query) -> Tensor:
 
 
 def mean_size(model: GaussianModel, _query: Query) -> Tensor:
-    """Return the mean over Gaussians of the largest standard deviation, divided by the radius of the scene, []."""
-    return model.scales().mean() / model.extent
+    """Return the mean scale in space over Gaussians and axes, divided by the radius of the scene, [] (3DGS-MCMC)."""
+    return model.spatial_scales().mean() / model.extent
 
 
 PENALTIES: dict[str, Penalty] = {"opacity": mean_opacity, "size": mean_size}
