@@ -108,6 +108,7 @@ class PenaltiesConfig:
 
     opacity: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean opacity
     size: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean scale in space, in parts of the scene's extent
+    strain: PenaltyConfig = field(default_factory=PenaltyConfig)  # how fast neighbours move apart, for their distance
 
 
 @dataclass
