@@ -12,7 +12,6 @@ where v_i = (m_i(t1) - m_i(t0)) / (t1 - t0) is the mean velocity, and w_ij = sqr
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -69,20 +68,18 @@ class Strain(Penalty):
         later = Query(query.center, query.time + share / self.frames)
         assert later.time is not None
         sample = self.rows[torch.randperm(len(self.rows), generator=draws)[:SAMPLES].to(self.rows.device)]
-        pairs = self.neighbours[sample].long()  # [B, k]
+        pairs = self.neighbours[sample].long().T.contiguous()  # [k, B]
 
         means, visible = self._seen(query)
         means_later, visible_later = self._seen(later)
         velocities = (means_later - means) / (later.time - query.time)
         # A Gaussian that is culled has no conditional mean, so its pairs do not count.
         visible = torch.where(visible_later > 0, visible, 0.0)
-        means = means.detach()
-        weights = (visible[sample, None] * visible[pairs]).sqrt()
-        distances = (means[sample, None] - means[pairs]).square().sum(-1) + (LEAST_DISTANCE * self.model.extent) ** 2
-        # `embedding` adds gradients of equal indices in a fixed order, `index` does not.
-        differences = F.embedding(sample, velocities)[:, None] - F.embedding(pairs, velocities)
-        strains = (weights / distances * differences.square().sum(-1)).sum(-1)  # [B]
-        return strains.sum() / (len(sample) * NEIGHBOURS)
+        weights = (visible[sample] * visible[pairs]).sqrt()
+        least = (LEAST_DISTANCE * self.model.extent) ** 2
+        distances = _differences(means.detach(), sample, pairs).square().sum(0) + least
+        strains = weights / distances * _differences(velocities, sample, pairs).square().sum(0)  # [k, B]
+        return strains.sum(0).sum() / pairs.numel()
 
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
         """Forget the neighbours, because Gaussians were added, removed or reordered."""
@@ -126,3 +123,17 @@ class Strain(Penalty):
         geometry = self.model.slice_geometry(raw, query)
         largest = torch.sigmoid(raw["opacities"].detach()).clamp(min=torch.finfo(geometry.means.dtype).tiny)
         return geometry.means, geometry.opacities.detach() / largest
+
+
+def _differences(
+    vectors: Tensor,  # [N, 3]
+    sample: Tensor,  # [B]
+    pairs: Tensor,  # [k, B]
+) -> Tensor:  # [3, k, B]
+    """Return the differences between the vectors of a sample of Gaussians and those of their neighbours.
+
+    On a CPU, the gradient of `gather` adds equal indices in a fixed order, and is faster than that of `embedding`.
+    """
+    columns = vectors.T.contiguous()
+    own, others = (columns.gather(1, rows.flatten().expand(3, -1)) for rows in (sample, pairs))
+    return own[:, None] - others.unflatten(1, pairs.shape)
