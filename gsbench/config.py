@@ -95,11 +95,11 @@ class DensifyConfig:
 
 @dataclass
 class PenaltyConfig:
-    """Set the weight and the steps of one loss term."""
+    """Set one loss term."""
 
     weight: float = 0.0  # 0: no term
     start: int = 0  # first step
-    stop: int | None = None  # step at which it ends; None: never
+    stop: int | None = None  # step after the last; None: never
 
 
 @dataclass
