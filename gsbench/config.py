@@ -95,11 +95,11 @@ class DensifyConfig:
 
 @dataclass
 class PenaltyConfig:
-    """Set the weight and the steps of one loss term."""
+    """Set one loss term."""
 
     weight: float = 0.0  # 0: no term
     start: int = 0  # first step
-    stop: int | None = None  # step at which it ends; None: never
+    stop: int | None = None  # step after the last; None: never
 
 
 @dataclass
@@ -107,7 +107,8 @@ class PenaltiesConfig:
     """Add terms to every view's loss."""
 
     opacity: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean opacity
-    size: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean largest scale, in parts of the scene's extent
+    size: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean scale in space, in parts of the scene's extent
+    strain: PenaltyConfig = field(default_factory=PenaltyConfig)  # how fast neighbours move apart, for their distance
 
 
 @dataclass

@@ -27,7 +27,7 @@ PLACES = (
 ALWAYS = {
     "train.densify.kind": "gradient",
     "train.densify.noise": 5e5,  # older runs had no `mcmc`, which it is for
-    **{f"train.penalties.{name}.{key}": 0 for name in ("opacity", "size") for key in ("weight", "start")},
+    **{f"train.penalties.{name}.{key}": 0 for name in ("opacity", "size", "strain") for key in ("weight", "start")},
 }
 _MOST_NAMED = 5  # the most differences that a message contains
 

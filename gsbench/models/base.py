@@ -91,8 +91,8 @@ class GaussianModel(nn.Module, ABC):
         """Condition Gaussians with raw parameters (before exp and sigmoid) on a camera centre and time."""
 
     @abstractmethod
-    def scales(self) -> Tensor:
-        """Return the largest spatial standard deviation of each Gaussian, [N], world units."""
+    def spatial_scales(self) -> Tensor:
+        """Return the scales of each Gaussian in space, [N, 3] or [N, 1] for spheres, world units, with gradients."""
 
     @abstractmethod
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
@@ -102,6 +102,10 @@ class GaussianModel(nn.Module, ABC):
             raw: the raw parameters of the parents, of which each has two copies, one after the other.
             generator: the source of all random numbers.
         """
+
+    def scales(self) -> Tensor:
+        """Return the largest spatial standard deviation of each Gaussian, [N], world units, without a gradient."""
+        return self.spatial_scales().detach().amax(-1)
 
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
         """Multiply the standard deviations of conditional 3D Gaussians by factors in (0, 1]; by default do nothing.

@@ -51,10 +51,10 @@ class BetaModel(GaussianModel):
         }
         return raw | {"times": torch.rand(N, 1, generator=generator)} if time else raw
 
-    def scales(self) -> Tensor:
-        """Return the largest standard deviation of the Gaussians that look like the profiles, [N]."""
-        raw = {name: value.detach() for name, value in self.splats.items()}
-        return torch.linalg.matrix_norm(self.factors(raw), ord=2) / reach_of(raw)
+    def spatial_scales(self) -> Tensor:
+        """Return the sizes S of the Gaussians that look like the profiles, [N, 3]; gradients reach S, not b."""
+        raw = dict(self.splats.items())
+        return positive(raw["scales"][:, :3]) / reach_of(raw).detach()[:, None]
 
     def log_sizes(self, index: int) -> Tensor:
         """Return the logarithms of the sizes of the Gaussian `index`, in position and then in other variables."""

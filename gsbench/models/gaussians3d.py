@@ -56,9 +56,9 @@ class Gaussians3DModel(GatedModel):
             return super().slice_geometry(raw, query)
         return Geometry(raw["means"], *slice_static(raw["scales"], raw["quats"], raw["opacities"]))
 
-    def scales(self) -> Tensor:
-        """Return the largest of the three scales of each Gaussian, [N]."""
-        return self.splats["scales"].detach().amax(-1).exp()
+    def spatial_scales(self) -> Tensor:
+        """Return the three scales of each Gaussian, [N, 3]."""
+        return sizes(self.splats["scales"])
 
     def log_sizes(self, index: int) -> Tensor:
         """Return the three log scales of the Gaussian `index`, [3]."""

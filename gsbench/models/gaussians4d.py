@@ -213,9 +213,9 @@ class Gaussians4DModel(JointModel):
         waves = dc.new_zeros(len(dc), self.time_degree + 1, K, 3)
         return {"sh0": dc[:, None, None], "shN": waves.flatten(1, 2)[:, 1:]}
 
-    def scales(self) -> Tensor:
-        """Return the largest of the three spatial scales of each Gaussian, [N], as 4DGS uses it in density control."""
-        return self.splats["scales"].detach()[:, :3].amax(-1).exp()
+    def spatial_scales(self) -> Tensor:
+        """Return the three spatial scales of each Gaussian, [N, 3]; density control uses the largest one, as 4DGS."""
+        return sizes(self.splats["scales"][:, :3])
 
     def log_sizes(self, index: int) -> Tensor:
         """Return the four log scales of the Gaussian `index`, [4]."""

@@ -156,6 +156,10 @@ class TriangularModel(JointModel):
         )
         return Geometry(*geometry)
 
+    def spatial_scales(self) -> Tensor:
+        """Return the diagonal entries of position in each Cholesky factor, [N, 3]."""
+        return sizes(self.splats["log_diagonal"][:, self.rows["p"]])
+
     def scales(self) -> Tensor:
         """Return the largest standard deviation of each conditional 3D Gaussian, [N]; it is the same at all times."""
         T_pp = reduce(self.factors(dict(self.splats.items())).detach()).T_pp

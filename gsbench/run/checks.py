@@ -55,6 +55,7 @@ RANGES = {  # the ranges of settings, both ends included
     "train.densify.noise": (0, ENDLESS),
     "train.penalties.opacity.weight": (0, math.inf),
     "train.penalties.size.weight": (0, math.inf),
+    "train.penalties.strain.weight": (0, math.inf),
     "train.densify.max_gaussians": (LEAST_GAUSSIANS, ENDLESS),
     "train.curve_points": (1, MAX_POINTS),
     "train.checkpoint_minutes": (0, ENDLESS),

@@ -11,6 +11,7 @@ from gsbench.kernels.backends import resolve
 from gsbench.models import GaussianModel
 from gsbench.run.checks import BACKGROUNDS, check_gates, scene_folder
 from gsbench.scenes import Scene
+from gsbench.train.penalties import check_observed
 
 
 def build(config: Config) -> GaussianModel:
@@ -18,7 +19,7 @@ def build(config: Config) -> GaussianModel:
 
     Raises:
         InputError: the model or an option is unknown, or `effects.gate` asks to remove time, direction or AGR (a
-            network) from Gaussians and the model does not support this.
+            network) from Gaussians and the model does not support this, or a penalty needs a model with time.
     """
     own: dict[str, Any] = {
         "module": config.model.module,
@@ -33,6 +34,7 @@ def build(config: Config) -> GaussianModel:
             raise InputError(f"model.options: expected no '{name}', which has a key of its own: set {key}")
     model = models.build(config.model.name, **own, **config.model.options)
     check_gates(model, config)
+    check_observed(model, config.train.penalties)
     return model
 
 

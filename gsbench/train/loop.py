@@ -26,7 +26,7 @@ from gsbench.train.densify.scores import ErrorScore
 from gsbench.train.finite_check import DivergedError, FiniteCheck
 from gsbench.train.gating import NO_GATES, Gating
 from gsbench.train.optim import Optimizer
-from gsbench.train.penalties import penalties_at
+from gsbench.train.penalties import Penalties
 from gsbench.train.pyramid import Pyramid
 from gsbench.train.renderer import Renderer
 from gsbench.train.rows import Rows
@@ -80,6 +80,7 @@ class Trainer:
         self.rows.add(self.minimum_scale)
         self.average = Average(model, self.schedule.average_start)
         self.rows.add(self.average)
+        self.penalties = Penalties(self.rows, train.penalties, self.schedule, config.seed, scene.train)
         self.pyramid = Pyramid(scene.train)
         self.stages = StageClock(config.device)
         self.effort = Effort()
@@ -163,8 +164,10 @@ class Trainer:
         factor = schedule.resolution(step)
         chosen = batch(step, len(self.scene.train), train.batch_size, self.config.seed)
         views = [self.pyramid.view(i, factor) for i in chosen]
+        with stages("loss"):
+            penalties = self.penalties.at(step, views)
         try:
-            seen = self.gradients(views, penalties_at(step, train.penalties, schedule))
+            seen = self.gradients(views, penalties)
         except DivergedError as error:
             raise DivergedError(f"step {step}: {error}") from None
         if step < schedule.densify_stop:
@@ -250,6 +253,7 @@ class Trainer:
             "minimum_scale": self.minimum_scale.state_dict(),
             "gating": self.gating.state_dict(),
             "average": self.average.state_dict(),
+            "penalties": self.penalties.state_dict(),
             "stages": self.stages.state_dict(),
             "effort": self.effort.state_dict(),
             "curve": self.curve.state_dict(),
@@ -270,6 +274,7 @@ class Trainer:
             self.minimum_scale.load_state_dict(state["minimum_scale"])
             self.gating.load_state_dict(state.get("gating", NO_GATES))
             self.average.load_state_dict(state.get("average", NO_AVERAGE))
+            self.penalties.load_state_dict(state.get("penalties", {}))
             self.stages.load_state_dict(state["stages"])
             self.effort.load_state_dict(state.get("effort"))
             self.curve.load_state_dict(state["curve"])

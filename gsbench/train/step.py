@@ -21,7 +21,7 @@ from gsbench.raster import RasterInfo
 from gsbench.scenes import View
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.losses import photometric
-from gsbench.train.penalties import Penalty
+from gsbench.train.penalties.base import Penalty
 
 Sums = dict[int, Tensor]  # gradients by the id of the tensor with respect to which they are taken
 
@@ -145,9 +145,7 @@ class Step:
         bounds = [len(views) * worker // workers for worker in range(workers + 1)]
         sums = deal(len(views), bounds)
         if workers == 1:
-            seen = [
-                self._see(view, sources, own, len(views), self.stages) for view, own in zip(views, sums, strict=True)
-            ]
+            seen = [self._see(i, view, sources, sums[i], len(views), self.stages) for i, view in enumerate(views)]
         else:
             seen = self._by_workers(views, sources, sums, bounds)
         with self.stages("backward"):
@@ -165,15 +163,17 @@ class Step:
         clocks = [StageClock() for _ in range(workers)]
 
         def run(worker: int) -> list[Seen]:
-            return [self._see(views[i], sources, sums[i], len(views), clocks[worker])
+            return [self._see(i, views[i], sources, sums[i], len(views), clocks[worker])
                     for i in range(bounds[worker], bounds[worker + 1])]  # fmt: skip
 
         seen = [one for part in side_by_side(run, range(workers), workers) for one in part]
         self.stages.share([clock.seconds for clock in clocks], time.perf_counter() - started)
         return seen
 
-    def _see(self, view: View, sources: list[nn.Parameter], sums: Sums, views: int, stages: StageClock) -> Seen:
-        """Render one view of a batch and add the gradients of its loss to `sums`."""
+    def _see(
+        self, index: int, view: View, sources: list[nn.Parameter], sums: Sums, views: int, stages: StageClock
+    ) -> Seen:
+        """Render view number `index` of a batch and add the gradients of its loss to `sums`."""
         with Tape() as tape:
             with stages("slice"):
                 query = Query.of(view.camera, view.time)
@@ -190,7 +190,7 @@ class Step:
             with stages("loss"):
                 loss = photometric(output.image, view.image[None], self.ssim_weight, self.model.backend)
                 for weight, penalty in self.penalties:
-                    loss = loss + weight * penalty(self.model, query)
+                    loss = loss + weight * penalty(query, index)
         with stages("backward"):
             means2d = output.info.means2d
             tape.backward(loss, torch.full_like(loss, 1 / views), [*sources, means2d], sums)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from small import CAMERA, moved, started
+from small import CAMERA, moved, seeded, started
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -22,6 +22,8 @@ from gsbench.models.simplifications import simplifications_of
 from gsbench.models.sliced import tensors_of
 from gsbench.scenes.trained import ply_of, read_trained
 from gsbench.schedule import ActiveComponents
+from gsbench.train.penalties import MeanOpacity, MeanSize
+from gsbench.train.penalties.base import Penalty
 from gsbench.view.gaussians import has_harmonics, trained_of
 
 N = 12
@@ -111,6 +113,28 @@ def test_gradients_reach_every_group(name: str, agr: bool) -> None:
             assert x.grad.any(), group
     grouped = [id(p) for parameters in model.groups().values() for p in parameters]
     assert sorted(grouped) == sorted(id(p) for p in model.parameters())  # each once
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("kind", [MeanOpacity, MeanSize])
+def test_penalties_have_the_gradients_of_their_values(name: str, kind: type[Penalty]) -> None:
+    """Catches a penalty whose gradient is lost or wrong, such as one of detached sizes: it is printed and acts on
+    nothing."""
+    model = made(name, False)
+    penalty = kind(model, 0, 1)
+    penalty(QUERY, 0).backward()
+    learns = {key for key, x in model.splats.items() if x.grad is not None and x.grad.any()}
+    assert learns == ({"opacities"} if kind is MeanOpacity else learns & set(model.geometry))
+    assert learns
+    for key in learns:
+        x, step = model.splats[key], 1e-6 * torch.randn(model.splats[key].shape, generator=seeded(1)).double()
+        ends = []
+        for sign in (1, -1):
+            x.data += sign * step
+            ends.append(penalty(QUERY, 0).detach())
+            x.data -= sign * step
+        assert x.grad is not None
+        torch.testing.assert_close((ends[0] - ends[1]) / 2, (x.grad * step).sum(), rtol=1e-6, atol=1e-15)
 
 
 @EVERY

@@ -28,8 +28,8 @@ class Balls(GaussianModel):
     def condition(self, raw: Raw, query: Any) -> Conditioned:
         return Conditioned(raw["means"], raw["radii"].exp()[:, :, None] * torch.eye(3), torch.ones(len(raw["means"])))
 
-    def scales(self) -> Tensor:
-        return self.splats["radii"].detach()[:, 0].exp()
+    def spatial_scales(self) -> Tensor:
+        return self.splats["radii"].exp()
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         return {"means": raw["means"], "radii": raw["radii"] / SHRINK}

@@ -43,8 +43,8 @@ class Shaped(GatedModel):
     def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
         return {}
 
-    def scales(self) -> Tensor:
-        return torch.full((len(self),), 0.1)
+    def spatial_scales(self) -> Tensor:
+        return torch.full((len(self), 1), 0.1)
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         return raw

@@ -109,7 +109,7 @@ def test_a_model_that_is_not_known_starts_with_spheres() -> None:
         def condition(self, raw: Raw, query: Query) -> Conditioned:
             raise NotImplementedError
 
-        def scales(self) -> Tensor:
+        def spatial_scales(self) -> Tensor:
             raise NotImplementedError
 
         def split(self, raw: Raw, generator: torch.Generator) -> Raw:

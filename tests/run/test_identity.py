@@ -107,7 +107,8 @@ def test_every_key_is_of_training_or_of_measuring() -> None:
                 "start", "stop", "every", "rounds", "reset_every", "grad_threshold", "clone_below", "prune_above",
                 "max_gaussians", "thin_to", "noise", "kind")), "coarse",
                 "penalties.opacity.weight", "penalties.opacity.start", "penalties.opacity.stop",
-                "penalties.size.weight", "penalties.size.start", "penalties.size.stop")),
+                "penalties.size.weight", "penalties.size.start", "penalties.size.stop",
+                "penalties.strain.weight", "penalties.strain.start", "penalties.strain.stop")),
     }  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from gsbench.scenes.scene import Scene, View
 from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import rate_at
-from gsbench.train.penalties import PENALTIES, penalties_at
+from gsbench.train.penalties import PENALTIES
 from gsbench.train.seeding import generator
 from gsbench.train.step import Seen
 from gsbench.train.thinning import blend_weights
@@ -353,7 +353,8 @@ def test_penalties_act_in_their_window_and_reach_the_gradient() -> None:
     for step, acts in ((start - 2, False), (start - 1, True)):
         found = []
         for one in (plain, penalised):
-            one.gradients(one.scene.train[:2], penalties_at(step, one.config.train.penalties, one.schedule))
+            views = one.scene.train[:2]
+            one.gradients(views, one.penalties.at(step, views))
             found.append(one.model.splats["opacities"].grad)
         opacities = torch.sigmoid(plain.model.splats["opacities"].detach())
         expected = 3.0 * opacities * (1 - opacities) / len(opacities)

@@ -1,0 +1,238 @@
+"""The motion regulariser by hand, its gradient, its random numbers and neighbours, and how it is refused."""
+
+import copy
+import math
+from typing import Any
+
+import pytest
+import torch
+from models.small import seeded
+from train.test_wiring import trainer
+
+from gsbench.errors import InputError
+from gsbench.models import GaussianModel, Query, build
+from gsbench.models.freetime import FreeTimeModel
+from gsbench.run import setup
+from gsbench.scenes.scene import Points
+from gsbench.schedule import ActiveComponents
+from gsbench.stability.training_cases import compose
+from gsbench.train.penalties import strain
+from gsbench.train.penalties.strain import LEAST_DISTANCE, Strain
+
+FRAMES = 7
+QUERY = Query.at(torch.tensor([0.0, 0.0, -4.0], dtype=torch.float64), 0.5)
+TIMED: dict[str, dict[str, Any]] = {
+    "4dgs": {},
+    "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
+    "7dgs_nodir": {"lambda_t": 0.5},
+    "dgs": {},
+    "freetime": {},
+}
+WEIGHT = ("train.penalties.strain.weight=1.0", "train.batch_size=2")
+
+
+def moving(positions: torch.Tensor, velocities: torch.Tensor) -> FreeTimeModel:
+    """Gaussians that are at `positions` at time 1/2, all with the opacity factor 1 then, and move."""
+    model = FreeTimeModel(duration=0.1)
+    model.initialise(Points(positions.float(), positions.float()), 2.0, seeded(0))
+    model.double()
+    for name, value in (("means", positions), ("velocities", velocities), ("times", torch.full_like(positions, 0.5))):
+        model.splats[name].data = value[:, : model.splats[name].shape[1]].clone()
+    return model
+
+
+def prepared(model: GaussianModel, step: int = 0, seed: int = 0) -> Strain:
+    penalty = Strain(model, seed, FRAMES)
+    penalty.prepare(step, QUERY)
+    return penalty
+
+
+def grid(count: int = 12) -> torch.Tensor:
+    return torch.rand(count, 3, generator=seeded(1), dtype=torch.float64) * 2 - 1
+
+
+def test_only_a_translation_has_no_strain() -> None:
+    """Catches a penalty of motion itself, which holds a moving object still, or one that a rotation escapes."""
+    x = grid()
+    still = prepared(moving(x, torch.tensor([[0.3, -0.2, 0.9]], dtype=torch.float64).expand_as(x)))
+    assert still(QUERY, 0).detach() < 1e-25
+    turn = torch.stack([-x[:, 1], x[:, 0], torch.zeros_like(x[:, 0])], -1)
+    assert prepared(moving(x, turn))(QUERY, 0).detach() > 0.1
+
+
+def test_two_points_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a missing factor: of the time step, the frames, the distance, the weight, or the number of pairs."""
+    monkeypatch.setattr(strain, "NEIGHBOURS", 1)
+    x = torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [10, 0, 0], [10.5, 0, 0]], dtype=torch.float64)
+    v = torch.tensor([[0.0, 0.2, 0], [0, -0.1, 0], [1, 1, 1], [1, 1, 1]], dtype=torch.float64)
+    model = moving(x, v)
+    model.splats["times"].data[0] -= 0.1  # one standard deviation of its opacity
+    model.splats["means"].data[0] -= 0.1 * v[0]  # and yet in its place at t0
+    weight = math.sqrt(math.exp(-0.5))
+    expected = 2 * weight * 0.3**2 / (0.5**2 + (LEAST_DISTANCE * model.extent) ** 2) / 4
+    for index in range(3):
+        torch.testing.assert_close(float(prepared(model)(QUERY, index).detach()), expected)
+
+
+def started(name: str, agr: bool) -> GaussianModel:
+    """A model at its start, in float64."""
+    model, points = build(name, agr=agr, **TIMED[name]), grid(14).float()
+    model.initialise(Points(points, points), 2.0, seeded(0))
+    return model.double()
+
+
+def lively(name: str, agr: bool) -> GaussianModel:
+    """A model in mid-training, all of whose Gaussians can be seen."""
+    model, g = started(name, agr), seeded(2)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
+    model.splats["times"].data.fill_(0.1 if name == "dgs" else 0.55)
+    model.set_active(ActiveComponents(3, agr, True))
+    return model
+
+
+# dGS with AGR is left out: no gradient flows through its direction, which AGR changes.
+@pytest.mark.parametrize(
+    ("name", "agr"), [(name, agr) for name in TIMED for agr in (False, True) if (name, agr) != ("dgs", True)]
+)
+def test_the_gradient_is_that_of_the_velocities(name: str, agr: bool) -> None:
+    """Catches a gradient that is lost on its way through a model, or that flows through weights or distances."""
+    model = lively(name, agr)
+    penalty, asked = prepared(model), []
+    real = penalty._seen
+    penalty._seen = lambda query: asked.append(query) or real(query)  # type: ignore[method-assign, func-returns-value]
+    value = penalty(QUERY, 1)
+    value.backward()
+    neighbours, (now, later) = penalty.neighbours, asked
+    assert neighbours is not None
+    assert sorted(penalty.rows.tolist()) == list(range(len(model)))
+    pairs = neighbours.long()
+    means, visible = real(now)
+    distances = (means[:, None] - means[pairs]).square().sum(-1) + (LEAST_DISTANCE * model.extent) ** 2
+    factors = ((visible[:, None] * visible[pairs]).sqrt() / distances / pairs.numel()).detach()
+
+    def expected() -> torch.Tensor:
+        velocities = (real(later)[0] - real(now)[0]) / (later.time - now.time)
+        return (factors * (velocities[:, None] - velocities[pairs]).square().sum(-1)).sum().detach()
+
+    torch.testing.assert_close(value.detach(), expected())
+    learns = {key: x for key, x in model.named_parameters() if x.grad is not None and x.grad.any()}
+    assert any("refinement" in key for key in learns) == agr
+    assert "splats.opacities" not in learns
+    for x in learns.values():
+        assert x.grad is not None
+        step, ends = 1e-8 * torch.randn(x.shape, generator=seeded(3)).double(), []
+        for sign in (1, -1):
+            x.data += sign * step
+            ends.append(expected())
+            x.data -= sign * step
+        torch.testing.assert_close((ends[0] - ends[1]) / 2, (x.grad * step).sum(), rtol=1e-4, atol=1e-14)
+
+
+def test_what_is_culled_later_does_not_count() -> None:
+    """Catches the jump of a mean that is culled at t1, and so stays at mu_p, taken for a very large velocity."""
+    model = started("7dgs_nodir", False)
+    splats = {name: x.data for name, x in model.splats.items()}
+    splats["times"].fill_(0.5)
+    splats["times"][:3] -= 5e-5
+    splats["log_diagonal"][:3, model.rows["t"]] = math.log(1e-4)
+    splats["motion"][:3] = 1.0  # at t0, the mean is half a unit from mu_p
+    penalty = prepared(model)
+    later = Query(QUERY.center, QUERY.time + 0.1 / FRAMES)
+    assert penalty._seen(QUERY)[1].min() > 0.5
+    assert penalty._seen(later)[1][:3].max() == 0
+    assert (penalty._seen(later)[0] - penalty._seen(QUERY)[0])[:3].abs().min() > 0.4
+    value = penalty(QUERY, 0)
+    value.backward()
+    assert value == 0
+    assert all(x.grad is None or not x.grad.any() for x in model.splats.values())
+
+
+def test_draws_are_of_the_seed_the_step_and_the_view() -> None:
+    """Catches draws from a generator that threads share, and the same draw for all views."""
+    model = lively("freetime", True)
+    values = [float(prepared(model, step, seed)(QUERY, index).detach())
+              for seed, step, index in ((0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, 0))]  # fmt: skip
+    assert values[0] == values[4]
+    assert len(set(values)) == 4
+
+
+def test_neighbours_are_searched_again() -> None:
+    """Catches neighbours of rows that have moved to other indices, and ones that are never or always searched."""
+    fitted = trainer("freetime", *WEIGHT)
+    (penalty,) = fitted.penalties.made.values()
+    assert isinstance(penalty, Strain)
+    penalty.prepare(5, Query.at(QUERY.center.float(), 0.5))
+    first = penalty.neighbours
+    assert first is not None
+    itself = torch.arange(len(first))[:, None]
+    assert not (first == itself).any()
+    distances = torch.cdist(fitted.model.splats["means"].double(), fitted.model.splats["means"].double()).detach()
+    torch.testing.assert_close(distances.gather(1, first.long()), distances.sort().values[:, 1:9])
+    penalty.prepare(104, Query.at(QUERY.center.float(), 0.5))
+    assert penalty.neighbours is first
+    fitted.rows.select(torch.arange(len(first)).flip(0))
+    penalty.prepare(104, Query.at(QUERY.center.float(), 0.5))
+    assert penalty.neighbours is not None
+    assert torch.equal(penalty.neighbours.flip(0), len(first) - 1 - first)
+    second = penalty.neighbours
+    penalty.prepare(204, Query.at(QUERY.center.float(), 0.5))
+    assert penalty.neighbours is not second
+
+
+@pytest.mark.parametrize("place", ["few", "same"])
+def test_neighbours_at_the_edge(place: str) -> None:
+    """Catches an index beyond the Gaussians where there are too few, and a Gaussian that is its own neighbour."""
+    x = grid(8) if place == "few" else torch.zeros(30, 3, dtype=torch.float64)
+    penalty = prepared(moving(x, grid(len(x))))
+    assert penalty.neighbours is not None
+    assert not (penalty.neighbours == torch.arange(len(x))[:, None]).any()
+    assert penalty(QUERY, 0).detach() >= 0
+    assert (len(penalty.rows) == 0) == (place == "few")
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize("name", ["7dgs", "4dgs", "dgs"])
+def test_any_number_of_threads_gives_the_same_bits(name: str) -> None:
+    """Catches draws that depend on the order of threads, and gradients that threads add in any order."""
+    found = []
+    for count in (1, 2):
+        torch.set_num_threads(count)
+        fitted = trainer(name, *WEIGHT, "train.refine_from=0", "train.batch_size=3")
+        for fitted.step in range(6):
+            fitted._descend()
+        found.append((fitted.finite_check.loss, fitted.model.pack()))
+    assert found[0][0] == found[1][0]
+    assert all(torch.equal(x, found[1][1][key]) for key, x in found[0][1].items())
+    plain = trainer(name, "train.batch_size=3", "train.refine_from=0")
+    for plain.step in range(6):
+        plain._descend()
+    assert plain.finite_check.loss != found[0][0]
+
+
+def test_neighbours_continue_from_a_checkpoint() -> None:
+    """Catches neighbours that a resumed training searches anew, and gets others."""
+    words = (*WEIGHT, "train.densify.start=0", "train.densify.stop=20", "train.densify.every=10",
+             "train.iterations=40", "train.recipe_iterations=40")  # fmt: skip
+    whole, part = trainer("7dgs", *words), trainer("7dgs", *words)
+    whole.run(lambda _: None, "whole")
+    stops = iter([True] * 24 + [False])
+    part.run(lambda _: None, "part", lambda: next(stops))
+    state = copy.deepcopy(part.state_dict())
+    assert state["penalties"]["strain"]["searched"] == 20
+    resumed = trainer("7dgs", *words)
+    resumed.load_state_dict(state)
+    resumed.run(lambda _: None, "resumed")
+    for name, value in whole.model.pack().items():
+        assert torch.equal(value, resumed.model.pack()[name]), name
+    state["penalties"]["strain"]["neighbours"][0, 0] = len(part.model)
+    with pytest.raises(InputError, match="neighbours"):
+        trainer("7dgs", *words).load_state_dict(state)
+
+
+@pytest.mark.parametrize("name", ["3dgs", "6dgs"])
+def test_a_model_without_time_is_refused(name: str) -> None:
+    """Catches a penalty that is asked for and does nothing."""
+    with pytest.raises(InputError, match=r"train.penalties.strain: expected a model that observes time"):
+        setup.build(compose(name, 100, "train.penalties.strain.weight=0.1"))
