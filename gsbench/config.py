@@ -35,7 +35,8 @@ class SceneConfig:
 
     name: str = MISSING  # folder in data.root
     released_as: str | None = None  # folder in the published data, if another
-    downscale: int = 1  # divisor of the image size (area filter)
+    downscale: int = 1  # divisor of the image size
+    resize: str | None = None  # its filter; None: area; pillow: bicubic on 8 bits, as 3DGS
     eval_split: str = "test"  # or val (D-NeRF lego)
     frames: list[int] | None = None  # first and last frame (Technicolor); None: all
 
@@ -142,7 +143,7 @@ class RasterConfig:
 class ProtocolConfig:
     """Choose how results are measured."""
 
-    name: str = MISSING  # gsbench or published
+    name: str = MISSING  # gsbench, published or dgs2026
     quantise: bool = False  # measure renders rounded to 8 bits
     best_on_test: bool = False  # also record the best test PSNR (a leak)
     lpips_alex: str | None = None  # file of AlexNet's weights; None: in $TORCH_HOME/hub/checkpoints

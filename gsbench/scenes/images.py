@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -179,11 +180,13 @@ def composite(
     background: tuple[float, float, float],
     downscale: int,
     where: str,  # the file's path, for the message
+    resize: str | None = None,  # one of gsbench.scenes.RESIZES
 ) -> Tensor:  # [H / downscale, W / downscale, 3] float32 in [0, 1]
     """Composite an image with straight alpha over a background colour, then average blocks of downscale^2 pixels.
 
     The order matters: if colours and alpha were averaged separately, the arbitrary colours of transparent pixels would
-    show at silhouettes.
+    show at silhouettes. With `resize="pillow"` the composite is truncated to 8 bits and reduced by Pillow's bicubic
+    filter, as in the code of 3DGS and of methods derived from it.
 
     Raises:
         InputError: `downscale` does not divide the width and the height.
@@ -193,6 +196,10 @@ def composite(
         raise InputError(
             f"{where}: expected a downscale that divides the image, got downscale={downscale} for {width}x{height}"
         )
+    if resize == "pillow":
+        whole = Image.fromarray(_composite_8_bits(pixels, background))
+        reduced = whole.resize((width // downscale, height // downscale), Image.Resampling.BICUBIC)
+        return torch.from_numpy(np.array(reduced)).float() / 255
     values = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
     image: NDArray[Any] = values[..., :3]
     if pixels.shape[2] == 4:
@@ -201,6 +208,19 @@ def composite(
     if downscale > 1:  # with an integer factor INTER_AREA is the mean of each block
         image = cv2.resize(image, (width // downscale, height // downscale), interpolation=cv2.INTER_AREA)
     return torch.from_numpy(np.clip(image, 0, 1))  # float rounding may leave [0, 1] by an ulp
+
+
+def _composite_8_bits(
+    pixels: Pixels,  # [H, W, 3|4] RGB or RGBA, straight alpha
+    background: tuple[float, float, float],
+) -> NDArray[np.uint8]:  # [H, W, 3]
+    """Composite an image in double precision and truncate it to 8 bits; one channel at a time, to save memory."""
+    most = np.iinfo(pixels.dtype).max
+    alpha = pixels[..., 3] / most if pixels.shape[2] == 4 else np.float64(1)
+    composited = np.empty((*pixels.shape[:2], 3), np.uint8)
+    for channel, color in enumerate(background):
+        composited[..., channel] = (pixels[..., channel] / most * alpha + color * (1 - alpha)) * 255
+    return composited
 
 
 def _decode(data: bytes, where: str) -> NDArray[Any]:

@@ -34,7 +34,12 @@ class _Image:
 
 
 def load(
-    root: Path, *, downscale: int, background: tuple[float, float, float], frames: tuple[int, int] | None = None
+    root: Path,
+    *,
+    downscale: int,
+    background: tuple[float, float, float],
+    resize: str | None = None,
+    frames: tuple[int, int] | None = None,
 ) -> Scene:
     """Load a scene of the Technicolor light field data (Sabater et al. 2017).
 
@@ -47,6 +52,7 @@ def load(
         root: the folder of the scene.
         downscale: the integer factor by which images are reduced; with 1 they stay in 8 bits.
         background: the background colour of renders; the images of the data set are opaque.
+        resize: the filter by which images are reduced; None: the mean of blocks.
         frames: the first and the last frame to load; None: all frames.
 
     Raises:
@@ -60,7 +66,7 @@ def load(
         raise InputError(f"{source}: expected more than {TEST_CAMERA} cameras, number {TEST_CAMERA} is the test view, "
                          f"got {len(rows)}")  # fmt: skip
     listed = _list_images(root, frames, len(rows))
-    views, digests = _read_views(listed, rows, downscale)
+    views, digests = _read_views(listed, rows, downscale, resize)
     digests[CAMERAS] = files.digest(text)
     train = [view for image, view in zip(listed, views, strict=True) if image.camera != TEST_CAMERA]
     test = [view for image, view in zip(listed, views, strict=True) if image.camera == TEST_CAMERA]
@@ -148,7 +154,7 @@ def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> li
 
 
 def _read_views(
-    listed: list[_Image], rows: list[dict[str, float]], downscale: int
+    listed: list[_Image], rows: list[dict[str, float]], downscale: int, resize: str | None
 ) -> tuple[list[View], dict[str, str]]:
     """Read all images by several threads; return their views, and the SHA-256 of each file by name."""
     first, last = listed[0].frame, listed[-1].frame
@@ -165,7 +171,10 @@ def _read_views(
         if decoded.shape[2] != 3:
             raise InputError(f"{where}: expected an opaque RGB image, got one with alpha")
         is_kept = downscale == 1 and decoded.dtype.name == "uint8"
-        pixels = torch.from_numpy(decoded) if is_kept else images.composite(decoded, (0, 0, 0), downscale, where)
+        if is_kept:
+            pixels = torch.from_numpy(decoded)
+        else:
+            pixels = images.composite(decoded, (0, 0, 0), downscale, where, resize)
         time = (image.frame - first) / max(1, last - first)
         return View(image.path.stem, cameras[image.camera], time, pixels), files.digest(data)
 

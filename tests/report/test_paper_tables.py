@@ -10,6 +10,7 @@ from make_golden_paper import GOLDEN_1, GOLDEN_2, at_paper, records
 from gsbench.measure import record as files
 from gsbench.report import paper, table1
 from gsbench.report.__main__ import main
+from gsbench.report.conditions import conditions
 from gsbench.report.paper_protocol import departure, sort
 from gsbench.report.paper_tables import NAMES, write
 
@@ -60,6 +61,7 @@ def test_seconds_of_two_machines_are_never_averaged(tmp_path):
         ({"eval_split": "val"}, "split"),
         ({"background": "white"}, "background"),
         ({"quantise": True}, "quantisation"),
+        ({"resize": "pillow"}, "filter"),
         ({"frames": [0, 49]}, "frames"),
         ({"dataset": "mini"}, "data"),
         ({"scene": "invented"}, "scene"),
@@ -118,6 +120,20 @@ def test_another_recipe_has_its_own_row(tmp_path):
            at_paper(psnr=30.0, variant="best_on_test=true")], tmp_path)  # fmt: skip
     lines = pd.read_csv(tmp_path / "table1.csv", keep_default_na=False)
     assert lines[["recipe", "seeds", "psnr"]].values.tolist() == [["", 1, 30.0], ["recipe=paper", 1, 20.0]]
+
+
+def test_the_protocol_of_dgs_shares_no_mean_with_gsbenchs(tmp_path):
+    """Would catch runs on images of another filter as more seeds of one row, or in one table without a word."""
+    own = {"name": "dgs2026", "resize": "pillow", "quantise": True, "variant": "protocol=dgs2026"}
+    runs = [at_paper(seed=0), at_paper(seed=1, **own), at_paper(seed=2, batch_size=1)]
+    runs.append(at_paper(seed=3, batch_size=1, variant="protocol=published"))
+    assert [len(pool.runs) for pool in sort(runs).other_protocol] == [2]  # one pool is shown, the other is named
+    (left,) = sort(runs).left_out["D-NeRF"]
+    assert "400x400 by pillow" in left
+    write(runs, tmp_path)
+    assert pd.read_csv(tmp_path / "table1.csv")["seeds"].tolist() == [1, 2]
+    said = conditions([at_paper(), at_paper(seed=1, **{**own, "variant": ""})])
+    assert any("WARNING: the rows differ in resize: area" in line and "pillow" in line for line in said)
 
 
 def test_only_the_pool_nearest_to_the_paper_is_shown():
