@@ -23,6 +23,7 @@ class DataConfig:
     root: str = MISSING  # folder of the scenes' folders, or pkg://MODULE
     published: str = ""  # where to get the data
     scenes: list[str] = field(default_factory=list)  # scenes of scene=all
+    repair: list[str] | None = None  # damaged images replaced by the frame before (Technicolor)
     background: str = "black"  # or white: background of images
     initial_lambda: float = 0.5  # initial lambda_t and lambda_d of 7DGS
     initial_points: int = 100_000  # random points, if the data have none

@@ -10,7 +10,7 @@ from gsbench.report.configurations import without
 
 WARNING = "WARNING"
 MOST_RUNS_NAMED = 3
-_UNSAID = {"resize": "area"}  # what a record means that lacks a part of its protocol
+_UNSAID = {"resize": "area", "repaired": "none"}  # what a record means that lacks a part of its protocol
 SPREAD = (
     "± is half the width of the 95 % interval over seeds (Student's t; of these scenes and views); one seed has none"
 )

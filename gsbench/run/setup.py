@@ -50,5 +50,6 @@ def load_scene(config: Config) -> Scene:
         resize=chosen.resize,
         background=background,
         frames=chosen.frames,
+        repair=config.data.repair,
     )
     return scene.to(config.device)

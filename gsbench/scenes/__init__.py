@@ -5,6 +5,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent
@@ -46,6 +47,7 @@ def load(
     resize: str | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     frames: Sequence[int] | None = None,
+    repair: Sequence[str] | None = None,
 ) -> Scene:
     """Load a scene from a folder in the Blender layout (NeRF-synthetic, D-NeRF) or the Technicolor layout.
 
@@ -59,6 +61,7 @@ def load(
             to 8 bits and reduces it by Pillow's bicubic filter, as in the code of 3DGS.
         background: the background colour, RGB in [0, 1].
         frames: the first and the last frame, for a layout with numbered frames; None: all.
+        repair: names of damaged images, each replaced by the frame before of its camera, for the same layout.
 
     Raises:
         InputError: the layout is unknown, or the data has an error; the message names the file and field.
@@ -85,7 +88,8 @@ def load(
     root = _folder(path)
     for layout in _LAYOUTS:
         if os.path.lexists(root / layout.marker):
-            more = {} if frames is None else {"frames": _frames(frames, layout)}
+            more: dict[str, Any] = {} if frames is None else {"frames": _frames(frames, layout)}
+            more |= {} if repair is None else {"repair": _repair(repair, layout)}
             reader = importlib.import_module(f"gsbench.scenes.{layout.reader}")
             scene: Scene = reader.load(root, downscale=downscale, background=background, resize=resize, **more)
             return scene
@@ -103,6 +107,15 @@ def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
     if not 0 <= frames[0] <= frames[1]:
         raise InputError(f"frames: expected 0 <= first <= last, got {frames!r:.80}")
     return frames[0], frames[1]
+
+
+def _repair(names: object, layout: _Layout) -> tuple[str, ...]:
+    """Check and return the names of images to replace; raise InputError for a layout without frames."""
+    if layout.reader != "technicolor":
+        raise InputError(f"repair: {layout.marker} has no frame before an image, got {names!r:.80}: leave it out")
+    if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"repair: expected names such as Birthday_undist_00173_09, got {names!r:.80}")
+    return tuple(names)
 
 
 def _folder(path: object) -> Path:

@@ -22,6 +22,10 @@ from gsbench.reading import read_file
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 
+class DamagedError(InputError):
+    """The bytes of a file are not those of a whole PNG."""
+
+
 class Kind(NamedTuple):
     """Describe the colour types and bit depths of PNG files that are accepted."""
 
@@ -70,7 +74,7 @@ def png_size(
         InputError: the data is not a PNG, is damaged, has zero or too many pixels, or an unexpected colour type.
     """
     if not data.startswith(_SIGNATURE):
-        raise InputError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
+        raise DamagedError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
     size = (0, 0)
     at = len(_SIGNATURE)
     while True:
@@ -78,12 +82,12 @@ def png_size(
         length, name = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
         body, checksum = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
         if len(checksum) < 4:
-            raise InputError(f"{where}: truncated PNG, it ends at byte {len(data)} before its IEND: copy it again")
+            raise DamagedError(f"{where}: truncated PNG, it ends at byte {len(data)} before its IEND: copy it again")
         if zlib.crc32(name + body) != int.from_bytes(checksum, "big"):
-            raise InputError(f"{where}: damaged PNG, wrong checksum of chunk {name!r} at byte {at}: copy it again")
+            raise DamagedError(f"{where}: damaged PNG, wrong checksum of chunk {name!r} at byte {at}: copy it again")
         if at == len(_SIGNATURE):
             if name != b"IHDR" or length != 13:
-                raise InputError(f"{where}: damaged PNG, its first chunk is {name!r} and not IHDR: copy it again")
+                raise DamagedError(f"{where}: damaged PNG, its first chunk is {name!r} and not IHDR: copy it again")
             size = _check_header(body, where, kind)
         if name == b"IEND":
             return size
@@ -230,9 +234,9 @@ def _decode(data: bytes, where: str) -> NDArray[Any]:
     except cv2.error as error:
         if error.code == cv2.Error.StsNoMem:
             raise MemoryError(f"{where}: OpenCV has none for its pixels") from None
-        raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again") from error
+        raise DamagedError(f"{where}: OpenCV cannot decode this PNG: copy or render it again") from error
     if pixels is None:
-        raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again")
+        raise DamagedError(f"{where}: OpenCV cannot decode this PNG: copy or render it again")
     return pixels
 
 
@@ -246,5 +250,5 @@ def _check_header(header: bytes, where: str, kind: Kind) -> tuple[int, int]:
     if depth not in kind.depths.get(color, ()):
         raise InputError(f"{where}: expected {kind.words}, got PNG's colour type {color} of {depth} bits")
     if compression or filtering or interlacing > 1:
-        raise InputError(f"{where}: damaged PNG, its compression, filter or interlacing is unknown: copy it again")
+        raise DamagedError(f"{where}: damaged PNG, its compression, filter or interlacing is unknown: copy it again")
     return width, height
