@@ -23,6 +23,7 @@ class DataConfig:
     root: str = MISSING  # folder of the scenes' folders, or pkg://MODULE
     published: str = ""  # where to get the data
     scenes: list[str] = field(default_factory=list)  # scenes of scene=all
+    repair: list[str] | None = None  # damaged images replaced by the frame before (Technicolor)
     background: str = "black"  # or white: background of images
     initial_lambda: float = 0.5  # initial lambda_t and lambda_d of 7DGS
     initial_points: int = 100_000  # random points, if the data have none
@@ -35,7 +36,8 @@ class SceneConfig:
 
     name: str = MISSING  # folder in data.root
     released_as: str | None = None  # folder in the published data, if another
-    downscale: int = 1  # divisor of the image size (area filter)
+    downscale: int = 1  # divisor of the image size
+    resize: str | None = None  # its filter; None: area; pillow: bicubic on 8 bits, as 3DGS
     eval_split: str = "test"  # or val (D-NeRF lego)
     frames: list[int] | None = None  # first and last frame (Technicolor); None: all
 
@@ -143,7 +145,7 @@ class RasterConfig:
 class ProtocolConfig:
     """Choose how results are measured."""
 
-    name: str = MISSING  # gsbench or published
+    name: str = MISSING  # gsbench, published or dgs2026
     quantise: bool = False  # measure renders rounded to 8 bits
     best_on_test: bool = False  # also record the best test PSNR (a leak)
     lpips_alex: str | None = None  # file of AlexNet's weights; None: in $TORCH_HOME/hub/checkpoints

@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("results", type=Path, metavar="RESULTS_DIR", help="a folder with records, at any depth")
     parser.add_argument("--train", action="store_true", help="also PSNR on training views: the gap is overfitting")
     either = parser.add_mutually_exclusive_group()
-    either.add_argument("--tables", action="store_true", help="only Tables 1 and 2 of the paper: table1.* and table2.*")
+    either.add_argument("--tables", action="store_true", help="only table1.*, table2.* and table_successors.*")
     either.add_argument("--live", action="store_true", help="write again whenever a record arrives, until Ctrl-C")
     either.add_argument("--publish", type=Path, metavar="DIR", help="copy the records to DIR, and write its table anew")
     parser.add_argument("--against", type=Path, metavar="DIR", help="compare with the records in DIR; 1 if they differ")

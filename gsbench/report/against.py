@@ -23,7 +23,8 @@ from gsbench.report.configurations import OF_THE_MACHINE, QUANTITIES
 from gsbench.report.intervals import LEVEL, Estimate, Spread, holm
 
 AGREES, DIFFERS, UNTOLD = "agrees", "differs", "cannot be told"
-MEASURING = ("eval_split", "quantise", "resolution", "background", "downscale")  # settings of a run's evaluation
+# Settings of a run's evaluation.
+MEASURING = ("eval_split", "quantise", "resolution", "background", "downscale", "resize")
 SAME_LOAD = 0.5  # if the mean loads of two machines differ more, times are not compared
 
 

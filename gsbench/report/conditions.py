@@ -10,6 +10,7 @@ from gsbench.report.configurations import without
 
 WARNING = "WARNING"
 MOST_RUNS_NAMED = 3
+_UNSAID = {"resize": "area", "repaired": "none"}  # what a record means that lacks a part of its protocol
 SPREAD = (
     "± is half the width of the 95 % interval over seeds (Student's t; of these scenes and views); one seed has none"
 )
@@ -65,7 +66,7 @@ def _stated(records: list[Record], spread: str) -> list[str]:
 
 
 def _protocol(record: Record, name: str) -> str:
-    return printable(record.protocol.get(name, "not recorded"))
+    return printable(record.protocol.get(name, _UNSAID.get(name, "not recorded")))
 
 
 def _iterations(record: Record) -> str:

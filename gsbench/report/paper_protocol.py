@@ -13,7 +13,8 @@ from gsbench.report.paper import PROTOCOLS
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
 # Settings of a variant that do not belong to a model's training settings: they change what is measured, or the heading
 # of a table names them.
-_NOT_OF_THE_RECIPE = ("iterations", "downscale", "eval_split", "protocol", "best_on_test", "curve_points")
+_NOT_OF_THE_RECIPE = ("iterations", "downscale", "eval_split", "best_on_test", "curve_points")
+_SAME_TRAINING = "protocol=published"  # only adds the best on test
 
 
 class ModelRecipe(NamedTuple):
@@ -37,7 +38,8 @@ class Pool:
     def heading(self) -> str:
         """Return a heading with the data set, the experiment, the image sizes and the training length of these runs."""
         sizes = ", ".join(sorted({_size(r) for r in self.runs}))
-        return f"{self.dataset}: experiment {self.experiment}, {sizes}, {self.steps:,} iterations"
+        resized = f" by {resize}" if (resize := self.runs[0].protocol.get("resize")) else ""
+        return f"{self.dataset}: experiment {self.experiment}, {sizes}{resized}, {self.steps:,} iterations"
 
     @property
     def effort(self) -> int:
@@ -65,7 +67,7 @@ def sort(records: list[Record]) -> Sorted:
     not one of the five in MODELS, or if its data neither belong to the paper nor stand in for its data.
     """
     at_paper: dict[str, list[Record]] = {name: [] for name in PROTOCOLS}
-    pools: dict[tuple[str, str, str, str, int], Pool] = {}  # by downscaling, as image sizes differ between scenes
+    pools: dict[tuple[str, str, str, str, str, int], Pool] = {}  # by downscaling, as image sizes differ between scenes
     for r in records:
         named = r.protocol.get("paper_dataset")
         if not isinstance(named, str) or named not in PROTOCOLS or r.model not in MODELS:
@@ -74,7 +76,8 @@ def sort(records: list[Record]) -> Sorted:
             at_paper[named].append(r)
             continue
         steps = iterations(r) or 0
-        key = named, r.dataset, r.experiment, str(r.protocol.get("downscale")), steps
+        reduced = str(r.protocol.get("downscale")), str(r.protocol.get("resize"))
+        key = named, r.dataset, r.experiment, *reduced, steps
         pools.setdefault(key, Pool(r.dataset, r.experiment, steps)).runs.append(r)
     nearest: dict[tuple[str, str], Pool] = {}
     for (named, dataset, *_), pool in sorted(pools.items(), key=lambda one: (-one[1].effort, one[0])):
@@ -103,6 +106,7 @@ def departure(record: Record) -> str:
     config = record.provenance.config
     expected: dict[str, tuple[Any, Any]] = {
         "size": (record.protocol.get("resolution"), protocol.sizes.get(record.scene, protocol.sizes["*"])),
+        "filter": (record.protocol.get("resize"), None),
         "iterations": (iterations(record), protocol.iterations),
         "batch size": (_part(config, "train").get("batch_size"), protocol.batch_size),
         "split": (record.protocol.get("eval_split"), protocol.splits.get(record.scene, protocol.splits["*"])),
@@ -117,7 +121,8 @@ def departure(record: Record) -> str:
 
 def model_recipe(record: Record) -> ModelRecipe:
     """Return the model, the experiment and the training settings of a run, which determine its table row."""
-    return ModelRecipe(record.model, record.experiment, without(record.variant, *_NOT_OF_THE_RECIPE))
+    words = without(record.variant, *_NOT_OF_THE_RECIPE).split(",")
+    return ModelRecipe(record.model, record.experiment, ",".join(word for word in words if word != _SAME_TRAINING))
 
 
 def model_recipes(records: list[Record]) -> list[ModelRecipe]:

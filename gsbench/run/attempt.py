@@ -129,6 +129,8 @@ class Attempt:
                 "quantise": config.protocol.quantise,
                 "backend": self.model.backend.name if self.model else config.raster.backend,
                 "paper_dataset": config.data.paper_dataset,
+                **({} if config.scene.resize is None else {"resize": config.scene.resize}),
+                **({"repaired": ", ".join(scene.repaired)} if scene and scene.repaired else {}),
             },
             provenance=provenance(
                 config=this.plain,

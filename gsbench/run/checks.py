@@ -20,7 +20,7 @@ from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
 from gsbench.models.gated import as_gated
 from gsbench.run.identity import hash_of
-from gsbench.scenes import Scene, View
+from gsbench.scenes import RESIZES, Scene, View
 from gsbench.scenes.trained import TrainedGaussians, read_trained
 from gsbench.train.densify import check_kind
 from gsbench.train.gating import GATES
@@ -82,6 +82,8 @@ def check_values(config: Config) -> None:
     """Raise InputError if a setting is invalid on every machine, for instance out of its range."""
     check_keys(config, Config, "")
     _check_choice("data.background", config.data.background, BACKGROUNDS)
+    if config.scene.resize is not None:
+        _check_choice("scene.resize", config.scene.resize, RESIZES)
     _check_choice("scene.eval_split", config.scene.eval_split, SPLITS)
     _check_choice("optim", config.optim, OPTIMIZERS)
     _check_choice("effects.gate", config.effects.gate, GATES)

@@ -46,5 +46,12 @@ def load_scene(config: Config) -> Scene:
     """
     background = BACKGROUNDS[config.data.background]
     chosen = config.scene
-    scene = scenes.load(scene_folder(config), downscale=chosen.downscale, background=background, frames=chosen.frames)
+    scene = scenes.load(
+        scene_folder(config),
+        downscale=chosen.downscale,
+        resize=chosen.resize,
+        background=background,
+        frames=chosen.frames,
+        repair=config.data.repair,
+    )
     return scene.to(config.device)

@@ -5,11 +5,14 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, did_you_mean
 from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent
 
-__all__ = ["Camera", "Points", "Scene", "View", "load", "scene_extent"]
+RESIZES = ("pillow",)  # filters by which images can be reduced, besides the mean of blocks
+
+__all__ = ["RESIZES", "Camera", "Points", "Scene", "View", "load", "scene_extent"]
 
 
 @dataclass(frozen=True)
@@ -18,7 +21,7 @@ class _Layout:
 
     marker: str
     expected: str  # the files of the layout and where such data is published, for the error message
-    reader: str  # module of this package with load(root, *, downscale, background); imported when it is needed
+    reader: str  # module of this package with load(root, *, downscale, background, resize); imported when it is needed
 
 
 _LAYOUTS = (
@@ -41,8 +44,10 @@ def load(
     path: str | Path,
     *,
     downscale: int = 1,
+    resize: str | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     frames: Sequence[int] | None = None,
+    repair: Sequence[str] | None = None,
 ) -> Scene:
     """Load a scene from a folder in the Blender layout (NeRF-synthetic, D-NeRF) or the Technicolor layout.
 
@@ -52,8 +57,11 @@ def load(
     Args:
         path: the folder of the scene.
         downscale: the integer factor by which images are reduced; it must divide their size.
+        resize: the filter by which they are reduced. None averages blocks of pixels; "pillow" truncates the composite
+            to 8 bits and reduces it by Pillow's bicubic filter, as in the code of 3DGS.
         background: the background colour, RGB in [0, 1].
         frames: the first and the last frame, for a layout with numbered frames; None: all.
+        repair: names of damaged images, each replaced by the frame before of its camera, for the same layout.
 
     Raises:
         InputError: the layout is unknown, or the data has an error; the message names the file and field.
@@ -72,15 +80,18 @@ def load(
     """
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
         raise InputError(f"downscale: expected a whole number of at least 1, got {downscale!r:.80}")
+    if resize is not None and resize not in RESIZES:
+        raise InputError(f"resize '{resize!s:.80}' is not known. {did_you_mean(str(resize), RESIZES)}")
     numbers = isinstance(background, tuple | list) and all(isinstance(value, int | float) for value in background)
     if not numbers or len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise InputError(f"background: expected three numbers in [0, 1], got {background!r:.80}")
     root = _folder(path)
     for layout in _LAYOUTS:
         if os.path.lexists(root / layout.marker):
-            more = {} if frames is None else {"frames": _frames(frames, layout)}
+            more: dict[str, Any] = {} if frames is None else {"frames": _frames(frames, layout)}
+            more |= {} if repair is None else {"repair": _repair(repair, layout)}
             reader = importlib.import_module(f"gsbench.scenes.{layout.reader}")
-            scene: Scene = reader.load(root, downscale=downscale, background=background, **more)
+            scene: Scene = reader.load(root, downscale=downscale, background=background, resize=resize, **more)
             return scene
     found = "a folder without it" if root.is_dir() else "no such folder"
     layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
@@ -96,6 +107,15 @@ def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
     if not 0 <= frames[0] <= frames[1]:
         raise InputError(f"frames: expected 0 <= first <= last, got {frames!r:.80}")
     return frames[0], frames[1]
+
+
+def _repair(names: object, layout: _Layout) -> tuple[str, ...]:
+    """Check and return the names of images to replace; raise InputError for a layout without frames."""
+    if layout.reader != "technicolor":
+        raise InputError(f"repair: {layout.marker} has no frame before an image, got {names!r:.80}: leave it out")
+    if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"repair: expected names such as Birthday_undist_00173_09, got {names!r:.80}")
+    return tuple(names)
 
 
 def _folder(path: object) -> Path:

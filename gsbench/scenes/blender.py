@@ -72,7 +72,7 @@ class _Split:
     digest: str
 
 
-def load(root: Path, *, downscale: int, background: tuple[float, float, float]) -> Scene:
+def load(root: Path, *, downscale: int, background: tuple[float, float, float], resize: str | None = None) -> Scene:
     """Load a scene in the Blender layout; see `gsbench.scenes.load` for the arguments.
 
     Each file transforms_{train,val,test}.json has
@@ -95,7 +95,7 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float]) 
     if os.path.lexists(root / "transforms_val.json"):  # a broken link is an error, not a data set without val
         splits["val"] = _read_split(root, "val")
     _check_times(splits)
-    views, digests = _read_views(root, splits, downscale, background)
+    views, digests = _read_views(root, splits, downscale, background, resize)
     digests |= {split.source.name: split.digest for split in splits.values()}
     return Scene(
         name=name,
@@ -213,7 +213,11 @@ def _check_times(splits: dict[str, _Split]) -> None:
 
 
 def _read_views(
-    root: Path, splits: dict[str, _Split], downscale: int, background: tuple[float, float, float]
+    root: Path,
+    splits: dict[str, _Split],
+    downscale: int,
+    background: tuple[float, float, float],
+    resize: str | None,
 ) -> tuple[dict[str, list[View]], dict[str, str]]:
     """Read all images by several threads.
 
@@ -226,7 +230,7 @@ def _read_views(
     first = listed[0][1]
     data = images.read_png(first.path, first.where)
     expected = images.png_size(data, first.where)
-    in_8_bits = images.stays_in_8_bits(data, expected, len(listed), downscale)
+    in_8_bits = resize is None and images.stays_in_8_bits(data, expected, len(listed), downscale)
 
     def read(entry: tuple[_Split, _Frame]) -> tuple[View, str]:
         split, frame = entry
@@ -234,7 +238,10 @@ def _read_views(
         _check_size(images.png_size(data, frame.where), expected, split, frame)
         decoded = images.decode_png(data, frame.where)
         is_kept = in_8_bits and decoded.dtype.name == "uint8"
-        image = torch.from_numpy(decoded) if is_kept else images.composite(decoded, background, downscale, frame.where)
+        if is_kept:
+            image = torch.from_numpy(decoded)
+        else:
+            image = images.composite(decoded, background, downscale, frame.where, resize)
         camera = Camera(frame.viewmat, split.intrinsics.matrix(*expected, downscale), image.shape[1], image.shape[0])
         alpha = None if is_kept else images.alpha_of(decoded, downscale)
         regions = None if frame.mask is None else _read_mask(root, frame, expected, downscale)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -19,6 +20,10 @@ from gsbench.process.memory import available, require
 from gsbench.reading import read_file
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+class DamagedError(InputError):
+    """The bytes of a file are not those of a whole PNG."""
 
 
 class Kind(NamedTuple):
@@ -69,7 +74,7 @@ def png_size(
         InputError: the data is not a PNG, is damaged, has zero or too many pixels, or an unexpected colour type.
     """
     if not data.startswith(_SIGNATURE):
-        raise InputError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
+        raise DamagedError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
     size = (0, 0)
     at = len(_SIGNATURE)
     while True:
@@ -77,12 +82,12 @@ def png_size(
         length, name = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
         body, checksum = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
         if len(checksum) < 4:
-            raise InputError(f"{where}: truncated PNG, it ends at byte {len(data)} before its IEND: copy it again")
+            raise DamagedError(f"{where}: truncated PNG, it ends at byte {len(data)} before its IEND: copy it again")
         if zlib.crc32(name + body) != int.from_bytes(checksum, "big"):
-            raise InputError(f"{where}: damaged PNG, wrong checksum of chunk {name!r} at byte {at}: copy it again")
+            raise DamagedError(f"{where}: damaged PNG, wrong checksum of chunk {name!r} at byte {at}: copy it again")
         if at == len(_SIGNATURE):
             if name != b"IHDR" or length != 13:
-                raise InputError(f"{where}: damaged PNG, its first chunk is {name!r} and not IHDR: copy it again")
+                raise DamagedError(f"{where}: damaged PNG, its first chunk is {name!r} and not IHDR: copy it again")
             size = _check_header(body, where, kind)
         if name == b"IEND":
             return size
@@ -179,11 +184,13 @@ def composite(
     background: tuple[float, float, float],
     downscale: int,
     where: str,  # the file's path, for the message
+    resize: str | None = None,  # one of gsbench.scenes.RESIZES
 ) -> Tensor:  # [H / downscale, W / downscale, 3] float32 in [0, 1]
     """Composite an image with straight alpha over a background colour, then average blocks of downscale^2 pixels.
 
     The order matters: if colours and alpha were averaged separately, the arbitrary colours of transparent pixels would
-    show at silhouettes.
+    show at silhouettes. With `resize="pillow"` the composite is truncated to 8 bits and reduced by Pillow's bicubic
+    filter, as in the code of 3DGS and of methods derived from it.
 
     Raises:
         InputError: `downscale` does not divide the width and the height.
@@ -193,6 +200,10 @@ def composite(
         raise InputError(
             f"{where}: expected a downscale that divides the image, got downscale={downscale} for {width}x{height}"
         )
+    if resize == "pillow":
+        whole = Image.fromarray(_composite_8_bits(pixels, background))
+        reduced = whole.resize((width // downscale, height // downscale), Image.Resampling.BICUBIC)
+        return torch.from_numpy(np.array(reduced)).float() / 255
     values = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
     image: NDArray[Any] = values[..., :3]
     if pixels.shape[2] == 4:
@@ -203,6 +214,19 @@ def composite(
     return torch.from_numpy(np.clip(image, 0, 1))  # float rounding may leave [0, 1] by an ulp
 
 
+def _composite_8_bits(
+    pixels: Pixels,  # [H, W, 3|4] RGB or RGBA, straight alpha
+    background: tuple[float, float, float],
+) -> NDArray[np.uint8]:  # [H, W, 3]
+    """Composite an image in double precision and truncate it to 8 bits; one channel at a time, to save memory."""
+    most = np.iinfo(pixels.dtype).max
+    alpha = pixels[..., 3] / most if pixels.shape[2] == 4 else np.float64(1)
+    composited = np.empty((*pixels.shape[:2], 3), np.uint8)
+    for channel, color in enumerate(background):
+        composited[..., channel] = (pixels[..., channel] / most * alpha + color * (1 - alpha)) * 255
+    return composited
+
+
 def _decode(data: bytes, where: str) -> NDArray[Any]:
     """Decode a checked PNG with OpenCV; raise InputError if OpenCV fails."""
     try:
@@ -210,9 +234,9 @@ def _decode(data: bytes, where: str) -> NDArray[Any]:
     except cv2.error as error:
         if error.code == cv2.Error.StsNoMem:
             raise MemoryError(f"{where}: OpenCV has none for its pixels") from None
-        raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again") from error
+        raise DamagedError(f"{where}: OpenCV cannot decode this PNG: copy or render it again") from error
     if pixels is None:
-        raise InputError(f"{where}: OpenCV cannot decode this PNG: copy or render it again")
+        raise DamagedError(f"{where}: OpenCV cannot decode this PNG: copy or render it again")
     return pixels
 
 
@@ -226,5 +250,5 @@ def _check_header(header: bytes, where: str, kind: Kind) -> tuple[int, int]:
     if depth not in kind.depths.get(color, ()):
         raise InputError(f"{where}: expected {kind.words}, got PNG's colour type {color} of {depth} bits")
     if compression or filtering or interlacing > 1:
-        raise InputError(f"{where}: damaged PNG, its compression, filter or interlacing is unknown: copy it again")
+        raise DamagedError(f"{where}: damaged PNG, its compression, filter or interlacing is unknown: copy it again")
     return width, height

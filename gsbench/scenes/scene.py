@@ -88,6 +88,7 @@ class Scene:
     extent: float  # 1.1 x the radius of the training cameras around their mean (3DGS, getNerfppNorm)
     points: Points | None  # None: the data set has no points
     fingerprint: str  # SHA-256 of the files, by which record.json identifies the data
+    repaired: tuple[str, ...] = ()  # names of damaged images that were replaced by the frame before
 
     @property
     def has_time(self) -> bool:

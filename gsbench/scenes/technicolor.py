@@ -2,6 +2,7 @@
 
 import math
 import re
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +35,13 @@ class _Image:
 
 
 def load(
-    root: Path, *, downscale: int, background: tuple[float, float, float], frames: tuple[int, int] | None = None
+    root: Path,
+    *,
+    downscale: int,
+    background: tuple[float, float, float],
+    resize: str | None = None,
+    frames: tuple[int, int] | None = None,
+    repair: tuple[str, ...] = (),
 ) -> Scene:
     """Load a scene of the Technicolor light field data (Sabater et al. 2017).
 
@@ -47,10 +54,14 @@ def load(
         root: the folder of the scene.
         downscale: the integer factor by which images are reduced; with 1 they stay in 8 bits.
         background: the background colour of renders; the images of the data set are opaque.
+        resize: the filter by which images are reduced; None: the mean of blocks.
         frames: the first and the last frame to load; None: all frames.
+        repair: names of damaged images, such as Birthday_undist_00173_09, each replaced by the image of the same camera
+            one frame before. Names of other scenes are ignored, so that the scenes of a data set can share a list.
 
     Raises:
-        InputError: something is missing, damaged or contradictory; the message names the file.
+        InputError: something is missing, damaged or contradictory; the message names the file. An image in `repair` is
+            whole, is not loaded, is one of the test camera, or the image before it is missing or damaged too.
     """
     root = root.resolve()
     source = root / CAMERAS
@@ -60,7 +71,10 @@ def load(
         raise InputError(f"{source}: expected more than {TEST_CAMERA} cameras, number {TEST_CAMERA} is the test view, "
                          f"got {len(rows)}")  # fmt: skip
     listed = _list_images(root, frames, len(rows))
-    views, digests = _read_views(listed, rows, downscale)
+    replaced = _replacements(repair, listed)
+    views, digests = _read_views(listed, replaced, rows, downscale, resize)
+    for image, before in replaced.items():
+        print(f"{image.path}: damaged, replaced by {before.path.name} (data.repair)", file=sys.stderr)
     digests[CAMERAS] = files.digest(text)
     train = [view for image, view in zip(listed, views, strict=True) if image.camera != TEST_CAMERA]
     test = [view for image, view in zip(listed, views, strict=True) if image.camera == TEST_CAMERA]
@@ -73,6 +87,7 @@ def load(
         extent=scene_extent(torch.stack([view.camera.viewmat for view in train])),
         points=_points(root),
         fingerprint=files.fingerprint(digests),
+        repaired=tuple(image.path.stem for image in replaced),
     )
 
 
@@ -147,10 +162,41 @@ def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> li
     return [_Image(found[frame, camera], frame, camera) for frame in numbers for camera in range(cameras)]
 
 
+def _replacements(names: tuple[str, ...], listed: list[_Image]) -> dict[_Image, _Image]:
+    """Return the image that replaces each named image of this scene: that of the same camera, one frame before."""
+    found = {(image.frame, image.camera): image for image in listed}
+    scene = IMAGE.fullmatch(listed[0].path.name)
+    replaced = {}
+    for name in names:
+        parts = IMAGE.fullmatch(f"{name.removesuffix('.png')}.png")
+        if parts is None:
+            raise InputError(f"data.repair: expected names such as Birthday_undist_00173_09, got {name!a:.80}")
+        if scene is None or parts["scene"] != scene["scene"]:
+            continue
+        frame, camera = int(parts["frame"]), int(parts["camera"])
+        if (frame, camera) not in found:
+            raise InputError(f"data.repair: expected an image that is loaded, got {name!a:.80}: leave it out")
+        if camera == TEST_CAMERA:
+            raise InputError(f"data.repair: expected a training image, {name} is a test image, and a test needs the "
+                             "true one: choose other scene.frames")  # fmt: skip
+        if (frame - 1, camera) not in found:
+            raise InputError(f"data.repair: {name}: expected the image of its camera in frame {frame - 1}, it is not "
+                             "loaded: choose other scene.frames")  # fmt: skip
+        replaced[found[frame, camera]] = found[frame - 1, camera]
+    return replaced
+
+
 def _read_views(
-    listed: list[_Image], rows: list[dict[str, float]], downscale: int
+    listed: list[_Image],
+    replaced: dict[_Image, _Image],
+    rows: list[dict[str, float]],
+    downscale: int,
+    resize: str | None,
 ) -> tuple[list[View], dict[str, str]]:
-    """Read all images by several threads; return their views, and the SHA-256 of each file by name."""
+    """Read all images by several threads; return their views, and the SHA-256 of each file by name.
+
+    The name of a damaged image that is replaced also says by which image, so that a fingerprint tells it.
+    """
     first, last = listed[0].frame, listed[-1].frame
     where = str(listed[0].path)
     size = images.png_size(images.read_png(listed[0].path, where), where)
@@ -159,13 +205,17 @@ def _read_views(
     def read(image: _Image) -> tuple[View, str]:
         where = str(image.path)
         data = images.read_png(image.path, where)
-        if images.png_size(data, where) != size:
-            raise InputError(f"{where}: expected {size[0]}x{size[1]} as the first image, got another size")
-        decoded = images.decode_png(data, where)
-        if decoded.shape[2] != 3:
-            raise InputError(f"{where}: expected an opaque RGB image, got one with alpha")
+        if image in replaced:
+            _check_damaged(data, image)
+            before = replaced[image].path
+            decoded = _decode(images.read_png(before, str(before)), before, size)
+        else:
+            decoded = _decode_or_advise(data, image, size)
         is_kept = downscale == 1 and decoded.dtype.name == "uint8"
-        pixels = torch.from_numpy(decoded) if is_kept else images.composite(decoded, (0, 0, 0), downscale, where)
+        if is_kept:
+            pixels = torch.from_numpy(decoded)
+        else:
+            pixels = images.composite(decoded, (0, 0, 0), downscale, where, resize)
         time = (image.frame - first) / max(1, last - first)
         return View(image.path.stem, cameras[image.camera], time, pixels), files.digest(data)
 
@@ -173,8 +223,39 @@ def _read_views(
     threads = images.count_readers(size, len(listed), downscale, where, kept)
     with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
         read_all = list(pool.map(read, listed))
-    digests = {image.path.name: digest for image, (_, digest) in zip(listed, read_all, strict=True)}
+    names = [f"{i.path.name} replaced by {replaced[i].path.name}" if i in replaced else i.path.name for i in listed]
+    digests = {name: digest for name, (_, digest) in zip(names, read_all, strict=True)}
     return [view for view, _ in read_all], digests
+
+
+def _decode(data: bytes, path: Path, size: tuple[int, int]) -> images.Pixels:
+    """Decode an image; raise InputError if it is damaged, is not opaque, or has another size than the first image."""
+    if images.png_size(data, str(path)) != size:
+        raise InputError(f"{path}: expected {size[0]}x{size[1]} as the first image, got another size")
+    decoded = images.decode_png(data, str(path))
+    if decoded.shape[2] != 3:
+        raise InputError(f"{path}: expected an opaque RGB image, got one with alpha")
+    return decoded
+
+
+def _decode_or_advise(data: bytes, image: _Image, size: tuple[int, int]) -> images.Pixels:
+    """Decode an image; if a training image is damaged, the error names the option that replaces it."""
+    try:
+        return _decode(data, image.path, size)
+    except images.DamagedError as error:
+        if image.camera == TEST_CAMERA:
+            raise
+        advice = f"replace it by the frame before with data.repair=[{image.path.stem}]"
+        raise images.DamagedError(f"{error}, or {advice}") from error
+
+
+def _check_damaged(data: bytes, image: _Image) -> None:
+    """Raise InputError if an image that is to be replaced is whole."""
+    try:
+        images.decode_png(data, str(image.path))
+    except images.DamagedError:
+        return
+    raise InputError(f"data.repair: expected a damaged image, {image.path} is whole: leave it out")
 
 
 def _points(root: Path) -> Points | None:

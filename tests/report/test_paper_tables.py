@@ -5,11 +5,12 @@ import dataclasses
 import pandas as pd
 import pytest
 from make_golden import make
-from make_golden_paper import GOLDEN_1, GOLDEN_2, at_paper, records
+from make_golden_paper import GOLDEN_1, GOLDEN_2, GOLDEN_3, at_paper, records
 
 from gsbench.measure import record as files
 from gsbench.report import paper, table1
 from gsbench.report.__main__ import main
+from gsbench.report.conditions import conditions
 from gsbench.report.paper_protocol import departure, sort
 from gsbench.report.paper_tables import NAMES, write
 
@@ -19,6 +20,7 @@ def test_the_golden_pages(tmp_path):
     write(records(), tmp_path)
     assert (tmp_path / "table1.md").read_text() == GOLDEN_1.read_text()
     assert (tmp_path / "table2.md").read_text() == GOLDEN_2.read_text()
+    assert (tmp_path / "table_successors.md").read_text() == GOLDEN_3.read_text()
 
 
 def test_the_difference_is_of_like_with_like(tmp_path):
@@ -60,6 +62,7 @@ def test_seconds_of_two_machines_are_never_averaged(tmp_path):
         ({"eval_split": "val"}, "split"),
         ({"background": "white"}, "background"),
         ({"quantise": True}, "quantisation"),
+        ({"resize": "pillow"}, "filter"),
         ({"frames": [0, 49]}, "frames"),
         ({"dataset": "mini"}, "data"),
         ({"scene": "invented"}, "scene"),
@@ -120,6 +123,20 @@ def test_another_recipe_has_its_own_row(tmp_path):
     assert lines[["recipe", "seeds", "psnr"]].values.tolist() == [["", 1, 30.0], ["recipe=paper", 1, 20.0]]
 
 
+def test_the_protocol_of_dgs_shares_no_mean_with_gsbenchs(tmp_path):
+    """Would catch runs on images of another filter as more seeds of one row, or in one table without a word."""
+    own = {"name": "dgs2026", "resize": "pillow", "quantise": True, "variant": "protocol=dgs2026"}
+    runs = [at_paper(seed=0), at_paper(seed=1, **own), at_paper(seed=2, batch_size=1)]
+    runs.append(at_paper(seed=3, batch_size=1, variant="protocol=published"))
+    assert [len(pool.runs) for pool in sort(runs).other_protocol] == [2]  # one pool is shown, the other is named
+    (left,) = sort(runs).left_out["D-NeRF"]
+    assert "400x400 by pillow" in left
+    write(runs, tmp_path)
+    assert pd.read_csv(tmp_path / "table1.csv")["seeds"].tolist() == [1, 2]
+    said = conditions([at_paper(), at_paper(seed=1, **{**own, "variant": ""})])
+    assert any("WARNING: the rows differ in resize: area" in line and "pillow" in line for line in said)
+
+
 def test_only_the_pool_nearest_to_the_paper_is_shown():
     """Would catch pages of trials, and runs that vanish without a word."""
     runs = [at_paper(iterations=n, resolution="100x100", experiment=f"e{n}") for n in (500, 7000, 1000)]
@@ -175,7 +192,7 @@ def test_hostile_names_stay_text(tmp_path):
     assert cells == ["'=1+1|x\\n# head <script>alert(1)</script> [a](http://b)"]
 
 
-def test_the_command_writes_four_files(tmp_path, capsys):
+def test_the_command_writes_its_files(tmp_path, capsys):
     """Would catch files elsewhere than said, a page written over, and an exit code of 0 without records."""
     for run in records():
         folder = files.run_path(tmp_path, run.experiment, run.scene, run.model, run.seed, variant=run.variant)

@@ -49,6 +49,7 @@ def named(*words: str) -> Run:
         (["+trial=7dgs/fast", "train.batch_size=1"], "7dgs,trial=7dgs.fast,batch_size=1"),
         (["raster.antialias=true"], "7dgs,antialias=true"),
         (["protocol=published"], "7dgs,protocol=published"),
+        (["protocol=dgs2026"], "7dgs,protocol=dgs2026"),
         (["effects.gate=end", "effects.budget_db=0.2"], "7dgs,gate=end,budget_db=0.2"),
     ],
 )  # fmt: skip
@@ -73,7 +74,7 @@ def test_measuring_is_not_training(word: str) -> None:
 @pytest.mark.parametrize(
     "word",
     ["seed=1", "train.iterations=9", "model.lr.means.end=1e-5", "scene.eval_split=val", "protocol.best_on_test=true",
-     "data.initial_points=9", "raster.backend=reference"],
+     "data.initial_points=9", "raster.backend=reference", "scene.resize=pillow"],
 )  # fmt: skip
 def test_training_is_training(word: str) -> None:
     """Catches a checkpoint that is taken by a run with other numbers."""
@@ -94,14 +95,30 @@ def test_a_file_to_start_from_is_training(tmp_path: Path) -> None:
     assert "init" not in named().plain  # so that the records of older runs are still those of the same config
 
 
+def test_the_protocol_of_dgs_is_whole_and_its_parts_can_be_set() -> None:
+    """Catches a name that stands over another filter, rounding, batch or number of tests than its authors'."""
+    composed = hydra.compose("config", ["+exp=dnerf", "scene=lego", "model=dgs", "protocol=dgs2026"])
+    assert (composed.scene.resize, composed.scene.downscale, composed.scene.eval_split) == ("pillow", 2, "val")
+    assert (composed.protocol.quantise, composed.protocol.best_on_test, composed.data.background) == (
+        True,
+        True,
+        "black",
+    )
+    assert composed.train.batch_size == 4
+    assert composed.train.iterations / composed.train.curve_points == 500
+    mcmc = ["+exp=dnerf", "scene=lego", "model=dgs", "protocol=dgs2026", "+recipe=mcmc", "train.batch_size=1"]
+    assert hydra.compose("config", mcmc).train.batch_size == 1
+
+
 def test_every_key_is_of_training_or_of_measuring() -> None:
     """Catches a new key of the config that nobody has sorted: then add it to MEASURING, or to this list."""
     keys = {key for key, _ in flat(training_part(named("model=3dgs").plain)) if not key.startswith("model.lr.")}
     assert keys == {
-        "seed", "device", "agr", "optim", "scene.name", "scene.downscale", "scene.eval_split", "scene.frames",
-        "data.background", "data.initial_lambda", "data.initial_points", "data.initial_half_width", "raster.backend",
-        "raster.antialias", "protocol.best_on_test", "model.name", "model.module", "model.published_with_agr",
-        "model.agr", "model.agr_octaves", "model.sh_degree", "model.min_opacity", *(f"train.{name}" for name in (
+        "seed", "device", "agr", "optim", "scene.name", "scene.downscale", "scene.resize", "scene.eval_split",
+        "scene.frames", "data.repair", "data.background", "data.initial_lambda", "data.initial_points",
+        "data.initial_half_width", "raster.backend", "raster.antialias", "protocol.best_on_test", "model.name",
+        "model.module", "model.published_with_agr", "model.agr", "model.agr_octaves", "model.sh_degree",
+        "model.min_opacity", *(f"train.{name}" for name in (
             "iterations", "recipe_iterations", "batch_size", "ssim_weight", "sh_every", "refine_from",
             "lambda_from", "cooldown_from", "average_from", "curve_points", *(f"densify.{name}" for name in (
                 "start", "stop", "every", "rounds", "reset_every", "grad_threshold", "clone_below", "prune_above",

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import hydra
 import pytest
+import torch
 from omegaconf import OmegaConf
 from scenes.tiny_scene import edit, write_tiny
 
@@ -41,6 +42,14 @@ def test_either_name_is_found(scene: str, folder: str, tmp_path: Path) -> None:
     assert loaded.name == folder
     assert (loaded.train[0].camera.width, loaded.train[0].camera.height) == (4, 3)  # half resolution
     assert float(loaded.train[0].camera.K[0, 0]) == pytest.approx(2 / 0.25534, rel=1e-4)  # tan(0.25)
+
+
+def test_images_are_reduced_by_the_filter_of_the_settings(tmp_path: Path) -> None:
+    """Catches a run that trains on images of another filter than its record says."""
+    write_tiny(tmp_path / "cloud")
+    pillow = config(tmp_path, "cloud")
+    pillow.scene.resize = "pillow"
+    assert not torch.equal(load_scene(pillow).train[0].image, load_scene(config(tmp_path, "cloud")).train[0].image)
 
 
 def test_both_hearts_of_a_release_are_told_apart(tmp_path: Path) -> None:

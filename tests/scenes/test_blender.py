@@ -168,6 +168,46 @@ def test_area_filter_is_the_mean_of_composited_blocks(
     np.testing.assert_allclose(image.numpy(), blocks, atol=1e-6)
 
 
+def bicubic(image: np.ndarray, axis: int) -> np.ndarray:
+    """Halve an axis of an 8-bit image by the cubic of Keys (a = -1/2) at twice its width, rounded to 8 bits."""
+    count = image.shape[axis]
+    distance = np.abs((np.arange(count)[None] + 0.5 - 2 * np.arange(count // 2)[:, None] - 1) / 2)
+    near = (1.5 * distance - 2.5) * distance**2 + 1
+    far = ((-0.5 * distance + 2.5) * distance - 4) * distance + 2
+    weights = np.where(distance < 1, near, np.where(distance < 2, far, 0))
+    weights /= weights.sum(1, keepdims=True)
+    return np.clip(np.rint(np.moveaxis(np.tensordot(weights, image, (1, axis)), 0, axis)), 0, 255)
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
+def test_pillows_filter_reduces_the_8_bit_composite(tiny: Path, background: tuple[float, float, float]) -> None:
+    """Catches a mean, a cubic that is not widened, a composite that is rounded up or reduced before it is made."""
+    rgba = cv2.cvtColor(cv2.imread(str(tiny / "train/r_0.png"), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA) / 255.0
+    alpha = rgba[..., 3:]
+    composite = np.floor((rgba[..., :3] * alpha + np.array(background) * (1 - alpha)) * 255)
+    whole = scenes.load(tiny, resize="pillow", background=background).train[0]
+    np.testing.assert_array_equal(whole.image.numpy(), (composite / 255).astype(np.float32))
+    half = scenes.load(tiny, resize="pillow", downscale=2, background=background).train[0]
+    expected = bicubic(bicubic(composite, 1), 0)
+    np.testing.assert_allclose(half.image.numpy() * 255, expected, atol=1e-3)
+    area = scenes.load(tiny, downscale=2, background=background).train[0]
+    assert (half.image - area.image).abs().max() > 0.02
+    assert torch.equal(half.camera.K, area.camera.K)
+
+
+def test_a_large_scene_is_not_kept_in_8_bits_of_alpha(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches the filter left out where images are composited at each access."""
+    small = scenes.load(tiny, resize="pillow").train[0].image
+    monkeypatch.setattr(images, "_MOST_FLOATS", 0)
+    assert torch.equal(scenes.load(tiny, resize="pillow").train[0].image, small)
+
+
+def test_an_unknown_filter_is_told(tiny: Path) -> None:
+    """Catches a misspelt filter that loads the images of another protocol."""
+    with pytest.raises(InputError, match=r"resize 'pilow' is not known\. Did you mean 'pillow'"):
+        scenes.load(tiny, resize="pilow")
+
+
 def test_focal_length_and_principal_point_from_the_file(tiny: Path) -> None:
     """Catches fl_x and its companions ignored, swapped or not scaled, and a fl_y that does not fall back to fl_x."""
     edit(tiny, lambda c: c.update(fl_x=10.0, fl_y=12.0, cx=3.0, cy=5.0, w=8, h=6))

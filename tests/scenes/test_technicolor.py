@@ -10,7 +10,7 @@ import torch
 
 from gsbench import scenes
 from gsbench.errors import InputError
-from gsbench.scenes import colmap
+from gsbench.scenes import colmap, files
 from gsbench.scenes.points import frustum_points
 from gsbench.scenes.technicolor import CAMERAS, TEST_CAMERA
 
@@ -118,6 +118,67 @@ def test_faulty_images_are_told(root: Path) -> None:
     (root / "Other_undist_00101_03.png").write_bytes(kept)
     with pytest.raises(InputError, match="images of one scene, got those of Other, Tiny"):
         scenes.load(root)
+
+
+def damage(root: Path, name: str) -> Path:
+    """Cut the end off an image, as in the release's Birthday_undist_00173_09.png."""
+    path = root / f"{name}.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    return path
+
+
+def test_a_damaged_image_is_replaced_if_it_is_named(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches an image of another camera or frame, and a replacement that no message, scene or fingerprint tells."""
+    whole = scenes.load(root)
+    damage(root, "Tiny_undist_00101_09")
+    with pytest.raises(
+        InputError, match=r"00101_09.*copy it again, or replace .* data\.repair=\[Tiny_undist_00101_09\]$"
+    ):
+        scenes.load(root)
+    repaired = scenes.load(root, repair=["Tiny_undist_00101_09", "Other_undist_00101_03"])
+    said = capsys.readouterr().err.splitlines()
+    assert said == [f"{root}/Tiny_undist_00101_09.png: damaged, replaced by Tiny_undist_00100_09.png (data.repair)"]
+    views = {view.name: view for view in repaired.train}
+    replaced = views["Tiny_undist_00101_09"]
+    torch.testing.assert_close(replaced.image[0, 0] * 255, torch.tensor([9.0, 100.0, 7.0]))
+    assert replaced.time == 0.5
+    assert repaired.repaired == ("Tiny_undist_00101_09",)
+    for view in whole.train:
+        assert torch.equal(view.pixels, views[view.name].pixels) == (view.name != "Tiny_undist_00101_09")
+    plain = files.fingerprint({path.name: files.digest(path.read_bytes()) for path in root.iterdir()})
+    (root / "Tiny_undist_00101_09.png").write_bytes((root / "Tiny_undist_00100_09.png").read_bytes())
+    copied = scenes.load(root)
+    assert copied.repaired == ()
+    assert len({whole.fingerprint, repaired.fingerprint, copied.fingerprint, plain}) == 4
+
+
+@pytest.mark.parametrize(
+    ("damaged", "name", "said"),
+    [
+        ([], "Tiny_undist_00101_09", "is whole: leave it out"),
+        (["Tiny_undist_00100_09"], "Tiny_undist_00100_09", "frame 99, it is not loaded"),
+        (["Tiny_undist_00101_09", "Tiny_undist_00100_09"], "Tiny_undist_00101_09", "00100_09.png: truncated"),
+        (["Tiny_undist_00101_10"], "Tiny_undist_00101_10", "is a test image"),
+        (["Tiny_undist_00101_09"], "Tiny_undist_00108_09", "expected an image that is loaded"),
+        (["Tiny_undist_00101_09"], "00101_09", "expected names such as"),
+    ],
+)
+def test_what_cannot_be_replaced_is_refused(root: Path, damaged: list[str], name: str, said: str) -> None:
+    """Catches a whole image that is thrown away, a test on another frame's image, and an image made of nothing."""
+    for one in damaged:
+        damage(root, one)
+    with pytest.raises(InputError, match=said):
+        scenes.load(root, repair=[name])
+
+
+def test_repair_is_of_this_layout(tmp_path: Path) -> None:
+    """Catches an option that other data sets ignore, and one name that is read as a list of letters."""
+    (tmp_path / "transforms_train.json").write_text("{}")
+    with pytest.raises(InputError, match=r"repair: transforms_train\.json has no frame before"):
+        scenes.load(tmp_path, repair=["Tiny_undist_00101_09"])
+    (tmp_path / "transforms_train.json").rename(tmp_path / CAMERAS)
+    with pytest.raises(InputError, match="repair: expected names such as"):
+        scenes.load(tmp_path, repair="Tiny_undist_00101_09")
 
 
 def test_points_of_colmap(root: Path) -> None:
