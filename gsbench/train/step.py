@@ -188,7 +188,7 @@ class Step:
                         raise
                     raise DivergedError(str(error)) from None
             with stages("loss"):
-                loss = photometric(output.image, view.image[None], self.ssim_weight, self.model.backend)
+                loss = photometric(output.image, view.target[None], self.ssim_weight, self.model.backend)
                 for weight, penalty in self.penalties:
                     loss = loss + weight * penalty(self.model, query)
         with stages("backward"):
