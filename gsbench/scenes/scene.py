@@ -1,6 +1,6 @@
 """Define the data types Camera, View (camera, time and image), Points and Scene (train, val and test views)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -14,11 +14,11 @@ class Camera:
     K: Tensor  # [3, 3] intrinsics in pixels
     width: int
     height: int
+    center: Tensor = field(init=False, compare=False, repr=False)  # [3] the position in world space
 
-    @property
-    def center(self) -> Tensor:
-        """The position of the camera in world space, [3]."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+    def __post_init__(self) -> None:
+        """Compute the position, which every rendering needs, once."""
+        object.__setattr__(self, "center", -self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
     def to(self, device: str) -> "Camera":
         """Return a copy of the camera whose tensors are on `device`."""
