@@ -263,10 +263,11 @@ GSB_FIELDS(ValueFlags, OUTPUTS, flags)
 struct SimilarityArgs {
     int height, width;
     const float *image, *target;  // [H, W, 3]
+    const uint8_t* target_bytes;  // [H, W, 3], 255 times the target; one of the two targets is null
     float ssim_weight;
     int threads;
 };
-GSB_FIELDS(SimilarityArgs, INPUTS, height, width, image, target, ssim_weight, threads)
+GSB_FIELDS(SimilarityArgs, INPUTS, height, width, image, target, target_bytes, ssim_weight, threads)
 
 struct SimilarityLoss {
     float* loss;      // [parts] partial sums of the loss, as many as `similarity_parts` returns

@@ -36,7 +36,7 @@ _show = Operation(
         "times": Input("N 1", left_out_with="time"),
         "center": Input("3", Gradient.REFUSED),
         "time": Input("", Gradient.REFUSED, left_out_with="time"),
-        "orders": Input("N", Gradient.REFUSED, torch.int32, left_out_with="orders"),
+        "orders": Input("N", Gradient.REFUSED, (torch.int32,), left_out_with="orders"),
     },
     outputs={"colors": Output("N 3")},
     numbers={"degree": int, "waves": int},

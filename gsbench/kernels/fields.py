@@ -27,14 +27,14 @@ class Input:
         shape: dimensions such as "N 3" or "C height width D". A dimension is a number or a name; equal names in one
             operation mean equal sizes. A first dimension that may be missing starts with a question mark.
         gradient: how the backward kernel returns the gradient.
-        dtype: the type, float32, or int32 for indices.
+        dtypes: the accepted types: float32, or int32 for indices.
         left_out_with: makes the input optional; inputs with the same value here are left out together.
         is_list: the tensor has one dimension, whose size changes from call to call and is used for no other tensor.
     """
 
     shape: str
     gradient: Gradient = Gradient.WRITTEN
-    dtype: torch.dtype = torch.float32
+    dtypes: tuple[torch.dtype, ...] = (torch.float32,)
     left_out_with: str | None = None
     is_list: bool = False
 

@@ -12,6 +12,8 @@ from gsbench.kernels.library import Slots, allocate, library_of
 from gsbench.kernels.operation import Operation, Tensors, address, in_rows
 from gsbench.kernels.tensors import check_number, check_tensor
 
+_TARGET = (torch.float32, torch.uint8)
+
 
 class _Similarity(Operation):
     """The loss as a differentiable operation; the forward pass also computes the gradient with respect to the image.
@@ -22,11 +24,12 @@ class _Similarity(Operation):
     def __init__(self) -> None:
         super().__init__(
             "l1_ssim",
-            inputs={"image": Input("?one height width 3"), "target": Input("?one height width 3", Gradient.REFUSED)},
+            inputs={"image": Input("?one height width 3"),
+                    "target": Input("?one height width 3", Gradient.REFUSED, _TARGET)},
             outputs={"loss": Output(""), "gradient": Output("numbers", gradient=False)},
             numbers={"ssim_weight": float, "with_gradient": bool},
             derive=lambda given, numbers: {"numbers": given["image"].numel() if numbers["with_gradient"] else 0},
-        )
+        )  # fmt: skip
 
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
         slots = self.match(tensors, numbers).copy()
@@ -38,7 +41,9 @@ class _Similarity(Operation):
         scratch = None
         if library.needs_scratch and slots["with_gradient"]:
             scratch = allocate("derivatives of SSIM", image, (3, 3, height, width))
-        slots |= {"image": image.data_ptr(), "target": target.data_ptr(), "out.loss": parts.data_ptr(),
+        in_bytes = target.dtype == torch.uint8
+        slots |= {"image": image.data_ptr(), "target": 0 if in_bytes else target.data_ptr(),
+                  "target_bytes": target.data_ptr() if in_bytes else 0, "out.loss": parts.data_ptr(),
                   "out.gradient": gradient.data_ptr(), "out.scratch": address(scratch)}  # fmt: skip
         library.call(self.name, slots, image)
         return [parts.sum() if parts.shape[0] > 1 else parts[0], gradient], slots
@@ -58,20 +63,21 @@ _similarity = _Similarity()
 
 def l1_ssim(
     image: Tensor,  # [H, W, 3] or [1, H, W, 3]
-    target: Tensor,  # as image
+    target: Tensor,  # as image, or the same in 8 bits
     ssim_weight: float,
 ) -> Tensor:  # []
     """Return the loss of 3DGS (eq. 7), (1 - w) L1 + w (1 - SSIM), differentiable with respect to `image`.
 
     The weight w is `ssim_weight`. SSIM has an 11 x 11 Gaussian window of sigma 1.5 and zero padding. The value is that
-    of `gsbench.train.losses.photometric`.
+    of `gsbench.train.losses.photometric`. A target of uint8 is divided by 255 as it is read; the result has the same
+    bits as with floats.
 
     Raises:
-        InputError: the arguments are not float32 images of the same size on one device, or `target` requires a
-            gradient.
+        InputError: the arguments are not images of the same size on one device, `image` is not float32, `target` is
+            neither float32 nor uint8, or it requires a gradient.
     """
     check_tensor(image, "l1_ssim: image", (torch.float32,))
-    check_tensor(target, "l1_ssim: target", (torch.float32,))
+    check_tensor(target, "l1_ssim: target", _TARGET)
     check_number(ssim_weight, "l1_ssim: ssim_weight", 0, 1)
     if image.dim() not in (3, 4) or image.shape[-1] != 3 or target.shape != image.shape or not image.numel():
         raise InputError(f"l1_ssim: expected image and target [H, W, 3] or [1, H, W, 3] of one size, got "

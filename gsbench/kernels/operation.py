@@ -236,7 +236,7 @@ class Operation:
                 raise InputError(f"{self.name}: expected all of {', '.join(together)}, or none of them")
         for (key, declared), x, own in zip(self.inputs.items(), tensors, there, strict=True):
             if own:
-                check_tensor(x, f"{self.name}: {key}", (declared.dtype,))
+                check_tensor(x, f"{self.name}: {key}", declared.dtypes)
         if self._derive is not None:
             given = {key: x for key, x, own in zip(self.inputs, tensors, there, strict=True) if own}
             slots.update(self._derive(given, slots))

@@ -101,8 +101,8 @@ _blend = Operation(
         "half_sizes": Input("C N 2", Gradient.NONE),
         "colors": Input("?sets N D"),
         "background": Input("D", Gradient.ON_REQUEST),
-        "offsets": Input("lists", Gradient.NONE, torch.int32),
-        "ids": Input("pairs", Gradient.NONE, torch.int32, is_list=True),
+        "offsets": Input("lists", Gradient.NONE, (torch.int32,)),
+        "ids": Input("pairs", Gradient.NONE, (torch.int32,), is_list=True),
     },
     outputs={
         "image": Output("C height width D"),

@@ -5,23 +5,26 @@ import os
 import re
 import secrets
 import socket
+from collections.abc import Callable
+from io import BufferedRandom
 from pathlib import Path
 
 WITHOUT_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # errors if hard links are not supported
 HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
 
 
-def write_atomically(path: Path, data: bytes, *, lasting: bool = True) -> None:
+def write_atomically(path: Path, data: bytes | Callable[[BufferedRandom], object], *, lasting: bool = True) -> None:
     """Write `data` to a temporary file in the folder of `path`, then rename the file to `path`.
 
-    If the folder does not exist, it is created. Readers of `path` see either the old file or the new file. If `lasting`
+    `data` may be a function that writes (and may read) the file that it gets, for content too large to be in memory. If
+    the folder does not exist, it is created. Readers of `path` see either the old file or the new file. If `lasting`
     is true, the file is flushed to the disk before it is renamed, so that it survives a power cut.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)
     try:
-        with temporary.open("xb") as file:
-            file.write(data)
+        with temporary.open("x+b") as file:
+            data(file) if callable(data) else file.write(data)
             if lasting:
                 file.flush()
                 os.fsync(file.fileno())

@@ -73,6 +73,7 @@ class GraphedFrames:
         recording = self._recordings[size]
         recording.camera.viewmat.copy_(camera.viewmat)
         recording.camera.K.copy_(camera.K)
+        recording.camera.center.copy_(camera.center)
         if recording.time is not None and time is not None:
             recording.time.fill_(time)
         recording.play()

@@ -1,6 +1,6 @@
 """Define the data types Camera, View (camera, time and image), Points and Scene (train, val and test views)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -14,11 +14,11 @@ class Camera:
     K: Tensor  # [3, 3] intrinsics in pixels
     width: int
     height: int
+    center: Tensor = field(init=False, compare=False, repr=False)  # [3] the position in world space
 
-    @property
-    def center(self) -> Tensor:
-        """The position of the camera in world space, [3]."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+    def __post_init__(self) -> None:
+        """Compute the position, which every rendering needs, once."""
+        object.__setattr__(self, "center", -self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
     def to(self, device: str) -> "Camera":
         """Return a copy of the camera whose tensors are on `device`."""
@@ -48,11 +48,7 @@ class View:
 
         An image that is stored in 8 bits is converted at each access.
         """
-        if self.pixels.is_floating_point():
-            return self.pixels
-        # The divisor is a tensor, because a GPU would replace a division by a number by a product, which rounds
-        # differently.
-        values = self.pixels.float().div_(torch.full((), 255.0, device=self.pixels.device))
+        values = to_floats(self.pixels)
         if values.shape[-1] == 3:
             return values
         alpha = values[..., 3:]
@@ -60,6 +56,11 @@ class View:
         if any(self.background):  # zeros would change nothing
             image.add_(values.new_tensor(self.background) * (1 - alpha)).clamp_(0, 1)
         return image
+
+    @property
+    def target(self) -> Tensor:
+        """The image that a training loss takes, [H, W, 3]: the 8 bits of an image without alpha, otherwise `image`."""
+        return self.pixels if self.pixels.shape[-1] == 3 else self.image
 
     def to(self, device: str) -> "View":
         """Return a copy of the view whose tensors are on `device`."""
@@ -99,6 +100,17 @@ class Scene:
         """Return a copy of the scene whose views are on `device`."""
         train, val, test = ([view.to(device) for view in views] for views in (self.train, self.val, self.test))
         return replace(self, train=train, val=val, test=test)
+
+
+def to_floats(
+    pixels: Tensor,  # [..] floats in [0, 1] or 8 bits
+) -> Tensor:
+    """Return the values of an image in [0, 1]; those of 8 bits are divided by 255."""
+    if pixels.is_floating_point():
+        return pixels
+    # The divisor is a tensor, because a GPU would replace a division by a number by a product, which rounds
+    # differently.
+    return pixels.float().div_(torch.full((), 255.0, device=pixels.device))
 
 
 def scene_extent(

@@ -51,10 +51,16 @@ class Checkpoint:
 
 def save(path: Path, content: Checkpoint) -> None:
     """Write a checkpoint atomically: another process that reads `path` gets the old file or the new file."""
-    buffer = io.BytesIO()
-    torch.save({f.name: getattr(content, f.name) for f in fields(content)}, buffer)
-    payload = buffer.getbuffer()
-    write_atomically(path, b"".join((MAGIC, hashlib.sha256(payload).hexdigest().encode(), b"\n", payload)))
+
+    def write(file: io.BufferedRandom) -> None:
+        file.write(MAGIC + b"0" * DIGEST + b"\n")
+        torch.save({f.name: getattr(content, f.name) for f in fields(content)}, file)
+        file.seek(len(MAGIC) + DIGEST + 1)
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        file.seek(len(MAGIC))
+        file.write(digest.encode())
+
+    write_atomically(path, write)
 
 
 def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | None:

@@ -176,7 +176,7 @@ class Trainer:
                     self.density.accumulate(
                         one.info.drawn, one.g_means2d, view.camera.width, view.camera.height, len(views)
                     )
-        self.finite_check.see(step, torch.stack([one.loss for one in seen]).sum(), self.model.groups())
+        self.finite_check.see(step, torch.stack([one.loss for one in seen]).sum(), self.optimizer.groups)
         with stages("optimizer"):
             drawn = torch.cat([one.info.drawn for one in seen]).any(0) if self.optimizer.is_sparse else None
             self.optimizer.step(step, drawn, slowed=self.gating.slows_agr(step))

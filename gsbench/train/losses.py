@@ -8,15 +8,20 @@ from torch import Tensor
 
 from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.loss import l1_ssim
+from gsbench.scenes.scene import to_floats
 
 WINDOW = 11
 SIGMA = 1.5
 
 
 def photometric(image: Tensor, target: Tensor, ssim_weight: float, backend: Backend = AUTO) -> Tensor:
-    """Compute the loss (1 - ssim_weight) L1 + ssim_weight (1 - SSIM) of an image and its target, [H, W, 3] each."""
+    """Compute the loss (1 - ssim_weight) L1 + ssim_weight (1 - SSIM) of an image and its target, [H, W, 3] each.
+
+    The target has floats in [0, 1], or 8 bits.
+    """
     if backend.serves(image):
         return l1_ssim(image, target, ssim_weight)
+    target = to_floats(target)
     loss = F.l1_loss(image, target)
     if ssim_weight == 0:
         return loss

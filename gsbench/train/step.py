@@ -116,6 +116,7 @@ class Step:
                 pass).
         """
         self.model = model
+        self.parameters = list(model.parameters())
         self.background = background
         self.ssim_weight = ssim_weight
         self.antialias = antialias
@@ -140,7 +141,7 @@ class Step:
             TooLargeError: the memory does not suffice.
         """
         self.penalties = penalties
-        sources = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
+        sources = [parameter for parameter in self.parameters if parameter.requires_grad]
         workers = min(len(views), self.model.backend.workers(self.model.splats["means"]))
         bounds = [len(views) * worker // workers for worker in range(workers + 1)]
         sums = deal(len(views), bounds)
@@ -188,7 +189,7 @@ class Step:
                         raise
                     raise DivergedError(str(error)) from None
             with stages("loss"):
-                loss = photometric(output.image, view.image[None], self.ssim_weight, self.model.backend)
+                loss = photometric(output.image, view.target[None], self.ssim_weight, self.model.backend)
                 for weight, penalty in self.penalties:
                     loss = loss + weight * penalty(query, index)
         with stages("backward"):

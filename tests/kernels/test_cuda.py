@@ -15,6 +15,7 @@ from gsbench.kernels.adam import adam
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.raster import backward_by_splat
 from gsbench.raster import rasterize
+from gsbench.scenes.scene import to_floats
 from gsbench.stability.brute import render
 from gsbench.train.losses import photometric
 from gsbench.train.optim import adam_reference
@@ -151,6 +152,16 @@ def test_loss_is_the_reference(height: int, width: int, weight: float, cuda_devi
     assert_gradients_close({"image": single.grad.cpu().double()}, {"image": image.grad})
     with torch.no_grad():
         assert l1_ssim(single, target.to(cuda_device), weight).item() == loss.item()
+
+
+def test_bytes_of_a_target_have_the_bits_of_floats(cuda_device: str) -> None:
+    """Catches a byte divided with another rounding, in the value or in the gradient alone."""
+    random = torch.Generator().manual_seed(0)
+    in_bytes = torch.randint(256, (37, 50, 3), generator=random, dtype=torch.uint8).to(cuda_device)
+    image = torch.rand(37, 50, 3, generator=random).to(cuda_device).requires_grad_()
+    losses = [l1_ssim(image, target, 0.2) for target in (in_bytes, to_floats(in_bytes))]
+    assert losses[0].item() == losses[1].item()
+    assert torch.equal(*(torch.autograd.grad(loss, image)[0] for loss in losses))
 
 
 @pytest.mark.parametrize("shape", [(1,), (700, 1, 3), (300, 28)])

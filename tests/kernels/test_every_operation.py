@@ -83,7 +83,7 @@ def call(operation: Operation, count: int = N, without: str | None = None) -> Ca
         for key, x in inputs.items():
             shape = shape_in(sizes, x.shape, unknown)
             if None not in shape:
-                tensors[key] = values(key, shape, x.dtype, count)
+                tensors[key] = values(key, shape, x.dtypes[0], count)
         if operation._derive is not None:
             sizes |= operation._derive(tensors, numbers)
     shapes = [tuple(shape_in(sizes, x.shape)) for x in operation.outputs.values()]
@@ -178,7 +178,7 @@ def test_wrong_arguments_are_refused(operation: Operation) -> None:
         with pytest.raises(InputError, match=f"^{operation.name}: "):
             operation(*at.with_(**{name: "a number"}))
     for name, x in operation.inputs.items():
-        if x.gradient is Gradient.REFUSED and x.dtype is torch.float32:
+        if x.gradient is Gradient.REFUSED and x.dtypes[0] is torch.float32:
             with pytest.raises(InputError, match=f"^{operation.name} has no gradient by {name}: "):
                 operation(*at.with_(**{name: at.tensors[name].clone().requires_grad_()}))
 

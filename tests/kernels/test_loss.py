@@ -5,6 +5,7 @@ import torch
 
 from gsbench.errors import InputError
 from gsbench.kernels.loss import l1_ssim
+from gsbench.scenes.scene import to_floats
 from gsbench.train.losses import photometric
 
 # Rows are filtered four at a time from fourteen: every height about those numbers, and widths about whole vectors. More
@@ -58,6 +59,22 @@ def test_same_bits_for_any_number_of_threads(height: int) -> None:
     assert all(torch.equal(x, y) for other in results[1:] for x, y in zip(results[0], other, strict=True))
 
 
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (12, 21), (16, 17), (17, 449)])
+def test_bytes_have_the_bits_of_floats(height: int, width: int) -> None:
+    """Catches a byte divided with another rounding, read as signed, or read past the end of a row."""
+    a, b = pictures(height, width)
+    in_bytes = (255 * b).round().to(torch.uint8)
+    in_bytes.view(-1)[:256] = torch.arange(256, dtype=torch.uint8)[: in_bytes.numel()]
+    results = []
+    for target in (in_bytes, to_floats(in_bytes)):
+        image = a.clone().requires_grad_()
+        loss = l1_ssim(image, target, 0.2)
+        loss.backward()
+        results.append((loss.detach(), image.grad))
+    assert all(torch.equal(x, y) for x, y in zip(*results, strict=True))
+
+
 def test_errors() -> None:
     """Catches pictures of different size or type that would be read past their end."""
     a, b = pictures(8, 8)
@@ -65,5 +82,7 @@ def test_errors() -> None:
         l1_ssim(a, b[1:], 0.2)
     with pytest.raises(InputError, match="float32"):
         l1_ssim(a.double(), b.double(), 0.2)
+    with pytest.raises(InputError, match="target: expected float32 or uint8, got int8"):
+        l1_ssim(a, b.to(torch.int8), 0.2)
     with pytest.raises(InputError, match="no gradient by target"):
         l1_ssim(a, b.requires_grad_(), 0.2)

@@ -6,6 +6,7 @@ import pickle
 import shutil
 import signal
 import time
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -168,6 +169,16 @@ def test_a_file_that_is_no_checkpoint_is_refused(
     with pytest.raises(InputError, match="start over with resume=false"):
         checkpoint.load(path, "config", "data", "cpu")
     assert not Path("owned").exists()
+
+
+def test_a_checkpoint_is_written_without_a_copy_in_memory(tmp_path: Path) -> None:
+    """Catches a state of gigabytes that is copied to write it: a training at the limit of the memory would end then."""
+    state = {"model": torch.zeros(1 << 20)}
+    tracemalloc.start()
+    checkpoint.save(tmp_path / checkpoint.FILE_NAME, Checkpoint("settings", "data", state))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < state["model"].nbytes / 2
 
 
 def test_a_checkpoint_of_another_run_is_not_taken(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import torch
 from gsbench.config import PenaltiesConfig
 from gsbench.errors import InputError
 from gsbench.kernels.adam import adam_all
-from gsbench.kernels.backends import AUTO, REFERENCE
+from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
 from gsbench.models import Query
@@ -62,6 +62,22 @@ def test_a_batch_is_a_mean() -> None:
     torch.testing.assert_close(four[1], one[1], rtol=1e-4, atol=1e-8)
     assert one[1].max() > 0
     assert four[2] == pytest.approx(one[2], rel=1e-5)
+
+
+@pytest.mark.parametrize("backend", [AUTO, REFERENCE], ids=lambda backend: backend.name)
+def test_bytes_train_as_floats_do(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a step that makes floats of an image in 8 bits for the kernel, and other gradients by its bytes."""
+    square = moving_square()
+    in_bytes = [replace(view, pixels=(255 * view.image).round().to(torch.uint8)) for view in square.train]
+    gradients = []
+    for views in (in_bytes, [replace(view, pixels=view.image) for view in in_bytes]):
+        fitted = trainer("3dgs", scene=replace(square, train=views))
+        fitted.model.backend = backend
+        with monkeypatch.context() as patch:
+            patch.setattr(View, "image", property(lambda _: pytest.fail("a float copy")))
+            fitted.gradients(views[:2])
+        gradients.append([p.grad for p in fitted.model.splats.values()])
+    assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
 
 
 def test_density_gradients_are_of_one_view_in_half_images() -> None:

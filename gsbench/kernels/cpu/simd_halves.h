@@ -297,6 +297,15 @@ GSB_HD inline void load_rgb(const float* in, int64_t stride, Vec (&channels)[3])
     for (int k = 0; k < 3; ++k) channels[k] = Vec::load(lane[k]);
 }
 
+// Returns the first n bytes as floats, and zero in the other lanes.
+GSB_HD inline Vec load_bytes(const uint8_t* p, int n) {
+    uint8_t bytes[LANES] = {};
+    n == LANES ? __builtin_memcpy(bytes, p, LANES) : __builtin_memcpy(bytes, p, n);
+    alignas(64) float lanes[LANES];
+    for (int i = 0; i < LANES; ++i) lanes[i] = static_cast<float>(bytes[i]);
+    return Vec::load(lanes);
+}
+
 GSB_HD inline void store_first(Vec x, float* p, int n) { n == LANES ? x.store(p) : scatter(x, p, 1, n); }
 
 // Writes base + k for each bit k that is set, in order, and returns their number.

@@ -140,12 +140,16 @@ struct Strip {
     // Returns the index of the first float that is read in row y.
     int64_t place(int y) const { return static_cast<int64_t>(y) * args.width * CHANNELS + left; }
 
+    // Returns the first n floats of the target from index `at` on.
+    GSB_HD Vec target(int64_t at, int n) const {
+        return args.target_bytes ? over_255(load_bytes(args.target_bytes + at, n)) : load_first(args.target + at, n);
+    }
+
     void read_row(int y) {
         const int64_t row = place(y);
-        const float *a = args.image + row, *b = args.target + row;
         for (int x = 0; x < width; x += LANES) {
             const int n = width - x < LANES ? width - x : LANES;
-            const Vec va = load_first(a + x, n), vb = load_first(b + x, n);
+            const Vec va = load_first(args.image + row + x, n), vb = target(row + x, n);
             const Vec values[MOMENTS] = {va, vb, va * va + vb * vb, va * vb};
             for (int k = 0; k < MOMENTS; ++k) values[k].store(padded_row(k) + x);
         }
@@ -189,7 +193,7 @@ struct Strip {
             if (gradient) filter_along_y(rows, x, g);
             for (int j = 0; j < count; ++j) {
                 const int64_t at = place(y + j) + x;
-                const Vec a = load_first(args.image + at, n), b = load_first(args.target + at, n), difference = a - b;
+                const Vec a = load_first(args.image + at, n), b = target(at, n), difference = a - b;
                 totals[j] += max(difference, -difference);
                 if (!gradient) continue;
                 const Vec sign = select(difference > zero, l1, select(difference < zero, -l1, zero));

@@ -35,6 +35,10 @@ struct Place {
           channel(static_cast<int>(blockIdx.z)), thread(static_cast<int>(threadIdx.y * SIDE + threadIdx.x)) {}
 };
 
+__device__ float target_at(const SimilarityArgs& a, int64_t at) {
+    return a.target_bytes ? over_255(static_cast<float>(a.target_bytes[at])) : a.target[at];
+}
+
 // Calls visit(row, column, x, y, whether inside the image) for each pixel of the tile and its border, each in one
 // thread.
 template <class Visit>
@@ -65,7 +69,7 @@ __global__ void __launch_bounds__(SIDE * SIDE) compare_kernel(SimilarityArgs a, 
     each_bordered(a, place, [&](int row, int column, int x, int y, bool inside) {
         const int64_t at = (static_cast<int64_t>(y) * a.width + x) * COLORS + place.channel;
         image[row][column] = inside ? a.image[at] : 0.0f;
-        target[row][column] = inside ? a.target[at] : 0.0f;
+        target[row][column] = inside ? target_at(a, at) : 0.0f;
     });
     __syncthreads();
     for (int i = place.thread; i < BORDERED * SIDE; i += SIDE * SIDE) {
@@ -133,7 +137,7 @@ __global__ void __launch_bounds__(SIDE * SIDE) gradient_kernel(SimilarityArgs a,
     }
     const float scale = 1.0f / (static_cast<float>(COLORS) * static_cast<float>(a.width) * static_cast<float>(a.height));
     const int64_t at = (static_cast<int64_t>(place.y) * a.width + place.x) * COLORS + place.channel;
-    const float x = a.image[at], y = a.target[at];
+    const float x = a.image[at], y = target_at(a, at);
     const float sign = x > y ? 1.0f : x < y ? -1.0f : 0.0f;
     out.gradient[at] = scale * ((1.0f - a.ssim_weight) * sign - a.ssim_weight * (g[0] + 2.0f * x * g[1] + y * g[2]));
 }
