@@ -52,6 +52,11 @@ def weights(arguments: Arguments) -> tuple[Tensor, Tensor]:
             torch.randn(*shape, 1, generator=g, dtype=torch.float64))  # fmt: skip
 
 
+def inputs_of(arguments: Arguments) -> list[str]:
+    """Return the names of the arguments by which the loss is differentiated."""
+    return [name for name in brute.DIFFERENTIABLE if name in arguments]
+
+
 def together(arguments: Arguments) -> ImageTruth:
     """Compute the exact image of many Gaussians and the exact gradients of the loss by brute force in float64."""
     exact: Arguments = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
@@ -74,7 +79,7 @@ def alone(arguments: Arguments) -> ImageTruth:
     x, shape = torch.cat(parts).tolist(), (1, size[1], size[0], 1)
     if not x[2] > torch.tensor(arguments.get("near", NEAR)).item():  # camera axes are world axes, so z is the depth
         none = torch.zeros(shape, dtype=torch.float64)
-        return none, none, none[..., 0] == 0, {k: torch.zeros_like(arguments[k]).double() for k in brute.DIFFERENTIABLE}
+        return none, none, none[..., 0] == 0, {k: torch.zeros_like(arguments[k]).double() for k in inputs_of(arguments)}
     function = partial(
         oracle.alphas, viewmat=arguments["viewmats"][0].tolist(), K=arguments["Ks"][0].tolist(), size=size,
         eps2d=float(torch.tensor(EPS2D)),
@@ -97,7 +102,7 @@ def differentiate(
     arguments: Arguments, backend: str, weight: Tensor, weight_alpha: Tensor
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Render image and alpha in float32 with one backend, and compute the gradients of the loss."""
-    inputs = {name: arguments[name].detach().clone().requires_grad_() for name in brute.DIFFERENTIABLE}
+    inputs = {name: arguments[name].detach().clone().requires_grad_() for name in inputs_of(arguments)}
     device = device_of(backend)
     there: Arguments = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in (arguments | inputs).items()}
     out = rasterize(**there, backend=backend)

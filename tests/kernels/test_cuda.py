@@ -28,7 +28,7 @@ def decided(arguments: dict[str, Any]) -> Tensor:
     return render(**exact).slack > 1e-3
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", names(beta=False))
 def test_picture_is_the_reference(name: str, cuda_device: str) -> None:
     """Catches any wrong rule of the picture, a bound, tile or patch that loses a Gaussian, and a wrong order."""
     expected = rasterize(**case(name), backend="reference")
@@ -73,7 +73,7 @@ def by_splat(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("by_splat")
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", names(beta=False))
 def test_gradients_are_those_of_the_reference(name: str, cuda_device: str) -> None:
     """Catches a wrong or missing derivative of any input, and sums that miss a patch, a lane or a camera."""
     exact, single = case(name), case(name, torch.float32, cuda_device)

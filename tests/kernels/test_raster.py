@@ -43,7 +43,7 @@ def undecided_pixels(arguments: dict[str, Any]) -> Tensor:
 
 
 @pytest.mark.usefixtures("instruction_set")
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", names(beta=False))
 def test_picture(name: str) -> None:
     """Catches any rule of the picture that differs, a bound that loses a pixel, and a wrong rounding in one ISA."""
     arguments = single(name)
@@ -55,7 +55,7 @@ def test_picture(name: str) -> None:
 
 
 @pytest.mark.usefixtures("instruction_set")
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", names(beta=False))
 def test_gradients(name: str) -> None:
     """Catches a wrong gradient of any input: by size, by direction, and by which entries are zero."""
     arguments = single(name)
@@ -74,7 +74,7 @@ def test_gradients(name: str) -> None:
         assert not ((truth == 0) & (got.abs() > noise)).any(), f"{key}: a gradient should be zero"
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", names(beta=False))
 def test_info(name: str) -> None:
     """Catches radii, means or depths that differ from the reference's: density control lives on them."""
     arguments = single(name)

@@ -5,15 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cases import camera, case, gaussians, names
+from cases import assert_beta_vector, camera, case, gaussians, names
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsbench.raster import RasterOutput, rasterize
+from gsbench.raster import RasterOutput, rasterize, reference
 from gsbench.stability.brute import Picture, render
 
-DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "Ks", "background")
+DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "shapes")
 PROPERTY = settings(max_examples=15, deadline=None)
 seeds = st.integers(0, 2**31)
 
@@ -78,7 +78,7 @@ def smooth(name: str) -> dict[str, Any]:
     """Six Gaussians of a case, whose picture has no decision so close that a finite difference would flip it."""
     arguments = case(name)
     few = torch.linspace(0, len(arguments["means"]) - 1, 6).long()
-    arguments |= {k: arguments[k][few] for k in ("means", "factors", "opacities")}
+    arguments |= {k: arguments[k][few] for k in ("means", "factors", "opacities", "shapes") if k in arguments}
     arguments["colors"] = arguments["colors"][..., few, :]
     D = arguments["colors"].shape[-1]
     arguments.setdefault("background", torch.linspace(0.2, 0.9, D, dtype=torch.float64))
@@ -88,7 +88,8 @@ def smooth(name: str) -> dict[str, Any]:
 
 
 GRADIENT_CASES = ("random", "off_screen", "larger_than_picture", "near_plane", "flat", "three_cameras", "antialiased",
-                  "oblong_pixels", "principal_point_outside", "one_channel", "five_channels")  # fmt: skip
+                  "oblong_pixels", "principal_point_outside", "one_channel", "five_channels", "beta",
+                  "beta_antialiased", "beta_of_three_cameras")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", GRADIENT_CASES)
@@ -98,7 +99,7 @@ def test_gradients_of_every_input(name: str) -> None:
     # Of Ks the four numbers: the others are fixed, and refused when central differences move them.
     Ks = arguments.pop("Ks")
     intrinsics = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], -1)
-    names = [k for k in DIFFERENTIABLE if k != "Ks"]
+    names = [k for k in DIFFERENTIABLE if k in arguments]
     inputs = tuple(x.requires_grad_() for x in (*map(arguments.pop, names), intrinsics))
     weight = torch.randn(2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
@@ -162,6 +163,25 @@ def test_a_point_without_filter() -> None:
     assert arguments["factors"].grad.isfinite().all()
     assert not output.info.radii[:, ::2].any()
     assert output.info.radii[:, 1::2].any()
+
+
+def test_beta_vector() -> None:
+    """Catches another formula of a Beta profile than that of Universal Beta Splatting, in value, size and gradient."""
+    assert_beta_vector("reference", torch.float64, 1e-4)
+
+
+@pytest.mark.parametrize("shape", [1e-6, 0.3, 1.0])
+def test_gradients_at_the_rim_are_held(shape: float) -> None:
+    """Catches an infinite gradient, or a missing one, where 1 - r^2 is below 1e-6 and the exponent below 1."""
+    rim = torch.tensor([0.99, 1 - 1e-6, 1 - 1e-9, 1 - 1e-16, 1.0, 1.1, 1e300], dtype=torch.float64, requires_grad=True)
+    exponents = torch.full((7,), shape, dtype=torch.float64, requires_grad=True)
+    profile = reference._beta(rim, exponents)
+    profile.sum().backward()
+    held = (1 - rim.detach()).clamp(min=1e-6)
+    inside = rim.detach() < 1
+    torch.testing.assert_close(profile.detach(), held**shape * inside)
+    torch.testing.assert_close(rim.grad, -shape * held ** (shape - 1) * inside)
+    torch.testing.assert_close(exponents.grad, held**shape * held.log() * inside)
 
 
 # ---- properties
@@ -255,10 +275,10 @@ def test_same_bits_twice(threads: int) -> None:
     try:
         torch.set_num_threads(threads)
         for _ in range(3):
-            inputs = [a[k].detach().requires_grad_() for k in DIFFERENTIABLE[:6]]
-            output = draw(a | dict(zip(DIFFERENTIABLE, inputs, strict=False)))
+            inputs = {k: a[k].detach().requires_grad_() for k in DIFFERENTIABLE if k in a}
+            output = draw(a | inputs)
             output.image.square().sum().backward()
-            runs.append([output.image.detach(), *(i.grad for i in inputs)])
+            runs.append([output.image.detach(), *(i.grad for i in inputs.values())])
     finally:
         torch.set_num_threads(before)
     for run in runs[1:]:
