@@ -58,8 +58,7 @@ def rasterize(
         eps2d: the number that is added to the diagonal of the projected covariances, pixels^2.
         backend: `reference` (torch), `cpu` or `cuda` (kernels), or `auto` (the fastest installed one).
         antialias: whether to scale opacities for the area that `eps2d` adds, as the 2D filter of Mip-Splatting does.
-        shapes: the exponents b > 0 of the Beta profiles (Universal Beta Splatting), [N]; None: Gaussians. Only backend
-            `reference` draws Beta profiles yet.
+        shapes: the exponents b > 0 of the Beta profiles (Universal Beta Splatting), [N]; None: Gaussians.
 
     Returns:
         The images [C, H, W, D], their alpha [C, H, W, 1], and `RasterInfo` for density control.
@@ -92,10 +91,8 @@ def rasterize(
     chosen = resolve(backend, means.device.type) if isinstance(backend, str) else backend
     inputs = means, factors, opacities, colors, viewmats, Ks, background
     viewport = Viewport(width, height, near, far, eps2d, antialias)
-    if shapes is not None and chosen.serves(means):
-        raise InputError("shapes: expected None for the kernels, which draw Gaussians only: use backend 'reference'")
     if chosen.serves(means):
-        return native.draw(*inputs, viewport)
+        return native.draw(*inputs, viewport, shapes)
     if backend != "auto" and chosen in (CPU, CUDA):
         raise InputError(f"raster backend '{chosen.name}': expected float32 tensors on device '{chosen.name}', got "
                          f"{means.dtype} on {means.device}; backend 'reference' takes any")  # fmt: skip

@@ -224,5 +224,7 @@ def _beta(r2: Tensor, shape: Tensor) -> Tensor:
     """
     inside = r2 < 1
     r2 = torch.where(inside, r2, 0.0)
-    r2 = r2 - (r2 - (1 - RIM_MIN)).clamp(min=0).detach()  # detached: the gradient is that of the held value
-    return torch.where(inside, torch.exp(shape * torch.log1p(-r2)), 0.0)
+    rest = 1 - r2
+    held = rest + (RIM_MIN - rest).clamp(min=0).detach()  # detached: the gradient is that of the held value
+    log_rest = torch.where(r2 < 0.5, torch.log1p(-r2), held.log())  # log1p keeps digits that large exponents need
+    return torch.where(inside, torch.exp(shape * log_rest), 0.0)

@@ -19,9 +19,9 @@ def case(name: str, dtype: torch.dtype = torch.float64, device: str = "cpu") -> 
     return {k: v.to(device, dtype) if isinstance(v, Tensor) else v for k, v in arguments.items()}
 
 
-def names(beta: bool = True) -> list[str]:
-    """Every case; without those of Beta profiles if `beta` is false."""
-    return [name for name in _BUILDERS if beta or not name.startswith("beta")]
+def names() -> list[str]:
+    """Every case."""
+    return list(_BUILDERS)
 
 
 def _case(build: Callable[[torch.Generator], Arguments]) -> Callable[[torch.Generator], Arguments]:

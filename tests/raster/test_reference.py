@@ -16,6 +16,7 @@ from gsbench.stability.brute import Picture, render
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "shapes")
 PROPERTY = settings(max_examples=15, deadline=None)
 seeds = st.integers(0, 2**31)
+exponents = st.none() | st.floats(-3, 6).map(lambda power: 10**power)  # of Beta profiles; None: Gaussians
 
 
 def draw(arguments: dict[str, Any]) -> RasterOutput:
@@ -27,8 +28,9 @@ def brute_force(arguments: dict[str, Any], **more: Any) -> Picture:
     return render(**exact, **more)
 
 
-def scene(seed: int, N: int = 12) -> dict[str, Any]:
-    return gaussians(torch.Generator().manual_seed(seed), N, size=0.3) | camera(16, 12)
+def scene(seed: int, exponent: float | None, N: int = 12) -> dict[str, Any]:
+    shapes = {} if exponent is None else {"shapes": torch.full((N,), exponent, dtype=torch.float64)}
+    return gaussians(torch.Generator().manual_seed(seed), N, size=0.3) | camera(16, 12) | shapes
 
 
 @pytest.mark.parametrize("name", names())
@@ -188,21 +190,21 @@ def test_gradients_at_the_rim_are_held(shape: float) -> None:
 
 
 @PROPERTY
-@given(seeds)
-def test_order_of_gaussians_does_not_matter(seed: int) -> None:
+@given(seeds, exponents)
+def test_order_of_gaussians_does_not_matter(seed: int, exponent: float | None) -> None:
     """Catches a sort by index. To 1e-12 and not to the bit: a matrix product may round by the place of a row."""
-    a = scene(seed)
+    a = scene(seed, exponent)
     order = torch.randperm(12, generator=torch.Generator().manual_seed(seed))
-    b = a | {k: a[k][order] for k in ("means", "factors", "opacities", "colors")}
+    b = a | {k: a[k][order] for k in ("means", "factors", "opacities", "colors", "shapes") if k in a}
     torch.testing.assert_close(draw(b).image, draw(a).image, rtol=0, atol=1e-12)
     assert torch.equal(draw(b).info.radii, draw(a).info.radii[:, order])
 
 
 @PROPERTY
-@given(seeds)
-def test_rigid_motion_of_the_world(seed: int) -> None:
+@given(seeds, exponents)
+def test_rigid_motion_of_the_world(seed: int, exponent: float | None) -> None:
     """Catches a camera that is not the inverse of its pose: moving world and camera alike changes nothing."""
-    a = scene(seed)
+    a = scene(seed, exponent)
     g = torch.Generator().manual_seed(seed)
     Q = torch.linalg.qr(torch.randn(3, 3, generator=g, dtype=torch.float64))[0]
     Q = Q * torch.linalg.det(Q).sign()
@@ -218,20 +220,22 @@ def test_rigid_motion_of_the_world(seed: int) -> None:
 
 
 @PROPERTY
-@given(seeds)
-def test_only_the_covariance_of_a_factor_matters(seed: int) -> None:
+@given(seeds, exponents)
+def test_only_the_covariance_of_a_factor_matters(seed: int, exponent: float | None) -> None:
     """Catches use of F other than by F F^T: F Q is the same Gaussian for any orthogonal Q, reflections included."""
-    a = scene(seed)
+    a = scene(seed, exponent)
     g = torch.Generator().manual_seed(seed)
     Q = torch.linalg.qr(torch.randn(12, 3, 3, generator=g, dtype=torch.float64))[0]
     torch.testing.assert_close(draw(a | {"factors": a["factors"] @ Q}).image, draw(a).image, rtol=0, atol=1e-9)
 
 
 @PROPERTY
-@given(seeds, st.floats(-3, 4), st.floats(0, 1))
-def test_pictures_are_finite_and_covered_at_most_once(seed: int, log_size: float, opacity: float) -> None:
+@given(seeds, exponents, st.floats(-3, 4), st.floats(0, 1))
+def test_pictures_are_finite_and_covered_at_most_once(
+    seed: int, exponent: float | None, log_size: float, opacity: float
+) -> None:
     """Catches NaN, and more light than there is, for sizes from a thousandth to 10^4 of the scene in float32."""
-    a = scene(seed) | {"opacities": torch.full((12,), opacity)}
+    a = scene(seed, exponent) | {"opacities": torch.full((12,), opacity)}
     a["factors"] = a["factors"] * 10**log_size
     a = {k: v.float() if isinstance(v, Tensor) else v for k, v in a.items()}
     output = draw(a)
@@ -243,10 +247,10 @@ def test_pictures_are_finite_and_covered_at_most_once(seed: int, log_size: float
 
 
 @PROPERTY
-@given(seeds, st.integers(0, 4))
-def test_coverage_grows_with_opacity(seed: int, which: int) -> None:
+@given(seeds, exponents, st.integers(0, 4))
+def test_coverage_grows_with_opacity(seed: int, exponent: float | None, which: int) -> None:
     """Catches a sign in the blending. Five Gaussians below 0.8 stay above the transmittance that ends a pixel."""
-    a = scene(seed, N=5)
+    a = scene(seed, exponent, N=5)
     a["opacities"] = a["opacities"] * 0.6
     more = a["opacities"].clone()
     more[which] += 0.2
@@ -254,10 +258,10 @@ def test_coverage_grows_with_opacity(seed: int, which: int) -> None:
 
 
 @PROPERTY
-@given(seeds)
-def test_background_shows_where_nothing_is(seed: int) -> None:
+@given(seeds, exponents)
+def test_background_shows_where_nothing_is(seed: int, exponent: float | None) -> None:
     """Catches a background that is added twice or not dimmed by what is before it."""
-    a = scene(seed)
+    a = scene(seed, exponent)
     background = torch.tensor([0.3, 0.5, 0.9], dtype=torch.float64)
     output, black = draw(a | {"background": background}), draw(a)
     torch.testing.assert_close(output.image, black.image + (1 - black.alpha) * background)
