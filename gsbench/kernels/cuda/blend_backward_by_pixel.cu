@@ -1,5 +1,5 @@
 // The gradients of blending with one lane per pixel: a splat's sums over the patch are reduced across the lanes and
-// added to its row by one atomic instruction in nine lanes.
+// added to its row by one atomic instruction in nine lanes, or ten.
 #include "blend_backward.h"
 
 namespace gsb::cuda {
@@ -47,18 +47,19 @@ __global__ void __launch_bounds__(PATCHES * WARP)
     by_pixel_kernel(BlendArgs a, BlendState picture, PictureGrads grads, BlendGrads out, int first_channel) {
     __shared__ StagedSplat shared[PATCHES][WARP];
     StagedSplat* staged = shared[threadIdx.x / WARP];
-    using Sums = WarpSums<Patch<Profile>::SUMS>;
-    const Patch<Profile> patch(a, first_channel);
+    using P = Patch<Profile>;
+    using Sums = WarpSums<P::SUMS>;
+    const P patch(a, first_channel);
     auto [place, grad, behind] = BackwardPixel(patch, patch.lane, picture, grads);
     const int my_value = Sums::value_of(patch.lane);
-    const bool writes = my_value >= 0 && my_value < patch.GEOMETRY + patch.count;
+    const bool writes = my_value >= 0 && my_value < P::GEOMETRY + patch.count;
     for (int first = (last_stop(place.stop) + WARP - 1) / WARP * WARP - WARP; first >= 0; first -= WARP) {
         for (int i = patch.stage(first, staged) - 1; i >= 0; --i) {
             const StagedSplat& s = staged[i];
             const Falloff<float, Profile> f(place.x - s.x, place.y - s.y, s);
             const bool blended = s.position < place.stop && f.alpha >= ALPHA_MIN;
             if (!__any_sync(ALL_LANES, blended)) continue;
-            float sums[patch.SUMS] = {};
+            float sums[P::SUMS] = {};
             if (blended) unblend(f, s.color, place, grad, behind, sums);
             const float sum = Sums::reduce(sums, patch.lane);
             if (writes) atomicAdd(sum_of(out, patch, s.id, my_value), sum);

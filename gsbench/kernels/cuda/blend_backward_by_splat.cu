@@ -48,7 +48,7 @@ __global__ void __launch_bounds__(PATCHES * WARP)
     by_splat_kernel(BlendArgs a, BlendState picture, PictureGrads grads, BlendGrads out, int first_channel) {
     __shared__ Traffic shared[PATCHES];
     Traffic& traffic = shared[threadIdx.x / WARP];
-    constexpr int SUMS = Patch<Profile>::SUMS;
+    constexpr int GEOMETRY = Profile::MOMENTS, SUMS = Patch<Profile>::SUMS;
     const Patch<Profile> patch(a, first_channel);
     // Lane l starts with the pixel that reaches lane 0 after 32 - l steps.
     const int mine = (WARP - patch.lane) % WARP;
@@ -88,7 +88,7 @@ __global__ void __launch_bounds__(PATCHES * WARP)
         __syncwarp();
         for (int k = patch.lane; k < steps * SUMS; k += WARP) {
             const int row = k / SUMS, column = k % SUMS;
-            if (traffic.ids[row] < 0 || column >= patch.GEOMETRY + patch.count) continue;
+            if (traffic.ids[row] < 0 || column >= GEOMETRY + patch.count) continue;
             atomicAdd(sum_of(out, patch, traffic.ids[row], column), traffic.sums[row][column]);
         }
         __syncwarp();
