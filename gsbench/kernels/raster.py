@@ -83,7 +83,7 @@ def project(
     The result is differentiable with respect to all arguments except Ks and shapes, on which only the sizes depend. The
     arguments are those of `gsbench.raster.rasterize`.
     """
-    return Splats(*_project(means, factors, opacities, viewmats, Ks, shapes, *viewport), shapes)
+    return Splats(*_project(means, factors, opacities, viewmats, Ks, shapes, *viewport))._replace(shapes=shapes)
 
 
 def _of_images(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
