@@ -138,13 +138,13 @@ def stages_of(name: str, N: int, size: int) -> Iterator[Row]:
 def binning(name: str, calls: dict[str, Call]) -> Iterator[Row]:
     """What the rasterizer does outside of operations: look for bad values, and list each tile's Gaussians."""
     project, blend = calls["project"], calls["blend"]
-    means, factors, opacities, viewmats, Ks = project.tensors
+    means, factors, opacities, viewmats, Ks, _ = project.tensors
     values = means, factors, opacities, blend.tensors[3], viewmats, Ks, blend.tensors[4]
     splats, viewport, flags = Splats(*project.outputs), Viewport(*project.numbers), torch.zeros(1, dtype=torch.int64)
     yield Row("stages", f"{name} check values", lambda: flag_values(*values), floor=("bytes", _bytes(values)))
     read = _bytes([splats.means2d, splats.depths, splats.half_sizes])
     yield Row("stages", f"{name} bin", lambda: bin_tiles(splats, viewport, flags),
-              floor=("bytes", read + _bytes(blend.tensors[5:])))  # fmt: skip
+              floor=("bytes", read + _bytes(blend.tensors[5:7])))  # fmt: skip
 
 
 def floors(call: Call, project: Call, N: int) -> list[tuple[str, float]]:
@@ -172,7 +172,7 @@ def loss_flops(pixels: int) -> float:
 @torch.no_grad()
 def blended_alphas(project: Call) -> float:
     """Count pairs of a pixel and a Gaussian that is blended into it: alpha of at least 1/255, before the pixel ends."""
-    means, factors, opacities, viewmats, Ks = project.tensors
+    means, factors, opacities, viewmats, Ks, _ = project.tensors
     viewport = Viewport(*project.numbers)
     splats = reference.project(means, factors, opacities, viewmats[0], Ks[0], *viewport)
     tiles, ids = reference.bin_tiles(splats, viewport.width, viewport.height)

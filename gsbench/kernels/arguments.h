@@ -182,12 +182,13 @@ struct ProjectArgs {
     int64_t N, C;
     const float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
     const float *viewmats, *Ks;                // [C, 4, 4] [C, 3, 3]
+    const float* shapes;                       // [N] exponents of Beta profiles; null: Gaussians
     int width, height;
     float near, far, eps2d;
     bool antialias;
     int threads;
 };
-GSB_FIELDS(ProjectArgs, INPUTS, N, C, means, factors, opacities, viewmats, Ks, width, height, near, far, eps2d,
+GSB_FIELDS(ProjectArgs, INPUTS, N, C, means, factors, opacities, viewmats, Ks, shapes, width, height, near, far, eps2d,
            antialias, threads)
 
 struct Splats {
@@ -215,11 +216,12 @@ struct BlendArgs {
     bool color_per_camera;  // colors are [C, N, D], else [1, N, D]
     const float *means2d, *roots, *half_sizes, *colors, *background;
     const int32_t *offsets, *ids;  // [C * tiles + 1] [pairs]: each tile's list of splats, front to back
+    const float* shapes;           // [N] exponents of Beta profiles; null: Gaussians
     int width, height;
     int threads;
 };
 GSB_FIELDS(BlendArgs, INPUTS, N, C, D, color_per_camera, means2d, roots, half_sizes, colors, background, offsets, ids,
-           width, height, threads)
+           shapes, width, height, threads)
 
 struct Picture {
     float *image, *alpha;         // [C, H, W, D] [C, H, W, 1]
@@ -240,18 +242,21 @@ GSB_FIELDS(PictureGrads, GIVEN, image, alpha)
 struct BlendGrads {
     float *means2d, *roots, *colors;  // [C, N, 2] [C, N, 4] as colors
     float* background;                // [D], zero on entry; null: not wanted
-    float* scratch;                   // [C, N, 6 + D] zero on entry, on a GPU
+    float* shapes;                    // [N]; null: Gaussians
+    float* scratch;                   // [C, N, moments + D] zero on entry, on a GPU
 };
-GSB_FIELDS(BlendGrads, GRADS, means2d, roots, colors, background, scratch)
+GSB_FIELDS(BlendGrads, GRADS, means2d, roots, colors, background, shapes, scratch)
 
 // Bit k of `flags` is set if the k-th array has a value that is not finite or out of range.
 struct ValueArgs {
     int64_t N, C, all_colors;  // all_colors: the size of `colors`
     int D;
     const float *means, *factors, *opacities, *colors, *viewmats, *Ks, *background;
+    const float* shapes;  // [N]; may be null
     int threads;
 };
-GSB_FIELDS(ValueArgs, INPUTS, N, C, all_colors, D, means, factors, opacities, colors, viewmats, Ks, background, threads)
+GSB_FIELDS(ValueArgs, INPUTS, N, C, all_colors, D, means, factors, opacities, colors, viewmats, Ks, background, shapes,
+           threads)
 
 struct ValueFlags {
     int64_t* flags;  // [1], zero on entry

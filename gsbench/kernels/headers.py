@@ -20,6 +20,7 @@ TIME_OPACITY_FACTOR_MIN = _thresholds["TIME_OPACITY_FACTOR_MIN"]
 ALPHA_MIN = _thresholds["ALPHA_MIN"]
 ALPHA_MAX = _thresholds["ALPHA_MAX"]
 TRANSMITTANCE_MIN = _thresholds["TRANSMITTANCE_MIN"]
+RIM_MIN = _thresholds["RIM_MIN"]
 
 _sizes = _constants("math/sizes.h", "int")
 TILE = int(_sizes["TILE"])

@@ -16,7 +16,7 @@ from gsbench.process.memory import require
 
 TILE_PIXELS = TILE * TILE
 MAX_PAIRS = (1 << 31) - 1  # splats and tile intersections (pairs of tile and splat) are numbered by int32
-GEOMETRY = 6  # numbers per splat: x, y, p, q, r, opacity
+GEOMETRY = 6  # numbers per splat: x, y, p, q, r, opacity; of a Beta profile its exponent too
 LOWER = "use a smaller image, fewer cameras at once or fewer Gaussians"  # where memory does not suffice
 
 
@@ -38,6 +38,7 @@ class Splats(NamedTuple):
     roots: Tensor  # [C, N, 4]: p, q, r of the inverse 2D covariance's triangular root (math/projection.h); the opacity
     depths: Tensor  # [C, N]
     half_sizes: Tensor  # [C, N, 2] pixels, beyond which alpha < 1/255; 0: not drawn; without a gradient
+    shapes: Tensor | None = None  # [N] exponents of Beta profiles; None: Gaussians
 
 
 class Bins(NamedTuple):
@@ -60,6 +61,7 @@ _project = Operation(
         "opacities": Input("N"),
         "viewmats": Input("C 4 4", Gradient.ON_REQUEST),
         "Ks": Input("C 3 3", Gradient.REFUSED),
+        "shapes": Input("N", Gradient.NONE, left_out_with="shapes"),
     },
     outputs={
         "means2d": Output("C N 2"),
@@ -73,14 +75,15 @@ _project = Operation(
 
 
 def project(
-    means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, viewport: Viewport
-) -> Splats:
+    means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, viewport: Viewport,
+    shapes: Tensor | None = None,
+) -> Splats:  # fmt: skip
     """Project 3D Gaussians to the image planes of all cameras (EWA splatting, eq. 29).
 
-    The result is differentiable with respect to all arguments except Ks. The arguments are those of
-    `gsbench.raster.rasterize`.
+    The result is differentiable with respect to all arguments except Ks and shapes, on which only the sizes depend. The
+    arguments are those of `gsbench.raster.rasterize`.
     """
-    return Splats(*_project(means, factors, opacities, viewmats, Ks, *viewport))
+    return Splats(*_project(means, factors, opacities, viewmats, Ks, shapes, *viewport))._replace(shapes=shapes)
 
 
 def _of_images(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
@@ -89,8 +92,8 @@ def _of_images(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, i
     if sets not in (1, C):
         raise InputError(f"blend: expected one set of colours, or one a camera, got {sets} for {C} cameras")
     tiles = C * count_tiles(numbers["width"], numbers["height"])
-    return {"color_per_camera": int(C > 1 and sets == C), "lists": tiles + 1, "sums": GEOMETRY + D, "D": D,
-            "state": tiles // C * TILE_PIXELS}  # fmt: skip
+    return {"color_per_camera": int(C > 1 and sets == C), "lists": tiles + 1, "D": D,
+            "sums": GEOMETRY + ("shapes" in given) + D, "state": tiles // C * TILE_PIXELS}  # fmt: skip
 
 
 _blend = Operation(
@@ -103,6 +106,7 @@ _blend = Operation(
         "background": Input("D", Gradient.ON_REQUEST),
         "offsets": Input("lists", Gradient.NONE, (torch.int32,)),
         "ids": Input("pairs", Gradient.NONE, (torch.int32,), is_list=True),
+        "shapes": Input("N", left_out_with="shapes"),
     },
     outputs={
         "image": Output("C height width D"),
@@ -122,8 +126,8 @@ def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewpo
 
     Colours are [N, D] if all cameras see the same ones, otherwise [C, N, D]. The background is [D].
     """
-    means2d, roots, _, half_sizes = splats
-    image, alpha, *_ = _blend(means2d, roots, half_sizes, colors, background, *bins, viewport.width, viewport.height)
+    means2d, roots, _, half_sizes, shapes = splats
+    image, alpha, *_ = _blend(means2d, roots, half_sizes, colors, background, *bins, shapes, *viewport[:2])
     return image, alpha
 
 
@@ -140,17 +144,19 @@ def backward_by_splat() -> Iterator[None]:
         _blend.backward_kernel = before
 
 
-def flag_values(*values: Tensor) -> Tensor:
+def flag_values(*values: Tensor, shapes: Tensor | None = None) -> Tensor:
     """Return a tensor [1] int64 that is not zero if any value is not finite or out of range.
 
-    The values are means, factors, opacities, colours, viewmats, Ks and background, as in `rasterize`.
+    The values are means, factors, opacities, colours, viewmats, Ks, background and shapes, as in `rasterize`.
     """
     means, _, _, colors, viewmats, *_ = values
-    flags, rows = torch.zeros(1, dtype=torch.int64, device=means.device), in_rows(list(values))
-    names = ("means", "factors", "opacities", "colors", "viewmats", "Ks", "background")
-    slots = {"N": len(means), "C": len(viewmats), "all_colors": colors.numel(), "D": colors.shape[-1],
+    flags = torch.zeros(1, dtype=torch.int64, device=means.device)
+    rows = in_rows([*values, *([] if shapes is None else [shapes])])
+    names = ("means", "factors", "opacities", "colors", "viewmats", "Ks", "background", "shapes")
+    slots = {"N": len(means), "C": len(viewmats), "all_colors": colors.numel(), "D": colors.shape[-1], "shapes": 0,
              "out.flags": address(flags)}  # fmt: skip
-    library_of(means.device.type).call("flag_values", slots | dict(zip(names, map(address, rows), strict=True)), means)
+    slots |= dict(zip(names, map(address, rows), strict=False))  # shapes may be left out
+    library_of(means.device.type).call("flag_values", slots, means)
     return flags
 
 

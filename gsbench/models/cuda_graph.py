@@ -92,10 +92,9 @@ class GraphedFrames:
         view = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, self.antialias)
 
         def frame() -> tuple[Tensor, Tensor]:
-            # A model with other alpha profiles than Gaussians never comes here: its first image raised an error.
-            means, factors, opacities, colors, _ = self.model.slice(Query.of(own, own_time))
+            means, factors, opacities, colors, shapes = self.model.slice(Query.of(own, own_time))
             return draw_within(means, factors, opacities, colors[None], own.viewmat[None], own.K[None],
-                                self.background, view, room)  # fmt: skip
+                                self.background, view, room, shapes)  # fmt: skip
 
         with torch.cuda.device_of(own.K):
             play, (image, needed) = capture(frame)

@@ -6,7 +6,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.backends import CPU, CUDA, Backend, resolve
 from gsbench.kernels.raster import Viewport
 from gsbench.raster import native, reference
-from gsbench.raster.checks import check_arguments, check_shapes, check_values
+from gsbench.raster.checks import check_arguments, check_values
 from gsbench.raster.output import RasterInfo, RasterOutput
 
 __all__ = ["EPS2D", "FAR", "NEAR", "RasterInfo", "RasterOutput", "rasterize"]
@@ -38,7 +38,9 @@ def rasterize(
     The covariance of a Gaussian is F F^T, where F is any square matrix in `factors`.
 
     Gaussians are blended front to back by camera depth; of equal depths the lower index comes first. The alpha of a
-    Gaussian in a pixel is `min(0.999, opacity * exp(-power))`, and alphas below 1/255 are skipped. A pixel stops before
+    Gaussian in a pixel is `min(0.999, opacity * exp(-r2 / 2))`. Here r2 = d^T S^-1 d, with the offset d from the centre
+    and the projected covariance S (with `eps2d`), in pixels. With `shapes` alpha is `min(0.999, opacity * (1 - r2)^b)`
+    where r2 < 1, and zero elsewhere; 1 - r2 is held above 1e-6. Alphas below 1/255 are skipped. A pixel stops before
     the Gaussian that would reduce its transmittance below 1e-4.
 
     Args:
@@ -56,8 +58,7 @@ def rasterize(
         eps2d: the number that is added to the diagonal of the projected covariances, pixels^2.
         backend: `reference` (torch), `cpu` or `cuda` (kernels), or `auto` (the fastest installed one).
         antialias: whether to scale opacities for the area that `eps2d` adds, as the 2D filter of Mip-Splatting does.
-        shapes: the exponents b of the alpha profiles (1 - r^2)^b of Universal Beta Splatting, [N]; None: Gaussians.
-            These profiles are not implemented yet: every backend raises InputError if `shapes` is not None.
+        shapes: the exponents b > 0 of the Beta profiles (Universal Beta Splatting), [N]; None: Gaussians.
 
     Returns:
         The images [C, H, W, D], their alpha [C, H, W, 1], and `RasterInfo` for density control.
@@ -82,17 +83,18 @@ def rasterize(
     if not isinstance(backend, str | Backend) or not isinstance(antialias, bool):
         raise InputError(f"backend, antialias: expected a name or a Backend, and True or False, got {backend!r:.40} "
                          f"and {antialias!r:.40}")  # fmt: skip
-    check_shapes(shapes, backend if isinstance(backend, str) else backend.name)
-    check_arguments(means, factors, opacities, colors, viewmats, Ks, width, height, background, near, far, eps2d)
+    check_arguments(
+        means, factors, opacities, colors, viewmats, Ks, width, height, background, near, far, eps2d, shapes
+    )
     if background is None:
         background = colors.new_zeros(colors.shape[-1])
     chosen = resolve(backend, means.device.type) if isinstance(backend, str) else backend
     inputs = means, factors, opacities, colors, viewmats, Ks, background
     viewport = Viewport(width, height, near, far, eps2d, antialias)
     if chosen.serves(means):
-        return native.draw(*inputs, viewport)
+        return native.draw(*inputs, viewport, shapes)
     if backend != "auto" and chosen in (CPU, CUDA):
         raise InputError(f"raster backend '{chosen.name}': expected float32 tensors on device '{chosen.name}', got "
                          f"{means.dtype} on {means.device}; backend 'reference' takes any")  # fmt: skip
-    check_values(*inputs)
-    return reference.draw(*inputs, viewport)
+    check_values(*inputs, shapes)
+    return reference.draw(*inputs, viewport, shapes)

@@ -17,27 +17,27 @@ _known: set[tuple[object, ...]] = set()  # shapes and dtypes that passed the che
 def check_arguments(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     width: int, height: int, background: Tensor | None, near: float, far: float, eps2d: float,
+    shapes: Tensor | None = None,
 ) -> None:  # fmt: skip
     """Raise InputError if a shape, dtype or device, or the image size, is not what `rasterize` requires."""
     _check_viewport(width, height, near, far, eps2d)
-    given = means, factors, opacities, colors, viewmats, Ks, background
+    given = means, factors, opacities, colors, viewmats, Ks, background, shapes
     call = width, height, *[(x.shape, x.dtype, x.device, x.layout) if isinstance(x, Tensor) else type(x) for x in given]
     if call in _known:
         return
     tensors = {"means": means, "factors": factors, "opacities": opacities, "colors": colors,
                "viewmats": viewmats, "Ks": Ks}  # fmt: skip
-    if background is not None:
-        tensors["background"] = background
+    tensors |= {name: x for name, x in (("background", background), ("shapes", shapes)) if x is not None}
     for name, tensor in tensors.items():
         check_tensor(tensor, name)
         if tensor.dim() == 0:
             raise InputError(f"{name}: expected a tensor of at least one dimension, got one of shape []")
     N, C, D = len(means), len(viewmats), colors.shape[-1]
-    shapes = {"means": (N, 3), "factors": (N, 3, 3), "opacities": (N,), "viewmats": (C, 4, 4), "Ks": (C, 3, 3),
-              "colors": (N, D) if colors.dim() == 2 else (C, N, D), "background": (D,)}  # fmt: skip
+    sizes = {"means": (N, 3), "factors": (N, 3, 3), "opacities": (N,), "viewmats": (C, 4, 4), "Ks": (C, 3, 3),
+             "colors": (N, D) if colors.dim() == 2 else (C, N, D), "background": (D,), "shapes": (N,)}  # fmt: skip
     for name, tensor in tensors.items():
-        if tuple(tensor.shape) != shapes[name]:
-            raise InputError(f"{name}: expected shape {list(shapes[name])}, got {list(tensor.shape)}")
+        if tuple(tensor.shape) != sizes[name]:
+            raise InputError(f"{name}: expected shape {list(sizes[name])}, got {list(tensor.shape)}")
         if tensor.dtype != means.dtype:
             raise InputError(f"{name}: expected {means.dtype} as means are, got {tensor.dtype}")
         if tensor.device != means.device:
@@ -50,14 +50,6 @@ def check_arguments(
     if len(_known) >= MOST_KNOWN:
         _known.clear()
     _known.add(call)
-
-
-def check_shapes(shapes: Tensor | None, backend: str) -> None:
-    """Raise InputError if `shapes` (exponents of alpha profiles) is not None: no backend renders such profiles yet."""
-    if shapes is not None:
-        got = f"a tensor of shape {list(shapes.shape)}" if isinstance(shapes, Tensor) else type(shapes).__name__
-        raise InputError(f"shapes: expected None, got {got}: raster backend '{backend:.40}' draws Gaussians only: "
-                         f"leave shapes out, or build their profile into it (docs/adding_a_kernel.md)")  # fmt: skip
 
 
 def _check_viewport(width: int, height: int, near: float, far: float, eps2d: float) -> None:
@@ -73,10 +65,13 @@ def _check_viewport(width: int, height: int, near: float, far: float, eps2d: flo
 
 def check_values(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, background: Tensor,
+    shapes: Tensor | None = None,
 ) -> None:  # fmt: skip
-    """Raise InputError unless all values are finite, opacities are in [0, 1] and focal lengths are positive."""
+    """Raise InputError unless values are finite, opacities in [0, 1], and focal lengths and shapes positive."""
     tensors = {"means": means, "factors": factors, "opacities": opacities, "colors": colors,
                "viewmats": viewmats, "Ks": Ks, "background": background}  # fmt: skip
+    if shapes is not None:
+        tensors["shapes"] = shapes
     for name, tensor in tensors.items():
         # The sum needs one pass. A finite sum contains no NaN, so single values are checked only if it is not finite.
         if not torch.isfinite(tensor.detach().sum()) and not torch.isfinite(tensor).all():
@@ -85,6 +80,10 @@ def check_values(
     low, high = opacities.detach().aminmax() if len(means) else (0, 0)
     if low < 0 or high > 1:
         raise InputError(f"opacities: expected values in [0, 1], got {low} to {high}")
+    if shapes is not None and len(shapes) and (least := shapes.detach().min()) <= 0:
+        raise InputError(
+            f"shapes: expected exponents above 0, got {least}: exponentiate raw parameters, or use softplus"
+        )
     if (Ks.detach()[:, [0, 1], [0, 1]] <= 0).any():
         raise InputError("Ks: expected positive focal lengths at [0, 0] and [1, 1]")
     rest = Ks.detach()[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]

@@ -24,7 +24,7 @@ MAX_GAUSSIANS = 1 << 24  # limit of the CPU kernel, which stores positions in th
 
 def draw(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    background: Tensor, viewport: Viewport,
+    background: Tensor, viewport: Viewport, shapes: Tensor | None = None,
 ) -> RasterOutput:  # fmt: skip
     """Render images for all cameras by the CPU or CUDA kernels; see `gsbench.raster.rasterize` for the arguments.
 
@@ -44,26 +44,26 @@ def draw(
     if C * N > MAX_PAIRS:
         raise InputError(f"raster backend '{device}': expected at most {MAX_PAIRS} Gaussians times cameras, got "
                          f"{C * N}")  # fmt: skip
-    flags = flag_values(means, factors, opacities, colors, viewmats, Ks, background)
-    splats = project(means, factors, opacities, viewmats, Ks, viewport)
+    flags = flag_values(means, factors, opacities, colors, viewmats, Ks, background, shapes=shapes)
+    splats = project(means, factors, opacities, viewmats, Ks, viewport, shapes)
     bins, flagged = bin_tiles(splats, viewport, flags)
     if flagged:  # the kernel found a bad value: find out which one, for the error message
-        check_values(means, factors, opacities, colors, viewmats, Ks, background)
+        check_values(means, factors, opacities, colors, viewmats, Ks, background, shapes)
     image, alpha = blend(splats, colors, background, bins, viewport)
     return RasterOutput(image, alpha, RasterInfo(splats.half_sizes, splats.means2d, splats.depths, len(bins.ids)))
 
 
 def draw_within(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    background: Tensor, viewport: Viewport, room: int,
+    background: Tensor, viewport: Viewport, room: int, shapes: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Render images [C, H, W, D] without a GPU synchronisation, with memory for `room` tile intersections.
 
     The second result, [2] int64, is the number of intersections, and a flag that is not zero if an input is out of
     range. If the number is larger than `room`, the image is incomplete.
     """
-    flags = flag_values(means, factors, opacities, colors, viewmats, Ks, background)
-    splats = project(means, factors, opacities, viewmats, Ks, viewport)
+    flags = flag_values(means, factors, opacities, colors, viewmats, Ks, background, shapes=shapes)
+    splats = project(means, factors, opacities, viewmats, Ks, viewport, shapes)
     bins, needed = bin_within(splats, viewport, flags, room)
     return blend(splats, colors, background, bins, viewport)[0], needed
 

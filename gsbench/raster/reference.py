@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, RIM_MIN, TRANSMITTANCE_MIN
 from gsbench.kernels.raster import Viewport
 from gsbench.raster.output import RasterInfo, RasterOutput
 
@@ -25,17 +25,19 @@ class CameraSplats(NamedTuple):
     opacities: Tensor  # [N]
     depths: Tensor  # [N]
     half_sizes: Tensor  # [N, 2] pixels: alpha < ALPHA_MIN outside of means2d +- half_sizes; 0: culled
+    shapes: Tensor | None = None  # [N] exponents of Beta profiles; None: Gaussians
 
 
 def draw(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    background: Tensor, viewport: Viewport,
+    background: Tensor, viewport: Viewport, shapes: Tensor | None = None,
 ) -> RasterOutput:  # fmt: skip
     """Render images for all cameras, one after the other; see `gsbench.raster.rasterize` for the arguments."""
     if colors.dim() == 2:
         colors = colors.expand(len(viewmats), *colors.shape)
     splats = [
-        project(means, factors, opacities, viewmat, K, *viewport) for viewmat, K in zip(viewmats, Ks, strict=True)
+        project(means, factors, opacities, viewmat, K, *viewport, shapes)
+        for viewmat, K in zip(viewmats, Ks, strict=True)
     ]
     means2d = torch.stack([s.means2d for s in splats])  # all images are computed from it, so it gets a gradient
     images, alphas, pairs = [], [], 0
@@ -66,6 +68,7 @@ def project(
     far: float,
     eps2d: float,
     antialias: bool,
+    shapes: Tensor | None = None,  # [N]
 ) -> CameraSplats:
     """Project Gaussians to an image by the affine approximation at each mean (EWA splatting, eq. 29)."""
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
@@ -105,13 +108,16 @@ def project(
         ratio = torch.where(area2 > 0, area2, 1.0) / det
         opacities = torch.where(area2 > 0, opacities * ratio.sqrt(), 0.0)
 
-    # alpha >= 1/255 only where power <= ln(255 opacity). The bounding box of this ellipse has the half sizes
-    # sqrt(2 power cov_xx), sqrt(2 power cov_yy). A hundredth of a pixel is added for rounding.
-    power = (255 * opacities.detach()).clamp(min=1).log()
-    half_sizes = (2 * power[:, None] * torch.stack([xx + eps, yy], -1).detach()).sqrt() * size[:, None] + 0.01
+    # alpha >= 1/255 only where r^2 <= 2 ln(255 opacity); of a Beta profile where r^2 <= 1 - (255 opacity)^(-1/b). The
+    # bounding box of this ellipse has the half sizes r sqrt(cov_xx), r sqrt(cov_yy). A hundredth of a pixel is added
+    # for rounding.
+    most = (255 * opacities.detach()).clamp(min=1).log()
+    reach = 2 * most if shapes is None else -torch.expm1(-most / shapes.detach())
+    half_sizes = (reach[:, None] * torch.stack([xx + eps, yy], -1).detach()).sqrt() * size[:, None] + 0.01
     inside = ((means2d + half_sizes > 0) & (means2d - half_sizes < means2d.new_tensor([width, height]))).all(-1)
     drawn = drawn & (opacities >= ALPHA_MIN) & inside
-    return CameraSplats(means2d, conics, opacities, means_c[:, 2], torch.where(drawn[:, None], half_sizes, 0.0))
+    half_sizes = torch.where(drawn[:, None], half_sizes, 0.0)
+    return CameraSplats(means2d, conics, opacities, means_c[:, 2], half_sizes, shapes)
 
 
 @torch.no_grad()
@@ -160,7 +166,9 @@ def blend(
     D = colors.shape[-1]
     # A table with a row for each Gaussian and a row of zeros for padding, so that one gather reads all parameters.
     table = torch.cat([splats.means2d, splats.conics, splats.opacities[:, None], colors], -1)
-    table = torch.cat([table, table.new_zeros(1, 6 + D)])
+    if splats.shapes is not None:
+        table = torch.cat([table, splats.shapes[:, None]], -1)
+    table = torch.cat([table, table.new_zeros(1, table.shape[1])])
 
     lengths = torch.bincount(tiles, minlength=across * down)
     starts = lengths.cumsum(0) - lengths
@@ -176,7 +184,7 @@ def blend(
         index = index.masked_fill(padding, len(table) - 1)
         # index_select, not table[index]: the backward pass of the latter adds rows in random order.
         rows = table.index_select(0, index.flatten()).unflatten(0, index.shape)
-        pieces.append(_blend_tiles(rows, chosen % across * TILE, chosen // across * TILE))
+        pieces.append(_blend_tiles(rows, D, chosen % across * TILE, chosen // across * TILE))
         first = last
     empty = table[-1, 0].expand(across * down - first, TILE * TILE, D + 1)  # zeros, but in the graph
     canvas = torch.cat([*pieces, empty])[torch.argsort(by_length)]  # back into the tiles' own order
@@ -186,7 +194,10 @@ def blend(
 
 
 def _blend_tiles(
-    rows: Tensor,  # [T, K, 6 + D]: mean2d, conic, opacity, colour of the K Gaussians of each of T tiles, in depth order
+    # [T, K, 6 + D]: mean2d, conic, opacity, colour of the K Gaussians of each of T tiles, in depth order; with the
+    # exponents of Beta profiles, [T, K, 7 + D]
+    rows: Tensor,
+    D: int,
     left: Tensor,  # [T] pixels
     top: Tensor,  # [T] pixels
 ) -> Tensor:  # [T, TILE * TILE, D + 1]: colour and alpha
@@ -194,11 +205,26 @@ def _blend_tiles(
     dx = (left[:, None, None] + offsets) - rows[..., 0:1]  # [T, K, TILE]
     dy = (top[:, None, None] + offsets) - rows[..., 1:2]
     a, b, c, opacity = rows[..., 2:6, None].unbind(-2)
-    power = ((b * dy)[..., :, None] + (a * dx)[..., None, :]).square() + (c * dy).square()[..., :, None]
-    alpha = (opacity[..., None] * torch.exp(-0.5 * power)).clamp(max=ALPHA_MAX).flatten(-2)
+    r2 = ((b * dy)[..., :, None] + (a * dx)[..., None, :]).square() + (c * dy).square()[..., :, None]
+    shape = rows[..., 6 + D :, None]  # [T, K, 0 or 1, 1]
+    profile = _beta(r2, shape) if shape.shape[-2] else torch.exp(-0.5 * r2)
+    alpha = (opacity[..., None] * profile).clamp(max=ALPHA_MAX).flatten(-2)
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
     after = torch.cumprod(1 - alpha, 1)  # transmittance behind each Gaussian
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
     weight = torch.where(after >= TRANSMITTANCE_MIN, alpha * before, 0.0)  # [T, K, TILE * TILE]
-    color = torch.cat([rows[..., 6:], torch.ones_like(rows[..., :1])], -1)
+    color = torch.cat([rows[..., 6 : 6 + D], torch.ones_like(rows[..., :1])], -1)
     return weight.transpose(1, 2) @ color
+
+
+def _beta(r2: Tensor, shape: Tensor) -> Tensor:
+    """Return the Beta profile (1 - r^2)^b inside of r = 1, and zero outside, where it has no gradient.
+
+    In the value and in the gradient, 1 - r^2 is held above RIM_MIN.
+    """
+    inside = r2 < 1
+    r2 = torch.where(inside, r2, 0.0)
+    rest = 1 - r2
+    held = rest + (RIM_MIN - rest).clamp(min=0).detach()  # detached: the gradient is that of the held value
+    log_rest = torch.where(r2 < 0.5, torch.log1p(-r2), held.log())  # log1p keeps digits that large exponents need
+    return torch.where(inside, torch.exp(shape * log_rest), 0.0)

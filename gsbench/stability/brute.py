@@ -13,7 +13,8 @@ from torch import Tensor
 
 PRODUCTS = 1 << 21  # (Gaussian, pixel) pairs in one chunk, to limit memory
 Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`
-DIFFERENTIABLE = ("means", "factors", "opacities", "colors")
+RIM = 1e-3  # a pixel with |1 - r^2| below this is at the rim of a Beta profile
+DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "shapes")
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class _Splats(NamedTuple):
     covs: Tensor  # [M, 2, 2] pixels^2
     opacities: Tensor  # [M]
     colors: Tensor  # [M, D]
+    shapes: Tensor | None  # [M] exponents of Beta profiles; None: Gaussians
 
 
 def render(
@@ -57,7 +59,7 @@ def render(
         height: height of the images, pixels.
         offsets2d: [C, N, 2] is added to the projected means, pixels.
         background: colour [D].
-        options: near, far, eps2d and antialias of `rasterize`.
+        options: near, far, eps2d, antialias and shapes of `rasterize`.
     """
     C, N, D = len(viewmats), len(means), colors.shape[-1]
     background = torch.zeros(D).double() if background is None else background
@@ -79,7 +81,7 @@ def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) ->
 
     The loss is the sum of weight [C, H, W, D] x image + weight_alpha [C, H, W, 1] x alpha.
     """
-    inputs = {name: arguments[name].detach().requires_grad_() for name in DIFFERENTIABLE}
+    inputs = {name: arguments[name].detach().requires_grad_() for name in DIFFERENTIABLE if name in arguments}
     rest = {name: value for name, value in arguments.items() if name not in DIFFERENTIABLE}
     viewmats, Ks, width, height = (rest.pop(name) for name in ("viewmats", "Ks", "width", "height"))
     background = rest.pop("background", None)
@@ -88,7 +90,7 @@ def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) ->
         for at, pixels in _pixels(width, height, len(inputs["means"])):
             own = inputs["colors"] if inputs["colors"].dim() == 2 else inputs["colors"][c]
             splats = _project(inputs["means"], inputs["factors"], inputs["opacities"], own, viewmats[c], Ks[c],
-                              width, height, None, **rest)  # fmt: skip
+                              width, height, None, shapes=inputs.get("shapes"), **rest)  # fmt: skip
             image, alpha, _, _ = _blend(splats, pixels, background)
             loss = (image * weight[c].flatten(0, 1)[at]).sum() + (alpha * weight_alpha[c].flatten(0, 1)[at]).sum()
             if loss.requires_grad:
@@ -105,7 +107,7 @@ def _pixels(width: int, height: int, N: int) -> Iterator[tuple[Tensor, Tensor]]:
 def _project(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmat: Tensor, K: Tensor,
     width: int, height: int, offsets: Tensor | None, near: float = 0.01, far: float = 1e10, eps2d: float = 0.3,
-    antialias: bool = False,
+    antialias: bool = False, shapes: Tensor | None = None,
 ) -> _Splats:  # fmt: skip
     R = viewmat[:3, :3]
     camera = means @ R.T + viewmat[:3, 3]
@@ -126,7 +128,7 @@ def _project(
     if antialias:
         opacities = opacities * (torch.linalg.det(covs).clamp(min=0) / torch.linalg.det(blurred)).sqrt()
     centers = centers if offsets is None else centers + offsets[order]
-    return _Splats(order, centers, blurred, opacities, colors[order])
+    return _Splats(order, centers, blurred, opacities, colors[order], None if shapes is None else shapes[order])
 
 
 def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -138,7 +140,8 @@ def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor,
     dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
     xx, xy, yy = (splats.covs[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     power = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
-    a = (splats.opacities[:, None] * torch.exp(-power)).clamp(max=0.999)
+    falloff = torch.exp(-power) if splats.shapes is None else _beta(2 * power, splats.shapes[:, None])
+    a = (splats.opacities[:, None] * falloff).clamp(max=0.999)
     touched = a >= 1 / 255
     after = torch.where(touched, 1 - a, 1.0).cumprod(0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
@@ -148,6 +151,16 @@ def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor,
     image = weight.T @ splats.colors + (1 - alpha) * background
     going = before >= 1e-4  # the first Gaussian that would take the transmittance below this ends the pixel
     distance = torch.where(going, (255 * a - 1).abs(), torch.inf)
+    if splats.shapes is not None:  # a Beta profile may end, or change too fast for float32, at its rim
+        seen = 255 * splats.opacities[:, None] * RIM ** splats.shapes[:, None] > 1
+        distance = torch.where(going & seen, torch.minimum(distance, (1 - 2 * power).abs()), distance)
     distance = torch.where(going & touched, torch.minimum(distance, (after / 1e-4 - 1).abs()), distance)
     slack = distance.amin(0) if len(distance) else torch.full((len(pixels),), torch.inf).double()
     return image, alpha, touched & going, slack.detach()
+
+
+def _beta(r2: Tensor, shapes: Tensor) -> Tensor:
+    """Return (1 - r^2)^b where r < 1, else 0. In the value and in the gradient, 1 - r^2 is held above 1e-6."""
+    left = torch.where(r2 < 1, 1 - r2, 1.0)
+    held = left + (1e-6 - left).clamp(min=0).detach()
+    return torch.where(r2 < 1, held**shapes, 0.0)

@@ -123,19 +123,40 @@ def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vecto
 
 def alphas(x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[float]], size: tuple[int, int],
            pixels: Sequence[tuple[float, float]], eps2d: float) -> Vector:  # fmt: skip
-    """Compute the alpha of one Gaussian at pixel centres in mpmath, by EWA splatting (Zwicker et al. 2001 eq. 29).
+    """Compute the alpha of one Gaussian at pixel centres in mpmath, without the cut-offs of 3DGS at 0.999 and 1/255.
 
-    Alpha is opacity exp(-power), without the cut-offs of 3DGS at 0.999 and 1/255.
+    Alpha is opacity exp(-r^2 / 2), with the squared distances r^2 of `distances`. If x has an exponent b, it is
+    opacity (1 - r^2)^b where r < 1, and zero elsewhere (Universal Beta Splatting).
 
     Args:
-        x: mean (3), factor (9) and opacity.
+        x: mean (3), factor (9), opacity, and the exponent of a Beta profile.
+        viewmat: as in `distances`, like the other arguments.
+        K: see there.
+        size: see there.
+        pixels: see there.
+        eps2d: see there.
+    """
+    squares = distances(x, viewmat, K, size, pixels, eps2d)
+    if len(x) == 13:
+        return [x[12] * mp.exp(-r2 / 2) for r2 in squares]
+    return [x[12] * (1 - r2) ** x[13] if r2 < 1 else mpf(0) for r2 in squares]
+
+
+def distances(x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[float]], size: tuple[int, int],
+              pixels: Sequence[tuple[float, float]], eps2d: float) -> Vector:  # fmt: skip
+    """Compute r^2 = d^T S^-1 d at pixel centres in mpmath, by EWA splatting (Zwicker et al. 2001 eq. 29).
+
+    Here d is the offset of the pixel from the projected mean, and S the 2D covariance.
+
+    Args:
+        x: mean (3) and factor (9); further entries are ignored.
         viewmat: world to camera.
         K: intrinsics.
         size: width and height of the image, pixels.
         pixels: the pixel centres.
         eps2d: added to the diagonal of the 2D covariance, pixels^2.
     """
-    mean, F, opacity = x[:3], [x[3:6], x[6:9], x[9:12]], x[12]
+    mean, F = x[:3], [x[3:6], x[6:9], x[9:12]]
     W = [[mpf(v) for v in row] for row in viewmat]
     px, py, pz = (mp.fdot(row[:3], mean) + row[3] for row in W[:3])
     (fx, _, cx), (_, fy, cy) = ([mpf(v) for v in row] for row in K[:2])
@@ -146,10 +167,10 @@ def alphas(x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[f
     J = [[fx / pz, mpf(0), -fx * tangents[0] / pz], [mpf(0), fy / pz, -fy * tangents[1] / pz]]
     M = [[mp.fsum(J[a][b] * W[b][c] * F[c][e] for b in range(3) for c in range(3)) for e in range(3)] for a in range(2)]
     xx, xy, yy = (mp.fdot(M[a], M[b]) + (mpf(eps2d) if a == b else 0) for a, b in ((0, 0), (0, 1), (1, 1)))
-    twice = 2 * (xx * yy - xy * xy)
-    a, b, c = yy / twice, -2 * xy / twice, xx / twice
+    det = xx * yy - xy * xy
+    a, b, c = yy / det, -2 * xy / det, xx / det
     offsets = ((i - u, j - v) for i, j in pixels)
-    return [opacity * mp.exp(-(dx * (a * dx + b * dy) + c * dy * dy)) for dx, dy in offsets]
+    return [dx * (a * dx + b * dy) + c * dy * dy for dx, dy in offsets]
 
 
 # ---- colours

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
+from gsbench.raster import EPS2D
 from gsbench.stability.cases import case
 
 Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`, float32
@@ -23,6 +24,12 @@ def single(mean: Tensor, factor: Tensor, opacity: float = 0.9) -> Arguments:
         "colors": torch.ones(1, 1), "viewmats": torch.eye(4)[None], "Ks": intrinsics(),
         "width": WIDTH, "height": HEIGHT,
     }  # fmt: skip
+
+
+def on_a_pixel(size: float) -> Arguments:
+    """Return rasterizer arguments for a round Gaussian whose mean is at a pixel centre; the size is in pixels."""
+    unit = DEPTH / FOCAL
+    return single(torch.tensor([0.5 * unit, 0.5 * unit, DEPTH]), size * unit * torch.eye(3))
 
 
 def intrinsics(fx: float = FOCAL, fy: float = FOCAL, cx: float = WIDTH / 2, cy: float = HEIGHT / 2) -> Tensor:
@@ -139,6 +146,38 @@ def principal_point_outside(g: Generator, severity: float) -> list[Arguments]:
     return [made | {"Ks": intrinsics(cx=WIDTH / 2 + away, cy=HEIGHT / 2 - away)}]
 
 
+@case("projection")
+def beta_exponent_below_one(g: Generator, severity: float) -> list[Arguments]:
+    """Use Beta profiles with exponents down to 10^-3: alpha drops to zero at the rim, where its slope is infinite."""
+    return [ordinary(g, 1.0) | {"shapes": torch.tensor([10 ** (-power * severity)])} for power in (0.3, 1.0, 3.0)]
+
+
+@case("projection")
+def beta_of_large_exponents(g: Generator, severity: float) -> list[Arguments]:
+    """Use exponents of 10^2 to 10^6, which multiply what rounding takes from 1 - r^2 where a Gaussian is seen."""
+    exponents = [10 ** (power * severity) for power in (2, 4, 6)]
+    return [ordinary(g, 0.3 * exponent**0.5) | {"shapes": torch.tensor([exponent])} for exponent in exponents]
+
+
+@case("projection", forward=1.01 / 255, gradient=NO_GRADIENT)
+def beta_at_the_rim(g: Generator, severity: float) -> list[Arguments]:  # noqa: ARG001
+    """Put pixel centres within rounding error of the rim r = 1 of Beta profiles, where log(1 - r^2) is infinite.
+
+    With these exponents alpha is below 1/255 at the rim, or within rounding error of it.
+    """
+    variance = 9 / (0.5 + 0.5 * severity)  # pixels^2; at severity 1 the rim is three pixels away
+    made = on_a_pixel((variance - EPS2D) ** 0.5)
+    return [made | {"shapes": torch.tensor([shape])} for shape in (0.45, 1.0, 1e3)]
+
+
+@case("projection", forward=1.01 / 255, gradient=NO_GRADIENT)
+def beta_opacity_at_its_limit(g: Generator, severity: float) -> list[Arguments]:  # noqa: ARG001
+    """Use opacities within rounding error of 1/255, where the size of a Beta profile is a root of almost zero."""
+    opacities = [1 / 255 * (1 + change * severity) for change in (-(2**-23), 0.0, 2**-22, 1e-3)]
+    return [on_a_pixel(10.0) | {"opacities": torch.tensor([opacity]), "shapes": torch.tensor([shape])}
+            for opacity in opacities for shape in (1e-3, 0.5, 50.0)]  # fmt: skip
+
+
 # ---- blending
 
 
@@ -158,6 +197,13 @@ def crowd(g: Generator, N: int, size: float) -> Arguments:
 def ordinary_crowd(g: Generator, severity: float) -> list[Arguments]:  # noqa: ARG001
     """Blend ordinary Gaussians, for which nothing is numerically hard, as the baseline of the hard cases."""
     return [crowd(g, 200, 0.15)]
+
+
+@case("blending")
+def beta_crowd(g: Generator, severity: float) -> list[Arguments]:
+    """Blend Beta profiles of exponents from 0.1 to 10 together: discs with a rim before and behind small peaks."""
+    exponents = 10 ** (severity * (2 * torch.rand(200, generator=g) - 1))
+    return [crowd(g, 200, 0.4) | {"shapes": exponents}]
 
 
 @case("blending")

@@ -52,6 +52,11 @@ def weights(arguments: Arguments) -> tuple[Tensor, Tensor]:
             torch.randn(*shape, 1, generator=g, dtype=torch.float64))  # fmt: skip
 
 
+def inputs_of(arguments: Arguments) -> list[str]:
+    """Return the names of the arguments by which the loss is differentiated."""
+    return [name for name in brute.DIFFERENTIABLE if name in arguments]
+
+
 def together(arguments: Arguments) -> ImageTruth:
     """Compute the exact image of many Gaussians and the exact gradients of the loss by brute force in float64."""
     exact: Arguments = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
@@ -70,25 +75,29 @@ def alone(arguments: Arguments) -> ImageTruth:
     """
     size = (arguments["width"], arguments["height"])
     pixels = [(i + 0.5, j + 0.5) for j in range(size[1]) for i in range(size[0])]
-    parts = [arguments[name].flatten() for name in ("means", "factors", "opacities")]
+    names = [name for name in inputs_of(arguments) if name != "colors"]
+    parts = [arguments[name].flatten() for name in names]
     x, shape = torch.cat(parts).tolist(), (1, size[1], size[0], 1)
     if not x[2] > torch.tensor(arguments.get("near", NEAR)).item():  # camera axes are world axes, so z is the depth
         none = torch.zeros(shape, dtype=torch.float64)
-        return none, none, none[..., 0] == 0, {k: torch.zeros_like(arguments[k]).double() for k in brute.DIFFERENTIABLE}
-    function = partial(
-        oracle.alphas, viewmat=arguments["viewmats"][0].tolist(), K=arguments["Ks"][0].tolist(), size=size,
-        eps2d=float(torch.tensor(EPS2D)),
-    )  # fmt: skip
+        return none, none, none[..., 0] == 0, {k: torch.zeros_like(arguments[k]).double() for k in inputs_of(arguments)}
+    view: Arguments = {"viewmat": arguments["viewmats"][0].tolist(), "K": arguments["Ks"][0].tolist(), "size": size,
+                       "eps2d": float(torch.tensor(EPS2D))}  # fmt: skip
+    function = partial(oracle.alphas, **view)
     seen = oracle.evaluate(partial(function, pixels=pixels), x)
     free = torch.tensor([float(v) for v in seen], dtype=torch.float64).view(shape)
     decided = ((free / ALPHA_MIN - 1).abs() > UNDECIDED)[..., 0]
+    if "shapes" in arguments:  # float32 may decide either way at the rim of a Beta profile too
+        squares = oracle.evaluate(partial(oracle.distances, pixels=pixels, **view), x)
+        rim = torch.tensor([float(abs(1 - r2)) for r2 in squares], dtype=torch.float64).view(decided.shape)
+        decided = decided & (rim > brute.RIM)
     shown = torch.where(free >= ALPHA_MIN, free, 0.0)
     weight = sum(weights(arguments)) * decided[..., None] * (shown > 0)
     counted = [(pixel, w) for pixel, w in zip(pixels, weight.flatten().tolist(), strict=True) if w]
     loss = partial(function, pixels=[pixel for pixel, _ in counted])
     gradient = torch.tensor([float(v) for v in oracle.gradient(loss, x, [w for _, w in counted])])
-    gradients = {name: part.view_as(arguments[name]).double() for name, part in
-                 zip(("means", "factors", "opacities"), gradient.split([3, 9, 1]), strict=True)}  # fmt: skip
+    split = gradient.split([arguments[name].numel() for name in names])
+    gradients = {name: part.view_as(arguments[name]).double() for name, part in zip(names, split, strict=True)}
     image_weight = weights(arguments)[0] * decided[..., None]
     return shown, shown, decided, gradients | {"colors": (image_weight * shown).sum().view(1, 1)}
 
@@ -97,7 +106,7 @@ def differentiate(
     arguments: Arguments, backend: str, weight: Tensor, weight_alpha: Tensor
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Render image and alpha in float32 with one backend, and compute the gradients of the loss."""
-    inputs = {name: arguments[name].detach().clone().requires_grad_() for name in brute.DIFFERENTIABLE}
+    inputs = {name: arguments[name].detach().clone().requires_grad_() for name in inputs_of(arguments)}
     device = device_of(backend)
     there: Arguments = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in (arguments | inputs).items()}
     out = rasterize(**there, backend=backend)

@@ -79,6 +79,18 @@ def test_replays_are_what_is_launched(name: str, agr: bool, device: str) -> None
     torch.testing.assert_close(replayed(seen, 0.9), launched(seen, 0.9), rtol=0, atol=1e-4)
 
 
+def test_replays_of_beta_profiles(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a replay that draws Gaussians where the slice has exponents, or ones of the wrong camera."""
+    fitted, replayed, launched = both(device, "3dgs")
+    gaussians, seen = launched(camera(device), 0.4), fitted.slice
+    exponents = torch.linspace(0.1, 6.0, 300, device=device)
+    monkeypatch.setattr(fitted, "slice", lambda query: seen(query)._replace(shapes=exponents))
+    for distance in (4.0, 4.5):
+        view = camera(device, distance)
+        torch.testing.assert_close(replayed(view, 0.4), launched(view, 0.4), rtol=0, atol=1e-4)
+    assert (launched(camera(device), 0.4) - gaussians).abs().max() > 0.1
+
+
 def test_more_pairs_than_there_is_room_for(device: str) -> None:
     """Catches Gaussians that are left out because a picture recorded from afar had few pairs of tiles and Gaussians."""
     _, replayed, launched = both(device, "7dgs")

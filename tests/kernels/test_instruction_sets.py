@@ -24,6 +24,7 @@ def calls() -> dict[str, Callable[[], object]]:
     sliced = {name: model(name, N, agr=agr) for name, agr in (("3dgs", False), ("4dgs", False), ("7dgs", True))}
     query = Query.at(torch.tensor([0.0, 0.0, -4.0]), 0.4)
     splats, (viewmats, Ks) = [x.requires_grad_() for x in gaussians(N)], camera(200)
+    b = torch.full((N,), 4.0).requires_grad_()
     image, target = torch.rand(200, 200, 3).requires_grad_(), torch.rand(200, 200, 3)
 
     def slice_both_ways(made: GaussianModel) -> None:
@@ -32,6 +33,7 @@ def calls() -> dict[str, Callable[[], object]]:
     return {
         **{f"slice and colours of {name}": partial(slice_both_ways, made) for name, made in sliced.items()},
         "raster": lambda: rasterize(*splats, viewmats, Ks, 200, 200).image.sum().backward(),
+        "raster of Beta profiles": lambda: rasterize(*splats, viewmats, Ks, 200, 200, shapes=b).image.sum().backward(),
         "loss": lambda: l1_ssim(image, target, 0.2).backward(),
     }  # fmt: skip
 

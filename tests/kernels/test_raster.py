@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from raster.cases import camera, case, gaussians, names
+from raster.cases import assert_beta_vector, camera, case, gaussians, names
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -13,7 +13,7 @@ from gsbench.kernels import raster
 from gsbench.raster import RasterOutput, rasterize
 from gsbench.stability.brute import render
 
-DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background")
+DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "shapes")
 
 
 def single(name: str) -> dict[str, Any]:
@@ -32,7 +32,7 @@ def differentiate(arguments: dict[str, Any], backend: str, undecided: Tensor) ->
     weight = torch.randn(output.image.shape, generator=g).to(output.image) * ~undecided[..., None]
     weight_alpha = torch.randn(output.alpha.shape, generator=g).to(output.image) * ~undecided[..., None]
     ((output.image * weight).sum() + (output.alpha * weight_alpha).sum()).backward()
-    gradients = {k: inputs[k].grad for k in DIFFERENTIABLE}
+    gradients = {k: inputs[k].grad for k in DIFFERENTIABLE if k in inputs}
     gradients["means2d"] = output.info.means2d.grad
     return output, {k: torch.zeros(()) if v is None else v for k, v in gradients.items()}
 
@@ -88,7 +88,7 @@ def test_info(name: str) -> None:
 
 
 @pytest.mark.usefixtures("threads")
-@pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels", "opaque_stack"])
+@pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels", "opaque_stack", "beta_of_three_cameras"])
 def test_same_bits_for_any_number_of_threads(name: str) -> None:
     """Catches sums whose order depends on who comes first."""
     arguments = single(name)
@@ -142,6 +142,54 @@ def test_one_bad_value_of_many_is_flagged(bad: float, place: int) -> None:
     assert int(raster.flag_values(*arrays, *rest)) == 1 << 1
 
 
+@pytest.mark.parametrize("bad", [0.0, -1.0, torch.nan, torch.inf])
+def test_exponents_of_beta_profiles_are_positive(bad: float) -> None:
+    """Catches an exponent that the kernel lets in and the reference refuses."""
+    arguments = single("beta")
+    arguments["shapes"][-1] = bad
+    with pytest.raises(InputError, match=r"^shapes: expected (exponents above 0|finite values), got"):
+        rasterize(**arguments, backend="cpu")
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_beta_vector() -> None:
+    """Catches another formula of a Beta profile than that of Universal Beta Splatting, in value, size and gradient."""
+    assert_beta_vector("cpu", torch.float32, 2e-4)
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_a_large_exponent_is_a_gaussian() -> None:
+    """Catches digits of 1 - r^2 that are lost near 1, which an exponent of 10^5 multiplies: alphas were off by 1e-3."""
+    arguments = single("random") | {"eps2d": 0.0}
+    large = {"factors": arguments["factors"] * (2e5**0.5), "shapes": torch.full((60,), 1e5)}
+    gaussian, beta = (rasterize(**a, backend="cpu").image for a in (arguments, arguments | large))
+    decided = ~undecided_pixels(arguments) & ~undecided_pixels(arguments | large)
+    assert decided.double().mean() > 0.8
+    torch.testing.assert_close(beta[decided], gaussian[decided], rtol=0, atol=1e-4)
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_gradients_at_the_rim_are_those_of_the_held_profile() -> None:
+    """Catches a gradient of an exponent below 1 that is infinite or missing at the rim: pixels are put on it."""
+    distances = torch.tensor([0.9, 1 - 1e-4, 1 - 6e-7, 1 + 1e-5]).sqrt()  # r at which each image has its one pixel
+    gradients = []
+    for backend, dtype in (("cpu", torch.float32), ("reference", torch.float32)):
+        factor = torch.diag(torch.tensor([1.0, 1, 0], dtype=dtype))[None].requires_grad_()
+        shapes = torch.tensor([0.2], dtype=dtype, requires_grad=True)
+        Ks = torch.tensor([[1.0, 0, 0], [0, 1, 0.5], [0, 0, 1]], dtype=dtype).repeat(4, 1, 1)
+        Ks[:, 0, 2] = 0.5 + distances
+        out = rasterize(torch.tensor([[0.0, 0, 1]], dtype=dtype), factor, torch.ones(1, dtype=dtype),
+                        torch.ones(1, 1, dtype=dtype), torch.eye(4, dtype=dtype).repeat(4, 1, 1), Ks, 1, 1, eps2d=0.0,
+                        shapes=shapes, backend=backend)  # fmt: skip
+        slopes = [torch.autograd.grad(x, (factor, shapes), retain_graph=True) for x in out.alpha.flatten()]
+        gradients.append((out.alpha.detach().flatten(), *map(torch.stack, zip(*slopes, strict=True))))
+    for got, want in zip(*gradients, strict=True):
+        assert want[2].abs().max() > 0
+        assert not want[3].any()
+        for one, other in zip(got, want, strict=True):  # the slope at r^2 = 1 - 1e-4 is known to 1e-3: r^2 is rounded
+            assert (one - other).norm() <= 5e-3 * other.norm()
+
+
 def test_what_it_cannot_do_is_said() -> None:
     """Catches a crash or a silent wrong result where the backend has limits the reference has not."""
     arguments = single("random")
@@ -165,7 +213,7 @@ def test_a_request_beyond_memory_fails_by_message() -> None:
         rasterize(**many, backend="cpu")
 
 
-@pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels"])
+@pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels", "beta_of_three_cameras"])
 def test_operations_keep_torch_s_rules(name: str) -> None:
     """Catches an operation that aliases, mutates or misdeclares its outputs, so that torch.compile would be wrong."""
     a = single(name)
@@ -173,9 +221,13 @@ def test_operations_keep_torch_s_rules(name: str) -> None:
     viewport = raster.Viewport(a["width"], a["height"], 0.01, 1e10, 0.3, False)
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
     ops = torch.ops.gsbench
-    torch.library.opcheck(ops.project, ([*inputs, a["Ks"]], *viewport), test_utils=checks)
-    splats = raster.Splats(*(x.detach() for x in raster.project(*inputs, a["Ks"], viewport)))
+    shapes = a.get("shapes")
+    given = torch.empty(0) if shapes is None else shapes.requires_grad_()
+    torch.library.opcheck(ops.project, ([*inputs, a["Ks"], given], *viewport), test_utils=checks)
+    splats = raster.Splats(*(x.detach() for x in raster.project(*inputs, a["Ks"], viewport, shapes)[:4]))
     bins, _ = raster.bin_tiles(splats, viewport, torch.zeros(1, dtype=torch.int64))
     colors = a["colors"] if a["colors"].dim() == 3 else a["colors"][None]
     blended = [splats.means2d.requires_grad_(), splats.roots.requires_grad_(), splats.half_sizes, colors]
-    torch.library.opcheck(ops.blend, ([*blended, a["background"], *bins], a["width"], a["height"]), test_utils=checks)
+    torch.library.opcheck(
+        ops.blend, ([*blended, a["background"], *bins, given], a["width"], a["height"]), test_utils=checks
+    )

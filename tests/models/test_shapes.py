@@ -1,4 +1,4 @@
-"""The optional shapes of a slice, on their way from a model to the rasterizer's door, which refuses them."""
+"""The optional shapes of a slice, on their way from a model to the image and back."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.backends import REFERENCE
+from gsbench.kernels.backends import AUTO, REFERENCE, Backend
+from gsbench.kernels.tape import Tape
 from gsbench.models import Query
 from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel
 from gsbench.models.gaussians3d import Gaussians3DModel
-from gsbench.models.render import render
+from gsbench.models.render import rasterize_slice, render
 from gsbench.models.sliced import Conditioned, joined_shapes, tensors_of
 from gsbench.scenes.scene import Camera, Points
 from gsbench.view.gaussians import has_profiles, trained_of
@@ -57,12 +58,28 @@ def made(kind: type[GaussianModel], **options: Any) -> GaussianModel:
     return model
 
 
-def test_a_model_s_shapes_reach_the_door() -> None:
+def test_a_model_s_shapes_reach_the_image() -> None:
     """Catches shapes that are dropped on the way, so that a Beta kernel is drawn as a Gaussian without a word."""
     model = made(Shaped)
-    torch.testing.assert_close(model.slice(HERE).shapes, torch.arange(float(N)).exp())
-    with pytest.raises(InputError, match=r"shapes: expected None, got a tensor of shape \[6\]: raster backend 'auto'"):
-        render(model, SEEN, None, torch.zeros(3))
+    seen = model.slice(HERE)
+    torch.testing.assert_close(seen.shapes, torch.arange(float(N)).exp())
+    drawn = [rasterize_slice(x, SEEN, torch.zeros(3), REFERENCE).image[0] for x in (seen, seen._replace(shapes=None))]
+    image = render(model, SEEN, None, torch.zeros(3))
+    torch.testing.assert_close(image, drawn[0], rtol=0, atol=1e-4)
+    assert (image - drawn[1]).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("backend", [AUTO, REFERENCE], ids=lambda backend: backend.name)
+def test_shapes_are_trained(backend: Backend) -> None:
+    """Catches a gradient of shapes that a recorded backward pass loses on its way to the parameter."""
+    model = made(Shaped, backend=backend)
+    parameter, sums = model.splats["shape"], {}
+    with Tape() as tape:
+        loss = render(model, SEEN, None, torch.zeros(3)).square().sum()
+    tape.backward(loss, torch.ones(()), [parameter], sums)
+    (expected,) = torch.autograd.grad(render(model, SEEN, None, torch.zeros(3)).square().sum(), parameter)
+    assert expected.any()
+    torch.testing.assert_close(sums[id(parameter)], expected)
 
 
 def test_rows_of_two_kinds_keep_their_shapes() -> None:

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsbench.raster import rasterize
+
 Arguments = dict[str, Any]
 _BUILDERS: dict[str, Callable[[torch.Generator], Arguments]] = {}
 
@@ -236,3 +238,72 @@ def antialiased(g: torch.Generator) -> Arguments:
 @_case
 def wide_filter(g: torch.Generator) -> Arguments:
     return gaussians(g, 30) | camera(16, 16) | {"eps2d": 2.0}
+
+
+@_case
+def beta(g: torch.Generator) -> Arguments:
+    """Beta profiles, from flat discs with a rim to small peaks."""
+    return gaussians(g, 60, size=0.5) | camera(33, 17) | {"shapes": 0.2 * 30 ** _rand(g, 60)}
+
+
+@_case
+def beta_at_the_rim(g: torch.Generator) -> Arguments:
+    """Exponents so small that alpha drops to zero at the rim."""
+    return gaussians(g, 30, size=0.5) | camera(24, 16) | {"shapes": 0.01 + 0.3 * _rand(g, 30)}
+
+
+@_case
+def beta_faint(g: torch.Generator) -> Arguments:
+    """Opacities just below and just above 1/255: culled ones, and ones that end close to their means."""
+    opacities = torch.tensor([0.99 / 255, 1.1 / 255, 2 / 255], dtype=torch.float64).repeat(10)
+    scene = gaussians(g, 30, size=2.0) | camera(16, 16) | {"shapes": 0.3 * 30 ** _rand(g, 30)}
+    return scene | {"opacities": opacities}
+
+
+@_case
+def beta_of_huge_exponents(g: torch.Generator) -> Arguments:
+    """Exponents of 10^2 to 10^6 on Gaussians so large that a few pixels are seen of them: as good as Gaussians."""
+    exponents = 10 ** (2 + 4 * _rand(g, 30))
+    scene = gaussians(g, 30) | camera(24, 16) | {"shapes": exponents}
+    return scene | {"factors": scene["factors"] * exponents[:, None, None].sqrt()}
+
+
+@_case
+def beta_antialiased(g: torch.Generator) -> Arguments:
+    scene = gaussians(g, 60, size=0.4) | camera(24, 16) | {"antialias": True, "shapes": 0.2 + 4 * _rand(g, 60)}
+    return scene | {"factors": scene["factors"] * 10 ** (1 - 2.5 * _rand(g, 60, 1, 1))}
+
+
+@_case
+def beta_of_three_cameras(g: torch.Generator) -> Arguments:
+    """One exponent for all cameras, but colours for each."""
+    return three_cameras(g) | {"shapes": 0.2 + 4 * _rand(g, 30)}
+
+
+@_case
+def beta_of_five_channels(g: torch.Generator) -> Arguments:
+    return five_channels(g) | {"shapes": 0.2 + 4 * _rand(g, 20)}
+
+
+@_case
+def beta_saturated(g: torch.Generator) -> Arguments:
+    """Opacity 1: alpha stops at 0.999 near the means, and there is no gradient there."""
+    return gaussians(g, 10, size=2.0) | camera(16, 16) | {"opacities": torch.ones(10), "shapes": 0.1 + _rand(g, 10)}
+
+
+def assert_beta_vector(backend: str, dtype: torch.dtype, tolerance: float) -> None:
+    """Compare alpha, the bounding box and the gradients of a Beta profile at one pixel with numbers known by hand."""
+    A, B, C, shape = (torch.tensor(x, dtype=dtype, requires_grad=True) for x in (0.02, 0.005, 0.03, 2.5))
+    covariance = torch.linalg.inv(torch.stack([A, B, B, C]).view(2, 2))  # pixels^2
+    factor = torch.nn.functional.pad(torch.linalg.cholesky(covariance), (0, 1, 0, 1))
+    drawn = rasterize(
+        torch.tensor([[0.0, 0, 1]], dtype=dtype, requires_grad=True), factor[None], torch.tensor([0.7], dtype=dtype),
+        torch.ones(1, 1, dtype=dtype), torch.eye(4, dtype=dtype)[None], intrinsics(1, 1, 5.5, 2.5)[None].to(dtype),
+        8, 8, eps2d=0.0, backend=backend, shapes=shape[None],
+    )  # fmt: skip
+    alpha, means2d = drawn.alpha[0, 4, 2, 0], drawn.info.means2d  # the mean minus the centre of this pixel is (3, -2)
+    slopes = torch.autograd.grad(alpha, (A, B, means2d, shape))
+    got = [alpha, slopes[0], slopes[1], slopes[2][0, 0, 0], slopes[3], (drawn.info.half_sizes[0, 0, 0] - 0.01) ** 2]
+    want = [0.352478, -10.4352, 13.9136, -0.115947, -0.096733, 0.874297 * covariance[0, 0].item()]
+    for x, known in zip(got, want, strict=True):
+        assert abs(x.item() / known - 1) < tolerance, (x, known)

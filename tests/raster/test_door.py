@@ -53,15 +53,25 @@ def test_a_background_that_is_no_tensor_is_none() -> None:
     refused({"background": [0.0, 0.0, 0.0]}, "background: expected a tensor, got list")
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda", "auto", REFERENCE])
-def test_shapes_of_alpha_profiles_are_refused_before_any_work(backend: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a backend that draws Gaussians where Beta kernels are asked for, or looks at the scene first."""
-    monkeypatch.setattr("gsbench.raster.check_arguments", None)
-    asked = backend if isinstance(backend, str) else backend.name
-    refused(
-        {"shapes": torch.ones(40).double(), "backend": backend}, f"got a tensor of shape [40]: raster backend '{asked}'"
-    )
-    refused({"shapes": 2.0, "backend": backend}, "shapes: expected None, got float")
+def test_exponents_of_beta_profiles() -> None:
+    """Catches exponents that are let in and draw NaN, or that broadcast over the Gaussians."""
+    good = torch.ones(40).double()
+    refused({"shapes": 2.0}, "shapes: expected a tensor, got float")
+    refused({"shapes": good[:1]}, "shapes: expected shape [40], got [1]")
+    refused({"shapes": good[:, None]}, "shapes: expected shape [40], got [40, 1]")
+    refused({"shapes": good.float()}, "shapes: expected torch.float64 as means are, got torch.float32")
+    refused({"shapes": good.int()}, "shapes: expected float32 or float64, got int32")
+    refused({"shapes": good.to("meta")}, "shapes: expected a tensor with values")
+    for bad, said in (
+        (0.0, "above 0, got 0.0"),
+        (-1.0, "above 0, got -1.0"),
+        (torch.nan, "finite"),
+        (torch.inf, "finite"),
+    ):
+        refused(
+            {"shapes": torch.where(torch.arange(40) == 7, bad, good)},
+            f"shapes: expected {'exponents ' * (bad <= 0)}{said}",
+        )
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])

@@ -5,17 +5,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cases import camera, case, gaussians, names
+from cases import assert_beta_vector, camera, case, gaussians, names
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsbench.raster import RasterOutput, rasterize
+from gsbench.raster import RasterOutput, rasterize, reference
 from gsbench.stability.brute import Picture, render
 
-DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "Ks", "background")
+DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "shapes")
 PROPERTY = settings(max_examples=15, deadline=None)
 seeds = st.integers(0, 2**31)
+exponents = st.none() | st.floats(-3, 6).map(lambda power: 10**power)  # of Beta profiles; None: Gaussians
 
 
 def draw(arguments: dict[str, Any]) -> RasterOutput:
@@ -27,8 +28,9 @@ def brute_force(arguments: dict[str, Any], **more: Any) -> Picture:
     return render(**exact, **more)
 
 
-def scene(seed: int, N: int = 12) -> dict[str, Any]:
-    return gaussians(torch.Generator().manual_seed(seed), N, size=0.3) | camera(16, 12)
+def scene(seed: int, exponent: float | None, N: int = 12) -> dict[str, Any]:
+    shapes = {} if exponent is None else {"shapes": torch.full((N,), exponent, dtype=torch.float64)}
+    return gaussians(torch.Generator().manual_seed(seed), N, size=0.3) | camera(16, 12) | shapes
 
 
 @pytest.mark.parametrize("name", names())
@@ -78,7 +80,7 @@ def smooth(name: str) -> dict[str, Any]:
     """Six Gaussians of a case, whose picture has no decision so close that a finite difference would flip it."""
     arguments = case(name)
     few = torch.linspace(0, len(arguments["means"]) - 1, 6).long()
-    arguments |= {k: arguments[k][few] for k in ("means", "factors", "opacities")}
+    arguments |= {k: arguments[k][few] for k in ("means", "factors", "opacities", "shapes") if k in arguments}
     arguments["colors"] = arguments["colors"][..., few, :]
     D = arguments["colors"].shape[-1]
     arguments.setdefault("background", torch.linspace(0.2, 0.9, D, dtype=torch.float64))
@@ -88,7 +90,8 @@ def smooth(name: str) -> dict[str, Any]:
 
 
 GRADIENT_CASES = ("random", "off_screen", "larger_than_picture", "near_plane", "flat", "three_cameras", "antialiased",
-                  "oblong_pixels", "principal_point_outside", "one_channel", "five_channels")  # fmt: skip
+                  "oblong_pixels", "principal_point_outside", "one_channel", "five_channels", "beta",
+                  "beta_antialiased", "beta_of_three_cameras")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", GRADIENT_CASES)
@@ -98,7 +101,7 @@ def test_gradients_of_every_input(name: str) -> None:
     # Of Ks the four numbers: the others are fixed, and refused when central differences move them.
     Ks = arguments.pop("Ks")
     intrinsics = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], -1)
-    names = [k for k in DIFFERENTIABLE if k != "Ks"]
+    names = [k for k in DIFFERENTIABLE if k in arguments]
     inputs = tuple(x.requires_grad_() for x in (*map(arguments.pop, names), intrinsics))
     weight = torch.randn(2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
@@ -164,25 +167,44 @@ def test_a_point_without_filter() -> None:
     assert output.info.radii[:, 1::2].any()
 
 
+def test_beta_vector() -> None:
+    """Catches another formula of a Beta profile than that of Universal Beta Splatting, in value, size and gradient."""
+    assert_beta_vector("reference", torch.float64, 1e-4)
+
+
+@pytest.mark.parametrize("shape", [1e-6, 0.3, 1.0])
+def test_gradients_at_the_rim_are_held(shape: float) -> None:
+    """Catches an infinite gradient, or a missing one, where 1 - r^2 is below 1e-6 and the exponent below 1."""
+    rim = torch.tensor([0.99, 1 - 1e-6, 1 - 1e-9, 1 - 1e-16, 1.0, 1.1, 1e300], dtype=torch.float64, requires_grad=True)
+    exponents = torch.full((7,), shape, dtype=torch.float64, requires_grad=True)
+    profile = reference._beta(rim, exponents)
+    profile.sum().backward()
+    held = (1 - rim.detach()).clamp(min=1e-6)
+    inside = rim.detach() < 1
+    torch.testing.assert_close(profile.detach(), held**shape * inside)
+    torch.testing.assert_close(rim.grad, -shape * held ** (shape - 1) * inside)
+    torch.testing.assert_close(exponents.grad, held**shape * held.log() * inside)
+
+
 # ---- properties
 
 
 @PROPERTY
-@given(seeds)
-def test_order_of_gaussians_does_not_matter(seed: int) -> None:
+@given(seeds, exponents)
+def test_order_of_gaussians_does_not_matter(seed: int, exponent: float | None) -> None:
     """Catches a sort by index. To 1e-12 and not to the bit: a matrix product may round by the place of a row."""
-    a = scene(seed)
+    a = scene(seed, exponent)
     order = torch.randperm(12, generator=torch.Generator().manual_seed(seed))
-    b = a | {k: a[k][order] for k in ("means", "factors", "opacities", "colors")}
+    b = a | {k: a[k][order] for k in ("means", "factors", "opacities", "colors", "shapes") if k in a}
     torch.testing.assert_close(draw(b).image, draw(a).image, rtol=0, atol=1e-12)
     assert torch.equal(draw(b).info.radii, draw(a).info.radii[:, order])
 
 
 @PROPERTY
-@given(seeds)
-def test_rigid_motion_of_the_world(seed: int) -> None:
+@given(seeds, exponents)
+def test_rigid_motion_of_the_world(seed: int, exponent: float | None) -> None:
     """Catches a camera that is not the inverse of its pose: moving world and camera alike changes nothing."""
-    a = scene(seed)
+    a = scene(seed, exponent)
     g = torch.Generator().manual_seed(seed)
     Q = torch.linalg.qr(torch.randn(3, 3, generator=g, dtype=torch.float64))[0]
     Q = Q * torch.linalg.det(Q).sign()
@@ -198,20 +220,22 @@ def test_rigid_motion_of_the_world(seed: int) -> None:
 
 
 @PROPERTY
-@given(seeds)
-def test_only_the_covariance_of_a_factor_matters(seed: int) -> None:
+@given(seeds, exponents)
+def test_only_the_covariance_of_a_factor_matters(seed: int, exponent: float | None) -> None:
     """Catches use of F other than by F F^T: F Q is the same Gaussian for any orthogonal Q, reflections included."""
-    a = scene(seed)
+    a = scene(seed, exponent)
     g = torch.Generator().manual_seed(seed)
     Q = torch.linalg.qr(torch.randn(12, 3, 3, generator=g, dtype=torch.float64))[0]
     torch.testing.assert_close(draw(a | {"factors": a["factors"] @ Q}).image, draw(a).image, rtol=0, atol=1e-9)
 
 
 @PROPERTY
-@given(seeds, st.floats(-3, 4), st.floats(0, 1))
-def test_pictures_are_finite_and_covered_at_most_once(seed: int, log_size: float, opacity: float) -> None:
+@given(seeds, exponents, st.floats(-3, 4), st.floats(0, 1))
+def test_pictures_are_finite_and_covered_at_most_once(
+    seed: int, exponent: float | None, log_size: float, opacity: float
+) -> None:
     """Catches NaN, and more light than there is, for sizes from a thousandth to 10^4 of the scene in float32."""
-    a = scene(seed) | {"opacities": torch.full((12,), opacity)}
+    a = scene(seed, exponent) | {"opacities": torch.full((12,), opacity)}
     a["factors"] = a["factors"] * 10**log_size
     a = {k: v.float() if isinstance(v, Tensor) else v for k, v in a.items()}
     output = draw(a)
@@ -223,10 +247,10 @@ def test_pictures_are_finite_and_covered_at_most_once(seed: int, log_size: float
 
 
 @PROPERTY
-@given(seeds, st.integers(0, 4))
-def test_coverage_grows_with_opacity(seed: int, which: int) -> None:
+@given(seeds, exponents, st.integers(0, 4))
+def test_coverage_grows_with_opacity(seed: int, exponent: float | None, which: int) -> None:
     """Catches a sign in the blending. Five Gaussians below 0.8 stay above the transmittance that ends a pixel."""
-    a = scene(seed, N=5)
+    a = scene(seed, exponent, N=5)
     a["opacities"] = a["opacities"] * 0.6
     more = a["opacities"].clone()
     more[which] += 0.2
@@ -234,10 +258,10 @@ def test_coverage_grows_with_opacity(seed: int, which: int) -> None:
 
 
 @PROPERTY
-@given(seeds)
-def test_background_shows_where_nothing_is(seed: int) -> None:
+@given(seeds, exponents)
+def test_background_shows_where_nothing_is(seed: int, exponent: float | None) -> None:
     """Catches a background that is added twice or not dimmed by what is before it."""
-    a = scene(seed)
+    a = scene(seed, exponent)
     background = torch.tensor([0.3, 0.5, 0.9], dtype=torch.float64)
     output, black = draw(a | {"background": background}), draw(a)
     torch.testing.assert_close(output.image, black.image + (1 - black.alpha) * background)
@@ -255,10 +279,10 @@ def test_same_bits_twice(threads: int) -> None:
     try:
         torch.set_num_threads(threads)
         for _ in range(3):
-            inputs = [a[k].detach().requires_grad_() for k in DIFFERENTIABLE[:6]]
-            output = draw(a | dict(zip(DIFFERENTIABLE, inputs, strict=False)))
+            inputs = {k: a[k].detach().requires_grad_() for k in DIFFERENTIABLE if k in a}
+            output = draw(a | inputs)
             output.image.square().sum().backward()
-            runs.append([output.image.detach(), *(i.grad for i in inputs)])
+            runs.append([output.image.detach(), *(i.grad for i in inputs.values())])
     finally:
         torch.set_num_threads(before)
     for run in runs[1:]:

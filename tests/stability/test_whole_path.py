@@ -12,7 +12,7 @@ from gsbench.kernels.backends import BACKENDS
 from gsbench.models import GaussianModel, Query
 from gsbench.models.sliced import tensors_of
 from gsbench.raster import rasterize
-from gsbench.stability import colors, picture_cases, slices  # noqa: F401  # their cases enter the list
+from gsbench.stability import colors, picture_cases, pictures, slices  # noqa: F401  # their cases enter the list
 from gsbench.stability.audit import present
 from gsbench.stability.cases import CASES, of_area
 from gsbench.stability.slicing_cases import COUNT, Observed
@@ -76,7 +76,7 @@ def check_any_numbers(model_name: str, values: list[float], seed: int, backend: 
 def check_picture(name: str, severity: float, seed: int, backend: str) -> None:
     for arguments in CASES[name](severity, seed):
         inputs: dict[str, Any] = {k: arguments[k].clone().requires_grad_() for k in
-                                  ("means", "factors", "opacities", "colors")}  # fmt: skip
+                                  pictures.inputs_of(arguments)}  # fmt: skip
         out = rasterize(**(arguments | inputs), backend=backend)
         assert out.image.isfinite().all()
         gradients = torch.autograd.grad((out.image.square().sum() + out.alpha.sum()), list(inputs.values()),

@@ -7,10 +7,11 @@ namespace gsb {
 inline namespace GSB_ISA {
 namespace {
 
+template <class Profile>
 struct TileJob {
     const BlendArgs& args;
     const Picture& out;
-    const Record* records;
+    const RecordOf<Profile>* records;
     const float* colors;  // of the camera, where there are not three channels
     int64_t tile;         // of all cameras' tiles
     int64_t camera;
@@ -30,12 +31,12 @@ struct Blocks {
 };
 
 // Blends one splat, the i-th of its tile, into one block.
-template <int D>
-GSB_HD inline void blend_block(const Record& s, const float* color, int channels, const TileGrid& grid, int64_t i,
-                               uint32_t b, Blocks blocks, float* stop) {
+template <int D, class Profile>
+GSB_HD inline void blend_block(const RecordOf<Profile>& s, const float* color, int channels, const TileGrid& grid,
+                               int64_t i, uint32_t b, Blocks blocks, float* stop) {
     const Vec zero(0.0f);
     float *T = blocks.transmittance(static_cast<int>(b)), *sums = blocks.color(static_cast<int>(b));
-    const Falloff<Vec> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s.p, s.q, s.r, s.opacity);
+    const Falloff<Vec, Profile> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s);
     const Vec before = Vec::load(T), after = before - before * f.alpha;
     const Mask seen = f.alpha >= Vec(ALPHA_MIN), enough = after >= Vec(TRANSMITTANCE_MIN);
     const Mask blended = seen & enough;
@@ -48,8 +49,8 @@ GSB_HD inline void blend_block(const Record& s, const float* color, int channels
 }
 
 // Writes the tile's colours over the background to the image, and its state for the backward pass.
-template <int D>
-void write_picture(const TileJob& job, const TileGrid& grid, Blocks blocks) {
+template <int D, class Profile>
+void write_picture(const TileJob<Profile>& job, const TileGrid& grid, Blocks blocks) {
     const BlendArgs& a = job.args;
     const int channels = D ? D : a.D;
     alignas(64) int32_t places[LANES];
@@ -74,13 +75,13 @@ void write_picture(const TileJob& job, const TileGrid& grid, Blocks blocks) {
 }
 
 // Blends one tile with D channels; D = 0 means the number of channels in the arguments.
-template <int D>
-void blend_tile(const TileJob& job) {
+template <int D, class Profile>
+void blend_tile(const TileJob<Profile>& job) {
     const BlendArgs& a = job.args;
     const int channels = D ? D : a.D;
     const TileGrid grid(job.tx, job.ty, a.width, a.height);
     const Blocks blocks{job.state, channels};
-    const Record* records = job.records;
+    const RecordOf<Profile>* records = job.records;
     const float* colors = job.colors;
     const int32_t* ids = a.ids + a.offsets[job.tile];
     const int64_t count = a.offsets[job.tile + 1] - a.offsets[job.tile];
@@ -109,7 +110,7 @@ void blend_tile(const TileJob& job) {
         for (int item = 0; item < items; ++item) {
             const int64_t i = first + work[item] / BLOCKS;
             const uint32_t b = work[item] % BLOCKS;
-            const Record& s = records[ids[i]];
+            const RecordOf<Profile>& s = records[ids[i]];
             const float* color = D == 3 ? s.color : colors + static_cast<int64_t>(ids[i]) * channels;
             blend_block<D>(s, color, channels, grid, i, b, blocks, stop);
         }
@@ -121,11 +122,10 @@ void blend_tile(const TileJob& job) {
     write_picture<D>(job, grid, blocks);
 }
 
-}  // namespace
-
-void blend(const BlendArgs& a, const Picture& out) {
+template <class Profile>
+void blend_as(const BlendArgs& a, const Picture& out) {
     const int across = tiles_along(a.width), tiles = across * tiles_along(a.height);
-    Buffer<Record> records(static_cast<size_t>(a.N));
+    Buffer<RecordOf<Profile>> records(static_cast<size_t>(a.N));
     const size_t scratch_size = Blocks::size(a.D);
     Buffer<float> scratch(scratch_size * static_cast<size_t>(a.threads));
     for (int64_t c = 0; c < a.C; ++c) {
@@ -133,11 +133,17 @@ void blend(const BlendArgs& a, const Picture& out) {
         const float* colors = a.colors + (a.color_per_camera ? c * a.N * a.D : 0);
 #pragma omp parallel for num_threads(a.threads) schedule(dynamic, 4)
         for (int tile = 0; tile < tiles; ++tile) {
-            const TileJob job{a, out, records.data(), colors, c * tiles + tile, c, tile % across, tile / across,
-                              scratch.data() + scratch_size * static_cast<size_t>(thread_index())};
+            const TileJob<Profile> job{a, out, records.data(), colors, c * tiles + tile, c, tile % across,
+                                       tile / across, scratch.data() + scratch_size * static_cast<size_t>(thread_index())};
             a.D == 3 ? blend_tile<3>(job) : blend_tile<0>(job);
         }
     }
+}
+
+}  // namespace
+
+void blend(const BlendArgs& a, const Picture& out) {
+    a.shapes ? blend_as<Beta>(a, out) : blend_as<Gaussian>(a, out);
 }
 
 }  // namespace GSB_ISA

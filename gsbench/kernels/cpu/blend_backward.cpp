@@ -10,20 +10,20 @@ namespace gsb {
 inline namespace GSB_ISA {
 namespace {
 
-constexpr int GEOMETRY = 6;  // moments of a pair, before its D sums of colour
 constexpr int64_t SPLATS_PER_TASK = 512;
 
+template <class Profile>
 struct TileJob {
     const BlendArgs& args;
     const BlendState& picture;
     const PictureGrads& grads;
-    const Record* records;
+    const RecordOf<Profile>* records;
     const float* colors;
     int64_t tile, camera;
     int tx, ty;
     float* state;       // scratch, see Blocks
     float* color_sums;  // scratch, [D][16]
-    float* pair_sums;   // [pairs][6 + D]
+    float* pair_sums;   // [pairs][MOMENTS + D]: moments, then sums of colour
     uint8_t* pair_seen;
     float* background;   // [D] of this tile
 };
@@ -42,8 +42,8 @@ struct Blocks {
 };
 
 // Loads the state behind all splats, where the background is seen, and computes the background's gradient.
-template <int D>
-void load_state(const TileJob& job, const TileGrid& grid, Blocks blocks) {
+template <int D, class Profile>
+void load_state(const TileJob<Profile>& job, const TileGrid& grid, Blocks blocks) {
     const BlendArgs& a = job.args;
     const int channels = D ? D : a.D;
     alignas(64) int32_t places[LANES];
@@ -70,35 +70,40 @@ void load_state(const TileJob& job, const TileGrid& grid, Blocks blocks) {
     }
 }
 
-template <int D>
-void store_sums(const FalloffMoments<Vec>& m, const Vec* color, int channels, float* out) {
+template <int D, class Profile>
+void store_sums(const FalloffMoments<Vec, Profile>& moments, const Vec* color, int channels, float* out) {
+    const auto& m = moments.of;
     alignas(64) float sums[8];
-    if constexpr (D == 3) {
-        sum4(m.v, m.u, m.w, m.w_dx, out);
-        sum4(m.u_dx, m.u_dy, color[0], color[1], out + 4);
+    sum4(m[0], m[1], m[2], m[3], out);
+    if constexpr (D == 3 && Profile::HAS_SHAPE) {
+        sum4(m[4], m[5], m[6], color[0], out + 4);
+        sum4(color[1], color[2], color[2], color[2], sums);
+        out[8] = sums[0];
+        out[9] = sums[1];
+    } else if constexpr (D == 3) {
+        sum4(m[4], m[5], color[0], color[1], out + 4);
         sum4(color[2], color[2], color[2], color[2], sums);
         out[8] = sums[0];
     } else {
-        sum4(m.v, m.u, m.w, m.w_dx, out);
-        sum4(m.u_dx, m.u_dy, m.v, m.v, sums);
-        out[4] = sums[0];
-        out[5] = sums[1];
-        for (int k = 0; k < channels; ++k) out[GEOMETRY + k] = sum(color[k]);
+        sum4(m[4], m[5], m[Profile::MOMENTS - 1], m[0], sums);
+        for (int k = 4; k < Profile::MOMENTS; ++k) out[k] = sums[k - 4];
+        for (int k = 0; k < channels; ++k) out[Profile::MOMENTS + k] = sum(color[k]);
     }
 }
 
 // Computes the sums of one splat, the i-th of its tile, over the blocks that it touches, and sets the pixels' state to
 // that in front of this splat.
-template <int D>
-GSB_HD inline void backward_splat(const Record& s, const float* c, int channels, const TileGrid& grid, int64_t i,
-                                  uint32_t touched, Blocks blocks, FalloffMoments<Vec>& moments, Vec* color) {
+template <int D, class Profile>
+GSB_HD inline void backward_splat(const RecordOf<Profile>& s, const float* c, int channels, const TileGrid& grid,
+                                  int64_t i, uint32_t touched, Blocks blocks, FalloffMoments<Vec, Profile>& moments,
+                                  Vec* color) {
     const Vec position(static_cast<float>(i)), zero(0.0f);
-    moments = {zero, zero, zero, zero, zero, zero};
+    for (Vec& moment : moments.of) moment = zero;
     for (int k = 0; k < (D ? D : channels); ++k) color[k] = zero;
     for (; touched; touched &= touched - 1) {
         const int b = __builtin_ctz(touched);
         float *T = blocks.transmittance(b), *behind = blocks.behind(b);
-        const Falloff<Vec> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s.p, s.q, s.r, s.opacity);
+        const Falloff<Vec, Profile> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s);
         const Mask blended = (f.alpha >= Vec(ALPHA_MIN)) & (position < Vec::load(blocks.stop(b)));
         const Vec alpha = select(blended, f.alpha, zero);
         const Vec before = Vec::load(T) * reciprocal(Vec(1.0f) - alpha);
@@ -117,13 +122,13 @@ GSB_HD inline void backward_splat(const Record& s, const float* c, int channels,
     }
 }
 
-template <int D>
-void backward_tile(const TileJob& job) {
+template <int D, class Profile>
+void backward_tile(const TileJob<Profile>& job) {
     const BlendArgs& a = job.args;
     const int channels = D ? D : a.D;
     const TileGrid grid(job.tx, job.ty, a.width, a.height);
     const Blocks blocks{job.state, channels};
-    const Record* records = job.records;
+    const RecordOf<Profile>* records = job.records;
     const int32_t* ids = a.ids + a.offsets[job.tile];
     load_state<D>(job, grid, blocks);
     alignas(64) float block_stop[BLOCKS];
@@ -136,7 +141,7 @@ void backward_tile(const TileJob& job) {
     const Vec stops = Vec::load(block_stop);
     Vec local[D ? D : 1];
     Vec* color = D ? local : reinterpret_cast<Vec*>(job.color_sums);
-    FalloffMoments<Vec> moments;
+    FalloffMoments<Vec, Profile> moments;
 
     uint32_t touched[BATCH];  // found for many splats at once, so that no branch waits for it
     for (int64_t end = static_cast<int64_t>(last); end > 0; end -= BATCH) {
@@ -147,11 +152,11 @@ void backward_tile(const TileJob& job) {
         }
         for (int64_t i = end - 1; i >= first; --i) {
             if (!touched[i - first]) continue;
-            const Record& s = records[ids[i]];
+            const RecordOf<Profile>& s = records[ids[i]];
             const float* c = D == 3 ? s.color : job.colors + static_cast<int64_t>(ids[i]) * channels;
             backward_splat<D>(s, c, channels, grid, i, touched[i - first], blocks, moments, color);
             const int64_t pair = s.pair(job.tx, job.ty);
-            store_sums<D>(moments, color, channels, job.pair_sums + pair * (GEOMETRY + channels));
+            store_sums<D>(moments, color, channels, job.pair_sums + pair * (Profile::MOMENTS + channels));
             job.pair_seen[pair] = 1;
         }
     }
@@ -159,35 +164,33 @@ void backward_tile(const TileJob& job) {
 
 // Computes one splat's gradient from the sums of its tile intersections [begin, end); a splat without any has no
 // record.
-void reduce_splat(const BlendArgs& a, const BlendGrads& out, int64_t camera, int64_t i, const Record& s, int64_t begin,
-                  int64_t end, const float* pair_sums, const uint8_t* pair_seen, float* color) {
-    const int width = GEOMETRY + a.D;
-    FalloffMoments<float> m{};
+template <class Profile>
+void reduce_splat(const BlendArgs& a, const BlendGrads& out, int64_t camera, int64_t i, const RecordOf<Profile>& s,
+                  int64_t begin, int64_t end, const float* pair_sums, const uint8_t* pair_seen, float* color) {
+    constexpr int MOMENTS = Profile::MOMENTS;
+    const int width = MOMENTS + a.D;
+    FalloffMoments<float, Profile> m{};
     for (int k = 0; k < a.D; ++k) color[k] = 0.0f;
     for (int64_t pair = begin; pair < end; ++pair) {
         if (!pair_seen[pair]) continue;
         const float* sums = pair_sums + pair * width;
-        m.v += sums[0];
-        m.u += sums[1];
-        m.w += sums[2];
-        m.w_dx += sums[3];
-        m.u_dx += sums[4];
-        m.u_dy += sums[5];
-        for (int k = 0; k < a.D; ++k) color[k] += sums[GEOMETRY + k];
+        for (int k = 0; k < MOMENTS; ++k) m.of[k] += sums[k];
+        for (int k = 0; k < a.D; ++k) color[k] += sums[MOMENTS + k];
     }
-    float g[GEOMETRY] = {};
-    if (begin < end && s.opacity > 0.0f) splat_gradient(m, s.p, s.q, s.r, s.opacity, g);
+    float g[MOMENTS] = {};
+    if (begin < end && s.opacity > 0.0f) splat_gradient(m, s, g);
     const int64_t at = camera * a.N + i;
     out.means2d[at * 2] = g[0];
     out.means2d[at * 2 + 1] = g[1];
     for (int k = 0; k < 4; ++k) out.roots[at * 4 + k] = g[2 + k];
     float* g_color = out.colors + (a.color_per_camera ? at : i) * a.D;
     for (int k = 0; k < a.D; ++k) g_color[k] = color[k] + (a.color_per_camera || camera == 0 ? 0.0f : g_color[k]);
+    if constexpr (Profile::HAS_SHAPE) out.shapes[i] = g[6] + (camera == 0 ? 0.0f : out.shapes[i]);
 }
 
-}  // namespace
-
-void blend_backward(const BlendArgs& a, const BlendState& picture, const PictureGrads& grads, const BlendGrads& out) {
+template <class Profile>
+void blend_backward_as(const BlendArgs& a, const BlendState& picture, const PictureGrads& grads,
+                       const BlendGrads& out) {
     const int across = tiles_along(a.width), tiles = across * tiles_along(a.height);
     const size_t D = static_cast<size_t>(a.D), threads = static_cast<size_t>(a.threads);
     int64_t most_pairs = 0;
@@ -195,10 +198,10 @@ void blend_backward(const BlendArgs& a, const BlendState& picture, const Picture
         const int64_t pairs = a.offsets[(c + 1) * tiles] - a.offsets[c * tiles];
         most_pairs = pairs > most_pairs ? pairs : most_pairs;
     }
-    Buffer<Record> records(static_cast<size_t>(a.N));
+    Buffer<RecordOf<Profile>> records(static_cast<size_t>(a.N));
     Buffer<int32_t> first_pairs(static_cast<size_t>(a.N) + 1);
     const size_t scratch_size = Blocks::size(a.D) + D * LANES;
-    Buffer<float> scratch(scratch_size * threads), pair_sums(static_cast<size_t>(most_pairs) * (GEOMETRY + D));
+    Buffer<float> scratch(scratch_size * threads), pair_sums(static_cast<size_t>(most_pairs) * (Profile::MOMENTS + D));
     Buffer<uint8_t> pair_seen(static_cast<size_t>(most_pairs));
     Buffer<float> background(D * static_cast<size_t>(tiles));
 
@@ -210,9 +213,9 @@ void blend_backward(const BlendArgs& a, const BlendState& picture, const Picture
 #pragma omp parallel for num_threads(a.threads) schedule(dynamic, 4)
         for (int tile = 0; tile < tiles; ++tile) {
             float* mine = scratch.data() + scratch_size * static_cast<size_t>(thread_index());
-            const TileJob job{a, picture, grads, records.data(), colors, c * tiles + tile, c, tile % across,
-                              tile / across, mine, mine + Blocks::size(a.D), pair_sums.data(), pair_seen.data(),
-                              background.data() + D * static_cast<size_t>(tile)};
+            const TileJob<Profile> job{a, picture, grads, records.data(), colors, c * tiles + tile, c, tile % across,
+                                       tile / across, mine, mine + Blocks::size(a.D), pair_sums.data(),
+                                       pair_seen.data(), background.data() + D * static_cast<size_t>(tile)};
             a.D == 3 ? backward_tile<3>(job) : backward_tile<0>(job);
         }
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > SPLATS_PER_TASK)
@@ -228,6 +231,12 @@ void blend_backward(const BlendArgs& a, const BlendState& picture, const Picture
             out.background[k] += static_cast<float>(total);
         }
     }
+}
+
+}  // namespace
+
+void blend_backward(const BlendArgs& a, const BlendState& picture, const PictureGrads& grads, const BlendGrads& out) {
+    a.shapes ? blend_backward_as<Beta>(a, picture, grads, out) : blend_backward_as<Gaussian>(a, picture, grads, out);
 }
 
 }  // namespace GSB_ISA

@@ -76,9 +76,15 @@ Vec3<Vec> masked(Mask m, const Vec3<Vec>& v) {
     return {select(m, v.x, Vec(0.0f)), select(m, v.y, Vec(0.0f)), select(m, v.z, Vec(0.0f))};
 }
 
-}  // namespace
+// Computes the splats of n Gaussians from the i-th on; `projection` is one of them.
+template <class Profile>
+Splat<Vec> splat_of(Projection<Vec>& projection, const ProjectArgs& a, int64_t i, int n) {
+    if constexpr (Profile::HAS_SHAPE) return projection.splat<Profile>(load_first(a.shapes + i, n));
+    return projection.splat<Profile>();
+}
 
-void project(const ProjectArgs& a, const Splats& out) {
+template <class Profile>
+void project_as(const ProjectArgs& a, const Splats& out) {
     for (int64_t c = 0; c < a.C; ++c) {
         const Camera camera = camera_of(a, c);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
@@ -88,12 +94,14 @@ void project(const ProjectArgs& a, const Splats& out) {
                 store_nothing(out, c * a.N + i, n);
                 continue;
             }
-            store_splat(load(a, camera, i, n).splat(), out, c * a.N + i, n);
+            Projection<Vec> projection = load(a, camera, i, n);
+            store_splat(splat_of<Profile>(projection, a, i, n), out, c * a.N + i, n);
         }
     }
 }
 
-void project_backward(const ProjectArgs& a, const SplatGrads& grads, const ProjectGrads& out) {
+template <class Profile>
+void project_backward_as(const ProjectArgs& a, const SplatGrads& grads, const ProjectGrads& out) {
     const int64_t chunks = (a.N + CHUNK - 1) / CHUNK;
     Buffer<float> camera_grads(static_cast<size_t>(chunks * a.C * 12));
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (chunks > 1)
@@ -113,7 +121,7 @@ void project_backward(const ProjectArgs& a, const SplatGrads& grads, const Proje
                     continue;
                 }
                 Projection<Vec> projection = load(a, camera, i, n);
-                const Splat<Vec> splat = projection.splat();
+                const Splat<Vec> splat = splat_of<Profile>(projection, a, i, n);
                 const Mask drawn = splat.half_x > Vec(0.0f);
                 const Splat<Vec> g = load_splat(grads, c * a.N + i, n);
                 const GaussianGrad<Vec> grad = projection.vjp(splat, g);
@@ -162,6 +170,16 @@ void project_backward(const ProjectArgs& a, const SplatGrads& grads, const Proje
         }
         for (int j = 0; j < 4; ++j) g[12 + j] = 0.0f;
     }
+}
+
+}  // namespace
+
+void project(const ProjectArgs& a, const Splats& out) {
+    a.shapes ? project_as<Beta>(a, out) : project_as<Gaussian>(a, out);
+}
+
+void project_backward(const ProjectArgs& a, const SplatGrads& grads, const ProjectGrads& out) {
+    a.shapes ? project_backward_as<Beta>(a, grads, out) : project_backward_as<Gaussian>(a, grads, out);
 }
 
 }  // namespace GSB_ISA

@@ -29,6 +29,9 @@ void roofline_triad(float* a, const float* b, const float* c, int64_t n) {
 // Runs the inner loop of blending in registers: LANES * rounds alphas, each blended into three channels.
 float roofline_alphas(int64_t rounds) {
     constexpr int CHAINS = 4;
+    constexpr struct {
+        float p = 0.6f, q = 0.1f, r = 0.5f, opacity = 0.01f;
+    } splat;
     Vec T[CHAINS], color[CHAINS][3], x = Vec(0.3f);
     for (int k = 0; k < CHAINS; ++k) {
         T[k] = Vec(1.0f);
@@ -36,7 +39,7 @@ float roofline_alphas(int64_t rounds) {
     }
     for (int64_t i = 0; i < rounds / CHAINS; ++i) {
         GSB_UNROLL for (int k = 0; k < CHAINS; ++k) {
-            const Falloff<Vec> f(x + static_cast<float>(k), x, Vec(0.6f), Vec(0.1f), Vec(0.5f), Vec(0.01f));
+            const Falloff<Vec> f(x + static_cast<float>(k), x, splat);
             const Vec after = T[k] - T[k] * f.alpha;
             const Mask blended = (f.alpha >= Vec(ALPHA_MIN)) & (after >= Vec(TRANSMITTANCE_MIN));
             const Vec weight = select(blended, T[k] * f.alpha, Vec(0.0f));

@@ -28,10 +28,20 @@ struct alignas(64) Record {
     int32_t pair(int tx, int ty) const { return first_pair + (ty - tile_y) * columns + (tx - tile_x); }
 };
 
-inline Record make_record(const BlendArgs& a, int64_t camera, int64_t i, const TileRect& rect) {
+// The record of a splat with this profile; a shape does not fit into the cache line.
+template <class Profile>
+struct RecordOf : Record {};
+template <>
+struct RecordOf<Beta> : Record {
+    float shape;
+};
+static_assert(sizeof(RecordOf<Gaussian>) == 64);
+
+template <class Profile>
+RecordOf<Profile> make_record(const BlendArgs& a, int64_t camera, int64_t i, const TileRect& rect) {
     const int64_t at = camera * a.N + i;
     const float *mean = a.means2d + at * 2, *root = a.roots + at * 4;
-    Record s{};
+    RecordOf<Profile> s{};
     s.x = mean[0];
     s.y = mean[1];
     s.p = root[0];
@@ -49,12 +59,14 @@ inline Record make_record(const BlendArgs& a, int64_t camera, int64_t i, const T
         const float* color = a.colors + (a.color_per_camera ? at : i) * 3;
         for (int k = 0; k < 3; ++k) s.color[k] = color[k];
     }
+    if constexpr (Profile::HAS_SHAPE) s.shape = a.shapes[i];
     return s;
 }
 
 // Makes the records of a camera's splats that touch tiles, without first_pair (see `number_pairs`). `pairs` [N] gets
 // the number of tiles of each splat; it may be null.
-inline void make_records(const BlendArgs& a, int64_t camera, Record* records, int32_t* pairs) {
+template <class Profile>
+void make_records(const BlendArgs& a, int64_t camera, RecordOf<Profile>* records, int32_t* pairs) {
     const int64_t base = camera * a.N;
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > 1024)
     for (int64_t first = 0; first < a.N; first += LANES) {
@@ -63,14 +75,15 @@ inline void make_records(const BlendArgs& a, int64_t camera, Record* records, in
         tile_rects(a.means2d + base * 2, a.half_sizes + base * 2, first, n, a.width, a.height, rects);
         for (int k = 0; k < n; ++k) {
             if (pairs) pairs[first + k] = static_cast<int32_t>(rects[k].count());
-            if (rects[k].count() > 0) records[first + k] = make_record(a, camera, first + k, rects[k]);
+            if (rects[k].count() > 0) records[first + k] = make_record<Profile>(a, camera, first + k, rects[k]);
         }
     }
 }
 
 // Sets first_pair of each splat, so that the tile intersections (pairs) of all splats are numbered consecutively.
 // `pairs` [N + 1] holds the number of pairs of each splat on entry, and the number of its first pair afterwards.
-inline void number_pairs(const BlendArgs& a, Record* records, int32_t* pairs) {
+template <class Profile>
+void number_pairs(const BlendArgs& a, RecordOf<Profile>* records, int32_t* pairs) {
     int32_t total = 0;
     for (int64_t i = 0; i < a.N; ++i) {
         const int32_t count = pairs[i];

@@ -31,12 +31,12 @@ __device__ Span tile_span(float low, float high, int pixels) {
 
 // Calls visit(whether the lane's tile is reached, the tile's index, the mask of lanes that reach theirs) for 32 tiles
 // at a time, in all lanes of a warp.
-template <class Visit>
+template <class Profile, class Visit>
 __device__ void each_tile(const BinArgs& a, int64_t s, Visit visit) {
     const float2 half = reinterpret_cast<const float2*>(a.half_sizes)[s];
     if (!(half.x > 0.0f)) return;
     const float2 mean = reinterpret_cast<const float2*>(a.means2d)[s];
-    const Reach reach(mean, reinterpret_cast<const float4*>(a.roots)[s]);
+    const Reach reach = reach_of<Profile>(mean, reinterpret_cast<const float4*>(a.roots)[s], a.half_sizes + s * 2);
     const Span columns = tile_span(mean.x - half.x, mean.x + half.x, a.width);
     const Span rows = tile_span(mean.y - half.y, mean.y + half.y, a.height);
     const int across = columns.end - columns.begin, count = across * (rows.end - rows.begin);
@@ -48,15 +48,17 @@ __device__ void each_tile(const BinArgs& a, int64_t s, Visit visit) {
     }
 }
 
+template <class Profile>
 __global__ void count_kernel(BinArgs a, const uint32_t* order, int64_t* counts) {
     const int64_t k = global_thread() / WARP;
     if (k >= a.N * a.C) return;
     int64_t count = 0;
-    each_tile(a, order[k], [&](bool, int, unsigned reached) { count += __popc(reached); });
+    each_tile<Profile>(a, order[k], [&](bool, int, unsigned reached) { count += __popc(reached); });
     if (threadIdx.x % WARP == 0) counts[k] = count;
 }
 
 // Intersections for which there is no memory are left out.
+template <class Profile>
 __global__ void fill_kernel(BinArgs a, TileOrder by_depth, int64_t no_tile, uint32_t* tiles, uint32_t* splats) {
     const int64_t k = global_thread() / WARP;
     if (k >= a.N * a.C) return;
@@ -64,7 +66,7 @@ __global__ void fill_kernel(BinArgs a, TileOrder by_depth, int64_t no_tile, uint
     const int64_t all = by_depth.ends[k], end = all < by_depth.pairs ? all : by_depth.pairs, s = by_depth.order[k];
     int64_t at = k > 0 ? by_depth.ends[k - 1] : 0;
     const int64_t first_tile = s / a.N * tiles_along(a.width) * tiles_along(a.height);
-    each_tile(a, s, [&](bool reached, int tile, unsigned others) {
+    each_tile<Profile>(a, s, [&](bool reached, int tile, unsigned others) {
         const int64_t mine = at + __popc(others & ((1u << lane) - 1));
         if (reached && mine < end) {
             tiles[mine] = static_cast<uint32_t>(first_tile + tile);
@@ -101,14 +103,16 @@ void count_tiles(const BinArgs& a, const TileCounts& out, Stream stream) {
     launch(key_kernel, blocks_for(a.N * a.C), THREADS, stream, a, out.keys, out.indices);
     sort_pairs(out.scratch, out.scratch_bytes, out.keys, out.sorted_keys, out.indices, out.order, a.N * a.C, 32,
                stream);
-    launch(count_kernel, blocks_for(a.N * a.C * WARP), THREADS, stream, a, out.order, out.ends);
+    launch(a.shapes ? count_kernel<Beta> : count_kernel<Gaussian>, blocks_for(a.N * a.C * WARP), THREADS, stream, a,
+           out.order, out.ends);
     running_sum(out.scratch, out.scratch_bytes, out.ends, a.N * a.C, stream);
 }
 
 void fill_tiles(const BinArgs& a, const TileOrder& by_depth, const TileLists& out, Stream stream) {
     const int64_t count = a.C * tiles_along(a.width) * tiles_along(a.height), pairs = by_depth.pairs;
     if (pairs > 0) {
-        launch(fill_kernel, blocks_for(a.N * a.C * WARP), THREADS, stream, a, by_depth, count, out.tiles, out.splats);
+        launch(a.shapes ? fill_kernel<Beta> : fill_kernel<Gaussian>, blocks_for(a.N * a.C * WARP), THREADS, stream, a,
+               by_depth, count, out.tiles, out.splats);
         sort_pairs(out.scratch, out.scratch_bytes, out.tiles, out.sorted_tiles, out.splats, out.ids, pairs,
                    bit_width(count), stream);
     }

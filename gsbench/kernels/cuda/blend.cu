@@ -4,10 +4,11 @@
 namespace gsb::cuda {
 namespace {
 
+template <class Profile>
 __global__ void __launch_bounds__(PATCHES * WARP) blend_kernel(BlendArgs a, Picture out, int first_channel) {
     __shared__ StagedSplat shared[PATCHES][WARP];
     StagedSplat* staged = shared[threadIdx.x / WARP];
-    const Patch patch(a, first_channel);
+    const Patch<Profile> patch(a, first_channel);
     const float x = static_cast<float>(patch.x(patch.lane)) + 0.5f, y = static_cast<float>(patch.y(patch.lane)) + 0.5f;
     bool open = patch.inside(patch.lane);
     float T = 1.0f, color[CHANNELS] = {};
@@ -17,7 +18,7 @@ __global__ void __launch_bounds__(PATCHES * WARP) blend_kernel(BlendArgs a, Pict
         const int n = patch.stage(first, staged);
         for (int i = 0; i < n; ++i) {
             const StagedSplat& s = staged[i];
-            const Falloff<float> f(x - s.x, y - s.y, s.p, s.q, s.r, s.opacity);
+            const Falloff<float, Profile> f(x - s.x, y - s.y, s);
             if (!open || f.alpha < ALPHA_MIN) continue;
             const float after = T - T * f.alpha;
             if (after < TRANSMITTANCE_MIN) {
@@ -45,7 +46,8 @@ __global__ void __launch_bounds__(PATCHES * WARP) blend_kernel(BlendArgs a, Pict
 
 void blend(const BlendArgs& a, const Picture& out, Stream stream) {
     for (int first = 0; first < a.D; first += CHANNELS) {
-        launch(blend_kernel, tiles_of(a), PATCHES * WARP, stream, a, out, first);
+        launch(a.shapes ? blend_kernel<Beta> : blend_kernel<Gaussian>, tiles_of(a), PATCHES * WARP, stream, a, out,
+               first);
     }
 }
 

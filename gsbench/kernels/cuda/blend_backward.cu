@@ -6,7 +6,9 @@ namespace gsb::cuda {
 namespace {
 
 // Computes the gradients of a Gaussian's splats and of its colour from their sums.
+template <class Profile>
 __global__ void finish_kernel(BlendArgs a, BlendGrads out) {
+    constexpr int GEOMETRY = Profile::MOMENTS;
     const int64_t i = global_thread();
     if (i >= a.N) return;
     for (int64_t c = 0; c < a.C; ++c) {
@@ -16,12 +18,17 @@ __global__ void finish_kernel(BlendArgs a, BlendGrads out) {
         for (int k = 0; k < GEOMETRY; ++k) any |= sums[k] != 0.0f;
         float g[GEOMETRY] = {};
         if (any) {  // else the splat may be one that was never drawn, and not finite
-            const FalloffMoments<float> m{sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]};
+            FalloffMoments<float, Profile> m;
+            for (int k = 0; k < GEOMETRY; ++k) m.of[k] = sums[k];
             const float4 root = reinterpret_cast<const float4*>(a.roots)[s];
-            splat_gradient(m, root.x, root.y, root.z, root.w, g);
+            StagedSplat splat{};
+            splat.p = root.x, splat.q = root.y, splat.r = root.z, splat.opacity = root.w;
+            if constexpr (Profile::HAS_SHAPE) splat.shape = a.shapes[i];
+            splat_gradient(m, splat, g);
         }
         reinterpret_cast<float2*>(out.means2d)[s] = {g[0], g[1]};
         reinterpret_cast<float4*>(out.roots)[s] = {g[2], g[3], g[4], g[5]};
+        if constexpr (Profile::HAS_SHAPE) out.shapes[i] = g[6] + (c == 0 ? 0.0f : out.shapes[i]);
         float* color = out.colors + (a.color_per_camera ? s : i) * a.D;
         for (int k = 0; k < a.D; ++k) {
             color[k] = sums[GEOMETRY + k] + (a.color_per_camera || c == 0 ? 0.0f : color[k]);
@@ -54,7 +61,8 @@ void backward(SumUp sum_up, const BlendArgs& a, const BlendState& picture, const
         launch(background_kernel, blocks < MOST_BLOCKS ? blocks : MOST_BLOCKS, THREADS, stream, a, picture, grads,
                out.background, first);
     }
-    if (a.N > 0) launch(finish_kernel, blocks_for(a.N), THREADS, stream, a, out);
+    if (a.N == 0) return;
+    launch(a.shapes ? finish_kernel<Beta> : finish_kernel<Gaussian>, blocks_for(a.N), THREADS, stream, a, out);
 }
 
 }  // namespace

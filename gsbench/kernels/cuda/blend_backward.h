@@ -7,9 +7,6 @@
 
 namespace gsb::cuda {
 
-constexpr int GEOMETRY = 6;
-constexpr int SUMS = GEOMETRY + CHANNELS;
-
 // A pixel of the image: its position, how many splats of the tile's list it blended, and the gradients of the loss by
 // its alpha and its colour. They are two structures of four numbers each, so that 32 lanes read them without bank
 // conflicts in shared memory.
@@ -35,7 +32,8 @@ struct BackwardPixel {
     Behind behind{1.0f, 0.0f};
 
     // Loads pixel number `k` of the patch; outside of the image nothing was blended.
-    __device__ BackwardPixel(const Patch& patch, int k, const BlendState& picture, const PictureGrads& grads) {
+    template <class Profile>
+    __device__ BackwardPixel(const Patch<Profile>& patch, int k, const BlendState& picture, const PictureGrads& grads) {
         place.x = static_cast<float>(patch.x(k)) + 0.5f, place.y = static_cast<float>(patch.y(k)) + 0.5f;
         if (!patch.inside(k)) return;
         const BlendArgs& a = patch.args;
@@ -60,8 +58,10 @@ __device__ inline int last_stop(int stop) {
 }
 
 // Removes a splat that was blended from the pixel's state, and adds to the splat's sums: moments, then colours.
-__device__ inline void unblend(const Falloff<float>& f, const float (&color)[CHANNELS], const Place& place,
-                               const ColorGrad& grad, Behind& behind, float (&sums)[SUMS]) {
+template <class Profile>
+__device__ void unblend(const Falloff<float, Profile>& f, const float (&color)[CHANNELS], const Place& place,
+                        const ColorGrad& grad, Behind& behind, float (&sums)[Patch<Profile>::SUMS]) {
+    constexpr int GEOMETRY = Profile::MOMENTS;
     behind.T = __fdividef(behind.T, 1.0f - f.alpha);  // which is at least 1/1000
     const float weight = f.alpha * behind.T;
     float own = place.alpha;  // the splat's own colour and cover, times the gradient
@@ -72,16 +72,18 @@ __device__ inline void unblend(const Falloff<float>& f, const float (&color)[CHA
     const float difference = own - behind.seen;
     behind.seen += f.alpha * difference;
     if (f.free > ALPHA_MAX) return;
-    FalloffMoments<float> m{sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]};
+    FalloffMoments<float, Profile> m;
+    for (int k = 0; k < GEOMETRY; ++k) m.of[k] = sums[k];
     m.add(f, weight * difference);
-    sums[0] = m.v, sums[1] = m.u, sums[2] = m.w, sums[3] = m.w_dx, sums[4] = m.u_dx, sums[5] = m.u_dy;
+    for (int k = 0; k < GEOMETRY; ++k) sums[k] = m.of[k];
 }
 
 // Returns the address at which sum `column` of a splat is accumulated, for a launch that blends channels from
 // `first_channel` on.
-__device__ inline float* sum_of(const BlendGrads& out, const Patch& patch, int32_t id, int column) {
-    const int at = column < GEOMETRY ? column : column + patch.first_channel;
-    return out.scratch + static_cast<int64_t>(id) * (GEOMETRY + patch.args.D) + at;
+template <class Profile>
+__device__ float* sum_of(const BlendGrads& out, const Patch<Profile>& patch, int32_t id, int column) {
+    const int at = column < Profile::MOMENTS ? column : column + patch.first_channel;
+    return out.scratch + static_cast<int64_t>(id) * (Profile::MOMENTS + patch.args.D) + at;
 }
 
 // The two kernels have the same arguments.

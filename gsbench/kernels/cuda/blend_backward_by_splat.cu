@@ -14,7 +14,7 @@ struct Traffic {
     Place places[WARP];
     ColorGrad colors[WARP];
     int waiting[2 * WARP];  // positions of splats that reach the patch, back to front: a ring
-    alignas(16) float sums[WARP][12];  // of splats that all pixels have passed; nine of twelve, to be aligned
+    alignas(16) float sums[WARP][12];  // of splats that all pixels have passed; nine or ten of twelve, to be aligned
     int32_t ids[WARP];                 // theirs; -1: none
 };
 
@@ -27,7 +27,8 @@ __device__ StagedSplat nobody() {
 
 // Reads the list backwards and queues splats that reach the patch, until there is one for every lane or the list ends;
 // `end` is the end of its unread part.
-__device__ void let_wait(const Patch& patch, int* waiting, int first, int& count, int& end) {
+template <class Profile>
+__device__ void let_wait(const Patch<Profile>& patch, int* waiting, int first, int& count, int& end) {
     while (count < WARP && end > 0) {
         const int position = end - 1 - patch.lane;
         const bool reached = position >= 0 && patch.is_reached_by(patch.splat_at(position));
@@ -42,11 +43,13 @@ __device__ void let_wait(const Patch& patch, int* waiting, int first, int& count
     __syncwarp();
 }
 
+template <class Profile>
 __global__ void __launch_bounds__(PATCHES * WARP)
     by_splat_kernel(BlendArgs a, BlendState picture, PictureGrads grads, BlendGrads out, int first_channel) {
     __shared__ Traffic shared[PATCHES];
     Traffic& traffic = shared[threadIdx.x / WARP];
-    const Patch patch(a, first_channel);
+    constexpr int GEOMETRY = Profile::MOMENTS, SUMS = Patch<Profile>::SUMS;
+    const Patch<Profile> patch(a, first_channel);
     // Lane l starts with the pixel that reaches lane 0 after 32 - l steps.
     const int mine = (WARP - patch.lane) % WARP;
     const BackwardPixel start(patch, mine, picture, grads);
@@ -76,7 +79,7 @@ __global__ void __launch_bounds__(PATCHES * WARP)
             }
             const int pixel = (step - patch.lane) & (WARP - 1);
             const Place place = traffic.places[pixel];
-            const Falloff<float> f(place.x - host.x, place.y - host.y, host.p, host.q, host.r, host.opacity);
+            const Falloff<float, Profile> f(place.x - host.x, place.y - host.y, host);
             if (host.position < place.stop && f.alpha >= ALPHA_MIN) {
                 unblend(f, host.color, place, traffic.colors[pixel], behind, sums);
             }
@@ -96,7 +99,8 @@ __global__ void __launch_bounds__(PATCHES * WARP)
 
 void sum_by_splat(const BlendArgs& a, const BlendState& picture, const PictureGrads& grads, const BlendGrads& out,
                   int first_channel, Stream stream) {
-    launch(by_splat_kernel, tiles_of(a), PATCHES * WARP, stream, a, picture, grads, out, first_channel);
+    launch(a.shapes ? by_splat_kernel<Beta> : by_splat_kernel<Gaussian>, tiles_of(a), PATCHES * WARP, stream, a,
+           picture, grads, out, first_channel);
 }
 
 }  // namespace gsb::cuda

@@ -19,9 +19,10 @@ namespace gsb {
 struct BinArgs {
     int64_t N, C;
     const float *means2d, *roots, *depths, *half_sizes;
+    const float* shapes;  // null: Gaussians
     int width, height;
 };
-GSB_FIELDS(BinArgs, INPUTS, N, C, means2d, roots, depths, half_sizes, width, height)
+GSB_FIELDS(BinArgs, INPUTS, N, C, means2d, roots, depths, half_sizes, shapes, width, height)
 
 // The arrays are [C * N].
 struct TileCounts {

@@ -18,13 +18,17 @@ struct alignas(16) StagedSplat {
     float x, y, p, q, r, opacity;
     int32_t id, position;  // among all splats; in the tile's list
     float color[CHANNELS];
+    float shape;  // of a Beta profile
 };
 
 inline unsigned tiles_of(const BlendArgs& a) {
     return static_cast<unsigned>(a.C * tiles_along(a.width) * tiles_along(a.height));
 }
 
+template <class Profile>
 struct Patch {
+    static constexpr int GEOMETRY = Profile::MOMENTS, SUMS = GEOMETRY + CHANNELS;  // sums over pixels for a splat
+
     const BlendArgs& args;
     int64_t camera;
     int lane, left, top;       // pixels
@@ -58,11 +62,14 @@ struct Patch {
         const float4 root = reinterpret_cast<const float4*>(args.roots)[s.id];
         s.x = mean.x, s.y = mean.y;
         s.p = root.x, s.q = root.y, s.r = root.z, s.opacity = root.w;
+        if constexpr (Profile::HAS_SHAPE) s.shape = args.shapes[s.id - camera * args.N];
         return s;
     }
 
     __device__ bool is_reached_by(const StagedSplat& s) const {
-        return Reach({s.x, s.y}, {s.p, s.q, s.r, s.opacity}).touches(left, top, PATCH_X, PATCH_Y);
+        const float* half_sizes = args.half_sizes + static_cast<int64_t>(s.id) * 2;
+        const Reach reach = reach_of<Profile>({s.x, s.y}, {s.p, s.q, s.r, s.opacity}, half_sizes);
+        return reach.touches(left, top, PATCH_X, PATCH_Y);
     }
 
     __device__ void load_color(StagedSplat& s) const {

@@ -27,12 +27,21 @@ __device__ Projection<float> projection_of(const ProjectArgs& a, const Camera& c
     return {camera, vec3(a.means + i * 3), factor, a.opacities[i]};
 }
 
+// Computes the splat of the i-th Gaussian; `projection` is its projection.
+template <class Profile>
+__device__ Splat<float> splat_of(Projection<float>& projection, const ProjectArgs& a, int64_t i) {
+    if constexpr (Profile::HAS_SHAPE) return projection.splat<Profile>(a.shapes[i]);
+    return projection.splat<Profile>();
+}
+
+template <class Profile>
 __global__ void project_kernel(ProjectArgs a, Splats out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
     for (int64_t c = blockIdx.y; c < a.C; c += gridDim.y) {
         const Camera camera = camera_of(a, c);
-        const Splat<float> s = projection_of(a, camera, i).splat();
+        Projection<float> projection = projection_of(a, camera, i);
+        const Splat<float> s = splat_of<Profile>(projection, a, i);
         const int64_t at = c * a.N + i;
         reinterpret_cast<float2*>(out.means2d)[at] = {s.x, s.y};
         reinterpret_cast<float4*>(out.roots)[at] = {s.p, s.q, s.r, s.opacity};
@@ -63,6 +72,7 @@ __device__ void add_camera_grad(const GaussianGrad<float>& grad, float* viewmat)
     }
 }
 
+template <class Profile>
 __global__ void project_backward_kernel(ProjectArgs a, SplatGrads grads, ProjectGrads out) {
     const int64_t i = global_thread();
     const bool exists = i < a.N;
@@ -72,7 +82,7 @@ __global__ void project_backward_kernel(ProjectArgs a, SplatGrads grads, Project
         if (exists) {
             const Camera camera = camera_of(a, c);
             Projection<float> projection = projection_of(a, camera, i);
-            const Splat<float> splat = projection.splat();
+            const Splat<float> splat = splat_of<Profile>(projection, a, i);
             if (splat.half_x > 0.0f) grad = projection.vjp(splat, splat_grad(grads, c * a.N + i));
         }
         sum.mean += grad.mean;
@@ -92,12 +102,13 @@ void project(const ProjectArgs& a, const Splats& out, Stream stream) {
     if (a.N == 0) return;
     constexpr int64_t MOST_ROWS = 65535;  // of blocks; further cameras are taken in turns
     const dim3 grid(blocks_for(a.N), static_cast<unsigned>(a.C < MOST_ROWS ? a.C : MOST_ROWS));
-    launch(project_kernel, grid, THREADS, stream, a, out);
+    launch(a.shapes ? project_kernel<Beta> : project_kernel<Gaussian>, grid, THREADS, stream, a, out);
 }
 
 void project_backward(const ProjectArgs& a, const SplatGrads& grads, const ProjectGrads& out, Stream stream) {
     if (a.N == 0) return;
-    launch(project_backward_kernel, blocks_for(a.N), THREADS, stream, a, grads, out);
+    launch(a.shapes ? project_backward_kernel<Beta> : project_backward_kernel<Gaussian>, blocks_for(a.N), THREADS,
+           stream, a, grads, out);
 }
 
 }  // namespace gsb::cuda

@@ -12,10 +12,10 @@ constexpr float POWER_MARGIN = 0.01f;  // added to log2(255 opacity), so that ro
 struct Reach {
     float x, y, p, q, r, foot_x, foot_y, most_power;
 
-    __device__ Reach(float2 mean, float4 root) : x(mean.x), y(mean.y), p(root.x), q(root.y), r(root.z) {
+    __device__ Reach(float2 mean, float4 root, float most_power)
+        : x(mean.x), y(mean.y), p(root.x), q(root.y), r(root.z), most_power(most_power) {
         foot_y = __fdividef(-q, r);
         foot_x = __fdividef(-q * r, p * p + q * q);
-        most_power = __log2f(255.0f * root.w) + POWER_MARGIN;
     }
 
     // Tests the centres of the pixels [left, left + width) x [top, top + height).
@@ -25,5 +25,16 @@ struct Reach {
                            foot_x, foot_y) <= most_power;
     }
 };
+
+// Returns the reach of a splat with this profile. That of a Beta profile is in its half width, which has a margin.
+template <class Profile>
+__device__ Reach reach_of(float2 mean, float4 root, const float* half_sizes) {
+    if constexpr (Profile::HAS_SHAPE) {
+        const float reach = half_sizes[0] * root.x;
+        return {mean, root, reach * reach};
+    } else {
+        return {mean, root, __log2f(255.0f * root.w) + POWER_MARGIN};
+    }
+}
 
 }  // namespace gsb::cuda

@@ -1,4 +1,4 @@
-// One projected Gaussian at one pixel (3DGS eq. 3): its alpha, and the gradients of blending.
+// One projected Gaussian at one pixel (3DGS eq. 3): its alpha by either profile, and the gradients of blending.
 #pragma once
 
 #include "projection.h"
@@ -7,47 +7,83 @@ namespace gsb {
 inline namespace GSB_ISA {
 
 // The falloff of a projected Gaussian at a pixel: alpha, and the coordinates u, w in which the Gaussian is isotropic.
-template <class T>
+// The splat has p, q, r, opacity and, of a Beta profile, shape.
+template <class T, class Profile = Gaussian>
 struct Falloff {
     T dx, dy, u, w;
     T free;   // opacity 2^-(u^2 + w^2), before it is held below ALPHA_MAX
     T alpha;  // after
 
-    GSB_HD Falloff(T dx, T dy, T p, T q, T r, T opacity) : dx(dx), dy(dy) {
-        w = p * dx;
-        u = q * dx + r * dy;
-        free = opacity * exp2(-(w * w) - u * u);
+    template <class S>
+    GSB_HD Falloff(T dx, T dy, const S& s) : dx(dx), dy(dy) {
+        w = T(s.p) * dx;
+        u = T(s.q) * dx + T(s.r) * dy;
+        free = T(s.opacity) * exp2(-(w * w) - u * u);
+        alpha = min(free, T(ALPHA_MAX));
+    }
+};
+
+template <class T>
+struct Falloff<T, Beta> {
+    T dx, dy, u, w;
+    T rest, log2_rest;  // 1 - r^2, held above RIM_MIN, and its logarithm
+    T free, alpha;      // free: opacity (1 - r^2)^shape
+
+    template <class S>
+    GSB_HD Falloff(T dx, T dy, const S& s) : dx(dx), dy(dy) {
+        const T one(1.0f);
+        w = T(s.p) * dx;
+        u = T(s.q) * dx + T(s.r) * dy;
+        const T r2 = min((w * w + u * u) * (1.0f / HALF_LOG2_E), one), difference = one - r2;
+        rest = max(difference, T(RIM_MIN));
+        // The second term is what rounding took from the difference: large exponents need it.
+        log2_rest = log2(rest) + ((one - difference) - r2) * LOG2_E;
+        free = select(r2 < one, T(s.opacity) * exp2(log2_rest * T(s.shape)), T(0.0f));
         alpha = min(free, T(ALPHA_MAX));
     }
 };
 
 // The sums over a Gaussian's pixels that its gradient needs: moments of v = alpha dLoss/dalpha.
-template <class T>
+template <class T, class Profile = Gaussian>
 struct FalloffMoments {
-    T v, u, w, w_dx, u_dx, u_dy;
+    enum { V, U, W, W_DX, U_DX, U_DY, SHAPE };
+    T of[Profile::MOMENTS];
 
-    GSB_HD void add(const Falloff<T>& f, T g) {
-        const T gu = g * f.u, gw = g * f.w;
-        v += g;
-        u += gu;
-        w += gw;
-        w_dx += gw * f.dx;
-        u_dx += gu * f.dx;
-        u_dy += gu * f.dy;
+    GSB_HD void add(const Falloff<T, Profile>& f, T g) {
+        of[V] += g;
+        T slope = g;
+        if constexpr (Profile::HAS_SHAPE) {
+            of[SHAPE] += g * f.log2_rest;
+            slope = g * reciprocal(f.rest);
+        }
+        const T gu = slope * f.u, gw = slope * f.w;
+        of[U] += gu;
+        of[W] += gw;
+        of[W_DX] += gw * f.dx;
+        of[U_DX] += gu * f.dx;
+        of[U_DY] += gu * f.dy;
     }
 };
 
-// Computes the gradients of x, y, p, q, r, opacity from the moments, by dalpha = alpha (dlog2 o - dpower) ln 2 with
-// power = u^2 + w^2 and opacity o.
-GSB_HD inline void splat_gradient(const FalloffMoments<float>& m, float p, float q, float r, float opacity,
-                                  float (&g)[6]) {
-    constexpr float two_ln2 = 2.0f * LN_2;
-    g[0] = two_ln2 * (p * m.w + q * m.u);
-    g[1] = two_ln2 * (r * m.u);
-    g[2] = -two_ln2 * m.w_dx;
-    g[3] = -two_ln2 * m.u_dx;
-    g[4] = -two_ln2 * m.u_dy;
-    g[5] = m.v / opacity;
+// Computes the gradients of x, y, p, q, r, opacity and shape from the moments. With power = u^2 + w^2 and opacity o,
+// dalpha = alpha (dlog2 o - dpower) ln 2 of a Gaussian. Of a Beta profile with shape b it is
+// alpha (dlog2 o - 2 b / (1 - r^2) dpower + log2(1 - r^2) db) ln 2.
+template <class Profile, class S>
+GSB_HD inline void splat_gradient(const FalloffMoments<float, Profile>& moments, const S& s,
+                                  float (&g)[Profile::MOMENTS]) {
+    using M = FalloffMoments<float, Profile>;
+    const auto& m = moments.of;
+    float scale = 2.0f * LN_2;
+    if constexpr (Profile::HAS_SHAPE) {
+        scale *= 2.0f * s.shape;
+        g[6] = LN_2 * m[M::SHAPE];
+    }
+    g[0] = scale * (s.p * m[M::W] + s.q * m[M::U]);
+    g[1] = scale * (s.r * m[M::U]);
+    g[2] = -scale * m[M::W_DX];
+    g[3] = -scale * m[M::U_DX];
+    g[4] = -scale * m[M::U_DY];
+    g[5] = m[M::V] / s.opacity;
 }
 
 // Returns the minimum of the power u^2 + w^2 in the rectangle [x0, x1] x [y0, y1], whose origin is the Gaussian's mean.

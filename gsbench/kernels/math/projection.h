@@ -5,19 +5,18 @@
 //   det = |m1 x m2|^2 + eps2d (|m1|^2 + |m2|^2) + eps2d^2            (Lagrange's identity)
 //   power = w^2 + u^2,  w = p dx,  u = q dx + r dy                    (a triangular root of the inverse)
 // So the falloff of a needle-shaped Gaussian is exact up to rounding, and the power is never negative. p, q, r are
-// scaled such that alpha = opacity 2^-power. Since det has the unit pixels^4, it would overflow float32 for a Gaussian
-// of 10^9 pixels. Therefore everything is computed in units of `size`, the size of the projected Gaussian. The result
-// does not depend on `size`, so derivatives treat it as a constant.
+// scaled such that alpha = opacity 2^-power for a Gaussian; r^2 = power / HALF_LOG2_E for either profile. Since det has
+// the unit pixels^4, it would overflow float32 for a Gaussian of 10^9 pixels. Therefore everything is computed in units
+// of `size`, the size of the projected Gaussian. The result does not depend on `size`, so derivatives treat it as a
+// constant.
 #pragma once
 
-#include "scalar.h"
-#include "thresholds.h"
+#include "profiles.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
 
-constexpr float HALF_LOG2_E = 0.721347520f;       // exp(-x/2) = 2^(-HALF_LOG2_E x)
-constexpr float SQRT_HALF_LOG2_E = 0.849321800f;  // so this scales the root
+constexpr float SQRT_HALF_LOG2_E = 0.849321800f;  // scales the root, as HALF_LOG2_E scales the power
 constexpr float BOUNDS_MARGIN = 0.01f;            // pixels, so that rounding cuts off no pixel
 
 // A pinhole camera and the settings of the projection.
@@ -76,7 +75,9 @@ struct Projection {
         }
     }
 
-    GSB_HD Splat<T> splat() {
+    // Projects a Gaussian with this profile; `shape` is the exponent of a Beta profile.
+    template <class Profile>
+    GSB_HD Splat<T> splat(T shape = T(0.0f)) {
         const T one(1.0f), zero(0.0f);
         x = dot(R[0], mean) + camera.translation[0];
         y = dot(R[1], mean) + camera.translation[1];
@@ -119,8 +120,8 @@ struct Projection {
         s.q = zero - xy / xx * s.r;
         s.opacity = opacity * compensation;
         s.depth = depth;
-        // alpha >= 1/255 only inside the ellipse power <= log2(255 opacity); this is the bounding box of the ellipse.
-        const T reach = log2(max(s.opacity * 255.0f, one)) * (1.0f / HALF_LOG2_E);
+        // alpha >= 1/255 only inside the ellipse r^2 <= reach; this is the bounding box of the ellipse.
+        const T reach = Profile::reach(s.opacity, shape);
         s.half_x = sqrt(reach * xx) * size + BOUNDS_MARGIN;
         s.half_y = sqrt(reach * yy) * size + BOUNDS_MARGIN;
         const auto drawn = solid & (s.opacity >= T(ALPHA_MIN)) & (s.x + s.half_x > zero) & (s.y + s.half_y > zero) &

@@ -17,5 +17,8 @@ constexpr float TIME_OPACITY_FACTOR_MIN = 0.05f;
 constexpr float ALPHA_MIN = 1.0f / 255.0f;
 constexpr float ALPHA_MAX = 0.999f;
 constexpr float TRANSMITTANCE_MIN = 1e-4f;
+// 1 - r^2 of a Beta profile is held above this in alpha and in its gradient, which for exponents below 1 is infinite at
+// the rim r = 1.
+constexpr float RIM_MIN = 1e-6f;
 
 }  // namespace gsb

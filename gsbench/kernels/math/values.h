@@ -15,7 +15,7 @@ struct Range {
     int bit;
 };
 
-constexpr int RANGES = 14;
+constexpr int RANGES = 15;
 
 struct Ranges {
     Range range[RANGES];
@@ -30,7 +30,8 @@ inline Ranges ranges_of(const ValueArgs& a) {
              finite(a.colors, a.all_colors, 3), finite(a.viewmats, a.C * 16, 4), finite(a.Ks, a.C * 9, 5),
              of_Ks(0, FLT_MIN, FLT_MAX), of_Ks(4, FLT_MIN, FLT_MAX),  // focal lengths
              of_Ks(1, 0.0f, 0.0f), of_Ks(3, 0.0f, 0.0f), of_Ks(6, 0.0f, 0.0f), of_Ks(7, 0.0f, 0.0f),
-             of_Ks(8, 1.0f, 1.0f), finite(a.background, a.D, 6)}};
+             of_Ks(8, 1.0f, 1.0f), finite(a.background, a.D, 6),
+             {a.shapes, a.shapes ? a.N : 0, 1, FLT_MIN, FLT_MAX, 7}}};
 }
 
 }  // namespace gsb
