@@ -109,8 +109,8 @@ def write_ply(asked: ExportRequest, path: Path) -> None:
     print(f"{path}: {len(trained)} Gaussians{when}, colours {colours}; {culled} of {len(run.model)} are left out, as "
           f"their opacity there is below 1/255")  # fmt: skip
     if has_profiles(run.model, query):
-        print(f"{path}: their alpha profiles (1 - r^2)^b are left out, as a PLY of 3DGS has no field for them: other "
-              f"programs draw Gaussians; --images and --video keep the profiles")  # fmt: skip
+        print(f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of 3DGS "
+              f"has no field for b; --images and --video keep the profiles")  # fmt: skip
 
 
 def slice_place(asked: ExportRequest) -> tuple[Query, bool]:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models.base import SHRINK, GaussianModel, Raw
+from gsbench.models.sliced import reach
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
 
@@ -54,7 +55,7 @@ class BetaModel(GaussianModel):
     def spatial_scales(self) -> Tensor:
         """Return the sizes S of the Gaussians that look like the profiles, [N, 3]; gradients reach S, not b."""
         raw = dict(self.splats.items())
-        return positive(raw["scales"][:, :3]) / reach_of(raw).detach()[:, None]
+        return positive(raw["scales"][:, :3]) / reach(profiles(raw)).detach()[:, None]
 
     def log_sizes(self, index: int) -> Tensor:
         """Return the logarithms of the sizes of the Gaussian `index`, in position and then in other variables."""
@@ -63,7 +64,7 @@ class BetaModel(GaussianModel):
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the sizes such that the Gaussians that look like the profiles are at least `least` [N] large."""
         raw = {name: value.data for name, value in self.splats.items()}
-        raw["scales"][:, :3].clamp_(min=softplus_inverse(least * reach_of(raw))[:, None])
+        raw["scales"][:, :3].clamp_(min=softplus_inverse(least * reach(profiles(raw)))[:, None])
 
     def spread(self, rows: Tensor) -> Tensor:
         """Return the factors of the conditional covariances of the Gaussians `rows` [M], [M, 3, 3]."""
@@ -75,13 +76,13 @@ class BetaModel(GaussianModel):
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Sample the means of children from the Gaussian that looks like the profile, and make sizes 1.6 x smaller."""
         z = torch.randn(raw["means"].shape, generator=generator).to(raw["means"])
-        means = raw["means"] + (self.factors(raw) @ z[..., None])[..., 0] / reach_of(raw)[:, None]
+        means = raw["means"] + (self.factors(raw) @ z[..., None])[..., 0] / reach(profiles(raw))[:, None]
         space, rest = raw["scales"][:, :3], raw["scales"][:, 3:]
         return {"means": means, "scales": torch.cat([softplus_inverse(positive(space) / SHRINK), rest], -1)}
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
         """Return spheres of the volumes of trained 3D Gaussians, larger by the reach of their profiles."""
-        larger = trained.log_scales + reach_of(raw).log()[:, None]
+        larger = trained.log_scales + reach(profiles(raw)).log()[:, None]
         return GaussianModel.shaped_as(self, replace(trained, log_scales=larger), raw)
 
 
@@ -90,9 +91,9 @@ def exponents(betas: Tensor) -> Tensor:
     return 4 * betas.clamp(-LOG_SIZE_MAX, LOG_SIZE_MAX).exp()
 
 
-def reach_of(raw: Raw) -> Tensor:
-    """Return how many standard deviations of the Gaussian that looks like it a profile reaches, sqrt(2 b), [N]."""
-    return (2 * exponents(raw["betas"][:, 0])).sqrt()
+def profiles(raw: Raw) -> Tensor:
+    """Compute the exponents b of the alpha profiles, [N]."""
+    return exponents(raw["betas"][:, 0])
 
 
 def shift_weights(betas: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
-from gsbench.models.beta import BetaModel, exponents, opacity_factor, positive, shift_weights
+from gsbench.models.beta import BetaModel, exponents, opacity_factor, positive, profiles, shift_weights
 from gsbench.models.dgs import COUPLING_SPREAD, TIME_PRECISION, coupling_matrix, precision_factor
 from gsbench.models.factors import sizes
 from gsbench.models.moving3d import MovingGaussians3D
@@ -66,11 +66,11 @@ class DirectBetaModel(BetaModel, MovingGaussians3D):
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Return moved means, covariance factors, opacity factors and the exponents of the profiles."""
-        return super().condition(raw, query)._replace(shapes=exponents(raw["betas"][:, 0]))
+        return super().condition(raw, query)._replace(shapes=profiles(raw))
 
     def static(self, raw: Raw) -> Conditioned:
         """Return the Gaussians at their means, with their profiles."""
-        return super().static(raw)._replace(shapes=exponents(raw["betas"][:, 0]))
+        return super().static(raw)._replace(shapes=profiles(raw))
 
     def change(self, raw: Raw, query: Query) -> tuple[Tensor, Tensor]:
         """Return how far the means move [N, 3] and the factors of the opacities [N], by the formulas of the class."""

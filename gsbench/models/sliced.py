@@ -42,6 +42,18 @@ def tensors_of(parts: Iterable[Tensor | None]) -> list[Tensor]:
     return [part for part in parts if part is not None]
 
 
+def reach(shapes: Tensor) -> Tensor:
+    """Return at how many standard deviations of the Gaussian that looks like it a Beta profile ends, sqrt(2 b), [N].
+
+    A profile (1 - r^2)^b ends at r = 1, and is close to the Gaussian exp(-b r^2), whose standard deviation is
+    1 / sqrt(2 b).
+
+    Args:
+        shapes: the exponents b, [N].
+    """
+    return (2 * shapes).sqrt()
+
+
 def joined_shapes(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     """Concatenate the exponents b of the alpha profiles (1 - r^2)^b of two groups of Gaussians; None if both are None.
 

@@ -12,9 +12,9 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.models.base import Raw
 from gsbench.models.beta import (
     BetaModel,
-    exponents,
     opacity_factor,
     positive,
+    profiles,
     shift_weights,
     skew_factor,
     softplus_inverse,
@@ -92,7 +92,7 @@ class UniversalBetaModel(BetaModel):
         else:
             shift = (gain_of(reduced.T_pq, reduced.T_qq) * (weights * delta)[:, None]).sum(-1)
         factors = self._modulated(reduced, weights)
-        profile = exponents(raw["betas"][:, 0])
+        profile = profiles(raw)
         return Conditioned(raw["means"] + shift, factors, opacity_factor(white, raw["betas"]), profile)
 
     def factors(self, raw: Raw) -> Tensor:

@@ -11,6 +11,7 @@ from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models.base import GaussianModel
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.query import Query
+from gsbench.models.sliced import reach
 from gsbench.scenes.points import SH_C0
 from gsbench.scenes.trained import TrainedGaussians
 
@@ -20,6 +21,8 @@ LARGEST_OPACITY = 1 - 2**-24  # the largest float32 below 1, whose logit is fini
 
 def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = False) -> TrainedGaussians:
     """Compute a model's 3D Gaussians at a viewpoint and a time, and return those with enough opacity to be drawn.
+
+    Beta profiles become the Gaussians that look like them.
 
     Args:
         model: the initialised model.
@@ -36,6 +39,8 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
     with torch.no_grad():
         seen = model.slice(query)
         means, factors, opacities, colors = (part.detach().cpu() for part in seen[:4])
+        if seen.shapes is not None:
+            factors = factors / reach(seen.shapes).cpu()[:, None, None]
         drawn = opacities >= ALPHA_MIN  # the rasterizer skips smaller alphas, and alpha is at most the opacity
         if not drawn.any():
             raise InputError("no Gaussian can be seen at this time and from this place: choose others")

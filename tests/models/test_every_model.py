@@ -19,7 +19,7 @@ from gsbench.models import GaussianModel, Query, build, registry
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel, as_gated
 from gsbench.models.simplifications import simplifications_of
-from gsbench.models.sliced import tensors_of
+from gsbench.models.sliced import reach, tensors_of
 from gsbench.scenes.trained import ply_of, read_trained
 from gsbench.schedule import ActiveComponents
 from gsbench.train.penalties import MeanOpacity, MeanSize
@@ -195,7 +195,8 @@ def test_a_slice_is_exported(name: str, agr: bool, tmp_path: Path) -> None:
     drawn = seen.opacities >= 1 / 255
     torch.testing.assert_close(read.means, seen.means[drawn].detach())
     torch.testing.assert_close(torch.sigmoid(read.logits), seen.opacities[drawn].detach())
-    volumes = torch.linalg.det(seen.factors[drawn].detach()).abs()
+    factors = seen.factors if seen.shapes is None else seen.factors / reach(seen.shapes)[:, None, None]
+    volumes = torch.linalg.det(factors[drawn].detach()).abs()
     torch.testing.assert_close(read.log_scales.sum(1).exp(), volumes, rtol=1e-3, atol=1e-6)
     if has_harmonics(model):
         assert len(trained_of(model, query, keep_harmonics=True)) == len(read)

@@ -49,7 +49,7 @@ def test_a_ply_says_that_it_has_no_profiles(
     assert main(asked) == 0
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 2
-    assert "a.ply: their alpha profiles (1 - r^2)^b are left out" in said[1]
+    assert "a.ply: their alpha profiles (1 - r^2)^b are now the Gaussians" in said[1]
 
 
 def test_a_video_has_its_frames(folder: Path, tmp_path: Path) -> None:
