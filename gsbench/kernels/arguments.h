@@ -76,6 +76,34 @@ struct ObservationGrads {
 };
 GSB_FIELDS(ObservationGrads, GIVEN, means, factors, opacities)
 
+// Gaussians of Universal Beta Splatting over position, direction and, unless `times` is null, time, with C = 3 or 4
+// variables besides position, and the camera centre and time at which they are sliced.
+struct UniversalArgs {
+    int64_t N;
+    const float *means, *directions, *times;        // [N, 3] [N, 3] [N, 1]
+    const float *scales, *skew, *lower, *betas;     // [N, 3 + C] [N, 3] [N, 3 C + C (C - 1) / 2] [N, 1 + C]
+    const float *opacities, *center, *time;         // [N] logits, [3] []
+    int threads;
+};
+GSB_FIELDS(UniversalArgs, INPUTS, N, means, directions, times, scales, skew, lower, betas, opacities, center, time,
+           threads)
+
+struct UniversalGrads {
+    float *means, *directions, *times, *scales, *skew, *lower, *betas, *opacities;  // added to
+};
+GSB_FIELDS(UniversalGrads, GRADS, means, directions, times, scales, skew, lower, betas, opacities)
+
+// A slice whose Gaussians have Beta profiles with the exponents `shapes`.
+struct BetaSlice {
+    float *means, *factors, *opacities, *shapes;  // [N, 3] [N, 3, 3] [N] [N]
+};
+GSB_FIELDS(BetaSlice, OUTPUTS, means, factors, opacities, shapes)
+
+struct BetaSliceGrads {
+    const float *means, *factors, *opacities, *shapes;
+};
+GSB_FIELDS(BetaSliceGrads, GIVEN, means, factors, opacities, shapes)
+
 // Gaussians of 3DGS with the factor R diag(exp scales), which do not change with the camera or the time.
 struct StaticArgs {
     int64_t N;
@@ -307,6 +335,8 @@ GSB_FIELDS(AdamState, OUTPUTS, parameter, mean, square)
     kernel(slice_triangular_backward, TriangularArgs, ObservationGrads, TriangularGrads)       \
     kernel(slice_rotated, RotatedArgs, Observation)                                            \
     kernel(slice_rotated_backward, RotatedArgs, ObservationGrads, RotatedGrads)                \
+    kernel(slice_universal, UniversalArgs, BetaSlice)                                          \
+    kernel(slice_universal_backward, UniversalArgs, BetaSliceGrads, UniversalGrads)            \
     kernel(slice_static, StaticArgs, StaticSlice)                                              \
     kernel(slice_static_backward, StaticArgs, StaticSliceGrads, StaticGrads)                   \
     kernel(show_colors, ColorArgs, Colors)                                                     \

@@ -1,4 +1,4 @@
-"""Compute the conditional 3D Gaussians (slice) of 7D, 6D or 4D Gaussians for one camera and time.
+"""Compute the conditional 3D Gaussians (slice) of 7D, 6D, 4D or Universal Beta Gaussians for one camera and time.
 
 3D Gaussians are converted to the same form.
 """
@@ -171,6 +171,65 @@ def slice_rotated(
     seen = _rotated(means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
                     EVERY_ROW if conditioned is None else conditioned)  # fmt: skip
     return seen[0], seen[1], seen[2]
+
+
+_universal = Operation(
+    "slice_universal",
+    inputs={
+        "means": Input("N 3", Gradient.ADDED),
+        "directions": Input("N 3", Gradient.ADDED),
+        "times": Input("N 1", Gradient.ADDED, left_out_with="time"),
+        "scales": Input("N rows", Gradient.ADDED),
+        "skew": Input("N 3", Gradient.ADDED),
+        "lower": Input("N entries", Gradient.ADDED),
+        "betas": Input("N exponents", Gradient.ADDED),
+        "opacities": Input("N", Gradient.ADDED),
+        "center": Input("3", Gradient.REFUSED),
+        "time": Input("", Gradient.REFUSED, left_out_with="time"),
+    },
+    outputs=_SLICE | {"shapes": Output("N")},
+    derive=lambda given, _: (
+        {"rows": 7, "entries": 18, "exponents": 5} if "times" in given else {"rows": 6, "entries": 12, "exponents": 4}
+    ),
+    memory="a slice's Gaussians",
+)
+
+
+def slice_universal(
+    means: Tensor,  # [N, 3]
+    directions: Tensor,  # [N, 3]
+    times: Tensor | None,  # [N, 1], None: time is not observed
+    scales: Tensor,  # [N, 3 + k], k numbers are observed
+    skew: Tensor,  # [N, 3]
+    lower: Tensor,  # [N, 3 k + k (k - 1) / 2]
+    betas: Tensor,  # [N, 1 + k]
+    opacities: Tensor,  # [N] logits
+    center: Tensor,  # [3]
+    time: Tensor | None,  # []
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Compute the conditional 3D Gaussians of UBS for a camera centre and a time, by `gsbench.models.ubs`, `whitened`.
+
+    Return means [N, 3], factors [N, 3, 3] of the covariances, opacities [N] and exponents of the Beta profiles [N].
+
+    Args:
+        means: the mean positions, world units.
+        directions: the mean directions.
+        times: the mean times; 1 is the length of the sequence.
+        scales: the sizes of position, direction and time before softplus.
+        skew: the entries A_01, A_02, A_12 of the rotation I + A.
+        lower: the entries below the diagonal of the factor's rows of direction and time, row by row.
+        betas: the exponents before 4 exp: of the profile, of direction and of time.
+        opacities: the opacities before the sigmoid (logits).
+        center: the camera's centre, world units.
+        time: the time at which to slice; 1 is the length of the sequence.
+
+    Raises:
+        InputError: tensors are not float32 on one device, their shapes do not match, or `center` or `time` requires a
+            gradient.
+    """
+    seen = _universal(means, directions, times, scales, skew, lower, betas, opacities, center,
+                      time if times is not None else None)  # fmt: skip
+    return seen[0], seen[1], seen[2], seen[3]
 
 
 _static = Operation(

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
+from gsbench.kernels.slices import slice_universal
 from gsbench.models.base import Raw
 from gsbench.models.beta import (
     BetaModel,
@@ -21,7 +22,7 @@ from gsbench.models.beta import (
 )
 from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
-from gsbench.models.sliced import Conditioned
+from gsbench.models.sliced import Conditioned, Geometry
 from gsbench.models.slicing import Reduced, cholesky3, gain_of, reduce, triangularise, whiten
 from gsbench.scenes.scene import Points
 
@@ -94,6 +95,24 @@ class UniversalBetaModel(BetaModel):
         factors = self._modulated(reduced, weights)
         profile = profiles(raw)
         return Conditioned(raw["means"] + shift, factors, opacity_factor(white, raw["betas"]), profile)
+
+    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+        """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the modulation."""
+        if self.modulation != "whitened" or not self.backend.serves(raw["means"]):
+            return super().slice_geometry(raw, query)
+        geometry = slice_universal(
+            raw["means"],
+            raw["directions"],
+            raw["times"] if "time" in self.observes else None,
+            raw["scales"],
+            raw["skew"],
+            raw["lower"],
+            raw["betas"],
+            raw["opacities"],
+            query.center,
+            query.time,
+        )
+        return Geometry(*geometry)
 
     def factors(self, raw: Raw) -> Tensor:
         """Compute the factors of the conditional covariances, [N, 3, 3], by the formula of the class."""

@@ -12,7 +12,7 @@ from gsbench.kernels.adam import adam
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.refine import HIDDEN, refine
-from gsbench.kernels.slices import slice_rotated, slice_static, slice_triangular
+from gsbench.kernels.slices import slice_rotated, slice_static, slice_triangular, slice_universal
 from gsbench.measure.quality import evaluate, psnr, psnr_channel_mean, quantise, ssim
 from gsbench.models.slicing import slice_gaussians
 from gsbench.raster import rasterize
@@ -48,6 +48,8 @@ def targets() -> dict[str, Target]:
                   "shape": rand(N, 3), "motion": rand(N, 12), "coupling": rand(N, 6), "center": rand(3),
                   "time": torch.tensor(0.5), "log_lambda_d": torch.tensor(0.1), "log_lambda_t": torch.tensor(0.1),
                   "conditioned_first": True}  # fmt: skip
+    universal = {**common, "directions": rand(N, 3), "times": rand(N, 1), "scales": rand(N, 7), "skew": rand(N, 3),
+                 "lower": rand(N, 18), "betas": rand(N, 5), "center": rand(3), "time": torch.tensor(0.5)}  # fmt: skip
     colors = {**common, "sh0": rand(N, 1, 3), "shN": rand(N, 15, 3), "center": rand(3), "degree": 3}
     moved = {"a": rand(N, 3), "b": rand(N, 7), "weight_in": rand(2 * HIDDEN, 5), "bias_in": rand(2 * HIDDEN),
              "weight_out": rand(10, HIDDEN), "bias_out": rand(10), "units": rand(10) + 1, "gamma": rand(2)}  # fmt: skip
@@ -65,6 +67,7 @@ def targets() -> dict[str, Target]:
         "slice_static": Target(slice_static, static),
         "slice_rotated": Target(slice_rotated, rotated, ("clock", "time")),
         "slice_triangular": Target(slice_triangular, triangular, ("center", "time")),
+        "slice_universal": Target(slice_universal, universal, ("center", "time")),
         "show_colors": Target(show_colors, colors, ("center", "opacities")),
         "l1_ssim": Target(l1_ssim, {"image": rand(12, 13, 3), "target": rand(12, 13, 3), "ssim_weight": 0.2},
                           ("target",)),

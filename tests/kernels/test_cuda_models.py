@@ -8,7 +8,17 @@ import pytest
 import test_tape
 import torch
 from test_prefixes import SHARES, gradients, intervals_around, kept
-from test_slices import VARIANTS, assert_same, color_inputs, model_and_raw, refined_exactly, rotated, static
+from test_slices import (
+    VARIANTS,
+    assert_same,
+    color_inputs,
+    covariances,
+    model_and_raw,
+    refined_exactly,
+    rotated,
+    static,
+    universal,
+)
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -21,7 +31,7 @@ from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement
-from gsbench.models.sliced import tensors_of
+from gsbench.models.sliced import Geometry, tensors_of
 from gsbench.train.step import Step
 
 Move = Callable[[Tensor], Tensor]
@@ -37,15 +47,17 @@ def back(tensors: list[Tensor]) -> list[Tensor]:
     return [x.cpu() for x in tensors]
 
 
-def assert_slices_agree(exact: GaussianModel, raw: dict[str, Tensor], move: Move) -> None:
+def assert_slices_agree(
+    exact: GaussianModel, raw: dict[str, Tensor], move: Move, of: Callable[[Geometry], list[Tensor]] = tensors_of
+) -> None:
     """The kernels' slice, and its gradients by all parameters, against those of torch in float64."""
     center, time = torch.tensor([0.3, -0.2, -3.0]), torch.tensor(0.4)
-    expected = tensors_of(exact.slice_geometry(raw, Query(center.double(), time.double())))
+    expected = of(exact.slice_geometry(raw, Query(center.double(), time.double())))
     lambdas = list(exact.log_lambda.parameters())
     single = {name: move(x) for name, x in raw.items()}
     model = deepcopy(exact).to(single["opacities"])
     model.condition = None  # nothing is left to torch
-    actual = tensors_of(model.slice_geometry(single, Query(move(center), move(time))))
+    actual = of(model.slice_geometry(single, Query(move(center), move(time))))
     assert_same(back(actual), expected)
     inputs = [*single.values(), *model.log_lambda.parameters()]
     assert_same(back(gradients(actual, inputs)), gradients(expected, [*raw.values(), *lambdas]))
@@ -67,6 +79,12 @@ def test_static_slice(move: Move) -> None:
     raw = static(torch.float64)
     raw = {"means": torch.zeros(len(raw["opacities"]), 3, dtype=torch.float64, requires_grad=True), **raw}
     assert_slices_agree(Gaussians3DModel(), raw, move)
+
+
+@pytest.mark.parametrize("name", ["ubs", "ubs_static"])
+def test_universal_slice(name: str, move: Move) -> None:
+    """Catches a thread that reads another row, and a kernel for Gaussians with time that is run for those without."""
+    assert_slices_agree(*universal(name, torch.float64), move, covariances)
 
 
 @pytest.mark.parametrize("share", SHARES)

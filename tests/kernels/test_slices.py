@@ -11,7 +11,7 @@ from gsbench.kernels import refine as refining
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.operation import EVERY_ROW
 from gsbench.kernels.refine import refine
-from gsbench.kernels.slices import slice_rotated, slice_static, slice_triangular
+from gsbench.kernels.slices import slice_rotated, slice_static, slice_triangular, slice_universal
 from gsbench.models import Query, build
 from gsbench.models.appearance import sh_colors, sh_time_colors
 from gsbench.models.factors import OFF_DIAGONALS
@@ -19,7 +19,9 @@ from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.query import unit
 from gsbench.models.refinement import Refinement
+from gsbench.models.sliced import Geometry, tensors_of
 from gsbench.models.triangular import TriangularModel
+from gsbench.models.ubs import UniversalBetaModel
 
 VARIANTS: list[tuple[str, dict[str, Any]]] = [
     ("7dgs", {}),
@@ -149,6 +151,61 @@ def test_static_slice() -> None:
     actual = list(slice_static(*single.values()))
     assert_same(actual, expected)
     assert_same(gradients(actual, list(single.values())), gradients(expected, list(raw.values())))
+
+
+def universal(name: str, dtype: torch.dtype) -> tuple[UniversalBetaModel, dict[str, Tensor]]:
+    g = torch.Generator().manual_seed(6)
+    k, N = {"ubs": 4, "ubs_static": 3}[name], 45
+    raw = {"means": torch.randn(N, 3, generator=g), "directions": torch.randn(N, 3, generator=g),
+           "scales": torch.randn(N, 3 + k, generator=g) - 1, "skew": 0.5 * torch.randn(N, 3, generator=g),
+           "lower": 0.5 * torch.randn(N, 3 * k + k * (k - 1) // 2, generator=g),
+           "betas": torch.randn(N, 1 + k, generator=g) - 1, "opacities": 2 * torch.randn(N, generator=g)}  # fmt: skip
+    raw["betas"][:3] = 0.0  # the root of I - B is zero
+    raw["betas"][3:5] = torch.tensor([17.0, -17.0])[:, None]  # beyond where exponents stop
+    raw["scales"][5:7, 0] = torch.tensor([-7.0, -17.0])  # a size that 1 + e^x would round; one that stops
+    raw["scales"][7:9, 3:] = -5.0  # so narrow that opacity factors are at their least
+    if name == "ubs":
+        raw["times"] = torch.rand(N, 1, generator=g)
+    model = build(name)
+    assert isinstance(model, UniversalBetaModel)
+    return model, {key: x.to(dtype).requires_grad_() for key, x in raw.items()}
+
+
+def covariances(geometry: Geometry) -> list[Tensor]:
+    """What is the same for every square factor F of F F^T."""
+    means, factors, *rest = tensors_of(geometry)
+    return [means, factors @ factors.mT, *rest]
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("name", ["ubs", "ubs_static"])
+def test_universal_slice(name: str) -> None:
+    """Catches a reflection that loses a column of direction or time, a wrong B, a size that does not stop, or a wrong
+    derivative, at a vector's end too."""
+    center = torch.tensor([0.3, -0.2, -3.0])
+    exact, raw = universal(name, torch.float64)
+    query = Query(center.double(), torch.tensor(0.4, dtype=torch.float64))
+    expected = covariances(exact.slice_geometry(raw, query))
+    _, single = universal(name, torch.float32)
+    actual = covariances(Geometry(*slice_universal(
+        single["means"], single["directions"], single.get("times"), single["scales"], single["skew"], single["lower"],
+        single["betas"], single["opacities"], center, torch.tensor(0.4),
+    )))  # fmt: skip
+    assert_same(actual, expected)
+    assert_same(gradients(actual, list(single.values())), gradients(expected, list(raw.values())))
+
+
+@pytest.mark.usefixtures("threads")
+def test_threads_do_not_change_a_universal_slice() -> None:
+    """Catches gradients that two threads add to the same row."""
+    model, raw = universal("ubs", torch.float32)
+    many = {key: x.detach().repeat(30, *[1] * (x.dim() - 1)).requires_grad_() for key, x in raw.items()}
+    found = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        seen = list(model.slice_geometry(many, Query.at(torch.tensor([0.3, -0.2, -3.0]), 0.4)))
+        found.append([*seen, *gradients(seen, list(many.values()))])
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 
 
 def color_inputs(waves: int, dtype: torch.dtype, N: int = 21) -> list[Tensor]:

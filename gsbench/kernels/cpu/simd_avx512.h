@@ -219,13 +219,12 @@ GSB_HD inline void load_columns(const float* p, Vec (&out)[W]) {
             }
         }
     } else {
-        static_assert(W <= LANES);
         Vec x[LANES];
         GSB_UNROLL for (int i = 0; i < LANES; ++i) {
             x[i] = i * W + LANES <= LANES * W ? Vec::load(p + i * W) : load_some(p + i * W, W);
         }
         transpose(x);
-        GSB_UNROLL for (int k = 0; k < W; ++k) out[k] = x[k];
+        GSB_UNROLL for (int k = 0; k < W; ++k) out[k] = k < LANES ? x[k] : gather(p + k, W);
     }
 }
 template <int W>
@@ -241,7 +240,6 @@ GSB_HD inline void store_columns(const Vec (&x)[W], float* p) {
             Vec(out).store(p + k * LANES);
         }
     } else {
-        static_assert(W <= LANES);
         Vec rows[LANES];
         GSB_UNROLL for (int k = 0; k < LANES; ++k) rows[k] = k < W ? x[k] : Vec(0.0f);
         transpose(rows);
@@ -249,6 +247,7 @@ GSB_HD inline void store_columns(const Vec (&x)[W], float* p) {
         GSB_UNROLL for (int i = 0; i < LANES; ++i) {
             i * W + LANES <= LANES * W ? rows[i].store(p + i * W) : store_first(rows[i], p + i * W, W);
         }
+        GSB_UNROLL for (int k = LANES; k < W; ++k) scatter(x[k], p + k, W);
     }
 }
 

@@ -1,5 +1,5 @@
-// How raw parameters of all models are mapped: log sizes by exp, quaternions to rotations, entries below a factor's
-// diagonal.
+// How raw parameters of all models are mapped: log sizes by exp, sizes by softplus, quaternions to rotations, entries
+// below a factor's diagonal.
 #pragma once
 
 #include "off_diagonal.h"
@@ -8,6 +8,8 @@
 
 namespace gsb {
 inline namespace GSB_ISA {
+
+constexpr float LEAST_SIZE = 1.12535175e-7f, LARGEST_SIZE = 8886110.52f;  // e^+-LOG_SIZE_MAX
 
 // The exp of a log size that is clamped to +-LOG_SIZE_MAX; the derivative is zero if the log size was clamped.
 template <class T>
@@ -18,6 +20,29 @@ GSB_HD inline T size_of(T log) {
 template <class T>
 GSB_HD inline T size_vjp(T log, T size, T g) {
     return select(max(log, T(0.0f) - log) <= T(LOG_SIZE_MAX), g * size, T(0.0f));
+}
+
+// Computes ln(1 + e^x). Of small e^x, ln is computed by the series of atanh, because 1 + e^x would lose digits.
+template <class T>
+GSB_HD inline T softplus(T x) {
+    const T u = exp(min(x, T(0.0f) - x)), s = u / (u + 2.0f), s2 = s * s;
+    T y = s2 * (1.0f / 13.0f) + (1.0f / 11.0f);
+    y = y * s2 + (1.0f / 9.0f);
+    y = y * s2 + (1.0f / 7.0f);
+    y = y * s2 + (1.0f / 5.0f);
+    y = y * s2 + (1.0f / 3.0f);
+    return max(x, T(0.0f)) + (s + s * s2 * y) * 2.0f;
+}
+
+// The size softplus(x), clamped to e^+-LOG_SIZE_MAX; the derivative is zero if the size was clamped.
+template <class T>
+GSB_HD inline T bounded_softplus(T x) {
+    return clamp(softplus(x), T(LEAST_SIZE), T(LARGEST_SIZE));
+}
+
+template <class T>
+GSB_HD inline T bounded_softplus_vjp(T x, T size, T g) {
+    return select(size > T(LEAST_SIZE), select(size < T(LARGEST_SIZE), g * sigmoid(x), T(0.0f)), T(0.0f));
 }
 
 // Returns an entry below the diagonal of a triangular factor from its parameter. If `relative`, the parameter is in
