@@ -21,6 +21,8 @@ ALPHA_MIN = _thresholds["ALPHA_MIN"]
 ALPHA_MAX = _thresholds["ALPHA_MAX"]
 TRANSMITTANCE_MIN = _thresholds["TRANSMITTANCE_MIN"]
 RIM_MIN = _thresholds["RIM_MIN"]
+DIRECT_FADING = _thresholds["DIRECT_FADING"]
+BETA_LOG_MIN = _thresholds["BETA_LOG_MIN"]
 
 _sizes = _constants("math/sizes.h", "int")
 TILE = int(_sizes["TILE"])

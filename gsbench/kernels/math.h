@@ -7,6 +7,10 @@
 
 #include "math/awake.h"
 #include "math/blending.h"
+#include "math/coupled.h"
+#include "math/direct.h"
+#include "math/direct_beta.h"
+#include "math/free_time.h"
 #include "math/harmonics.h"
 #include "math/parameters.h"
 #include "math/projection.h"

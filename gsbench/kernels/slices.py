@@ -11,7 +11,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.operation import EVERY_ROW, Operation, first_rows
 
-_SLICE = {"means": Output("N 3"), "factors": Output("N 3 3"), "opacities": Output("N")}
+SLICE = {"means": Output("N 3"), "factors": Output("N 3 3"), "opacities": Output("N")}
 
 _triangular = Operation(
     "slice_triangular",
@@ -29,14 +29,14 @@ _triangular = Operation(
         "log_lambda_d": Input("", Gradient.SUMMED, left_out_with="direction"),
         "log_lambda_t": Input("", Gradient.SUMMED, left_out_with="time"),
     },
-    outputs=_SLICE,
+    outputs=SLICE,
     numbers={"half": float, "conditioned_first": bool, "form": int, "subtracts": bool, "conditioned": int},
-    derive=lambda given, numbers: _entries(given) | _conditioned(given, numbers),
+    derive=lambda given, numbers: _entries(given) | conditioned_rows(given, numbers),
     memory="a slice's Gaussians",
 )
 
 
-def _conditioned(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
+def conditioned_rows(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
     """Return how many Gaussians, counted from the first, change with the camera and the time."""
     return {"conditioned": first_rows("conditioned", numbers["conditioned"], given["means"])}
 
@@ -123,9 +123,9 @@ _rotated = Operation(
         "time": Input("", Gradient.REFUSED),
         "log_lambda_t": Input("", Gradient.SUMMED),
     },
-    outputs=_SLICE,
+    outputs=SLICE,
     numbers={"conditioned": int},
-    derive=lambda given, numbers: _conditioned(given, numbers),
+    derive=conditioned_rows,
     memory="a slice's Gaussians",
 )
 

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.kernels.headers import LOG_SIZE_MAX
+from gsbench.kernels.headers import BETA_LOG_MIN, LOG_SIZE_MAX
 from gsbench.models.base import SHRINK, GaussianModel, Raw
 from gsbench.models.sliced import reach
 from gsbench.scenes.scene import Points
@@ -19,7 +19,6 @@ from gsbench.scenes.trained import TrainedGaussians
 
 LARGEST_SHIFT = 4.0  # the exponent at which a variable has its full effect on the mean
 VIEW_BETA = -3.0  # initial `betas` of direction in a model with time: exponents of 0.2, so directions start weak
-LEAST_LOG = math.log(1.2e-7)  # of 1 - tanh, as in the authors' code
 
 
 class BetaModel(GaussianModel):
@@ -110,7 +109,7 @@ def opacity_factor(white: Tensor, betas: Tensor) -> Tensor:
         white: whitened distances y of the direction and time of a query from their means, [N, C].
         betas: the parameters of the exponents, [N, 1 + C]; the first is that of the alpha profile.
     """
-    logs = (math.log(2) - F.softplus(2 * white.square())).clamp(min=LEAST_LOG)
+    logs = (math.log(2) - F.softplus(2 * white.square())).clamp(min=BETA_LOG_MIN)
     return (exponents(betas[:, 1:]) * logs).sum(-1).exp()
 
 

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from gsbench.kernels.moving import slice_direct_beta
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
 from gsbench.models.beta import BetaModel, exponents, opacity_factor, positive, profiles, shift_weights
@@ -18,7 +19,7 @@ from gsbench.models.factors import sizes
 from gsbench.models.moving3d import MovingGaussians3D
 from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
-from gsbench.models.sliced import Conditioned
+from gsbench.models.sliced import Conditioned, Geometry
 from gsbench.scenes.scene import Points
 
 
@@ -83,6 +84,26 @@ class DirectBetaModel(BetaModel, MovingGaussians3D):
         V_pq = coupling_matrix(raw["coupling"], positive(raw["scales"]))
         moved = V_pq @ (shift_weights(raw["betas"]) * (L @ white[..., None])[..., 0])[..., None]
         return moved[..., 0], opacity_factor(white, raw["betas"])
+
+    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+        """Compute the moved 3D Gaussians and their exponents by the backend's kernel if it has one, else in torch."""
+        if not self.backend.serves(raw["means"]):
+            return super().slice_geometry(raw, query)
+        geometry = slice_direct_beta(
+            raw["means"],
+            raw["directions"],
+            raw["times"] if "time" in self.observes else None,
+            raw["scales"],
+            raw["skew"],
+            raw["precision"],
+            raw["coupling"],
+            raw["betas"],
+            raw["opacities"],
+            query.center,
+            query.time,
+            conditioned=self.conditioned,
+        )
+        return Geometry(*geometry)
 
     def lifetimes(self) -> tuple[Tensor, Tensor] | None:
         """Return mean times [N] and standard deviations [N] of the Gaussians exp(-b z^2); None without time.

@@ -12,16 +12,18 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
+from gsbench.kernels.headers import DIRECT_FADING
+from gsbench.kernels.moving import slice_direct
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
 from gsbench.models.factors import sizes
 from gsbench.models.moving3d import MovingGaussians3D
 from gsbench.models.query import Query, times_inside, unit
 from gsbench.models.registry import register
+from gsbench.models.sliced import Geometry
 from gsbench.scenes.scene import Points
 
 COUPLINGS = ("text", "interpolated", "none")
-FADING = 0.35  # lambda_o, the coefficient in the exponent of the opacity factor
 TIME_PRECISION = math.sqrt(10)  # initial L_tt
 SHARES = -1.2  # initial logits of Lam
 LARGEST_SHARE = 0.999  # of Lam after `shrink_rows`: the logit of 1 is infinite
@@ -88,7 +90,7 @@ class DirectModel(MovingGaussians3D):
         delta = torch.cat([direction - unit(raw["directions"]), query.time - torch.sigmoid(raw["times"])], -1)
         L = precision_factor(raw["precision"])
         white = (L.mT @ delta[..., None])[..., 0]
-        opacity_factor = torch.exp(-FADING * white.square().sum(-1))
+        opacity_factor = torch.exp(-DIRECT_FADING * white.square().sum(-1))
         if self.coupling == "none":
             return torch.zeros_like(raw["means"]), opacity_factor
         V_pq = coupling_matrix(raw["coupling"], sizes(raw["scales"]))
@@ -97,6 +99,27 @@ class DirectModel(MovingGaussians3D):
         if self.coupling == "interpolated":
             shift = shift + (1 - shares) * delta
         return (V_pq @ shift[..., None])[..., 0], opacity_factor
+
+    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+        """Compute the moved 3D Gaussians by a kernel, or in torch if the backend has none for this `coupling`."""
+        if self.coupling != "text" or not self.backend.serves(raw["means"]):
+            return super().slice_geometry(raw, query)
+        assert query.time is not None
+        geometry = slice_direct(
+            raw["means"],
+            raw["directions"],
+            raw["times"],
+            raw["scales"],
+            raw["quats"],
+            raw["precision"],
+            raw["coupling"],
+            raw["shares"],
+            raw["opacities"],
+            query.center,
+            query.time,
+            conditioned=self.conditioned,
+        )
+        return Geometry(*geometry)
 
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
@@ -112,7 +135,7 @@ class DirectModel(MovingGaussians3D):
     def lifetimes(self) -> tuple[Tensor, Tensor]:
         """Return the mean time [N] of each Gaussian, and the standard deviation [N] of its opacity over time."""
         L_tt = sizes(self.splats["precision"].detach()[:, 6])
-        return torch.sigmoid(self.splats["times"].detach()[:, 0]), 1 / (math.sqrt(2 * FADING) * L_tt)
+        return torch.sigmoid(self.splats["times"].detach()[:, 0]), 1 / (math.sqrt(2 * DIRECT_FADING) * L_tt)
 
 
 def coupling_matrix(coupling: Tensor, scales: Tensor) -> Tensor:

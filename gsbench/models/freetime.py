@@ -9,12 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsbench.kernels.moving import slice_free_time
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
 from gsbench.models.factors import sizes
 from gsbench.models.moving3d import MovingGaussians3D
 from gsbench.models.query import Query
 from gsbench.models.registry import register
+from gsbench.models.sliced import Geometry
 from gsbench.scenes.scene import Points
 
 
@@ -62,6 +64,24 @@ class FreeTimeModel(MovingGaussians3D):
         delta = query.time - raw["times"]
         opacity_factor = torch.exp(-0.5 * (delta / sizes(raw["durations"])).square())[:, 0]
         return raw["velocities"] * delta, opacity_factor
+
+    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+        """Compute the moved 3D Gaussians by the backend's kernel if it has one, else in torch."""
+        if not self.backend.serves(raw["means"]):
+            return super().slice_geometry(raw, query)
+        assert query.time is not None
+        geometry = slice_free_time(
+            raw["means"],
+            raw["times"],
+            raw["scales"],
+            raw["quats"],
+            raw["durations"],
+            raw["velocities"],
+            raw["opacities"],
+            query.time,
+            conditioned=self.conditioned,
+        )
+        return Geometry(*geometry)
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
         """Return the mean times mu_t [N] and the standard deviations s [N] in time."""

@@ -11,6 +11,7 @@ from torch import Tensor
 from gsbench.kernels.adam import adam
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
+from gsbench.kernels.moving import slice_direct, slice_direct_beta, slice_free_time
 from gsbench.kernels.refine import HIDDEN, refine
 from gsbench.kernels.slices import slice_rotated, slice_static, slice_triangular, slice_universal
 from gsbench.measure.quality import evaluate, psnr, psnr_channel_mean, quantise, ssim
@@ -50,6 +51,12 @@ def targets() -> dict[str, Target]:
                   "conditioned_first": True}  # fmt: skip
     universal = {**common, "directions": rand(N, 3), "times": rand(N, 1), "scales": rand(N, 7), "skew": rand(N, 3),
                  "lower": rand(N, 18), "betas": rand(N, 5), "center": rand(3), "time": torch.tensor(0.5)}  # fmt: skip
+    timed = {"times": rand(N, 1), "time": torch.tensor(0.5)}
+    free = {**common, **static, **timed, "durations": rand(N, 1), "velocities": rand(N, 3)}
+    coupled = {**common, **timed, "directions": rand(N, 3), "scales": rand(N, 3), "precision": rand(N, 7),
+               "coupling": rand(N, 12), "center": rand(3)}  # fmt: skip
+    direct = {**coupled, "quats": rand(N, 4), "shares": rand(N, 2)}
+    direct_beta = {**coupled, "skew": rand(N, 3), "betas": rand(N, 5)}
     colors = {**common, "sh0": rand(N, 1, 3), "shN": rand(N, 15, 3), "center": rand(3), "degree": 3}
     moved = {"a": rand(N, 3), "b": rand(N, 7), "weight_in": rand(2 * HIDDEN, 5), "bias_in": rand(2 * HIDDEN),
              "weight_out": rand(10, HIDDEN), "bias_out": rand(10), "units": rand(10) + 1, "gamma": rand(2)}  # fmt: skip
@@ -68,6 +75,9 @@ def targets() -> dict[str, Target]:
         "slice_rotated": Target(slice_rotated, rotated, ("clock", "time")),
         "slice_triangular": Target(slice_triangular, triangular, ("center", "time")),
         "slice_universal": Target(slice_universal, universal, ("center", "time")),
+        "slice_direct": Target(slice_direct, direct, ("center", "time")),
+        "slice_direct_beta": Target(slice_direct_beta, direct_beta, ("center", "time")),
+        "slice_free_time": Target(slice_free_time, free, ("time",)),
         "show_colors": Target(show_colors, colors, ("center", "opacities")),
         "l1_ssim": Target(l1_ssim, {"image": rand(12, 13, 3), "target": rand(12, 13, 3), "ssim_weight": 0.2},
                           ("target",)),

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import test_tape
 import torch
+from test_moving import NAMES, N, moving
 from test_prefixes import SHARES, gradients, intervals_around, kept
 from test_slices import (
     VARIANTS,
@@ -101,6 +102,15 @@ def test_static_rows_of_rotated_factors(share: float, move: Move) -> None:
     """Catches a static row that is turned otherwise than by its left quaternion, or fades."""
     exact, raw = rotated(torch.float64)
     exact.effect_sets = EffectSets(0, round(share * 45), None)
+    assert_slices_agree(exact, raw, move)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("name", NAMES)
+def test_moving_slice(name: str, share: float, move: Move) -> None:
+    """Catches a row of a moving or a static Gaussian that is read from another place, or whose gradient is lost."""
+    exact, raw = moving(name, torch.float64)
+    exact.effect_sets = EffectSets(0, round(share * N), None)
     assert_slices_agree(exact, raw, move)
 
 

@@ -1,0 +1,152 @@
+// One Gaussian of dBS, a Beta profile that moves and fades with direction and, if K = 4, time: its 3D Gaussian for a
+// view, and the gradients.
+#pragma once
+
+#include "coupled.h"
+#include "direct.h"
+
+namespace gsb {
+inline namespace GSB_ISA {
+
+// ln(1 + q) for 0 <= q <= 1, by the series of atanh, to float's precision relative to the result.
+template <class T>
+GSB_HD inline T log1p_of(T q) {
+    const T s = q / (q + 2.0f), s2 = s * s;
+    T y = s2 * (1.0f / 15.0f) + (1.0f / 13.0f);
+    y = y * s2 + (1.0f / 11.0f);
+    y = y * s2 + (1.0f / 9.0f);
+    y = y * s2 + (1.0f / 7.0f);
+    y = y * s2 + (1.0f / 5.0f);
+    y = y * s2 + (1.0f / 3.0f);
+    return (y * s2 + 1.0f) * s * 2.0f;
+}
+
+template <class T>
+struct StaticBetaParameters {
+    T scales[3], skew[3], opacity, beta;  // sizes are softplus of scales; A_01, A_02, A_12; a logit; of the profile
+};
+
+// A Gaussian of dBS that does not depend on time or direction: its factor (I + A) S, its opacity and its exponent.
+template <class T>
+struct StaticBetaGaussian {
+    const StaticBetaParameters<T>& raw;
+    T turn[3][3], factor[3][3], size[3], slope[3], opacity, shape;  // slope: of a size by its parameter
+
+    GSB_HD explicit StaticBetaGaussian(const StaticBetaParameters<T>& raw) : raw(raw) {
+        const T zero(0.0f), one(1.0f);
+        turn[0][0] = turn[1][1] = turn[2][2] = one;
+        GSB_UNROLL for (int k = 0; k < 3; ++k) {
+            const int i = k / 2, j = (k + 3) / 2;  // (0, 1), (0, 2), (1, 2)
+            turn[i][j] = raw.skew[k];
+            turn[j][i] = zero - raw.skew[k];
+        }
+        const T least = exp(T(-LOG_SIZE_MAX)), most = exp(T(LOG_SIZE_MAX));
+        GSB_UNROLL for (int j = 0; j < 3; ++j) {
+            const T x = raw.scales[j], q = exp(min(x, zero - x)), free = max(x, zero) + log1p_of(q);
+            size[j] = clamp(free, least, most);
+            slope[j] = select(size[j] == free, select(x < zero, q, one) / (one + q), zero);
+            GSB_UNROLL for (int i = 0; i < 3; ++i) factor[i][j] = turn[i][j] * size[j];
+        }
+        opacity = sigmoid(raw.opacity);
+        shape = size_of(raw.beta) * 4.0f;
+    }
+
+    GSB_HD void vjp(const T (&g_factor)[3][3], T g_opacity, T g_shape, StaticBetaParameters<T>& out) const {
+        GSB_UNROLL for (int k = 0; k < 3; ++k) {
+            const int i = k / 2, j = (k + 3) / 2;
+            out.skew[k] = g_factor[i][j] * size[j] - g_factor[j][i] * size[i];
+            const T g_size = g_factor[0][k] * turn[0][k] + g_factor[1][k] * turn[1][k] + g_factor[2][k] * turn[2][k];
+            out.scales[k] = g_size * slope[k];
+        }
+        out.opacity = g_opacity * opacity * (T(1.0f) - opacity);
+        out.beta = size_vjp(raw.beta, shape, g_shape);
+    }
+};
+
+template <class T>
+struct ObservedBeta : Observed<T> {
+    T shape;
+};
+
+template <class T, int K>
+struct DirectBetaParameters {
+    StaticBetaParameters<T> still;
+    CoupledParameters<T, K> motion;
+    T mean[3], direction[3], time, betas[K];  // the last are of the opacity factors
+};
+
+template <class T, int K>
+struct DirectBetaGaussian {
+    using Parameters = DirectBetaParameters<T, K>;
+    using Still = StaticBetaGaussian<T>;
+    using StillParameters = StaticBetaParameters<T>;
+    using Seen = ObservedBeta<T>;
+
+    const Parameters& raw;
+    Still still;
+    T exponents[K];  // over 4
+    CoupledMotion<T, K> motion;
+    T logs[K], falls[K], opacity_factor;  // logs: ln(1 - tanh(white^2)); falls: their derivative by white, negative
+
+    GSB_HD DirectBetaGaussian(const Parameters& raw, const ViewPoint& view)
+        : raw(raw), still(raw.still), motion(moved(view)) {
+        const T zero(0.0f), one(1.0f), least(BETA_LOG_MIN);
+        T sum = zero;
+        GSB_UNROLL for (int k = 0; k < K; ++k) {
+            const T x = motion.white[k] * motion.white[k] * 2.0f, q = exp(zero - x);
+            const T free = T(LN_2) - log1p_of(q) - x;
+            logs[k] = max(free, least);
+            falls[k] = select(free < least, zero, motion.white[k] * 4.0f / (one + q));
+            sum = sum + exponents[k] * logs[k];
+        }
+        opacity_factor = exp(sum * 4.0f);
+    }
+
+    GSB_HD Seen observe() const {
+        Seen out;
+        GSB_UNROLL for (int i = 0; i < 3; ++i) {
+            out.mean[i] = raw.mean[i] + motion.mean_size * motion.shift[i];
+            GSB_UNROLL for (int j = 0; j < 3; ++j) out.factor[i][j] = still.factor[i][j];
+        }
+        out.opacity = still.opacity * opacity_factor;
+        out.shape = still.shape;
+        return out;
+    }
+
+    GSB_HD void vjp(const Seen& g, Parameters& out) const {
+        const T zero(0.0f), one(1.0f), third(1.0f / 3.0f);
+        const T g_sum = g.opacity * still.opacity * opacity_factor * 4.0f;
+        T g_white[K], g_weights[K], g_delta[K];
+        GSB_UNROLL for (int k = 0; k < K; ++k) g_white[k] = zero - g_sum * exponents[k] * falls[k];
+        const T g_size = motion.vjp(g.mean, g_white, out.motion, g_weights, g_delta) * third;
+        GSB_UNROLL for (int k = 0; k < K; ++k) {
+            const T g_exponent = g_sum * logs[k] + select(exponents[k] <= one, g_weights[k], zero);
+            out.betas[k] = size_vjp(raw.betas[k], exponents[k], g_exponent);
+        }
+        GSB_UNROLL for (int i = 0; i < 3; ++i) out.direction[i] = zero - g_delta[i];
+        if constexpr (K > 3) out.time = zero - g_delta[3];
+        still.vjp(g.factor, g.opacity * opacity_factor, g.shape, out.still);
+        GSB_UNROLL for (int i = 0; i < 3; ++i) {
+            out.mean[i] = g.mean[i];
+            out.still.scales[i] = out.still.scales[i] + g_size * still.slope[i];
+        }
+    }
+
+private:
+    GSB_HD CoupledMotion<T, K> moved(const ViewPoint& view) {
+        const Vec3<T> d = direction_to(raw.mean, view);
+        T delta[K], weights[K];
+        delta[0] = d.x - raw.direction[0];
+        delta[1] = d.y - raw.direction[1];
+        delta[2] = d.z - raw.direction[2];
+        if constexpr (K > 3) delta[3] = T(view.time) - raw.time;
+        GSB_UNROLL for (int k = 0; k < K; ++k) {
+            exponents[k] = size_of(raw.betas[k]);
+            weights[k] = min(exponents[k], T(1.0f));
+        }
+        return {raw.motion, delta, weights, (still.size[0] + still.size[1] + still.size[2]) * (1.0f / 3.0f)};
+    }
+};
+
+}  // namespace GSB_ISA
+}  // namespace gsb
