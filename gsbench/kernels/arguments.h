@@ -162,16 +162,6 @@ struct DirectBetaGrads {
 };
 GSB_FIELDS(DirectBetaGrads, GRADS, means, directions, times, scales, skew, precision, coupling, betas, opacities)
 
-struct BetaSlice {
-    float *means, *factors, *opacities, *shapes;  // [N, 3] [N, 3, 3] [N] [N]
-};
-GSB_FIELDS(BetaSlice, OUTPUTS, means, factors, opacities, shapes)
-
-struct BetaSliceGrads {
-    const float *means, *factors, *opacities, *shapes;
-};
-GSB_FIELDS(BetaSliceGrads, GIVEN, means, factors, opacities, shapes)
-
 // Gaussians of FreeTimeGS.
 struct FreeTimeArgs {
     int64_t N, conditioned;

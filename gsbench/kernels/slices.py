@@ -187,7 +187,7 @@ _universal = Operation(
         "center": Input("3", Gradient.REFUSED),
         "time": Input("", Gradient.REFUSED, left_out_with="time"),
     },
-    outputs=_SLICE | {"shapes": Output("N")},
+    outputs=SLICE | {"shapes": Output("N")},
     derive=lambda given, _: (
         {"rows": 7, "entries": 18, "exponents": 5} if "times" in given else {"rows": 6, "entries": 12, "exponents": 4}
     ),
