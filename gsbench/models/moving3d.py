@@ -42,7 +42,7 @@ class MovingGaussians3D(Gaussians3DModel):
         return Conditioned(raw["means"] + shift, self.factors(raw), opacity_factor)
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
-        """Compute means, covariance factors and opacities of the 3D Gaussians for a camera and a time, in torch."""
+        """Compute the 3D Gaussians for a camera and a time in torch; a model with a kernel overrides this."""
         return GatedModel.slice_geometry(self, raw, query)
 
     @torch.no_grad()
