@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
+from gsbench.kernels.tensors import check_positive
 from gsbench.kernels.slices import slice_universal
 from gsbench.models.base import Raw
 from gsbench.models.beta import (
@@ -48,10 +49,14 @@ class UniversalBetaModel(BetaModel):
     centers: ClassVar[tuple[str, ...]] = ("means", "times", "directions")
     geometry: ClassVar[tuple[str, ...]] = ("scales", "skew", "lower", "betas")
 
-    def __init__(self, *, modulation: str = "whitened", **options: Any) -> None:
+    def __init__(
+        self, *, time_size: float = 1.0, view_size: float = 1.0, modulation: str = "whitened", **options: Any
+    ) -> None:
         """Make a model without Gaussians.
 
         Args:
+            time_size: the initial size of the Gaussians in time.
+            view_size: their initial size in direction.
             modulation: where B acts. `whitened`: as in the class. `raw`: mean = mu_p + K B delta and cov = S_pp - K B
                 S_qp with K = S_pq S_qq^-1, as in the authors' code. This matrix is not symmetric; its upper triangle is
                 used, and where that is indefinite the Gaussian becomes flat.
@@ -63,17 +68,20 @@ class UniversalBetaModel(BetaModel):
         super().__init__(**options)
         if modulation not in MODULATIONS:
             raise InputError(f"modulation '{modulation}' is not known. {did_you_mean(modulation, MODULATIONS)}")
+        check_positive(time_size, "time_size")
+        check_positive(view_size, "view_size")
         self.modulation = modulation
+        self.initial_sizes = [view_size] * 3 + [time_size] * ("time" in self.observes)
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Return spheres with a size of 1 in direction and time, and almost no covariance between the variables."""
+        """Return spheres of given size in direction and time, with almost no covariance between the variables."""
         raw = super().initial_geometry(points, distances, generator)
         N, C = len(distances), raw["betas"].shape[1] - 1
 
         def noise(count: int) -> Tensor:
             return NOISE * torch.randn(N, count, generator=generator)
 
-        raw["scales"] = torch.cat([raw["scales"], softplus_inverse(1 + noise(C))], -1)
+        raw["scales"] = torch.cat([raw["scales"], softplus_inverse(torch.tensor(self.initial_sizes) + noise(C))], -1)
         raw["skew"] = noise(3)
         raw["lower"] = noise(3 * C + C * (C - 1) // 2)
         return raw

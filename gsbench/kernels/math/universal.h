@@ -18,7 +18,7 @@ struct Reflection {
     T first, rest[E];
     T length, inverse, step;  // length has the sign of `first`; 1 / length; 1 / (first + length)
 
-    GSB_HD Reflection() = default;
+    Reflection() = default;
     GSB_HD Reflection(T first, const T (&row)[E]) : first(first) {
         const T zero(0.0f), one(1.0f);
         T square = first * first;
