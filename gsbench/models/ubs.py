@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
-from gsbench.kernels.tensors import check_positive
 from gsbench.kernels.slices import slice_universal
+from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
 from gsbench.models.beta import (
     BetaModel,
