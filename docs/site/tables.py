@@ -32,8 +32,8 @@ def models() -> str:
     """Return a row for each choice of model=, as it is composed for the embedded scenes."""
     register_schema()
     rows = [
-        "| `model=` | what it does | observes | AGR | numbers a Gaussian |",
-        "| --- | --- | --- | --- | ---: |",
+        "| `model=` | what it does | observes | numbers a Gaussian |",
+        "| --- | --- | --- | ---: |",
     ]
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         rows += [row_of(path) for path in sorted((CONF / "model").glob("*.yaml"))]
@@ -47,12 +47,12 @@ def row_of(path: Path) -> str:
     about = " ".join(re.findall("^# (.*)", path.read_text(), re.MULTILINE))
     if composed.model.candidates:
         chosen = " or ".join(f"`{one.name}`" for one in composed.model.candidates.values())
-        return f"| {name} | {about} | what the chosen one does: {chosen} | | |"
+        return f"| {name} | {about} | what the chosen one does: {chosen} | |"
     model = find(composed.model.name)
     if path.stem == composed.model.name:
         about = (inspect.getdoc(inspect.getmodule(model)) or "").partition("\n")[0]
     observes = " and ".join(model.observes) or "neither"
-    return f"| {name} | {about} | {observes} | {'yes' if composed.agr else 'no'} | {numbers(composed)} |"
+    return f"| {name} | {about} | {observes} | {numbers(composed)} |"
 
 
 def numbers(composed: DictConfig) -> int:
@@ -127,7 +127,7 @@ def frontier() -> str:
         runs = [published("frontier", f"{model}{variant}") for model in models]
         psnr = [mean(one, lambda run: run.metrics["psnr"]) for one in runs]
         shown = [f"**{x:.2f}**" if x == max(psnr) else f"{x:.2f}" for x in psnr]
-        seconds = [f"{mean(one, lambda run: run.cost.train_s):.1f} s" for one in runs]
+        seconds = [f"{mean(one, lambda run: run.cost.train_s):.1f}" for one in runs]
         cells = [f"{x}, {s}" for x, s in zip(shown, seconds, strict=True)]
         rows.append(f"| {title} | {' | '.join(cells)} |")
     return "\n".join(rows)
