@@ -8,19 +8,6 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-// ln(1 + q) for 0 <= q <= 1, by the series of atanh, to float's precision relative to the result.
-template <class T>
-GSB_HD inline T log1p_of(T q) {
-    const T s = q / (q + 2.0f), s2 = s * s;
-    T y = s2 * (1.0f / 15.0f) + (1.0f / 13.0f);
-    y = y * s2 + (1.0f / 11.0f);
-    y = y * s2 + (1.0f / 9.0f);
-    y = y * s2 + (1.0f / 7.0f);
-    y = y * s2 + (1.0f / 5.0f);
-    y = y * s2 + (1.0f / 3.0f);
-    return (y * s2 + 1.0f) * s * 2.0f;
-}
-
 template <class T>
 struct StaticBetaParameters {
     T scales[3], skew[3], opacity, beta;  // sizes are softplus of scales; A_01, A_02, A_12; a logit; of the profile
@@ -30,21 +17,18 @@ struct StaticBetaParameters {
 template <class T>
 struct StaticBetaGaussian {
     const StaticBetaParameters<T>& raw;
-    T turn[3][3], factor[3][3], size[3], slope[3], opacity, shape;  // slope: of a size by its parameter
+    T turn[3][3], factor[3][3], size[3], opacity, shape;
 
     GSB_HD explicit StaticBetaGaussian(const StaticBetaParameters<T>& raw) : raw(raw) {
-        const T zero(0.0f), one(1.0f);
-        turn[0][0] = turn[1][1] = turn[2][2] = one;
+        const T zero(0.0f);
+        turn[0][0] = turn[1][1] = turn[2][2] = T(1.0f);
         GSB_UNROLL for (int k = 0; k < 3; ++k) {
             const int i = k / 2, j = (k + 3) / 2;  // (0, 1), (0, 2), (1, 2)
             turn[i][j] = raw.skew[k];
             turn[j][i] = zero - raw.skew[k];
         }
-        const T least = exp(T(-LOG_SIZE_MAX)), most = exp(T(LOG_SIZE_MAX));
         GSB_UNROLL for (int j = 0; j < 3; ++j) {
-            const T x = raw.scales[j], q = exp(min(x, zero - x)), free = max(x, zero) + log1p_of(q);
-            size[j] = clamp(free, least, most);
-            slope[j] = select(size[j] == free, select(x < zero, q, one) / (one + q), zero);
+            size[j] = bounded_softplus(raw.scales[j]);
             GSB_UNROLL for (int i = 0; i < 3; ++i) factor[i][j] = turn[i][j] * size[j];
         }
         opacity = sigmoid(raw.opacity);
@@ -56,7 +40,7 @@ struct StaticBetaGaussian {
             const int i = k / 2, j = (k + 3) / 2;
             out.skew[k] = g_factor[i][j] * size[j] - g_factor[j][i] * size[i];
             const T g_size = g_factor[0][k] * turn[0][k] + g_factor[1][k] * turn[1][k] + g_factor[2][k] * turn[2][k];
-            out.scales[k] = g_size * slope[k];
+            out.scales[k] = bounded_softplus_vjp(raw.scales[k], size[k], g_size);
         }
         out.opacity = g_opacity * opacity * (T(1.0f) - opacity);
         out.beta = size_vjp(raw.beta, shape, g_shape);
@@ -90,13 +74,12 @@ struct DirectBetaGaussian {
 
     GSB_HD DirectBetaGaussian(const Parameters& raw, const ViewPoint& view)
         : raw(raw), still(raw.still), motion(moved(view)) {
-        const T zero(0.0f), one(1.0f), least(BETA_LOG_MIN);
+        const T zero(0.0f), least(BETA_LOG_MIN);
         T sum = zero;
         GSB_UNROLL for (int k = 0; k < K; ++k) {
-            const T x = motion.white[k] * motion.white[k] * 2.0f, q = exp(zero - x);
-            const T free = T(LN_2) - log1p_of(q) - x;
+            const T x = motion.white[k] * motion.white[k] * 2.0f, free = T(LN_2) - softplus(x);
             logs[k] = max(free, least);
-            falls[k] = select(free < least, zero, motion.white[k] * 4.0f / (one + q));
+            falls[k] = select(free < least, zero, motion.white[k] * 4.0f * sigmoid(x));
             sum = sum + exponents[k] * logs[k];
         }
         opacity_factor = exp(sum * 4.0f);
@@ -128,7 +111,8 @@ struct DirectBetaGaussian {
         still.vjp(g.factor, g.opacity * opacity_factor, g.shape, out.still);
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
             out.mean[i] = g.mean[i];
-            out.still.scales[i] = out.still.scales[i] + g_size * still.slope[i];
+            const T g_scale = bounded_softplus_vjp(raw.still.scales[i], still.size[i], g_size);
+            out.still.scales[i] = out.still.scales[i] + g_scale;
         }
     }
 

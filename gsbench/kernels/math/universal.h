@@ -9,8 +9,6 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-constexpr float LN_LEAST = -15.9357738f;  // the least ln(1 - tanh(y^2)), ln 1.2e-7, as in the authors' code
-
 // A row of a factor that a reflection from the right changes into the row (length, 0, .., 0). Only E + 1 of its entries
 // are not zero: `first`, and the vector `rest`. The reflection changes the same entries of every other row.
 template <class T, int E>
@@ -216,7 +214,7 @@ struct UniversalGaussian {
             const T left = one - weight[i];
             root[i] = select(left > zero, sqrt(select(left > zero, left, one)), zero);
             shift[i] = weight[i] * white[i];
-            dimmed[i] = max(T(LN_2) - softplus(doubled_square(i)), T(LN_LEAST));
+            dimmed[i] = max(T(LN_2) - softplus(doubled_square(i)), T(BETA_LOG_MIN));
             sum = sum + exponent[i] * dimmed[i];
         }
         opacity = sigmoid(raw.opacity);
@@ -271,7 +269,7 @@ struct UniversalGaussian {
             g_weight = g_weight - select(some, g_root * 0.5f / select(some, root[i], one), zero);
             const T g_exponent = g_sum * dimmed[i] + select(exponent[i] * 0.25f <= one, g_weight * 0.25f, zero);
             out.betas[1 + i] = size_vjp(raw.betas[1 + i], exponent[i], g_exponent);
-            const T g_dimmed = select(dimmed[i] > T(LN_LEAST), g_sum * exponent[i], zero);
+            const T g_dimmed = select(dimmed[i] > T(BETA_LOG_MIN), g_sum * exponent[i], zero);
             g_white[i] = g_white[i] * weight[i] - g_dimmed * sigmoid(doubled_square(i)) * white[i] * 4.0f;
         }
         whiten_vjp(t, white, g_white, g_t);  // now that of delta
