@@ -19,7 +19,7 @@ from gsbench.models.factors import sizes
 from gsbench.models.moving3d import MovingGaussians3D
 from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
-from gsbench.models.sliced import Conditioned, Geometry
+from gsbench.models.sliced import Conditioned, Geometry, reach
 from gsbench.scenes.scene import Points
 
 
@@ -114,7 +114,7 @@ class DirectBetaModel(BetaModel, MovingGaussians3D):
             return None
         L_tt = sizes(self.splats["precision"].detach()[:, -1])
         b = exponents(self.splats["betas"].detach()[:, -1])
-        return self.splats["times"].detach()[:, 0], 1 / ((2 * b).sqrt() * L_tt)
+        return self.splats["times"].detach()[:, 0], 1 / (reach(b) * L_tt)
 
 
 @register("dbs_static")

@@ -118,21 +118,6 @@ GSB_HD inline void store_still(const StaticBetaGaussian<Vec>& seen, const BetaSl
     store_first(seen.shape, out.shapes + i, n);
 }
 
-GSB_HD inline void store(const ObservedBeta<Vec>& seen, const BetaSlice& out, int64_t i, int n) {
-    store(seen, Observation{out.means, out.factors, out.opacities}, i, n);
-    store_first(seen.shape, out.shapes + i, n);
-}
-
-GSB_HD inline void load(const BetaSliceGrads& given, int64_t i, int n, ObservedBeta<Vec>& out) {
-    load(ObservationGrads{given.means, given.factors, given.opacities}, i, n, out);
-    out.shape = load_first(given.shapes + i, n);
-}
-
-GSB_HD inline bool is_zero(const BetaSliceGrads& given, int64_t i, int n) {
-    return is_zero(ObservationGrads{given.means, given.factors, given.opacities}, i, n) &&
-           all_zero(given.shapes, 1, i, n);
-}
-
 GSB_HD inline void still_vjp(const StaticBetaGaussian<Vec>& still, const ObservedBeta<Vec>& g,
                              StaticBetaParameters<Vec>& out) {
     still.vjp(g.factor, g.opacity, g.shape, out);

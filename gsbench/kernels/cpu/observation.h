@@ -1,7 +1,7 @@
 // Stores sixteen conditional 3D Gaussians to arrays, and loads their gradients.
 #pragma once
 
-#include "../math/triangular.h"
+#include "../math/beta_slice.h"
 
 #include "rows.h"
 
@@ -23,6 +23,21 @@ GSB_HD inline void load(const ObservationGrads& given, int64_t i, int n, Observe
 // Returns whether all given gradients of these Gaussians are zero, for instance because no pixel shows them.
 GSB_HD inline bool is_zero(const ObservationGrads& given, int64_t i, int n) {
     return all_zero(given.opacities, 1, i, n) && all_zero(given.means, 3, i, n) && all_zero(given.factors, 9, i, n);
+}
+
+GSB_HD inline void store(const ObservedBeta<Vec>& seen, const BetaSlice& out, int64_t i, int n) {
+    store(seen, Observation{out.means, out.factors, out.opacities}, i, n);
+    store_first(seen.shape, out.shapes + i, n);
+}
+
+GSB_HD inline void load(const BetaSliceGrads& given, int64_t i, int n, ObservedBeta<Vec>& out) {
+    load(ObservationGrads{given.means, given.factors, given.opacities}, i, n, out);
+    out.shape = load_first(given.shapes + i, n);
+}
+
+GSB_HD inline bool is_zero(const BetaSliceGrads& given, int64_t i, int n) {
+    return is_zero(ObservationGrads{given.means, given.factors, given.opacities}, i, n) &&
+           all_zero(given.shapes, 1, i, n);
 }
 
 }  // namespace GSB_ISA

@@ -2,13 +2,13 @@
 #include "../math/universal.h"
 
 #include "isa.h"
-#include "rows.h"
+#include "observation.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
 namespace {
 
-UniversalModel model_of(const UniversalArgs& a) {
+ViewPoint view_of(const UniversalArgs& a) {
     return {{a.center[0], a.center[1], a.center[2]}, a.times ? *a.time : 0.0f};
 }
 
@@ -26,42 +26,29 @@ GSB_HD inline void load(const UniversalArgs& a, int64_t i, int n, UniversalParam
 
 template <bool TIME>
 void observe(const UniversalArgs& a, const BetaSlice& out) {
-    const UniversalModel model = model_of(a);
+    const ViewPoint view = view_of(a);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > 512)
     for (int64_t i = 0; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
         UniversalParameters<Vec, TIME> raw;
         load<TIME>(a, i, n, raw);
-        UniversalGaussian<Vec, TIME> gaussian(model, raw);
-        const BetaObserved<Vec> seen = gaussian.observe();
-        scatter_row(seen.mean, out.means, i, n);
-        scatter_matrix(seen.factor, out.factors, i, n);
-        store_first(seen.opacity, out.opacities + i, n);
-        store_first(seen.shape, out.shapes + i, n);
+        UniversalGaussian<Vec, TIME> gaussian(view, raw);
+        store(gaussian.observe(), out, i, n);
     }
-}
-
-// Returns whether all given gradients of these Gaussians are zero, for instance because no pixel shows them.
-GSB_HD inline bool is_zero(const BetaSliceGrads& given, int64_t i, int n) {
-    return all_zero(given.opacities, 1, i, n) && all_zero(given.shapes, 1, i, n) && all_zero(given.means, 3, i, n) &&
-           all_zero(given.factors, 9, i, n);
 }
 
 template <bool TIME>
 void observe_backward(const UniversalArgs& a, const BetaSliceGrads& grads, const UniversalGrads& out) {
-    const UniversalModel model = model_of(a);
+    const ViewPoint view = view_of(a);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > 512)
     for (int64_t i = 0; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
         if (is_zero(grads, i, n)) continue;
         UniversalParameters<Vec, TIME> raw, g;
-        BetaObserved<Vec> given;
+        ObservedBeta<Vec> given;
         load<TIME>(a, i, n, raw);
-        gather_row(grads.means, i, n, given.mean);
-        gather_matrix(grads.factors, i, n, given.factor);
-        given.opacity = load_first(grads.opacities + i, n);
-        given.shape = load_first(grads.shapes + i, n);
-        UniversalGaussian<Vec, TIME> gaussian(model, raw);
+        load(grads, i, n, given);
+        UniversalGaussian<Vec, TIME> gaussian(view, raw);
         gaussian.observe();
         gaussian.vjp(given, g);
         add_row(g.mean, out.means, i, n);

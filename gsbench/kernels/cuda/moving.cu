@@ -54,7 +54,11 @@ __device__ void store_still(const StaticGaussian<float>& seen, const float* mean
 
 __device__ void store(const Observed<float>& seen, const Observation& out, int64_t i) { store_observed(seen, out, i); }
 
+__device__ void store(const ObservedBeta<float>& seen, const BetaSlice& out, int64_t i) { store_observed(seen, out, i); }
+
 __device__ void load(const ObservationGrads& given, int64_t i, Observed<float>& out) { out = load_observed(given, i); }
+
+__device__ void load(const BetaSliceGrads& given, int64_t i, ObservedBeta<float>& out) { out = load_observed(given, i); }
 
 __device__ void still_vjp(const StaticGaussian<float>& still, const Observed<float>& g, StaticParameters<float>& out) {
     still.vjp(g.factor, g.opacity, out);
@@ -111,16 +115,6 @@ __device__ void add(const DirectBetaParameters<float, K>& g, const DirectBetaGra
 __device__ void store_still(const StaticBetaGaussian<float>& seen, const float* means, const BetaSlice& out, int64_t i) {
     store_static(seen, means, Observation{out.means, out.factors, out.opacities}, i);
     out.shapes[i] = seen.shape;
-}
-
-__device__ void store(const ObservedBeta<float>& seen, const BetaSlice& out, int64_t i) {
-    store_observed(seen, Observation{out.means, out.factors, out.opacities}, i);
-    out.shapes[i] = seen.shape;
-}
-
-__device__ void load(const BetaSliceGrads& given, int64_t i, ObservedBeta<float>& out) {
-    load(ObservationGrads{given.means, given.factors, given.opacities}, i, static_cast<Observed<float>&>(out));
-    out.shape = given.shapes[i];
 }
 
 __device__ void still_vjp(const StaticBetaGaussian<float>& still, const ObservedBeta<float>& g,

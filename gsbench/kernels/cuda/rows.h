@@ -1,7 +1,7 @@
 // Loads rows of arrays to registers and stores them, for kernels in which one thread slices one Gaussian.
 #pragma once
 
-#include "../math/triangular.h"
+#include "../math/beta_slice.h"
 
 #include "launch.h"
 
@@ -54,6 +54,15 @@ __device__ inline Observed<float> load_observed(const ObservationGrads& o, int64
     load_matrix(o.factors, i, out.factor);
     out.opacity = o.opacities[i];
     return out;
+}
+
+__device__ inline void store_observed(const ObservedBeta<float>& seen, const BetaSlice& out, int64_t i) {
+    store_observed(seen, Observation{out.means, out.factors, out.opacities}, i);
+    out.shapes[i] = seen.shape;
+}
+
+__device__ inline ObservedBeta<float> load_observed(const BetaSliceGrads& o, int64_t i) {
+    return {load_observed(ObservationGrads{o.means, o.factors, o.opacities}, i), o.shapes[i]};
 }
 
 constexpr int SMALL_BLOCK = 128;  // a thread needs many registers

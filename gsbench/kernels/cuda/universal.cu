@@ -8,7 +8,7 @@ namespace gsb::cuda {
 namespace {
 
 template <bool TIME>
-__device__ UniversalModel model_of(const UniversalArgs& a) {
+__device__ ViewPoint view_of(const UniversalArgs& a) {
     return {{a.center[0], a.center[1], a.center[2]}, TIME ? *a.time : 0.0f};
 }
 
@@ -30,30 +30,21 @@ template <bool TIME>
 __global__ void universal_kernel(UniversalArgs a, BetaSlice out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    const UniversalModel model = model_of<TIME>(a);
+    const ViewPoint view = view_of<TIME>(a);
     const auto raw = parameters<TIME>(a, i);
-    const BetaObserved<float> seen = UniversalGaussian<float, TIME>(model, raw).observe();
-    store_row(seen.mean, out.means, i);
-    store_matrix(seen.factor, out.factors, i);
-    out.opacities[i] = seen.opacity;
-    out.shapes[i] = seen.shape;
+    store_observed(UniversalGaussian<float, TIME>(view, raw).observe(), out, i);
 }
 
 template <bool TIME>
 __global__ void universal_backward_kernel(UniversalArgs a, BetaSliceGrads grads, UniversalGrads out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    const UniversalModel model = model_of<TIME>(a);
+    const ViewPoint view = view_of<TIME>(a);
     const auto raw = parameters<TIME>(a, i);
-    BetaObserved<float> given{};
-    load_row(grads.means, i, given.mean);
-    load_matrix(grads.factors, i, given.factor);
-    given.opacity = grads.opacities[i];
-    given.shape = grads.shapes[i];
     UniversalParameters<float, TIME> g{};
-    UniversalGaussian<float, TIME> gaussian(model, raw);
+    UniversalGaussian<float, TIME> gaussian(view, raw);
     gaussian.observe();
-    gaussian.vjp(given, g);
+    gaussian.vjp(load_observed(grads, i), g);
     add_row(g.mean, out.means, i);
     add_row(g.direction, out.directions, i);
     if constexpr (TIME) out.times[i] += g.time;

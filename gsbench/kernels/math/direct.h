@@ -8,11 +8,6 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-// The camera centre and the time of a view.
-struct ViewPoint {
-    float center[3], time;
-};
-
 // The direction from the camera to a mean, through which no gradient flows.
 template <class T>
 GSB_HD inline Vec3<T> direction_to(const T (&mean)[3], const ViewPoint& view) {

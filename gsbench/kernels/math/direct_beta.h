@@ -2,6 +2,7 @@
 // view, and the gradients.
 #pragma once
 
+#include "beta_slice.h"
 #include "coupled.h"
 #include "direct.h"
 
@@ -17,39 +18,25 @@ struct StaticBetaParameters {
 template <class T>
 struct StaticBetaGaussian {
     const StaticBetaParameters<T>& raw;
-    T turn[3][3], factor[3][3], size[3], opacity, shape;
+    SkewTurn<T> skew;
+    T factor[3][3], size[3], opacity, shape;
 
-    GSB_HD explicit StaticBetaGaussian(const StaticBetaParameters<T>& raw) : raw(raw) {
-        const T zero(0.0f);
-        turn[0][0] = turn[1][1] = turn[2][2] = T(1.0f);
-        GSB_UNROLL for (int k = 0; k < 3; ++k) {
-            const int i = k / 2, j = (k + 3) / 2;  // (0, 1), (0, 2), (1, 2)
-            turn[i][j] = raw.skew[k];
-            turn[j][i] = zero - raw.skew[k];
-        }
+    GSB_HD explicit StaticBetaGaussian(const StaticBetaParameters<T>& raw) : raw(raw), skew(raw.skew) {
         GSB_UNROLL for (int j = 0; j < 3; ++j) {
             size[j] = bounded_softplus(raw.scales[j]);
-            GSB_UNROLL for (int i = 0; i < 3; ++i) factor[i][j] = turn[i][j] * size[j];
+            GSB_UNROLL for (int i = 0; i < 3; ++i) factor[i][j] = skew.turn[i][j] * size[j];
         }
         opacity = sigmoid(raw.opacity);
         shape = size_of(raw.beta) * 4.0f;
     }
 
     GSB_HD void vjp(const T (&g_factor)[3][3], T g_opacity, T g_shape, StaticBetaParameters<T>& out) const {
-        GSB_UNROLL for (int k = 0; k < 3; ++k) {
-            const int i = k / 2, j = (k + 3) / 2;
-            out.skew[k] = g_factor[i][j] * size[j] - g_factor[j][i] * size[i];
-            const T g_size = g_factor[0][k] * turn[0][k] + g_factor[1][k] * turn[1][k] + g_factor[2][k] * turn[2][k];
-            out.scales[k] = bounded_softplus_vjp(raw.scales[k], size[k], g_size);
-        }
+        T g_size[3];
+        skew.vjp(g_factor, size, out.skew, g_size);
+        GSB_UNROLL for (int k = 0; k < 3; ++k) out.scales[k] = bounded_softplus_vjp(raw.scales[k], size[k], g_size[k]);
         out.opacity = g_opacity * opacity * (T(1.0f) - opacity);
         out.beta = size_vjp(raw.beta, shape, g_shape);
     }
-};
-
-template <class T>
-struct ObservedBeta : Observed<T> {
-    T shape;
 };
 
 template <class T, int K>

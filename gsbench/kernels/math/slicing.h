@@ -12,6 +12,11 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
+// The camera centre and the time of a view.
+struct ViewPoint {
+    float center[3], time;
+};
+
 // The reduced factor [T_qq 0; T_pq T_pp]: K rows of q, then three rows of p.
 template <class T, int K>
 struct Reduced {

@@ -2,6 +2,7 @@
 // with the exponent of its Beta profile, and the gradients. The formulas are those of gsbench/models/ubs.py.
 #pragma once
 
+#include "beta_slice.h"
 #include "harmonics.h"
 #include "parameters.h"
 #include "slicing.h"
@@ -161,17 +162,6 @@ private:
     }
 };
 
-// The values that are equal for all Gaussians of a model: the camera centre and time.
-struct UniversalModel {
-    float center[3], time;
-};
-
-// The conditional 3D Gaussian with a Beta profile, which the rasterizer gets.
-template <class T>
-struct BetaObserved {
-    T mean[3], factor[3][3], opacity, shape;
-};
-
 template <class T, bool TIME>
 struct UniversalParameters {
     static constexpr int K = 3 + TIME, LOWER = 3 * K + K * (K - 1) / 2;
@@ -185,7 +175,7 @@ struct UniversalGaussian {
     using Parameters = UniversalParameters<T, TIME>;
     static constexpr int K = Parameters::K;
 
-    const UniversalModel& model;
+    const ViewPoint& view;
     const Parameters& raw;
     T size[3 + K];
     Reflection<T, 3> reflections[K];
@@ -194,18 +184,18 @@ struct UniversalGaussian {
     T white[K], weight[K], root[K], exponent[K], dimmed[K];  // y, B, (I - B)^(1/2), b, ln(1 - tanh(y^2))
     T opacity, opacity_factor, rows[3][3 + K];
 
-    GSB_HD UniversalGaussian(const UniversalModel& model, const Parameters& raw) : model(model), raw(raw) {}
+    GSB_HD UniversalGaussian(const ViewPoint& view, const Parameters& raw) : view(view), raw(raw) {}
 
-    GSB_HD BetaObserved<T> observe() {
+    GSB_HD ObservedBeta<T> observe() {
         const T zero(0.0f), one(1.0f);
         reduce();
-        offset = {raw.mean[0] - model.center[0], raw.mean[1] - model.center[1], raw.mean[2] - model.center[2]};
+        offset = {raw.mean[0] - view.center[0], raw.mean[1] - view.center[1], raw.mean[2] - view.center[2]};
         const Vec3<T> d = Unit<T>(offset).direction;
         T delta[K];
         delta[0] = d.x - raw.direction[0];
         delta[1] = d.y - raw.direction[1];
         delta[2] = d.z - raw.direction[2];
-        if constexpr (TIME) delta[3] = T(model.time) - raw.time;
+        if constexpr (TIME) delta[3] = T(view.time) - raw.time;
         whiten(t, delta, white);
         T shift[K], sum = zero;
         GSB_UNROLL for (int i = 0; i < K; ++i) {
@@ -221,7 +211,7 @@ struct UniversalGaussian {
         opacity_factor = exp(max(sum, T(-EXPONENT_MAX)));
         opacity_factor = select(sum < T(-EXPONENT_MAX), zero, opacity_factor);
 
-        BetaObserved<T> out;
+        ObservedBeta<T> out;
         const Vec3<T> moved = moved_mean(t, {raw.mean[0], raw.mean[1], raw.mean[2]}, shift);
         out.mean[0] = moved.x;
         out.mean[1] = moved.y;
@@ -240,7 +230,7 @@ struct UniversalGaussian {
     }
 
     // Computes the gradients of the parameters; call it after `observe`.
-    GSB_HD void vjp(const BetaObserved<T>& g, Parameters& out) const {
+    GSB_HD void vjp(const ObservedBeta<T>& g, Parameters& out) const {
         const T zero(0.0f), one(1.0f);
         T g_rows[3][3 + K];
         TriangularRows<T, 3 + K>(rows).vjp(g.factor, g_rows);
@@ -290,24 +280,14 @@ private:
     // Returns 2 y_i^2, at most so large that 1 - tanh(y_i^2) is at its least anyway.
     GSB_HD T doubled_square(int i) const { return min(white[i] * white[i] * 2.0f, T(EXPONENT_MAX)); }
 
-    // Returns I + A.
-    GSB_HD void turn(T (&out)[3][3]) const {
-        const T zero(0.0f), a = raw.skew[0], b = raw.skew[1], c = raw.skew[2];
-        const T rows[3][3] = {{T(1.0f), a, b}, {zero - a, T(1.0f), c}, {zero - b, zero - c, T(1.0f)}};
-        GSB_UNROLL for (int i = 0; i < 3; ++i) {
-            GSB_UNROLL for (int j = 0; j < 3; ++j) out[i][j] = rows[i][j];
-        }
-    }
-
     // Computes the factor and reduces it. With the columns of q before those of p, its rows are [L_q L_qp] and
     // [0 (I + A) S_p]. Since L_q is triangular, the reflection of row i only changes column i and those of p.
     GSB_HD void reduce() {
         GSB_UNROLL for (int i = 0; i < 3 + K; ++i) size[i] = bounded_softplus(raw.scales[i]);
         t.zero();
-        T R[3][3];
-        turn(R);
+        const SkewTurn<T> skew(raw.skew);
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
-            GSB_UNROLL for (int j = 0; j < 3; ++j) t.pp[i][j] = R[i][j] * size[j];
+            GSB_UNROLL for (int j = 0; j < 3; ++j) t.pp[i][j] = skew.turn[i][j] * size[j];
         }
         GSB_UNROLL for (int i = 0; i < K; ++i) {
             T rest[3];
@@ -348,16 +328,9 @@ private:
         GSB_UNROLL for (int i = 0; i < K; ++i) {
             GSB_UNROLL for (int j = 0; j < 3; ++j) out.lower[place(i) + j] = g_rest[i][j];
         }
-        T R[3][3];
-        turn(R);
-        GSB_UNROLL for (int j = 0; j < 3; ++j) {
-            T g_size = zero;
-            GSB_UNROLL for (int i = 0; i < 3; ++i) g_size = g_size + g_pp[i][j] * R[i][j];
-            out.scales[j] = bounded_softplus_vjp(raw.scales[j], size[j], g_size);
-        }
-        out.skew[0] = g_pp[0][1] * size[1] - g_pp[1][0] * size[0];
-        out.skew[1] = g_pp[0][2] * size[2] - g_pp[2][0] * size[0];
-        out.skew[2] = g_pp[1][2] * size[2] - g_pp[2][1] * size[1];
+        T g_size[3];
+        SkewTurn<T>(raw.skew).vjp(g_pp, size, out.skew, g_size);
+        GSB_UNROLL for (int j = 0; j < 3; ++j) out.scales[j] = bounded_softplus_vjp(raw.scales[j], size[j], g_size[j]);
     }
 };
 
