@@ -15,7 +15,7 @@ CUDA := $(if $(shell nvidia-smi -L 2> /dev/null),auto,off)
 # The instruction sets that the kernels are built for: native, this machine's best, or all, which takes twice as long.
 LEVELS ?= native
 
-.PHONY: help table1 frontier tables test test-all stability stability-long bench gpu-check slurm-check sanitize lint format docs setup locks clean
+.PHONY: help table1 frontier tables test test-all stability stability-long bench gpu-check slurm-check sanitize lint format docs scenes setup locks clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
@@ -118,6 +118,14 @@ docs: $(VENV)/installed-docs  ## build the site from docs/ into build/site
 	$(BIN)/python docs/site/tables.py
 	$(BIN)/python -m sphinx -q -E -W --keep-going -b html -d build/doctrees docs build/site
 	@echo "open build/site/index.html"
+
+# Blender has a .venv of its own, for it needs Python 3.11 and an older numpy.
+scenes:  ## render the embedded scenes anew into build/scenes, with Blender (Python 3.11, 1 GB); half an hour
+	$(PYTHON) -m venv build/blender
+	build/blender/bin/pip install --quiet --disable-pip-version-check --no-deps --require-hashes --requirement locks/blender.txt
+	for scene in suzanne moving-matte rig; do \
+		build/blender/bin/python gsbench/scenes/generate.py $$scene build/scenes/$$scene || exit; \
+	done
 
 locks:  ## resolve locks/ anew, after a change of pyproject.toml or constraints.txt; asks PyPI
 	$(PYTHON) -m venv build/uv

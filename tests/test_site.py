@@ -1,7 +1,9 @@
 """The site that `make docs` builds: its tables, that every page and link is there, that it needs no network."""
 
 import importlib.util
+import json
 import os
+import re
 import subprocess
 import sys
 from collections import defaultdict
@@ -10,7 +12,10 @@ from pathlib import Path
 from types import ModuleType
 from urllib.parse import unquote
 
+import published as published_blocks
 import pytest
+import readme_blocks
+import results_blocks
 from tiny_run import ROOT, environment
 
 DEAD = "http://127.0.0.1:9"  # a proxy that nothing listens at
@@ -27,10 +32,55 @@ def tables() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("name", ["models", "config", "results"])
-def test_a_table_is_what_the_code_says(tables: ModuleType, name: str) -> None:
+@pytest.mark.parametrize("page", ["README.md", "docs/models.md", "docs/config.md", "docs/results.md"])
+def test_a_page_is_what_code_and_records_say(tables: ModuleType, page: str) -> None:
     """Catches a model, a key, a default or a published record that was changed without its page."""
-    assert (ROOT / "docs" / f"{name}.md").read_text() == tables.filled(name), "write it anew by docs/site/tables.py"
+    assert (ROOT / page).read_text() == tables.filled(page), "write it anew by docs/site/tables.py"
+
+
+def without_pictures(published: Path, to: Path, experiment: str) -> None:
+    """Copy the records of an experiment, and nothing that they do not need."""
+    for path in (published / experiment).rglob("record.json"):
+        copy = to / experiment / path.relative_to(published / experiment)
+        copy.parent.mkdir(parents=True)
+        copy.write_bytes(path.read_bytes())
+
+
+def test_a_sentence_follows_from_the_records(tmp_path: Path) -> None:
+    """Catches a sentence of README that stays when the records say something else."""
+    for name in ("frontier", "mini"):
+        without_pictures(ROOT / "results" / "published", tmp_path, name)
+    before = readme_blocks.cost(tmp_path)
+    assert re.search(r"\d of 7 models have lower PSNR at 4,000 iterations", before)
+    for path in tmp_path.glob("frontier/*/*,iterations=4000/seed*/record.json"):
+        record = json.loads(path.read_text())
+        record["metrics"]["psnr"] += 20
+        path.write_text(json.dumps(record))
+    published_blocks.experiments.cache_clear()
+    after = readme_blocks.cost(tmp_path)
+    assert "overfit" not in after
+    old, new = ([float(cell) for cell in re.findall(r"(\d\d\.\d\d)\**,", row_of(text))] for text in (before, after))
+    assert new == pytest.approx([psnr + 20 for psnr in old])
+
+
+def row_of(block: str) -> str:
+    """The row of the longest runs."""
+    (found,) = (line for line in block.splitlines() if line.startswith("| 4,000 |"))
+    return found
+
+
+def test_the_sign_of_a_price_follows_from_the_records(tmp_path: Path) -> None:
+    """Catches a sentence about an effect that stays when the effect changes its sign."""
+    for name in ("frontier", "dnerf_trex100"):
+        without_pictures(ROOT / "results" / "published", tmp_path, name)
+    assert "memorises" in results_blocks.effects(tmp_path)
+    for path in tmp_path.glob("frontier/*/7dgs_noagr/seed*/record.json"):
+        record = json.loads(path.read_text())
+        for view in record["per_view"]:
+            view["psnr"] += 3
+        path.write_text(json.dumps(record))
+    published_blocks.experiments.cache_clear()
+    assert "memorises" not in results_blocks.effects(tmp_path)
 
 
 def test_the_tables_name_every_model_and_key(tables: ModuleType) -> None:

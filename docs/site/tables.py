@@ -1,30 +1,33 @@
-"""Write tables of docs/: models and config keys from the code, results from the published records.
+"""Write blocks of README and docs/: models and config keys from the code, results from the published records.
 
-`make docs` runs it; a test fails where a table is not what this writes.
+`make docs` runs it; a test fails where a block is not what this writes.
 """
 
 import dataclasses
 import inspect
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import hydra
+import readme_blocks
+import results_blocks
 import torch
 from omegaconf import MISSING, DictConfig
 
 from gsbench.config import CONF, Config, register_schema
-from gsbench.measure.record import FILE_NAME, Record, read
 from gsbench.models import find
 from gsbench.models.base import GaussianModel
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Points
 
-DOCS = Path(__file__).resolve().parents[1]
-PUBLISHED = DOCS.parent / "results" / "published"
+ROOT = Path(__file__).resolve().parents[2]
+PUBLISHED = ROOT / "results" / "published"
+WIDTH = 120
+WHOLE = {"break_long_words": False, "break_on_hyphens": False}
 MARKS = "<!-- written by docs/site/tables.py: {} -->", "<!-- end -->"
 
 
@@ -103,80 +106,40 @@ def default_of(field: "dataclasses.Field[Any]") -> str:
     return f"`{words[value] if isinstance(value, bool | str) and value in words else value}`"
 
 
-def table1() -> str:
-    """Return a row for each model of `make table1`, means over the two embedded scenes and three seeds."""
-    rows = [
-        "| model | PSNR | SSIM | LPIPS-Alex | training, s | FPS | Gaussians |",
-        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
-    ]
-    for model in ("3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs", "auto"):
-        runs = published("mini", model)
-        psnr, similarity, distance = (mean(runs, lambda run, key=key: run.metrics[key]) for key in METRICS)
-        seconds, fps, count = (mean(runs, lambda run, key=key: getattr(run.cost, key)) for key in COSTS)
-        rows.append(
-            f"| {model} | {psnr:.2f} | {similarity:.3f} | {distance:.3f} | {seconds:.1f} | {fps:,.0f} | {count:,.0f} |"
-        )
-    return "\n".join(rows)
-
-
-def frontier() -> str:
-    """Return PSNR and seconds of each model at each length and capacity, means over two scenes and three seeds."""
-    models = ("3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto")
-    rows = [f"| iterations | {' | '.join(models)} |", f"| ---: |{' ---: |' * len(models)}"]
-    for title, variant in CASES.items():
-        runs = [published("frontier", f"{model}{variant}") for model in models]
-        psnr = [mean(one, lambda run: run.metrics["psnr"]) for one in runs]
-        shown = [f"**{x:.2f}**" if x == max(psnr) else f"{x:.2f}" for x in psnr]
-        seconds = [f"{mean(one, lambda run: run.cost.train_s):.1f}" for one in runs]
-        cells = [f"{x}, {s}" for x, s in zip(shown, seconds, strict=True)]
-        rows.append(f"| {title} | {' | '.join(cells)} |")
-    return "\n".join(rows)
-
-
-def published(experiment: str, folder: str) -> list[Record]:
-    """Read the published records of an experiment in model folders of that name, of all scenes and seeds."""
-    found = [read(path) for path in sorted((PUBLISHED / experiment).glob(f"*/{folder}/seed*/{FILE_NAME}"))]
-    assert len(found) == len({(run.scene, run.seed) for run in found}) == RUNS, (
-        f"{experiment}/{folder}: {len(found)} runs"
-    )
-    return found
-
-
-def mean(runs: list[Record], value: Callable[[Any], float]) -> float:
-    """Average a value over runs: the scenes have the same seeds, so this is the mean over scenes too."""
-    return fmean(value(run) for run in runs)
-
-
-METRICS = ("psnr", "ssim", "lpips_alex")
-COSTS = ("train_s", "fps", "num_gaussians")
-RUNS = 6  # two scenes, three seeds
-CASES = {
-    "250": ",iterations=250",
-    "500": ",iterations=500",
-    "1,000": "",
-    "1,000, threshold 4e-4": ",densify.grad_threshold=0.0004",
-    "1,000, threshold 1e-4": ",densify.grad_threshold=0.0001",
-    "2,000": ",iterations=2000",
-    "4,000": ",iterations=4000",
+TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
+    "README.md": readme_blocks.BLOCKS,
+    "docs/models.md": {"models": lambda _: models()},
+    "docs/config.md": {"config": lambda _: config()},
+    "docs/results.md": results_blocks.BLOCKS,
 }
-TABLES = {"models": models, "config": config, "table1": table1, "frontier": frontier}
-PAGES = {"models": ("models",), "config": ("config",), "results": ("table1", "frontier")}
 
 
-def filled(page: str) -> str:
-    """Return a page with its tables as they should be."""
-    text = (DOCS / f"{page}.md").read_text()
-    for name in PAGES[page]:
+def filled(page: str, published: Path = PUBLISHED) -> str:
+    """Return a page with its blocks as they should be.
+
+    Args:
+        page: its path in the project.
+        published: the folder of published records.
+    """
+    text = (ROOT / page).read_text()
+    for name, write in TABLES[page].items():
         first, last = MARKS[0].format(name), MARKS[1]
-        before, _, rest = text.partition(first)
-        text = f"{before}{first}\n\n{TABLES[name]()}\n\n{last}{rest.partition(last)[2]}"
+        before, found, rest = text.partition(first)
+        assert found, f"{page}: expected the line {first}"
+        text = f"{before}{first}\n\n{wrapped(write(published))}\n\n{last}{rest.partition(last)[2]}"
     return text
+
+
+def wrapped(block: str) -> str:
+    """Break the sentences of a block into lines; tables and images stay as they are."""
+    parts = block.split("\n\n")
+    return "\n\n".join(part if part[0] in "|!#" else textwrap.fill(part, WIDTH, **WHOLE) for part in parts)
 
 
 def main() -> int:
     """Write the pages."""
-    for page in PAGES:
-        (DOCS / f"{page}.md").write_text(filled(page))
+    for page in TABLES:
+        (ROOT / page).write_text(filled(page))
     return 0
 
 

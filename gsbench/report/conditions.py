@@ -11,6 +11,12 @@ from gsbench.report.configurations import without
 WARNING = "WARNING"
 MOST_RUNS_NAMED = 3
 _UNSAID = {"resize": "area", "repaired": "none"}  # what a record means that lacks a part of its protocol
+# The scenes on which gsbench's own settings were chosen; what is found on them may not hold on others.
+TUNED = frozenset((
+    "bouncingballs", "cloud", "moving-matte", "static-glossy", "static-matte", "suzanne",  # conf/exp/tuning.yaml
+    "lego", "trex",
+    "scene1_close_proximity", "scene4_occlusion", "scene7_deformation", "scene10_texture",
+))  # fmt: skip
 SPREAD = (
     "± is half the width of the 95 % interval over seeds (Student's t; of these scenes and views); one seed has none"
 )
@@ -55,6 +61,11 @@ def _stated(records: list[Record], spread: str) -> list[str]:
                 notes.append(_differ(printable(name), silent, get))
     if any(r.scene == "lego" and r.protocol.get("eval_split") == "val" for r in records):
         notes.append("lego is measured on val: the test split of D-NeRF's lego contradicts its motion.")
+    scenes = {r.scene for r in records}
+    tuned, others = sorted(scenes & TUNED), sorted(scenes - TUNED)
+    if tuned:
+        rest = f"; not on {', '.join(map(printable, others))}" if others else ""
+        notes.append(f"settings of gsbench were chosen on {', '.join(tuned)}{rest} (docs/tuning.md).")
     for title, get in (("machine", _machine), ("commit", _commit), ("versions", _versions)):
         same = len({get(r) for r in records}) == 1
         notes.append(f"{title}: {get(records[0])}" if same else _differ(title, records, get))

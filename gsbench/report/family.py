@@ -82,4 +82,4 @@ def _key(weights: Weights) -> tuple[Key, float]:
 
 
 def _turned(of: Estimate) -> Estimate:
-    return replace(of, mean=-of.mean)
+    return replace(of, mean=-of.mean, each=tuple(-mean for mean in of.each))

@@ -6,12 +6,13 @@ Student's t needs 4.3 for three values. This module therefore estimates the vari
 separately, and applies Student's t to each. The simulations are in docs/statistics.md.
 
 - With three or more scenes, the means of the scenes are a sample of similar scenes. Their variance includes that of
-seeds and views. Student's t with (scenes - 1) degrees of freedom is exact if these means are normal. - With one or two
-scenes, the interval does not hold for other scenes. All seeds see the same views, so seeds and views are crossed
-factors. Each factor has a half width by Student's t, and the squares of the half widths are added (MOVER: Zou and
-Donner 2008). The residual variance is contained in both factors, so it is subtracted once from the variance over seeds.
-The interval is never narrower than that of the seeds alone. - With one seed, there is no interval, because the variance
-over seeds is not known.
+  seeds and views. Student's t with (scenes - 1) degrees of freedom is exact if these means are normal.
+- With one or two scenes, the interval does not hold for other scenes. All seeds see the same views, so seeds and views
+  are crossed factors. Each factor has a half width by Student's t, and the squares of the half widths are added (MOVER:
+  Zou and Donner 2008). The residual variance is contained in both factors, so it is subtracted once from the variance
+  over seeds. The interval is never narrower than that of the seeds alone. For two scenes, `Estimate.half_over_scenes`
+  says how much wider an interval for similar scenes is.
+- With one seed, there is no interval, because the variance over seeds is not known.
 """
 
 import math
@@ -53,6 +54,7 @@ class Estimate:
     over: str  # what the interval generalises to: "scenes", "seeds and views", "seeds"; "" without an interval
     levels: tuple[Spread, ...] = ()  # their half widths add in squares
     floor: Spread | None = None  # the interval is not narrower than this one
+    each: tuple[float, ...] = ()  # the mean of each scene
 
     @cached_property
     def half(self) -> float:
@@ -68,6 +70,16 @@ class Estimate:
     def high(self) -> float:
         """Return the upper end of the mean's 95 % interval."""
         return self.mean + self.half
+
+    @property
+    def half_over_scenes(self) -> float:
+        """Return half the width of the 95 % interval for similar scenes: Student's t over the means of the scenes.
+
+        NaN with fewer than two scenes. With two scenes it is wide (t = 12.7), which is what two scenes can tell.
+        """
+        if len(self.each) < 2:
+            return math.nan
+        return _of_scenes(np.array(self.each)).half_width(LEVEL)
 
     @cached_property
     def p(self) -> float:
@@ -106,16 +118,17 @@ def estimate(scenes: list[Values], *, generalise: bool = True) -> Estimate:
         return Estimate(math.nan, 0, 0, "")
     means = np.array([scene.mean() for scene in scenes])
     mean, count, seeds = float(means.mean()), len(scenes), min(len(scene) for scene in scenes)
+    each = tuple(means.tolist())
     if seeds < 2:
-        return Estimate(mean, count, seeds, "")
+        return Estimate(mean, count, seeds, "", each=each)
     if generalise and count >= LEAST_SCENES:
-        return Estimate(mean, count, seeds, "scenes", (Spread(float(means.var(ddof=1)) / count, count - 1),))
+        return Estimate(mean, count, seeds, "scenes", (_of_scenes(means),), each=each)
     of_seeds = _combined([Spread(scene.mean(1).var(ddof=1) / len(scene), len(scene) - 1) for scene in scenes])
     if min(scene.shape[1] for scene in scenes) < 2:
-        return Estimate(mean, count, seeds, "seeds", (of_seeds,))
+        return Estimate(mean, count, seeds, "seeds", (of_seeds,), each=each)
     own = _combined([_without_rest(scene) for scene in scenes])
     of_views = _combined([Spread(s.mean(0).var(ddof=1) / s.shape[1], s.shape[1] - 1) for s in scenes])
-    return Estimate(mean, count, seeds, "seeds and views", (own, of_views), of_seeds)
+    return Estimate(mean, count, seeds, "seeds and views", (own, of_views), of_seeds, each)
 
 
 def over_seeds(values: Sequence[float]) -> Estimate:
@@ -125,6 +138,11 @@ def over_seeds(values: Sequence[float]) -> Estimate:
         values: one value for each seed.
     """
     return estimate([np.array(values, dtype=np.float64)[:, None]], generalise=False)
+
+
+def _of_scenes(means: Values) -> Spread:
+    """Return the variance of the mean of scenes that are a sample of similar scenes, from the means of the scenes."""
+    return Spread(float(means.var(ddof=1)) / len(means), len(means) - 1)
 
 
 def _combined(scenes: list[Spread]) -> Spread:

@@ -5,12 +5,14 @@ import dataclasses
 import subprocess
 import sys
 
+import hydra
 import pandas as pd
 import pytest
 from make_golden import GOLDEN, GOLDEN_TERMINAL, NO_REGIONS, make, moving, records
 
+from gsbench.config import CONF, register_schema
 from gsbench.measure import record as files
-from gsbench.report import layout, tables
+from gsbench.report import conditions, layout, tables
 from gsbench.report.__main__ import main
 from gsbench.report.page.content import Column, DataTable
 
@@ -34,6 +36,20 @@ def test_the_golden_page():
     """Would catch any change of the page nobody meant. If it is meant: run make_golden.py and read the difference."""
     assert page(*records()) == GOLDEN.read_text()
     assert layout.terminal(tables.build(records())) == GOLDEN_TERMINAL.read_text()
+
+
+def test_a_table_names_the_scenes_that_settings_were_chosen_on():
+    """Would catch a page that reports as a finding what was chosen on its own scene."""
+    text = page(make(scene="suzanne"), make(scene="nobodys"))
+    assert "settings of gsbench were chosen on suzanne; not on nobodys" in text
+    assert "were chosen on" not in page(make(scene="nobodys"))
+
+
+def test_every_scene_of_the_trials_counts_as_tuned():
+    """Would catch a scene that is added to the trials and then reported as if nothing had been chosen on it."""
+    register_schema()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        assert set(hydra.compose("config", ["+exp=tuning", "scene=suzanne"]).data.scenes) <= conditions.TUNED
 
 
 def test_no_run_is_dropped():

@@ -12,6 +12,7 @@ from gsbench.report import compare
 from gsbench.report.compare import Cube, Pair, Price
 from gsbench.report.configurations import Group
 from gsbench.report.family import Family
+from gsbench.report.intervals import Estimate
 from gsbench.report.page import charts, messages
 from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, PageSection, Swatch, Tab, Value
 
@@ -60,13 +61,14 @@ def effects_section(group: Group, family: Family, canvas: Canvas) -> PageSection
     for _, title, digits in UNITS:
         columns += [Column(title, digits), Column(f"{title}: 95 % low", digits), Column(f"{title}: high", digits)]
         columns.append(Column(f"{title}: told from nothing"))
-    columns.append(Column("interval of dB over"))
+    columns += [Column("interval of dB over"), Column("dB: half width over scenes like these", 2)]
+    columns += [Column("scenes that gain", 0), Column("scenes that lose", 0)]
     priced: list[list[Value]] = [
         [
             p.name,
             p.models,
             *(v for unit, _, _ in UNITS for v in _cells(p, unit)),
-            messages.over(p.costs["psnr"]),
+            *_over_scenes(p.costs["psnr"]),
         ]
         for p in shown
     ]
@@ -85,6 +87,12 @@ def _cells(price: Price, unit: str) -> tuple[Value, ...]:
     of = price.costs[unit]
     told = "yes" if price.told[unit] else "no" if of.over else "not known"
     return of.mean, of.low, of.high, told
+
+
+def _over_scenes(gain: Estimate) -> tuple[Value, ...]:
+    """Return what an interval is over, its half width over scenes, and how many scenes gain and lose PSNR."""
+    gains, losses = (sum(sign * mean > 0 for mean in gain.each) for sign in (1, -1))
+    return messages.over(gain), gain.half_over_scenes, gains, losses
 
 
 def _scope(cube: Cube, family: Family) -> list[str]:
@@ -111,7 +119,8 @@ def _effect_words(cube: Cube) -> list[str]:
     single = [p for p in cube.prices if compare.is_single(p.name)]
     best = max(single, key=lambda p: p.costs["psnr"].mean)
     gain, seconds = best.costs["psnr"], best.costs["seconds"]
-    text = f"Worth most: {best.name}, {messages.signed(gain.mean)} dB ({messages.interval(gain, sign=True)})"
+    text = f"Worth most: {best.name}, {messages.signed(gain.mean)} dB ({messages.interval(gain, sign=True)}"
+    text += f"{_scene_words(gain)})"
     text += f", for {messages.signed(seconds.mean, 1)} s of training." if seconds.scenes else "."
     if gain.mean <= 0:
         text = f"No effect raises PSNR here; {best.name} lowers it least: {messages.signed(gain.mean)} dB."
@@ -122,7 +131,7 @@ def _effect_words(cube: Cube) -> list[str]:
             of = price.costs["psnr"]
             told = f", {'' if price.told['psnr'] else 'not '}told from nothing" if of.over else ""
             said.append(f"{messages.sentence(price.name)}, within one parametrisation: {messages.signed(of.mean)} dB "
-                        f"({messages.interval(of, sign=True)}){told}.")  # fmt: skip
+                        f"({messages.interval(of, sign=True)}{_scene_words(of)}){told}.")  # fmt: skip
     for price in cube.prices:
         of = price.costs["psnr"]
         if price.order == 2 and price.told["psnr"]:
@@ -133,6 +142,15 @@ def _effect_words(cube: Cube) -> list[str]:
                 f"{messages.sentence(price.name)}: together they bring {side} ({messages.interval(of, sign=True)})."
             )
     return [s for s in said[:5] if s]
+
+
+def _scene_words(gain: Estimate) -> str:
+    """Say on how many scenes PSNR gains, and how wide the interval over scenes like these is; "" for one scene."""
+    gains = sum(mean > 0 for mean in gain.each)
+    if len(gain.each) < 2:
+        return ""
+    wide = "" if gain.over in ("", "scenes") else f"; ± {messages.plain(gain.half_over_scenes)} over scenes like these"
+    return f"{wide}; {gains} of {messages.count(len(gain.each), 'scene')} gain"
 
 
 def stages_section(group: Group, canvas: Canvas) -> PageSection:

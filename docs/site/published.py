@@ -1,0 +1,188 @@
+"""Read published records as the reports do, and write their numbers in one form on all pages."""
+
+import functools
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+from gsbench.measure.record import Record
+from gsbench.report import compare, tables
+from gsbench.report.comparisons import comparisons
+from gsbench.report.configurations import Configuration, Group, Values, groups
+from gsbench.report.family import Family, Tested
+from gsbench.report.intervals import Estimate, estimate
+
+MODELS = ("3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto")
+NAMES = {"7dgs": "7DGS", "7dgs_noagr": "7DGS without AGR", "7dgs_nodir": "7DGS without direction", "4dgs": "4DGS",
+         "3dgs": "3DGS", "6dgs": "6DGS", "auto": "`model=auto`", "freetime": "FreeTimeGS", "dbs": "dBS", "ubs": "UBS",
+         "ndgs": "N-DGS", "dgs": "dGS"}  # fmt: skip
+SUCCESSORS = ("freetime", "dbs", "ubs", "ndgs", "dgs")
+CASES = {
+    "250": "iterations=250",
+    "500": "iterations=500",
+    "1,000": "",
+    "1,000, threshold 4e-4": "densify.grad_threshold=0.0004",
+    "1,000, threshold 1e-4": "densify.grad_threshold=0.0001",
+    "2,000": "iterations=2000",
+    "4,000": "iterations=4000",
+}
+PAPERS = "best_on_test=true"  # trex by the paper's protocol
+SMALLER = "downscale=4,iterations=7000"  # trex at 200 x 200 pixels
+LIMITED = "recipe=quick,iterations=6500,densify.max_gaussians=110000"
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The published records of one experiment on one data set, with all comparisons that its report makes."""
+
+    group: Group
+
+    @functools.cached_property
+    def family(self) -> Family:
+        """Return all comparisons of the experiment's report, so that the page is as strict as the report."""
+        return comparisons(self.group)
+
+    @functools.cached_property
+    def _found(self) -> dict[tuple[str, str], Configuration]:
+        return {(c.model, c.variant): c for c in self.group.configurations}
+
+    def has(self, model: str, variant: str = "") -> bool:
+        """Tell whether a model has finished runs with these settings."""
+        return (model, variant) in self._found
+
+    def runs(self, model: str, variant: str = "") -> list[Record]:
+        """Return the runs of a model with these settings, on all scenes and with all seeds."""
+        return [run for runs in self._found[model, variant].runs.values() for run in runs]
+
+    def of(self, model: str, variant: str = "", quantity: str = "psnr") -> Estimate:
+        """Estimate a quantity of a model, averaged over scenes; the interval is over seeds."""
+        found = self._found[model, variant]
+        values = [self.group.sample(found, scene, quantity)[:, None] for scene in found.runs]
+        return estimate(values, generalise=False) if all(map(len, values)) else Estimate(math.nan, 0, 0, "")
+
+    def difference(self, model: str, other: str, variant: str = "") -> Estimate:
+        """Estimate how much more PSNR a model has than another one, paired by scene, seed and view."""
+        return estimate(self.contrast(model, other, variant))
+
+    def contrast(self, model: str, other: str, variant: str = "") -> list[Values]:
+        """Return the paired differences in PSNR of two models with the same settings, one array for each scene."""
+        terms = [(1.0, self._found[model, variant]), (-1.0, self._found[other, variant])]
+        return self.group.contrast(terms, "psnr")
+
+    def tested(self, model: str, other: str, variant: str = "") -> Tested:
+        """Return the difference of two models as the experiment's report tests it."""
+        return self.family.of([(1.0, self._found[model, variant]), (-1.0, self._found[other, variant])])
+
+
+@functools.cache
+def experiments(folder: Path) -> list[Experiment]:
+    """Read the records of a folder, one experiment for each data set.
+
+    Raises:
+        AssertionError: a record cannot be read, or the folder has none.
+    """
+    records, faults = tables.load(folder)
+    assert records, f"{folder}: no records"
+    assert not faults, faults
+    return [Experiment(group) for group in groups(records)]
+
+
+def experiment(published: Path, name: str) -> Experiment:
+    """Read an experiment that has one data set."""
+    (found,) = experiments(published / name)
+    return found
+
+
+def machine(found: Experiment) -> str:
+    """Name the machine on which most runs were made, without what changes no time."""
+    parts = found.group.machine.split(", ")
+    processor = parts[0].replace("AMD EPYC family 25 model 17 stepping 1", "AMD EPYC Zen 4")
+    return ", ".join([processor, *(part for part in parts[1:] if "core" in part or "thread" in part)])
+
+
+def prices(found: Experiment) -> dict[str, compare.Price]:
+    """Return the price of each effect by name, within one parametrisation where 7DGS without direction was run."""
+    cube = compare.cube(found.group, found.family)
+    return {price.name: price for price in [*cube.prices, *cube.nested] if compare.is_single(price.name)}
+
+
+def metric(runs: list[Record], name: str) -> float:
+    """Average a metric over runs; NaN if one lacks it."""
+    values = [value for run in runs if run.metrics and (value := run.metrics.get(name)) is not None]
+    return fmean(values) if values and len(values) == len(runs) else math.nan
+
+
+def number(value: float, digits: int = 2) -> str:
+    """Format a number with commas; a dash for NaN."""
+    return "–" if math.isnan(value) else f"{value:,.{digits}f}"
+
+
+def signed(value: float, digits: int = 2) -> str:
+    """Format a difference with its sign; one that rounds to zero has none."""
+    text = f"{value:+,.{digits}f}"
+    return text if float(text.replace(",", "")) else text[1:]
+
+
+def change(tested: Tested | Estimate, told: bool, digits: int = 2) -> str:
+    """Format a difference with its interval, bold if it is significant."""
+    of = tested.difference if isinstance(tested, Tested) else tested
+    mean = f"**{signed(of.mean, digits)}**" if told else signed(of.mean, digits)
+    return f"{mean} ({number(of.low, digits)} to {number(of.high, digits)})"
+
+
+def row(cells: Iterable[str]) -> str:
+    """Return a row of a table."""
+    return f"| {' | '.join(cells)} |"
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]], left: int = 1) -> str:
+    """Return a table whose columns after the first `left` ones are numbers."""
+    titles = list(head)
+    marks = ["---"] * left + ["---:"] * (len(titles) - left)
+    return "\n".join([row(titles), row(marks), *map(row, rows)])
+
+
+def best(values: list[float], texts: list[str]) -> list[str]:
+    """Mark the highest value bold, as it is shown."""
+    highest = max(text for text, value in zip(texts, values, strict=True) if value == max(values))
+    return [f"**{text}**" if text == highest else text for text in texts]
+
+
+def plus_minus(of: Estimate) -> str:
+    """Format a number of one model with half the width of its interval, if it has one."""
+    return f"{of.mean:.2f} ± {of.half:.2f}" if of.over else f"{of.mean:.2f}"
+
+
+def costs(found: Experiment, case: str, models: Iterable[str], form: str) -> list[str]:
+    """Return a row of PSNR and seconds of training; the highest PSNR is bold."""
+    psnr = [found.of(model, CASES[case]).mean for model in models]
+    seconds = [found.of(model, CASES[case], "seconds").mean for model in models]
+    shown = best(psnr, [f"{value:.2f}" for value in psnr])
+    return [case, *(form.format(psnr=p, seconds=number(s, 1)) for p, s in zip(shown, seconds, strict=True))]
+
+
+def gated(published: Path, model: str) -> dict[str, list[float]]:
+    """Return how PSNR, and frame time and size in per cent, change on each scene if effects are removed."""
+    changes: dict[str, list[float]] = {"psnr": [], "ms": [], "mb": []}
+    for group in (found.group for found in experiments(published / "effects")):
+        own = [c for c in group.configurations if c.model == model]
+        full = [c for c in own if not c.on_demand]
+        for less in (c for c in own if c.on_demand):
+            before = max(full, key=lambda c: _shared(c.variant, less.variant))
+            for scene in less.runs:
+                for unit, values in changes.items():
+                    old, new = (float(group.sample(c, scene, unit).mean()) for c in (before, less))
+                    values.append(new - old if unit == "psnr" else 100 * (new / old - 1))
+    return changes
+
+
+def _shared(variant: str, other: str) -> int:
+    """Count the settings that two variants share."""
+    return len(set(variant.split(",")) & set(other.split(",")))
+
+
+def span(values: list[float], digits: int) -> str:
+    """Format the lowest and the highest of some differences."""
+    return f"{signed(min(values), digits)} to {signed(max(values), digits)}"

@@ -1,0 +1,123 @@
+"""Write the blocks of README: tables and sentences that follow from the published records.
+
+A sentence says only what the records say: its numbers, its words, and whether it stands at all are computed, so a
+record that changes changes the sentence.
+"""
+
+from pathlib import Path
+
+from published import (
+    CASES,
+    MODELS,
+    NAMES,
+    PAPERS,
+    SUCCESSORS,
+    best,
+    costs,
+    experiment,
+    gated,
+    machine,
+    metric,
+    number,
+    prices,
+    signed,
+    span,
+    table,
+)
+
+from gsbench.report.compare import Price
+from gsbench.report.page.messages import count, listing
+from gsbench.report.paper import paper_row
+
+SHORT = ("250", "1,000", "4,000")  # iterations
+
+
+def figure(published: Path) -> str:
+    """Return README's figure with its caption."""
+    found = experiment(published, "frontier")
+    of = found.of("7dgs")
+    return (
+        "![PSNR on test against seconds of training, a line for each model](docs/images/frontier.png)\n\n"
+        f"*PSNR on test against training time (`make frontier`; {machine(found)}): means over {of.scenes} scenes and "
+        f"{of.seeds} seeds, 95 % intervals over seeds.*"
+    )
+
+
+def cost(published: Path) -> str:
+    """Return README's table of PSNR and seconds at three lengths of training, and what longer training does."""
+    found = experiment(published, "frontier")
+    models = [model for model in MODELS if model != "6dgs"]
+    longer = [m for m in MODELS if found.of(m, CASES["4,000"]).mean < found.of(m, CASES["2,000"]).mean]
+    said = "Bold: the highest PSNR of a row. `7dgs_noagr` is 7DGS without AGR, `7dgs_nodir` is 7DGS without direction."
+    if longer:
+        said += f" {len(longer)} of {count(len(MODELS), 'model')} have lower PSNR at 4,000 iterations than at 2,000: "
+        said += "they overfit the training views ([all rows](docs/results.md))."
+    newer = experiment(published, "mini")
+    ranked = sorted(((newer.of(m).mean, NAMES[m]) for m in SUCCESSORS if newer.has(m)), reverse=True)
+    (first, name), *others = ranked
+    said += f" After 1,000 iterations {name} has {first:.2f} dB, {listing([f'{n} {x:.2f}' for x, n in others])}."
+    rows = [costs(found, length, models, "{psnr}, {seconds} s") for length in SHORT]
+    return f"{table(['iterations', *models], rows, left=0)}\n\n{said}"
+
+
+def worth(published: Path) -> str:
+    """Return README's table of what time, direction and AGR gain, with intervals over seeds and over scenes."""
+    found = experiment(published, "frontier")
+    priced = prices(found)
+    asked = {
+        "time": ("time alone", "time, with AGR"),
+        "direction, given time": ("direction, with time", "direction, with time and AGR"),
+        "AGR, given time and direction": (None, "AGR, with time and direction"),
+    }
+    cells = [[name, *(_worth(priced[key]) if key else "" for key in keys)] for name, keys in asked.items()]
+    shown = {key: priced[key].costs["psnr"] for keys in asked.values() for key in keys if key}
+    unsure = [key for key, gain in shown.items() if gain.half_over_scenes > abs(gain.mean)]
+    scenes = count(min(gain.scenes for gain in shown.values()), "scene")
+    said = (
+        "Cells show how PSNR (95 % interval over seeds and views) and seconds of training change if time, direction or "
+        "AGR is added. Bold changes are significant after Holm's correction "
+        f"([the rule](docs/statistics.md#the-rule)). All are of {scenes}."
+    )
+    if unsure:
+        said += f" Over scenes like these, the intervals of {len(unsure)} of {count(len(shown), 'change')} contain "
+        said += "zero, so on another scene the sign may differ."
+    return f"{table(['', 'without AGR', 'with AGR'], cells)}\n\n{said}"
+
+
+def _worth(price: Price) -> str:
+    gain, seconds = price.costs["psnr"], price.costs["seconds"].mean
+    mean = f"**{signed(gain.mean)} dB**" if price.told["psnr"] else f"{signed(gain.mean)} dB"
+    return f"{mean} ({number(gain.low)} to {number(gain.high)}), {signed(seconds, 1)} s"
+
+
+def trex(published: Path) -> str:
+    """Return README's table of trex by the paper's protocol."""
+    found = experiment(published, "dnerf")
+    models = ("7dgs", "7dgs_noagr", "4dgs")
+    ours = [found.of(m, PAPERS, "psnr").mean for m in models]
+    leaking = [metric(found.runs(m, PAPERS), "psnr_best_on_test") for m in models]
+    theirs = [paper_row("D-NeRF", "trex", model).psnr for model in models]
+    rows = [
+        ["last iteration, dB", *best(ours, [f"{x:.2f}" for x in ours])],
+        ["best on test, dB", *best(leaking, [f"{x:.2f}" for x in leaking])],
+        ["paper (best on test), dB", *best(theirs, [f"{x:.2f}" for x in theirs])],
+    ]
+    by_paper = found.of("7dgs_noagr", f"recipe=paper,{PAPERS}").mean
+    said = (
+        "Our numbers on trex are no independent reproduction: one setting was chosen after a result on test was known. "
+        f"With the paper's learning rates (`+recipe=paper`), 7DGS without its network AGR has {by_paper:.2f} dB."
+    )
+    return f"{table(['', *models], rows)}\n\n{said}"
+
+
+def demand(published: Path) -> str:
+    """Return README's sentence on what effects on demand change."""
+    changed = gated(published, "7dgs")
+    scenes = count(len(changed["psnr"]), "scene")
+    return (
+        f"On {scenes} this changes the frame time of 7DGS by {span(changed['ms'], 0)} %, and its PSNR by "
+        f"{span(changed['psnr'], 2)} dB ([docs/effects.md](docs/effects.md))."
+    )
+
+
+BLOCKS = {"figure": figure, "cost": cost, "worth": worth, "trex": trex, "demand": demand}

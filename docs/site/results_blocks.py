@@ -1,0 +1,272 @@
+"""Write the blocks of docs/results.md: tables and sentences that follow from the published records."""
+
+import math
+from pathlib import Path
+from statistics import fmean
+
+from published import (
+    CASES,
+    LIMITED,
+    MODELS,
+    NAMES,
+    PAPERS,
+    SMALLER,
+    SUCCESSORS,
+    Experiment,
+    change,
+    costs,
+    experiment,
+    gated,
+    machine,
+    metric,
+    number,
+    plus_minus,
+    prices,
+    row,
+    signed,
+    span,
+    table,
+)
+
+from gsbench.measure.record import Record
+from gsbench.report import frontier
+from gsbench.report.configurations import psnr_val
+from gsbench.report.intervals import Estimate, estimate
+from gsbench.report.page.messages import count, listing
+from gsbench.report.paper import paper_row
+
+ABLATIONS = {
+    "no_agr": "no AGR",
+    "time_only": "no direction: 4DGS with AGR",
+    "direction_only": "no time: 6DGS with AGR",
+    "no_effects": "neither time nor direction: 3DGS with AGR",
+    "paper_order": "Cholesky factor over (position, time, direction), as in the paper",
+    "row_scaled": "off-diagonals of the factor as parts of their row's diagonal",
+    "raw_off_diagonal": "off-diagonals of the factor as raw entries",
+    "schur": "slices by a Schur complement",
+    "cholesky": "slices by a Cholesky factor",
+    "no_time_split": "Gaussians split in space only",
+    "fixed_lambda": "constant λ, the coefficients in the exponents of the opacity",
+}
+
+
+def table1(published: Path) -> str:
+    """Return the table of `make table1`, and how model=auto and the successors compare."""
+    found = experiment(published, "mini")
+    rows = []
+    for model in (m for m in MODELS if found.has(m)):
+        runs = found.runs(model)
+        metrics = [number(metric(runs, key), digits) for key, digits in (("psnr", 2), ("ssim", 3), ("lpips_alex", 3))]
+        costs_ = [run.cost for run in runs if run.cost]
+        seconds, fps, many = (fmean(getattr(c, key) for c in costs_) for key in ("train_s", "fps", "num_gaussians"))
+        rows.append([model, *metrics, f"{seconds:.1f}", f"{fps:,.0f}", f"{many:,.0f}"])
+    full, less = ([run.cost for run in found.runs(m) if run.cost] for m in ("7dgs", "auto"))
+    kept = fmean(c.num_gaussians for c in less) / fmean(c.num_gaussians for c in full)
+    faster = fmean(c.fps for c in less) / fmean(c.fps for c in full)
+    tested = found.tested("auto", "7dgs")
+    newer = sorted(((found.of(m).mean, m) for m in SUCCESSORS if found.has(m)), reverse=True)
+    said = (
+        f"The result of `model=auto` has {100 * kept:.0f} % of the Gaussians of 7DGS and {faster:.1f} times its frame "
+        f"rate. The difference in PSNR to 7DGS, {change(tested, tested.told)} dB, is "
+        f"{'' if tested.told else 'not '}significant. Successors have "
+        f"{listing([f'{psnr:.2f} dB (`{m}`)' for psnr, m in newer])}."
+    )
+    head = ["model", "PSNR", "SSIM", "LPIPS-Alex", "training, s", "FPS", "Gaussians"]
+    return f"Measured on {machine(found)}.\n\n{table(head, rows)}\n\n{said}"
+
+
+def lengths(published: Path) -> str:
+    """Return the table of `make frontier`, which model is best within each budget, and which ones overfit."""
+    found = experiment(published, "frontier")
+    rows = [costs(found, case, MODELS, "{psnr}, {seconds}") for case in CASES]
+    newer = [m for m in SUCCESSORS if found.has(m, CASES["4,000"])]
+    points = frontier.points(found.group, found.group.basis)
+    answers = []
+    for unit, budget in frontier.BUDGETS:
+        choice = frontier.choose(points, unit, budget, found.family)
+        limit = f"{budget:g} s of training" if unit == "seconds" else f"{1000 / budget:.0f} frames a second"
+        if choice is None:
+            answers.append([limit, "none", "", ""])
+            continue
+        others = len(choice.ahead) + len(choice.level) + len(choice.behind) + len(choice.unknown)
+        psnr, name = choice.point.psnr, choice.point.configuration.name
+        answers.append([limit, f"`{name}`", plus_minus(psnr), f"{len(choice.ahead)} of {others}"])
+    longer = [m for m in MODELS if found.of(m, CASES["4,000"]).mean < found.of(m, CASES["2,000"]).mean]
+    said = "The model with the best PSNR on val within a budget, its PSNR on test, and how many others it beats there:"
+    parts = [table(["iterations", *MODELS], rows, left=0)]
+    if newer:
+        own = [costs(found, case, newer, "{psnr}, {seconds}") for case in CASES if found.has(newer[0], CASES[case])]
+        parts += ["The successors of 7DGS:", table(["iterations", *newer], own, left=0)]
+    head = ["budget", "best", "PSNR", "significantly better than"]
+    parts += [said, "\n".join([row(head), row(["---", "---", "---:", "---"]), *map(row, answers)])]
+    if longer:
+        parts.append(
+            f"Between 2,000 and 4,000 iterations, PSNR on test falls for {len(longer)} of {len(MODELS)} models: they "
+            "overfit the training views."
+        )
+    return f"Measured on {machine(found)}.\n\n" + "\n\n".join(parts)
+
+
+def effects(published: Path) -> str:
+    """Return the table of what time, direction and AGR gain and cost, given the other effects."""
+    found = experiment(published, "frontier")
+    rows = []
+    for name, price in prices(found).items():
+        gain = price.costs["psnr"]
+        up = sum(mean > 0 for mean in gain.each)
+        told = change(gain, price.told["psnr"])
+        numbers = [signed(price.costs[unit].mean, digits) for unit, digits in (("seconds", 1), ("ms", 2), ("mb", 2))]
+        title = name.replace(" alone", "").replace(", with", " given")
+        rows.append([title, told, f"± {gain.half_over_scenes:.1f}", f"{up} of {gain.scenes}", *numbers])
+    head = ["effect", "PSNR, dB", "over scenes", "scenes that gain", "training, s", "frame, ms", "model, MB"]
+    text = table(head, rows, left=2)
+    gain = prices(found)["direction, with time"]
+    if gain.told["psnr"] and gain.costs["psnr"].mean < 0:
+        text += "\n\nDirection lowers PSNR of a model with time and without AGR, because the model memorises the views."
+    other = experiment(published, "dnerf_trex100")
+    variant = other.group.variant
+    if other.has("7dgs_nodir_agr", variant):
+        direction = _paired(other, "7dgs", "7dgs_nodir_agr")
+        agr = _paired(other, "7dgs", "7dgs_noagr")
+        text += (
+            "\n\nOn D-NeRF trex at 100 × 100 ([records](../results/published/dnerf_trex100/), 3,000 iterations) "
+            f"direction changes PSNR by {change(direction, told=False)} in a model with time and AGR, and AGR by "
+            f"{change(agr, told=False)} in a model with time and direction."
+        )
+    return text
+
+
+def _paired(found: Experiment, model: str, other: str) -> Estimate:
+    """Estimate the difference of two models that have one variant each, whatever its name."""
+    (a,), (b,) = ([c for c in found.group.configurations if c.model == name] for name in (model, other))
+    return estimate(found.group.contrast([(1.0, a), (-1.0, b)], "psnr"))
+
+
+def ablation(published: Path) -> str:
+    """Return the table of what each part of 7DGS is worth."""
+    found = experiment(published, "ablation")
+    full = found.of("7dgs", "ablation=none").mean
+    rows = [row(["changed", "`+ablation=`", "PSNR, dB"]), row(["---"] * 3), row(["nothing", "`none`", f"{full:.2f}"])]
+    by_variant = {c.variant: c for c in found.group.configurations}
+    for name, words in ABLATIONS.items():
+        tested = found.family.of([(1.0, by_variant[f"ablation={name}"]), (-1.0, by_variant["ablation=none"])])
+        rows.append(row([words, f"`{name}`", change(tested, tested.told)]))
+    return "\n".join(rows)
+
+
+def recipe(published: Path) -> str:
+    """Return PSNR of the moving scenes that the recipe was tuned on, of successors, and of two static scenes."""
+    models = ("7dgs_noagr", "7dgs", "4dgs")
+    trex100, lego100 = experiment(published, "dnerf_trex100"), experiment(published, "dnerf_lego100")
+    rows = [
+        [name, *(plus_minus(_only(found, model)) for model in models)]
+        for name, found in (
+            ("trex 100 × 100, 3,000 iterations, test", trex100),
+            ("lego 100 × 100, 1,000 iterations, val ([why](protocol.md#how-it-is-measured))", lego100),
+        )
+    ]
+    newer = [m for m in SUCCESSORS if m in trex100.group.models]
+    said = "Successors, trex 100: " + ", ".join(f"`{m}` {plus_minus(_only(trex100, m))}" for m in newer) + "."
+    still = experiment(published, "static")
+    gains = {scene: float(values.mean()) for scene, values in
+             zip(still.group.scenes, still.contrast("6dgs", "3dgs"), strict=True)}  # fmt: skip
+    said += "\n\nOn static scenes, 6DGS differs in PSNR on test from 3DGS by "
+    said += listing([f"{signed(gain)} dB ({scene})" for scene, gain in gains.items()])
+    return f"{table(['', *models], rows)}\n\n{said} ([records](../results/published/static/))."
+
+
+def _only(found: Experiment, model: str) -> Estimate:
+    """Estimate PSNR of a model that has one variant, whatever its name."""
+    (one,) = (c for c in found.group.configurations if c.model == model)
+    return found.of(model, one.variant)
+
+
+def trex200(published: Path) -> str:
+    """Return the table of trex at 200 x 200 pixels, three seeds."""
+    found = experiment(published, "dnerf")
+    models = [c.model for c in found.group.configurations if c.variant == SMALLER]
+    models.sort(key=lambda model: -found.of(model, SMALLER).mean)
+    rows = []
+    for model in models:
+        runs = found.runs(model, SMALLER)
+        psnr = plus_minus(found.of(model, SMALLER))
+        train, ssim, lpips = (metric(runs, key) for key in ("psnr_train", "ssim", "lpips_alex"))
+        many = fmean(run.cost.num_gaussians for run in runs if run.cost)
+        shown = f"**{psnr}**" if model == models[0] else psnr
+        rows.append([model, shown, number(train), number(ssim, 3), number(lpips, 3), f"{many:,.0f}"])
+    said = [
+        f"by {change(found.difference('7dgs', other, SMALLER), told=False)} dB from {NAMES[other]}"
+        for other in ("4dgs", "7dgs_noagr")
+    ]
+    head = ["model", "PSNR", "PSNR train", "SSIM", "LPIPS-Alex", "Gaussians"]
+    return f"{table(head, rows)}\n\n7DGS differs {listing(said)}."
+
+
+def trex400(published: Path) -> str:
+    """Return the table of trex by the paper's own protocol, beside the paper's rows."""
+    found = experiment(published, "dnerf")
+    rows = []
+    for model in ("7dgs", "7dgs_noagr", "4dgs"):
+        rows.append([model, *_whole(found.runs(model, PAPERS))])
+        own = paper_row("D-NeRF", "trex", model)
+        minutes = number(math.nan if own.train_min is None else own.train_min, 1)
+        rows.append(["paper", "–", f"{own.psnr:.2f}", "–", "–", number(own.ssim, 3), number(own.lpips, 3), minutes,
+                     number(own.fps, 1), f"{own.num_gaussians:,}"])  # fmt: skip
+    for name, words in (("paper", "the numbers that the paper prints"), ("authors", "its authors' later code")):
+        variant = f"recipe={name},{PAPERS}"
+        rows.append([f"7dgs_noagr with {words}, `+recipe={name}`", *_whole(found.runs("7dgs_noagr", variant))])
+    head = ["trex, 400 x 400", "PSNR, last iteration", "best on test (leaks)", "val", "training views", "SSIM",
+            "LPIPS-Alex", "train min", "FPS", "Gaussians"]  # fmt: skip
+    ours = found.of("7dgs", PAPERS).mean - found.of("7dgs_noagr", PAPERS).mean
+    theirs = paper_row("D-NeRF", "trex", "7dgs").psnr - paper_row("D-NeRF", "trex", "7dgs_noagr").psnr
+    said = f"On trex AGR changes PSNR by {signed(ours)} dB here, by {signed(theirs)} in the paper."
+    return f"{table(head, rows)}\n\n{said}"
+
+
+def _whole(runs: list[Record]) -> list[str]:
+    """Return the numbers of a row at 400 x 400 pixels, means over seeds."""
+    metrics = [metric(runs, key) for key in ("psnr", "psnr_best_on_test", "psnr_train", "ssim", "lpips_alex")]
+    psnr, leaking, train, ssim, lpips = metrics
+    minutes, fps, many = (fmean(getattr(r.cost, key) for r in runs if r.cost)
+                          for key in ("train_s", "fps", "num_gaussians"))  # fmt: skip
+    val = fmean(psnr_val(run) for run in runs)
+    return [number(psnr), number(leaking), number(val), number(train, 1), number(ssim, 3), number(lpips, 3),
+            number(minutes / 60, 1), number(fps, 1), f"{many:,.0f}"]  # fmt: skip
+
+
+def quick(published: Path) -> str:
+    """Return the tables of trex with `+recipe=quick`, and with fewer steps and a limit of Gaussians."""
+    found = experiment(published, "dnerf")
+    rows = []
+    for variant, words in (("recipe=quick", ""), (LIMITED, ", 6,500 iterations, at most 110,000 Gaussians")):
+        for model in (m for m in ("7dgs", "4dgs", "7dgs_noagr") if found.has(m, variant)):
+            runs = found.runs(model, variant)
+            _, _, val, _, ssim, lpips, _, _, many = _whole(runs)
+            cpu = fmean((run.cost.train_cpu_s or math.nan) / 60 for run in runs if run.cost)
+            psnr = plus_minus(found.of(model, variant))
+            rows.append([f"{model}{words}", psnr, val, ssim, lpips, number(cpu, 1), many, str(len(runs))])
+    head = ["trex, 400 x 400", "PSNR", "val", "SSIM", "LPIPS-Alex", "CPU min", "Gaussians", "seeds"]
+    return table(head, rows)
+
+
+def on_demand(published: Path) -> str:
+    """Return the table of what the removal of effects from Gaussians changes, as a range over scenes."""
+    changed = {model: gated(published, model) for model in ("7dgs", "7dgs_noagr", "4dgs")}
+    head = ["", *(f"{model}, {count(len(found['psnr']), 'scene')}" for model, found in changed.items())]
+    rows = [["PSNR on test, dB", *(span(found["psnr"], 2) for found in changed.values())]]
+    for title, unit in (("frame time, %", "ms"), ("size of the model, %", "mb")):
+        rows.append([title, *(span(found[unit], 0) for found in changed.values())])
+    return table(head, rows, left=4)
+
+
+BLOCKS = {
+    "table1": table1,
+    "frontier": lengths,
+    "effects": effects,
+    "ablation": ablation,
+    "recipe": recipe,
+    "trex200": trex200,
+    "trex400": trex400,
+    "quick": quick,
+    "on_demand": on_demand,
+}

@@ -1,0 +1,54 @@
+"""The views of the embedded scenes: enough of them, good poses, and held-out views between training views."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from gsbench.scenes import generate
+from gsbench.scenes.generate import RECIPES, Shot
+
+
+@pytest.mark.parametrize("name", sorted(RECIPES))
+def test_the_splits_have_enough_views(name: str) -> None:
+    """Catches a scene whose views are learnt by heart because they are few."""
+    counts = Counter(shot.split for shot in RECIPES[name].shots())
+    assert 100 <= counts["train"] <= 150
+    assert counts["val"] >= 10
+    assert counts["test"] >= 15
+
+
+@pytest.mark.parametrize("name", sorted(RECIPES))
+def test_cameras_look_at_the_origin(name: str) -> None:
+    """Catches a mirrored or tilted camera, which Blender would accept."""
+    for shot in RECIPES[name].shots():
+        turn, place = shot.pose[:3, :3], shot.pose[:3, 3]
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(turn) == pytest.approx(1)
+        np.testing.assert_allclose(turn[:, 2] * generate.DISTANCE, place, atol=1e-12)  # a camera looks along -z
+        assert turn[2, 1] > 0  # upright
+
+
+def within(shot: Shot, others: list[Shot]) -> bool:
+    """Whether a time lies strictly between two times of others."""
+    times = [other.time for other in others]
+    return min(times) <= shot.time <= max(times) and shot.time not in times
+
+
+@pytest.mark.parametrize("name", sorted(RECIPES))
+def test_held_out_views_lie_between_training_views(name: str) -> None:
+    """Catches a test view at a time, or from a place, that training saw or that is outside of what it saw."""
+    shots = RECIPES[name].shots()
+    train = [shot for shot in shots if shot.split == "train"]
+    for shot in (shot for shot in shots if shot.split == "test"):
+        assert within(shot, train)
+        angles = [np.degrees(np.arccos(np.clip(shot.pose[:3, 2] @ one.pose[:3, 2], -1, 1))) for one in train]
+        assert 0.1 < min(angles) < 30
+
+
+def test_a_rig_repeats_its_places_and_an_orbit_does_not() -> None:
+    """Catches a rig whose cameras move, and a monocular scene that sees a moment twice."""
+    for name, places, times in (("rig", 12, 11), ("suzanne", 120, 120)):
+        train = [shot for shot in RECIPES[name].shots() if shot.split == "train"]
+        assert len({shot.pose.tobytes() for shot in train}) == places
+        assert len({shot.time for shot in train}) == times
