@@ -79,7 +79,7 @@ def lengths(published: Path) -> str:
     """Return the table of `make frontier`, which model is best within each budget, and which ones overfit."""
     found = experiment(published, "frontier")
     rows = [costs(found, case, MODELS, "{psnr}, {seconds}") for case in CASES]
-    newer = [m for m in SUCCESSORS if found.has(m, CASES["4,000"])]
+    newer = [m for m in SUCCESSORS if found.has(m, CASES["2,000"])]
     points = frontier.points(found.group, found.group.basis)
     answers = []
     for unit, budget in frontier.BUDGETS:
