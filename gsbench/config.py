@@ -39,6 +39,7 @@ class SceneConfig:
     downscale: int = 1  # divisor of the image size
     resize: str | None = None  # its filter; None: area; pillow: bicubic on 8 bits, as 3DGS
     eval_split: str = "test"  # or val (D-NeRF lego)
+    val_every: int | None = None  # every n-th training view is of val, where the data have no val; None: none
     frames: list[int] | None = None  # first and last frame (Technicolor); None: all
 
 

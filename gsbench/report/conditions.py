@@ -10,7 +10,8 @@ from gsbench.report.configurations import without
 
 WARNING = "WARNING"
 MOST_RUNS_NAMED = 3
-_UNSAID = {"resize": "area", "repaired": "none"}  # what a record means that lacks a part of its protocol
+# What a record means that lacks a part of its protocol.
+_UNSAID = {"resize": "area", "repaired": "none", "val_every": "none"}
 # The scenes on which gsbench's own settings were chosen; what is found on them may not hold on others.
 TUNED = frozenset((
     "bouncingballs", "cloud", "moving-matte", "static-glossy", "static-matte", "suzanne",  # conf/exp/tuning.yaml

@@ -130,6 +130,7 @@ class Attempt:
                 "backend": self.model.backend.name if self.model else config.raster.backend,
                 "paper_dataset": config.data.paper_dataset,
                 **({} if config.scene.resize is None else {"resize": config.scene.resize}),
+                **({} if config.scene.val_every is None else {"val_every": config.scene.val_every}),
                 **({"repaired": ", ".join(scene.repaired)} if scene and scene.repaired else {}),
             },
             provenance=provenance(

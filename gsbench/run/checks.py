@@ -63,6 +63,7 @@ RANGES = {  # the ranges of settings, both ends included
     "data.initial_points": (4, ENDLESS),
     "data.initial_half_width": (1e-6, 1e6),
     "scene.downscale": (1, 10_000),
+    "scene.val_every": (2, ENDLESS),
     "effects.budget_db": (0, 10),
     "protocol.renders": (LEAST_RENDERS, 1_000_000),
     "protocol.pictures": (0, 10_000),

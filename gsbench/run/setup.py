@@ -54,4 +54,6 @@ def load_scene(config: Config) -> Scene:
         frames=chosen.frames,
         repair=config.data.repair,
     )
+    if chosen.val_every is not None:
+        scene = scene.with_val(chosen.val_every)
     return scene.to(config.device)

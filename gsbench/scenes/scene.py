@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from gsbench.errors import InputError
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -95,6 +97,25 @@ class Scene:
     def has_time(self) -> bool:
         """Whether every training view has a time."""
         return all(view.time is not None for view in self.train)
+
+    def with_val(self, every: int) -> "Scene":
+        """Return a copy of the scene in which every n-th training view is a validation view, from the n-th on.
+
+        The extent stays, so that learning rates do. Test views are not used.
+
+        Raises:
+            InputError: the scene has validation views, or too few training views.
+        """
+        if self.val:
+            raise InputError(f"scene.val_every: expected a scene without val, {self.name} has one of {len(self.val)}")
+        held = set(range(every - 1, len(self.train), every))
+        if not held or len(held) == len(self.train):
+            raise InputError(
+                f"scene.val_every: expected views for train and for val, "
+                f"got every {every} of {len(self.train)} training views of {self.name}"
+            )
+        train = [view for i, view in enumerate(self.train) if i not in held]
+        return replace(self, train=train, val=[self.train[i] for i in sorted(held)])
 
     def to(self, device: str) -> "Scene":
         """Return a copy of the scene whose views are on `device`."""

@@ -144,3 +144,13 @@ def test_of_ten_pairs_without_a_difference_one_is_called_in_at_most_five_percent
 def test_a_percentile_bootstrap_would_not_do():
     """Says why intervals are not a plain bootstrap: with three seeds it holds the truth in fewer than 90 %."""
     assert coverage(percentile_bootstrap, (1, 3, 20), SPREADS["seeds differ most"], 300) < 0.9
+
+
+def test_half_width_over_scenes_is_students_t_of_their_means():
+    """Catches an interval of two scenes that reads as if it held for others, and a sign that stays behind."""
+    two = estimate([np.full((3, 4), 1.0), np.full((3, 4), 2.0)])
+    assert two.each == (1.0, 2.0)
+    assert two.half_over_scenes == pytest.approx(12.7062 * 0.5, rel=1e-4)  # t(1) at 97.5 %, sd 0.7071 / sqrt(2)
+    assert math.isnan(estimate([np.full((3, 4), 1.0)]).half_over_scenes)
+    three = estimate([np.full((3, 4), mean) for mean in (1.0, 2.0, 4.0)])
+    assert three.half_over_scenes == pytest.approx(three.half)

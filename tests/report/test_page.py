@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import json
+import math
 import re
 import time
 from html.parser import HTMLParser
@@ -171,7 +172,10 @@ def test_differences_of_two_scenes_say_so_first():
     records = frontier(lengths=(1000,))
     assert effects_section(records).sentences[0] == f"Two {said}"
     assert pairs_section(records).sentences[0] == f"Two {said}"
-    assert {row[-1] for row in effects_section(records).table.rows} == {"seeds and views, on 2 scenes"}
+    rows = effects_section(records).table.rows
+    assert {row[-4] for row in rows} == {"seeds and views, on 2 scenes"}
+    assert all(math.isfinite(row[-3]) for row in rows)
+    assert {row[-2] + row[-1] for row in rows} <= {0, 1, 2}
     three = frontier(scenes=("a", "b", "c"), lengths=(1000,))
     assert effects_section(three).sentences[0].startswith("3 scenes; an interval over scenes like these")
 

@@ -115,10 +115,10 @@ def test_every_key_is_of_training_or_of_measuring() -> None:
     keys = {key for key, _ in flat(training_part(named("model=3dgs").plain)) if not key.startswith("model.lr.")}
     assert keys == {
         "seed", "device", "agr", "optim", "scene.name", "scene.downscale", "scene.resize", "scene.eval_split",
-        "scene.frames", "data.repair", "data.background", "data.initial_lambda", "data.initial_points",
-        "data.initial_half_width", "raster.backend", "raster.antialias", "protocol.best_on_test", "model.name",
-        "model.module", "model.published_with_agr", "model.agr", "model.agr_octaves", "model.sh_degree",
-        "model.min_opacity", *(f"train.{name}" for name in (
+        "scene.val_every", "scene.frames", "data.repair", "data.background", "data.initial_lambda",
+        "data.initial_points", "data.initial_half_width", "raster.backend", "raster.antialias",
+        "protocol.best_on_test", "model.name", "model.module", "model.published_with_agr", "model.agr",
+        "model.agr_octaves", "model.sh_degree", "model.min_opacity", *(f"train.{name}" for name in (
             "iterations", "recipe_iterations", "batch_size", "ssim_weight", "sh_every", "refine_from",
             "lambda_from", "cooldown_from", "average_from", "curve_points", *(f"densify.{name}" for name in (
                 "start", "stop", "every", "rounds", "reset_every", "grad_threshold", "clone_below", "prune_above",

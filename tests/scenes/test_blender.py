@@ -230,6 +230,20 @@ def test_static_sets_and_sets_without_val(tiny: Path) -> None:
     assert all(view.time is None for view in scene.train + scene.test)
 
 
+def test_val_is_held_out_of_train_where_there_is_none(tiny: Path) -> None:
+    """Catches views that are in train and val, an extent that changes the rates, and a val that is overwritten."""
+    with pytest.raises(InputError, match=r"expected a scene without val, tiny has one of 1"):
+        scenes.load(tiny).with_val(2)
+    (tiny / "transforms_val.json").unlink()
+    scene = scenes.load(tiny)
+    held = scene.with_val(2)
+    assert [view.name for view in held.train] == [view.name for view in scene.train[::2]]
+    assert [view.name for view in held.val] == [view.name for view in scene.train[1::2]]
+    assert (held.extent, held.test) == (scene.extent, scene.test)
+    with pytest.raises(InputError, match=rf"got every 9 of {len(scene.train)} training views"):
+        scene.with_val(9)
+
+
 def test_suffixes_duplicates_and_paths_that_stay_inside(tiny: Path) -> None:
     """A path may carry its suffix, wander within the folder, and be named twice: catches r_0.png.png."""
     edit(tiny, lambda c: c["frames"][0].update(file_path="val/../train/r_0.png"))
