@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 Pose = NDArray[np.float64]  # [4, 4] camera to world, OpenGL axes
 ANGLE_X = 0.6911  # horizontal field of view in radians, as in NeRF-synthetic
-DISTANCE = 4.0
+DISTANCE = 4.6
 SPLITS = ("train", "val", "test")
 CEILING_VIEWS = 3  # views rendered with a second seed, to measure the noise
 
@@ -292,7 +292,7 @@ def _studio(bpy: Any, size: int, samples: int) -> tuple[Any, Any]:
     scene.world.use_nodes = True
     scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.6, 0.65, 0.7, 1.0)
     lamp = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "SUN"))
-    lamp.data.energy, lamp.data.angle, lamp.rotation_euler = 2.5, 0.2, (0.6, 0.3, 0.0)
+    lamp.data.energy, lamp.data.angle, lamp.rotation_euler = 2.0, 0.2, (0.6, 0.3, 0.0)
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.data.angle_x = ANGLE_X
     for added in (lamp, camera):
