@@ -70,11 +70,15 @@ def test_7dgs_without_direction_learns_as_7dgs_does() -> None:
 
 
 def test_every_model_goes_as_far_in_a_short_run() -> None:
-    """Catches a model whose geometry keeps the rates of 30,000 steps at 300: all are ten times faster, colours not."""
+    """Catches a model whose geometry keeps the rates of 30,000 steps at 300: all are ten times faster, colours not.
+
+    The harmonics of 3DGS and 6DGS are, which was chosen on static scenes.
+    """
     for model in ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_nodir"):
         short, long = (rates(composed(f"model={model}", f"train.iterations={n}"), 0.0) for n in (300, 30_000))
         for name in long.keys() - {"lambda"}:
-            expected = 1 if name in ("opacities", "sh0", "shN", "refinement") else 10
+            fixed = ("opacities", "sh0", "refinement", *(() if model in ("3dgs", "6dgs") else ("shN",)))
+            expected = 1 if name in fixed else 10
             assert abs(short[name] / long[name] - expected) < 1e-9, f"{model}: {name}"
 
 
