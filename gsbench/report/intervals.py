@@ -75,11 +75,12 @@ class Estimate:
     def half_over_scenes(self) -> float:
         """Return half the width of the 95 % interval for similar scenes: Student's t over the means of the scenes.
 
-        NaN with fewer than two scenes. With two scenes it is wide (t = 12.7), which is what two scenes can tell.
+        NaN with fewer than two scenes. With two scenes it is wide (t = 12.7), which is what two scenes can tell. It is
+        never narrower than the interval for these scenes, because two means may be equal by chance.
         """
         if len(self.each) < 2:
             return math.nan
-        return _of_scenes(np.array(self.each)).half_width(LEVEL)
+        return max(_of_scenes(np.array(self.each)).half_width(LEVEL), self.half if self.over else 0.0)
 
     @cached_property
     def p(self) -> float:

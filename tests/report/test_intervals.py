@@ -152,5 +152,8 @@ def test_half_width_over_scenes_is_students_t_of_their_means():
     assert two.each == (1.0, 2.0)
     assert two.half_over_scenes == pytest.approx(12.7062 * 0.5, rel=1e-4)  # t(1) at 97.5 %, sd 0.7071 / sqrt(2)
     assert math.isnan(estimate([np.full((3, 4), 1.0)]).half_over_scenes)
+    seeds = np.arange(3.0)[:, None] + np.zeros(4)
+    alike = estimate([seeds, seeds])
+    assert alike.half_over_scenes == alike.half > 0
     three = estimate([np.full((3, 4), mean) for mean in (1.0, 2.0, 4.0)])
     assert three.half_over_scenes == pytest.approx(three.half)

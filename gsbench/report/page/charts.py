@@ -12,6 +12,7 @@ from gsbench.report.page.palette import Style
 from gsbench.report.page.svg import INK, LANE, MUTED, PAPER, Panel, model_colour, stage_colour
 
 LOG_FROM = 5.0  # an axis is logarithmic if its largest value is this many times its smallest
+SOLID = ("s", "o", "D", "X", "p", "d", "8", "H")  # markers that look large for their area
 ROW = 38  # height in pixels of a row with its label above it
 
 
@@ -73,7 +74,7 @@ def frontier(curves: list[FrontierCurve], x: str, y: str = "PSNR, dB") -> Panel:
 
 def _dots(axes: Axes, marks: Sequence[Mark], style: Style, size: float, **how: Any) -> None:
     """Draw a model's marker at each point; marker shapes with a small area are drawn larger."""
-    area = size * (1.3 if style.marker in "^v<>hP" else 1.0)
+    area = size * (1.0 if style.marker in SOLID else 1.3)
     colour: dict[str, Any] = {} if "facecolors" in how else {"c": model_colour(style.colour)}
     axes.scatter([m.x for m in marks], [m.y for m in marks], s=area, marker=style.marker, **colour, **how)
 

@@ -7,8 +7,9 @@ markers distinguish the models without colour.
 
 from dataclasses import dataclass
 
+Marker = str | tuple[int, int, int]  # of matplotlib; a star as (number of points, 1, angle)
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "3dgs_agr", "4dgs_agr", "6dgs_agr", "auto",
-          "7dgs_nodir", "7dgs_nodir_agr")  # fmt: skip
+          "7dgs_nodir", "7dgs_nodir_agr", "dgs", "freetime", "dbs", "ubs", "ndgs")  # fmt: skip
 EFFECT_SET_LIKE = {  # a Gaussian has the colour of the model with the same effects
     "refined": "7dgs",
     "conditioned": "7dgs_noagr",
@@ -17,10 +18,28 @@ EFFECT_SET_LIKE = {  # a Gaussian has the colour of the model with the same effe
     "static": "3dgs",
 }
 LIGHT = ("#5c6066", "#0069a8", "#00734f", "#b34700", "#9c3d82", "#7d6608", "#1f6f78", "#4b4fa3", "#8c2d2d", "#3d6b1f",
-         "#b0185a", "#6a4a2f")  # fmt: skip
+         "#b0185a", "#6a4a2f", "#2e5cb8", "#8a5a00", "#7a1fa2", "#00708f", "#b3261e")  # fmt: skip
 DARK = ("#b9bec6", "#5cbcf2", "#3ccb9f", "#ff9454", "#eb9fd0", "#e3cc4a", "#6fd0da", "#a9adff", "#ff9c9c", "#a8d672",
-        "#ff8fbf", "#d9b38c")  # fmt: skip
-MARKERS = ("^", "s", "h", "o", "D", "v", "P", "X", "<", ">", "p", "d")
+        "#ff8fbf", "#d9b38c", "#8fb4ff", "#f0b860", "#d7a3f7", "#66d4f5", "#ff8a80")  # fmt: skip
+MARKERS: tuple[Marker, ...] = (
+    "^",
+    "s",
+    "h",
+    "o",
+    "D",
+    "v",
+    "P",
+    "X",
+    "<",
+    ">",
+    "p",
+    "d",
+    "*",
+    "H",
+    "8",
+    (4, 1, 0),
+    (6, 1, 0),
+)
 # Stages of a training step are shades of one hue, stages that occur once a run have two other hues, the rest is grey.
 STAGES_LIGHT = ("#22476b", "#3b6b96", "#6390b8", "#8fb2d1", "#b7cfe3", "#d7e4ef", "#b9770e", "#efc06a", "#9a9da3")
 STAGES_DARK = ("#c9e0f5", "#a3c6e6", "#7ba8cf", "#588ab3", "#3f6e95", "#2c5373", "#f0b35a", "#96651f", "#7d828b")
@@ -31,7 +50,7 @@ class Style:
     """The style of a model in figures: the number of its colour and its matplotlib marker."""
 
     colour: int
-    marker: str
+    marker: Marker
 
 
 def styles(models: list[str]) -> dict[str, Style]:

@@ -17,6 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.markers import MarkerStyle
 from matplotlib.ticker import NullLocator
 
+from gsbench.report.page.palette import Marker
+
 WIDTH = 360  # width of a figure in pixels, which fits on the screen of a phone
 FONT = 11.5
 INK, MUTED, LINE, PAPER = "#010101", "#010102", "#010103", "#010104"
@@ -138,12 +140,12 @@ def _variable(colour: str) -> str:
     return f"{kind}{int(colour[5:], 16)}" if kind else VARIABLES.get(colour, "ink")
 
 
-def marker(letter: str, colour: int) -> str:
+def marker(shape: Marker, colour: int) -> str:
     """Return the marker of a model as a small SVG element for legends."""
-    style = MarkerStyle(letter)
+    style = MarkerStyle(shape)
     path = style.get_path().transformed(style.get_transform())
     outlines: Any = path.to_polygons(closed_only=False)
     reach = max(abs(v) for line in outlines for v in (*line[:, 0], *line[:, 1]))
     drawn = "".join("M" + "L".join(f"{5 * x / reach:.2f} {-5 * y / reach:.2f}" for x, y in line) for line in outlines)
-    shape = f'<path d="{drawn}Z" fill="var(--model-{colour})"/>'
-    return f'<svg class="marker" viewBox="-6 -6 12 12" aria-hidden="true">{shape}</svg>'
+    path_of = f'<path d="{drawn}Z" fill="var(--model-{colour})"/>'
+    return f'<svg class="marker" viewBox="-6 -6 12 12" aria-hidden="true">{path_of}</svg>'
