@@ -6,8 +6,9 @@ markers distinguish the models without colour.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
-Marker = str | tuple[int, int, int]  # of matplotlib; a star as (number of points, 1, angle)
+Marker = str | tuple[int, Literal[1], int]  # of matplotlib; a star as (number of points, 1, angle)
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "3dgs_agr", "4dgs_agr", "6dgs_agr", "auto",
           "7dgs_nodir", "7dgs_nodir_agr", "dgs", "freetime", "dbs", "ubs", "ndgs")  # fmt: skip
 EFFECT_SET_LIKE = {  # a Gaussian has the colour of the model with the same effects
