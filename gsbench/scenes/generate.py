@@ -347,7 +347,10 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         generate(options.scene, options.folder, size=options.size, samples=options.samples, limit=options.limit)
-    except (ImportError, OSError) as error:
+    except ImportError as error:
+        print(f"generate: expected Blender, which `make scenes` installs: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
         print(f"generate: {error}", file=sys.stderr)
         return 2
     print(f"Written: {options.folder}")

@@ -107,7 +107,7 @@ class Scene:
             InputError: the scene has validation views, or too few training views.
         """
         if self.val:
-            raise InputError(f"scene.val_every: expected a scene without val, {self.name} has one of {len(self.val)}")
+            raise InputError(f"scene.val_every: expected no views of val, {self.name} has {len(self.val)}")
         held = set(range(every - 1, len(self.train), every))
         if not held or len(held) == len(self.train):
             raise InputError(

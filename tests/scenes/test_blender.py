@@ -232,7 +232,7 @@ def test_static_sets_and_sets_without_val(tiny: Path) -> None:
 
 def test_val_is_held_out_of_train_where_there_is_none(tiny: Path) -> None:
     """Catches views that are in train and val, an extent that changes the rates, and a val that is overwritten."""
-    with pytest.raises(InputError, match=r"expected a scene without val, tiny has one of 1"):
+    with pytest.raises(InputError, match=r"expected no views of val, tiny has 1"):
         scenes.load(tiny).with_val(2)
     (tiny / "transforms_val.json").unlink()
     scene = scenes.load(tiny)
