@@ -10,14 +10,14 @@ from pathlib import Path
 
 import matplotlib as mpl
 from matplotlib import pyplot
+from published import CASES, experiment
 
-from gsbench.measure.record import FILE_NAME, read
 from gsbench.report.page.palette import LIGHT, styles
 
 ROOT = Path(__file__).resolve().parents[2]
-RECORDS = ROOT / "results" / "published" / "frontier"
+PUBLISHED = ROOT / "results" / "published"
 PICTURE = ROOT / "docs" / "images" / "frontier.png"
-LENGTHS = (250, 500, 1000, 2000, 4000)  # iterations
+LENGTHS = ("250", "500", "1,000", "2,000", "4,000")  # iterations
 NAMES = {"auto": "7DGS on demand (auto)", "7dgs": "7DGS", "7dgs_nodir": "7DGS without direction", "4dgs": "4DGS",
          "7dgs_noagr": "7DGS without AGR", "6dgs": "6DGS", "3dgs": "3DGS"}  # fmt: skip
 T_95 = 4.303  # of Student's t, three seeds
@@ -31,10 +31,8 @@ def points(model: str) -> list[Point]:
     """Average the runs of a model over the two scenes at each length; the interval is over the seeds' averages."""
     found = []
     for length in LENGTHS:
-        folder = model if length == 1000 else f"{model},iterations={length}"
         by_seed = defaultdict(list)
-        for path in RECORDS.glob(f"*/{folder}/seed*/{FILE_NAME}"):
-            record = read(path)
+        for record in experiment(PUBLISHED, "frontier").runs(model, CASES[length]):
             assert record.metrics is not None
             assert record.cost is not None
             by_seed[record.seed].append((record.cost.train_s, record.metrics["psnr"] or 0.0))

@@ -11,8 +11,9 @@ from gsbench.measure.record import Record
 from gsbench.report import compare, tables
 from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import Configuration, Group, Values, groups
-from gsbench.report.family import Family, Tested
+from gsbench.report.family import Family, Tested, Weights
 from gsbench.report.intervals import Estimate, estimate
+from gsbench.report.page import messages
 
 MODELS = ("3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto")
 NAMES = {"7dgs": "7DGS", "7dgs_noagr": "7DGS without AGR", "7dgs_nodir": "7DGS without direction", "4dgs": "4DGS",
@@ -52,28 +53,37 @@ class Experiment:
         """Tell whether a model has finished runs with these settings."""
         return (model, variant) in self._found
 
+    def configuration(self, model: str, variant: str | None = "") -> Configuration:
+        """Return a model with these settings; None: with the only settings it was run with."""
+        if variant is not None:
+            return self._found[model, variant]
+        (only,) = (c for c in self.group.configurations if c.model == model)
+        return only
+
     def runs(self, model: str, variant: str = "") -> list[Record]:
         """Return the runs of a model with these settings, on all scenes and with all seeds."""
-        return [run for runs in self._found[model, variant].runs.values() for run in runs]
+        return [run for runs in self.configuration(model, variant).runs.values() for run in runs]
 
-    def of(self, model: str, variant: str = "", quantity: str = "psnr") -> Estimate:
+    def of(self, model: str, variant: str | None = "", quantity: str = "psnr") -> Estimate:
         """Estimate a quantity of a model, averaged over scenes; the interval is over seeds."""
-        found = self._found[model, variant]
+        found = self.configuration(model, variant)
         values = [self.group.sample(found, scene, quantity)[:, None] for scene in found.runs]
         return estimate(values, generalise=False) if all(map(len, values)) else Estimate(math.nan, 0, 0, "")
 
-    def difference(self, model: str, other: str, variant: str = "") -> Estimate:
+    def difference(self, model: str, other: str, variant: str | None = "") -> Estimate:
         """Estimate how much more PSNR a model has than another one, paired by scene, seed and view."""
         return estimate(self.contrast(model, other, variant))
 
-    def contrast(self, model: str, other: str, variant: str = "") -> list[Values]:
-        """Return the paired differences in PSNR of two models with the same settings, one array for each scene."""
-        terms = [(1.0, self._found[model, variant]), (-1.0, self._found[other, variant])]
-        return self.group.contrast(terms, "psnr")
+    def contrast(self, model: str, other: str, variant: str | None = "") -> list[Values]:
+        """Return the paired differences in PSNR of two models, one array for each scene."""
+        return self.group.contrast(self._minus(model, other, variant), "psnr")
 
     def tested(self, model: str, other: str, variant: str = "") -> Tested:
         """Return the difference of two models as the experiment's report tests it."""
-        return self.family.of([(1.0, self._found[model, variant]), (-1.0, self._found[other, variant])])
+        return self.family.of(self._minus(model, other, variant))
+
+    def _minus(self, model: str, other: str, variant: str | None) -> Weights:
+        return [(1.0, self.configuration(model, variant)), (-1.0, self.configuration(other, variant))]
 
 
 @functools.cache
@@ -114,22 +124,35 @@ def metric(runs: list[Record], name: str) -> float:
     return fmean(values) if values and len(values) == len(runs) else math.nan
 
 
+def cost(runs: list[Record], name: str) -> float:
+    """Average a part of the cost over runs, such as "train_s"."""
+    return fmean(getattr(run.cost, name) for run in runs if run.cost)
+
+
+def overfitted(found: Experiment) -> list[str]:
+    """Return the models that have lower PSNR after 4,000 iterations than after 2,000."""
+    return [m for m in MODELS if found.of(m, CASES["4,000"]).mean < found.of(m, CASES["2,000"]).mean]
+
+
+def successors(found: Experiment) -> list[tuple[float, str]]:
+    """Return PSNR and name of each successor that was run, the highest PSNR first."""
+    return sorted(((found.of(model).mean, model) for model in SUCCESSORS if found.has(model)), reverse=True)
+
+
 def number(value: float, digits: int = 2) -> str:
     """Format a number with commas; a dash for NaN."""
     return "–" if math.isnan(value) else f"{value:,.{digits}f}"
 
 
 def signed(value: float, digits: int = 2) -> str:
-    """Format a difference with its sign; one that rounds to zero has none."""
-    text = f"{value:+,.{digits}f}"
-    return text if float(text.replace(",", "")) else text[1:]
+    """Format a difference as the reports do, with the minus of a keyboard."""
+    return messages.signed(value, digits).replace("−", "-")
 
 
-def change(tested: Tested | Estimate, told: bool, digits: int = 2) -> str:
+def change(of: Estimate, *, told: bool = False) -> str:
     """Format a difference with its interval, bold if it is significant."""
-    of = tested.difference if isinstance(tested, Tested) else tested
-    mean = f"**{signed(of.mean, digits)}**" if told else signed(of.mean, digits)
-    return f"{mean} ({number(of.low, digits)} to {number(of.high, digits)})"
+    mean = f"**{signed(of.mean)}**" if told else signed(of.mean)
+    return f"{mean} ({number(of.low)} to {number(of.high)})"
 
 
 def row(cells: Iterable[str]) -> str:

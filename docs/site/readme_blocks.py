@@ -7,11 +7,9 @@ record that changes changes the sentence.
 from pathlib import Path
 
 from published import (
-    CASES,
     MODELS,
     NAMES,
     PAPERS,
-    SUCCESSORS,
     best,
     costs,
     experiment,
@@ -19,9 +17,11 @@ from published import (
     machine,
     metric,
     number,
+    overfitted,
     prices,
     signed,
     span,
+    successors,
     table,
 )
 
@@ -47,15 +47,14 @@ def cost(published: Path) -> str:
     """Return README's table of PSNR and seconds at three lengths of training, and what longer training does."""
     found = experiment(published, "frontier")
     models = [model for model in MODELS if model != "6dgs"]
-    longer = [m for m in MODELS if found.of(m, CASES["4,000"]).mean < found.of(m, CASES["2,000"]).mean]
+    longer = overfitted(found)
     said = "Bold: the highest PSNR of a row. `7dgs_noagr` is 7DGS without AGR, `7dgs_nodir` is 7DGS without direction."
     if longer:
         said += f" {len(longer)} of {count(len(MODELS), 'model')} have lower PSNR at 4,000 iterations than at 2,000: "
         said += "they overfit the training views ([all rows](docs/results.md))."
-    newer = experiment(published, "mini")
-    ranked = sorted(((newer.of(m).mean, NAMES[m]) for m in SUCCESSORS if newer.has(m)), reverse=True)
-    (first, name), *others = ranked
-    said += f" After 1,000 iterations {name} has {first:.2f} dB, {listing([f'{n} {x:.2f}' for x, n in others])}."
+    (first, name), *others = successors(experiment(published, "mini"))
+    said += f" After 1,000 iterations {NAMES[name]} has {first:.2f} dB, "
+    said += f"{listing([f'{NAMES[m]} {psnr:.2f}' for psnr, m in others])}."
     rows = [costs(found, length, models, "{psnr}, {seconds} s") for length in SHORT]
     return f"{table(['iterations', *models], rows, left=0)}\n\n{said}"
 

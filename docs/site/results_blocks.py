@@ -12,26 +12,27 @@ from published import (
     PAPERS,
     SMALLER,
     SUCCESSORS,
-    Experiment,
     change,
+    cost,
     costs,
     experiment,
     gated,
     machine,
     metric,
     number,
+    overfitted,
     plus_minus,
     prices,
     row,
     signed,
     span,
+    successors,
     table,
 )
 
 from gsbench.measure.record import Record
 from gsbench.report import frontier
 from gsbench.report.configurations import psnr_val
-from gsbench.report.intervals import Estimate, estimate
 from gsbench.report.page.messages import count, listing
 from gsbench.report.paper import paper_row
 
@@ -57,19 +58,15 @@ def table1(published: Path) -> str:
     for model in (m for m in MODELS if found.has(m)):
         runs = found.runs(model)
         metrics = [number(metric(runs, key), digits) for key, digits in (("psnr", 2), ("ssim", 3), ("lpips_alex", 3))]
-        costs_ = [run.cost for run in runs if run.cost]
-        seconds, fps, many = (fmean(getattr(c, key) for c in costs_) for key in ("train_s", "fps", "num_gaussians"))
+        seconds, fps, many = (cost(runs, key) for key in ("train_s", "fps", "num_gaussians"))
         rows.append([model, *metrics, f"{seconds:.1f}", f"{fps:,.0f}", f"{many:,.0f}"])
-    full, less = ([run.cost for run in found.runs(m) if run.cost] for m in ("7dgs", "auto"))
-    kept = fmean(c.num_gaussians for c in less) / fmean(c.num_gaussians for c in full)
-    faster = fmean(c.fps for c in less) / fmean(c.fps for c in full)
+    kept, faster = (cost(found.runs("auto"), key) / cost(found.runs("7dgs"), key) for key in ("num_gaussians", "fps"))
     tested = found.tested("auto", "7dgs")
-    newer = sorted(((found.of(m).mean, m) for m in SUCCESSORS if found.has(m)), reverse=True)
     said = (
         f"The result of `model=auto` has {100 * kept:.0f} % of the Gaussians of 7DGS and {faster:.1f} times its frame "
-        f"rate. The difference in PSNR to 7DGS, {change(tested, tested.told)} dB, is "
+        f"rate. The difference in PSNR to 7DGS, {change(tested.difference, told=tested.told)} dB, is "
         f"{'' if tested.told else 'not '}significant. Successors have "
-        f"{listing([f'{psnr:.2f} dB (`{m}`)' for psnr, m in newer])}."
+        f"{listing([f'{psnr:.2f} dB (`{m}`)' for psnr, m in successors(found)])}."
     )
     head = ["model", "PSNR", "SSIM", "LPIPS-Alex", "training, s", "FPS", "Gaussians"]
     return f"Measured on {machine(found)}.\n\n{table(head, rows)}\n\n{said}"
@@ -88,10 +85,9 @@ def lengths(published: Path) -> str:
         if choice is None:
             answers.append([limit, "none", "", ""])
             continue
-        others = len(choice.ahead) + len(choice.level) + len(choice.behind) + len(choice.unknown)
         psnr, name = choice.point.psnr, choice.point.configuration.name
-        answers.append([limit, f"`{name}`", plus_minus(psnr), f"{len(choice.ahead)} of {others}"])
-    longer = [m for m in MODELS if found.of(m, CASES["4,000"]).mean < found.of(m, CASES["2,000"]).mean]
+        answers.append([limit, f"`{name}`", plus_minus(psnr), f"{len(choice.ahead)} of {choice.others}"])
+    longer = overfitted(found)
     said = "The model with the best PSNR on val within a budget, its PSNR on test, and how many others it beats there:"
     parts = [table(["iterations", *MODELS], rows, left=0)]
     if newer:
@@ -110,36 +106,28 @@ def lengths(published: Path) -> str:
 def effects(published: Path) -> str:
     """Return the table of what time, direction and AGR gain and cost, given the other effects."""
     found = experiment(published, "frontier")
+    priced = prices(found)
     rows = []
-    for name, price in prices(found).items():
+    for name, price in priced.items():
         gain = price.costs["psnr"]
-        up = sum(mean > 0 for mean in gain.each)
-        told = change(gain, price.told["psnr"])
+        told = change(gain, told=price.told["psnr"])
         numbers = [signed(price.costs[unit].mean, digits) for unit, digits in (("seconds", 1), ("ms", 2), ("mb", 2))]
         title = name.replace(" alone", "").replace(", with", " given")
-        rows.append([title, told, f"± {gain.half_over_scenes:.1f}", f"{up} of {gain.scenes}", *numbers])
+        rows.append([title, told, f"± {gain.half_over_scenes:.1f}", f"{gain.gaining} of {gain.scenes}", *numbers])
     head = ["effect", "PSNR, dB", "over scenes", "scenes that gain", "training, s", "frame, ms", "model, MB"]
     text = table(head, rows, left=2)
-    gain = prices(found)["direction, with time"]
-    if gain.told["psnr"] and gain.costs["psnr"].mean < 0:
+    direction = priced["direction, with time"]
+    if direction.told["psnr"] and direction.costs["psnr"].mean < 0:
         text += "\n\nDirection lowers PSNR of a model with time and without AGR, because the model memorises the views."
     other = experiment(published, "dnerf_trex100")
-    variant = other.group.variant
-    if other.has("7dgs_nodir_agr", variant):
-        direction = _paired(other, "7dgs", "7dgs_nodir_agr")
-        agr = _paired(other, "7dgs", "7dgs_noagr")
+    if "7dgs_nodir_agr" in other.group.models:
+        views, agr = (other.difference("7dgs", less, None) for less in ("7dgs_nodir_agr", "7dgs_noagr"))
         text += (
             "\n\nOn D-NeRF trex at 100 × 100 ([records](../results/published/dnerf_trex100/), 3,000 iterations) "
-            f"direction changes PSNR by {change(direction, told=False)} in a model with time and AGR, and AGR by "
-            f"{change(agr, told=False)} in a model with time and direction."
+            f"direction changes PSNR by {change(views)} in a model with time and AGR, and AGR by "
+            f"{change(agr)} in a model with time and direction."
         )
     return text
-
-
-def _paired(found: Experiment, model: str, other: str) -> Estimate:
-    """Estimate the difference of two models that have one variant each, whatever its name."""
-    (a,), (b,) = ([c for c in found.group.configurations if c.model == name] for name in (model, other))
-    return estimate(found.group.contrast([(1.0, a), (-1.0, b)], "psnr"))
 
 
 def ablation(published: Path) -> str:
@@ -150,7 +138,7 @@ def ablation(published: Path) -> str:
     by_variant = {c.variant: c for c in found.group.configurations}
     for name, words in ABLATIONS.items():
         tested = found.family.of([(1.0, by_variant[f"ablation={name}"]), (-1.0, by_variant["ablation=none"])])
-        rows.append(row([words, f"`{name}`", change(tested, tested.told)]))
+        rows.append(row([words, f"`{name}`", change(tested.difference, told=tested.told)]))
     return "\n".join(rows)
 
 
@@ -159,26 +147,20 @@ def recipe(published: Path) -> str:
     models = ("7dgs_noagr", "7dgs", "4dgs")
     trex100, lego100 = experiment(published, "dnerf_trex100"), experiment(published, "dnerf_lego100")
     rows = [
-        [name, *(plus_minus(_only(found, model)) for model in models)]
+        [name, *(plus_minus(found.of(model, None)) for model in models)]
         for name, found in (
             ("trex 100 × 100, 3,000 iterations, test", trex100),
             ("lego 100 × 100, 1,000 iterations, val ([why](protocol.md#how-it-is-measured))", lego100),
         )
     ]
     newer = [m for m in SUCCESSORS if m in trex100.group.models]
-    said = "Successors, trex 100: " + ", ".join(f"`{m}` {plus_minus(_only(trex100, m))}" for m in newer) + "."
+    said = "Successors, trex 100: " + ", ".join(f"`{m}` {plus_minus(trex100.of(m, None))}" for m in newer) + "."
     still = experiment(published, "static")
     gains = {scene: float(values.mean()) for scene, values in
              zip(still.group.scenes, still.contrast("6dgs", "3dgs"), strict=True)}  # fmt: skip
     said += "\n\nOn static scenes, 6DGS differs in PSNR on test from 3DGS by "
     said += listing([f"{signed(gain)} dB ({scene})" for scene, gain in gains.items()])
     return f"{table(['', *models], rows)}\n\n{said} ([records](../results/published/static/))."
-
-
-def _only(found: Experiment, model: str) -> Estimate:
-    """Estimate PSNR of a model that has one variant, whatever its name."""
-    (one,) = (c for c in found.group.configurations if c.model == model)
-    return found.of(model, one.variant)
 
 
 def trex200(published: Path) -> str:
@@ -191,11 +173,11 @@ def trex200(published: Path) -> str:
         runs = found.runs(model, SMALLER)
         psnr = plus_minus(found.of(model, SMALLER))
         train, ssim, lpips = (metric(runs, key) for key in ("psnr_train", "ssim", "lpips_alex"))
-        many = fmean(run.cost.num_gaussians for run in runs if run.cost)
+        many = cost(runs, "num_gaussians")
         shown = f"**{psnr}**" if model == models[0] else psnr
         rows.append([model, shown, number(train), number(ssim, 3), number(lpips, 3), f"{many:,.0f}"])
     said = [
-        f"by {change(found.difference('7dgs', other, SMALLER), told=False)} dB from {NAMES[other]}"
+        f"by {change(found.difference('7dgs', other, SMALLER))} dB from {NAMES[other]}"
         for other in ("4dgs", "7dgs_noagr")
     ]
     head = ["model", "PSNR", "PSNR train", "SSIM", "LPIPS-Alex", "Gaussians"]
@@ -227,11 +209,10 @@ def _whole(runs: list[Record]) -> list[str]:
     """Return the numbers of a row at 400 x 400 pixels, means over seeds."""
     metrics = [metric(runs, key) for key in ("psnr", "psnr_best_on_test", "psnr_train", "ssim", "lpips_alex")]
     psnr, leaking, train, ssim, lpips = metrics
-    minutes, fps, many = (fmean(getattr(r.cost, key) for r in runs if r.cost)
-                          for key in ("train_s", "fps", "num_gaussians"))  # fmt: skip
+    seconds, fps, many = (cost(runs, key) for key in ("train_s", "fps", "num_gaussians"))
     val = fmean(psnr_val(run) for run in runs)
     return [number(psnr), number(leaking), number(val), number(train, 1), number(ssim, 3), number(lpips, 3),
-            number(minutes / 60, 1), number(fps, 1), f"{many:,.0f}"]  # fmt: skip
+            number(seconds / 60, 1), number(fps, 1), f"{many:,.0f}"]  # fmt: skip
 
 
 def quick(published: Path) -> str:
@@ -242,7 +223,7 @@ def quick(published: Path) -> str:
         for model in (m for m in ("7dgs", "4dgs", "7dgs_noagr") if found.has(m, variant)):
             runs = found.runs(model, variant)
             _, _, val, _, ssim, lpips, _, _, many = _whole(runs)
-            cpu = fmean((run.cost.train_cpu_s or math.nan) / 60 for run in runs if run.cost)
+            cpu = cost(runs, "train_cpu_s") / 60
             psnr = plus_minus(found.of(model, variant))
             rows.append([f"{model}{words}", psnr, val, ssim, lpips, number(cpu, 1), many, str(len(runs))])
     head = ["trex, 400 x 400", "PSNR", "val", "SSIM", "LPIPS-Alex", "CPU min", "Gaussians", "seeds"]

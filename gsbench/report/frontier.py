@@ -85,6 +85,11 @@ class BudgetChoice:
     behind: list[FrontierPoint]  # models that are significantly better
     unknown: list[FrontierPoint]  # models without a known spread over seeds
 
+    @property
+    def others(self) -> int:
+        """Return the number of models to which the best one was compared."""
+        return len(self.ahead) + len(self.level) + len(self.behind) + len(self.unknown)
+
 
 def has_val(of: Sequence[FrontierPoint]) -> bool:
     """Tell whether the PSNR on the validation views is known for every model that is compared.

@@ -72,6 +72,11 @@ class Estimate:
         return self.mean + self.half
 
     @property
+    def gaining(self) -> int:
+        """Return the number of scenes whose mean is above zero."""
+        return sum(mean > 0 for mean in self.each)
+
+    @property
     def half_over_scenes(self) -> float:
         """Return half the width of the 95 % interval for similar scenes: Student's t over the means of the scenes.
 

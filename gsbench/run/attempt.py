@@ -129,8 +129,7 @@ class Attempt:
                 "quantise": config.protocol.quantise,
                 "backend": self.model.backend.name if self.model else config.raster.backend,
                 "paper_dataset": config.data.paper_dataset,
-                **({} if config.scene.resize is None else {"resize": config.scene.resize}),
-                **({} if config.scene.val_every is None else {"val_every": config.scene.val_every}),
+                **{key: value for key in ("resize", "val_every") if (value := getattr(config.scene, key)) is not None},
                 **({"repaired": ", ".join(scene.repaired)} if scene and scene.repaired else {}),
             },
             provenance=provenance(

@@ -89,7 +89,7 @@ def _answer(points: list[FrontierPoint], family: Family, cost: str, budget: floa
 
 def _compared(choice: f.BudgetChoice) -> str:
     """Say whether the chosen model is significantly better than each other model within the budget."""
-    others = len(choice.ahead) + len(choice.level) + len(choice.behind) + len(choice.unknown)
+    others = choice.others
     if not others:
         return "No other model fits."
     if len(choice.unknown) == others:

@@ -91,8 +91,8 @@ def _cells(price: Price, unit: str) -> tuple[Value, ...]:
 
 def _over_scenes(gain: Estimate) -> tuple[Value, ...]:
     """Return what an interval is over, its half width over scenes, and how many scenes gain and lose PSNR."""
-    gains, losses = (sum(sign * mean > 0 for mean in gain.each) for sign in (1, -1))
-    return messages.over(gain), gain.half_over_scenes, gains, losses
+    losses = sum(mean < 0 for mean in gain.each)
+    return messages.over(gain), gain.half_over_scenes, gain.gaining, losses
 
 
 def _scope(cube: Cube, family: Family) -> list[str]:
@@ -146,11 +146,10 @@ def _effect_words(cube: Cube) -> list[str]:
 
 def _scene_words(gain: Estimate) -> str:
     """Say on how many scenes PSNR gains, and how wide the interval over scenes like these is; "" for one scene."""
-    gains = sum(mean > 0 for mean in gain.each)
     if len(gain.each) < 2:
         return ""
     wide = "" if gain.over in ("", "scenes") else f"; ± {messages.plain(gain.half_over_scenes)} over scenes like these"
-    return f"{wide}; {gains} of {messages.count(len(gain.each), 'scene')} gain"
+    return f"{wide}; {gain.gaining} of {messages.count(len(gain.each), 'scene')} gain"
 
 
 def stages_section(group: Group, canvas: Canvas) -> PageSection:
