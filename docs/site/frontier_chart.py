@@ -4,8 +4,6 @@ python docs/site/frontier_chart.py
 """
 
 import itertools
-import statistics
-from collections import defaultdict
 from pathlib import Path
 
 import matplotlib as mpl
@@ -20,7 +18,6 @@ PICTURE = ROOT / "docs" / "images" / "frontier.png"
 LENGTHS = ("250", "500", "1,000", "2,000", "4,000")  # iterations
 NAMES = {"auto": "7DGS on demand (auto)", "7dgs": "7DGS", "7dgs_nodir": "7DGS without direction", "4dgs": "4DGS",
          "7dgs_noagr": "7DGS without AGR", "6dgs": "6DGS", "3dgs": "3DGS"}  # fmt: skip
-T_95 = 4.303  # of Student's t, three seeds
 APART = 0.32  # dB between two labels
 TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200)  # seconds
 
@@ -28,19 +25,13 @@ Point = tuple[float, float, float]  # seconds, dB, half of the 95 % interval
 
 
 def points(model: str) -> list[Point]:
-    """Average the runs of a model over the two scenes at each length; the interval is over the seeds' averages."""
-    found = []
-    for length in LENGTHS:
-        by_seed = defaultdict(list)
-        for record in experiment(PUBLISHED, "frontier").runs(model, CASES[length]):
-            assert record.metrics is not None
-            assert record.cost is not None
-            by_seed[record.seed].append((record.cost.train_s, record.metrics["psnr"] or 0.0))
-        means = [[statistics.fmean(column) for column in zip(*runs, strict=True)] for runs in by_seed.values()]
-        seconds, psnr = ([mean[i] for mean in means] for i in (0, 1))
-        half = T_95 * statistics.stdev(psnr) / len(psnr) ** 0.5
-        found.append((statistics.fmean(seconds), statistics.fmean(psnr), half))
-    return found
+    """Return the means of a model over scenes and seeds at each length, with the interval that the tables have."""
+    found = experiment(PUBLISHED, "frontier")
+    line = []
+    for case in (CASES[length] for length in LENGTHS):
+        psnr, seconds = found.of(model, case), found.of(model, case, "seconds")
+        line.append((seconds.mean, psnr.mean, psnr.half))
+    return line
 
 
 def heights(ends: dict[str, float]) -> dict[str, float]:
