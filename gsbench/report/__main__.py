@@ -2,25 +2,61 @@
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line
+from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
-from gsbench.report import against_table, layout, live, paper_tables, tables
+from gsbench.report import against_table, layout, live, paper_tables, select, tables
 from gsbench.report.against import DIFFERS, Comparison, compare
+from gsbench.report.latex import latex
+from gsbench.report.numbers import numbers
 from gsbench.report.page import build
 from gsbench.report.publish import publish
+
+PRINTED = Path("-")  # the value of --json without a FILE
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Print and write the result tables and ``report.html`` for a folder of run records.
 
     A record is left out, and the reason is printed, if it is damaged or if another record describes the same run.
+    With the options --latex, --select, or --json without a FILE, nothing is written into the folder.
 
     Returns:
         1 if a record is left out or if the option --against finds that PSNR differs, 2 if there is no record or a file
         cannot be read or written, otherwise 0.
     """
+    options = _options(arguments)
+    if options.live:
+        return live.watch(options.results, train=options.train)
+    differs = False
+    try:
+        chosen = select.parse(options.select)
+        records, faults = tables.load(options.results)
+        records = chosen.of(records)
+        if options.publish:
+            print(publish(options.results, options.publish))
+        elif records and options.tables:
+            _paper_tables(records, options)
+        elif records and options.against:
+            differs = _against(records, faults, options)
+        elif records:
+            _tables(records, faults, chosen.columns, options)
+        if records and options.figures:
+            written = build.write_figures(records, options.results, options.figures)
+            print(f"Written: {len(written) // 2} figures in {options.figures}", file=sys.stderr)
+    except (InputError, OSError) as error:
+        print(f"gsbench.report: {one_line(error)}", file=sys.stderr)
+        return 2
+    for fault in faults:
+        print(f"gsbench.report: left out: {fault}", file=sys.stderr)
+    return 1 if faults or differs else 0
+
+
+def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m gsbench.report", description=__doc__)
     parser.add_argument("results", type=Path, metavar="RESULTS_DIR", help="a folder with records, at any depth")
     parser.add_argument("--train", action="store_true", help="also PSNR on training views: the gap is overfitting")
@@ -28,40 +64,70 @@ def main(arguments: list[str] | None = None) -> int:
     either.add_argument("--tables", action="store_true", help="only table1.*, table2.* and table_successors.*")
     either.add_argument("--live", action="store_true", help="write again whenever a record arrives, until Ctrl-C")
     either.add_argument("--publish", type=Path, metavar="DIR", help="copy the records to DIR, and write its table anew")
-    parser.add_argument("--against", type=Path, metavar="DIR", help="compare with the records in DIR; 1 if they differ")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the comparison to FILE")
+    either.add_argument("--against", type=Path, metavar="DIR", help="compare with the records in DIR; 1 if they differ")
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--latex", action="store_true", help="print the tables as LaTeX for a paper, and write nothing")
+    form.add_argument("--json", type=Path, nargs="?", const=PRINTED, metavar="FILE",
+                      help="print the numbers as JSON, and write nothing; FILE: also write them there")  # fmt: skip
+    parser.add_argument("--figures", type=Path, metavar="FOLDER", help="write the page's figures there as PDF and SVG")
+    parser.add_argument("--select", nargs="+", default=[], metavar="KEY=A,B",
+                        help="only these: model=.. scene=.. column=..; nothing is written to RESULTS_DIR")  # fmt: skip
     options = parser.parse_args(arguments)
-    folder = options.results
-    if options.json and not options.against:
-        parser.error("--json: expected --against beside it")
-    if options.against and (options.live or options.tables or options.publish):
-        parser.error("--against: expected none of --live, --tables and --publish beside it")
-    if options.live:
-        return live.watch(folder, train=options.train)
-    differs = False
-    try:
-        records, faults = tables.load(folder)
-        if options.publish:
-            print(publish(folder, options.publish))
-        elif records and options.tables:
-            print(layout.terminal(paper_tables.write(records, folder)))
-            print(f"Written: {', '.join(str(folder / name) for name in paper_tables.NAMES)}")
-        elif records:
-            print(layout.terminal(tables.write(records, folder, train=options.train)))
-            compared = _compared(records, folder, options.against) if options.against else None
-            page = build.write(records, folder, faults, against=compared)
-            print(f"Written: {folder / 'table.md'}, {folder / 'table.csv'}, {page}")
-            if compared:
-                differs = compared.verdict == DIFFERS
-                if options.json:
-                    against_table.write_json(compared, options.json)
-                print(f"\n{layout.terminal(against_table.tables(compared))}\n{compared.line}")
-    except (InputError, OSError) as error:
-        print(f"gsbench.report: {one_line(error)}", file=sys.stderr)
-        return 2
-    for fault in faults:
-        print(f"gsbench.report: left out: {fault}", file=sys.stderr)
-    return 1 if faults or differs else 0
+    if options.against and options.latex:
+        parser.error("--against: expected no --latex beside it")
+    if (options.live or options.publish) and (options.latex or options.json or options.figures or options.select):
+        parser.error("--live, --publish: expected none of --latex, --json, --figures and --select beside them")
+    if options.select and (options.tables or options.against):
+        parser.error("--select: expected none of --tables and --against beside it")
+    return options
+
+
+def _tables(records: list[Record], faults: list[str], columns: list[str], options: argparse.Namespace) -> None:
+    """Print the result tables, and write them with the HTML report unless only a part or another form was asked for."""
+    built = tables.build(records, train=options.train, columns=columns)
+    if _is_printed(options, built, lambda: numbers(records, built, faults)):
+        return
+    print(layout.terminal(built))
+    if not options.select:
+        tables.write(records, options.results, built)
+        page = build.write(records, options.results, faults)
+        print(f"Written: {options.results / 'table.md'}, {options.results / 'table.csv'}, {page}")
+
+
+def _paper_tables(records: list[Record], options: argparse.Namespace) -> None:
+    """Print the tables of papers, and write them unless another form was asked for."""
+    built = paper_tables.build(records)
+    shown = [table for made, _ in built.values() for table in made]
+    if _is_printed(options, shown, lambda: {name: lines for name, (_, lines) in built.items()}):
+        return
+    paper_tables.write(built, options.results)
+    print(layout.terminal(shown))
+    print(f"Written: {', '.join(str(options.results / name) for name in paper_tables.NAMES)}")
+
+
+def _against(records: list[Record], faults: list[str], options: argparse.Namespace) -> bool:
+    """Print and write the comparison with another folder, and return whether PSNR differs."""
+    compared = _compared(records, options.results, options.against)
+    made = against_table.tables(compared)
+    if not _is_printed(options, made, lambda: against_table.content(compared)):
+        built = tables.build(records, train=options.train)
+        print(layout.terminal(built))
+        tables.write(records, options.results, built)
+        page = build.write(records, options.results, faults, against=compared)
+        print(f"Written: {options.results / 'table.md'}, {options.results / 'table.csv'}, {page}")
+        print(f"\n{layout.terminal(made)}\n{compared.line}")
+    return compared.verdict == DIFFERS
+
+
+def _is_printed(options: argparse.Namespace, built: list[layout.Table], content: Callable[[], object]) -> bool:
+    """Print tables as LaTeX or JSON if that was asked for, and return whether it was; write JSON to a given FILE."""
+    if options.latex:
+        print(latex(built))
+    elif options.json == PRINTED:
+        print(as_json(content()))
+    elif options.json:
+        write_atomically(options.json, f"{as_json(content())}\n".encode())
+    return bool(options.latex or options.json == PRINTED)
 
 
 def _compared(records: list[Record], folder: Path, other: Path) -> Comparison:

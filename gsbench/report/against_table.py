@@ -1,12 +1,9 @@
-"""Write a comparison of two folders of run records as a table for the terminal and the report, and as JSON."""
+"""Show a comparison of two folders of run records as a table for the terminal and the report, and as plain values."""
 
-import json
 import math
-from pathlib import Path
 from typing import Any
 
 from gsbench.errors import printable
-from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
 from gsbench.report.against import LIMITS, RULE, ComparedRuns, Comparison, Judged, value
 from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
@@ -81,12 +78,9 @@ def _reasons(rows: list[ComparedRuns]) -> list[str]:
     return said
 
 
-def write_json(of: Comparison, path: Path) -> None:
-    """Write a comparison of two folders of run records to a JSON file; an unknown number becomes null.
-
-    The file is replaced atomically, so a reader never sees a half-written one.
-    """
-    content = {
+def content(of: Comparison) -> dict[str, Any]:
+    """Return a comparison of two folders of run records as plain values for JSON."""
+    return {
         "ours": of.ours,
         "theirs": of.theirs,
         "verdict": of.verdict,
@@ -96,7 +90,6 @@ def write_json(of: Comparison, path: Path) -> None:
         "only_ours": of.only_ours,
         "only_theirs": of.only_theirs,
     }
-    write_atomically(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def _plain(row: ComparedRuns) -> dict[str, Any]:
@@ -109,10 +102,10 @@ def _plain(row: ComparedRuns) -> dict[str, Any]:
         quantity: {
             "verdict": found.verdict,
             "reason": found.reason or None,
-            "difference": _number(found.difference.mean),
-            "low": _number(found.difference.low),
-            "high": _number(found.difference.high),
-            "p_holm": _number(found.p_holm),
+            "difference": found.difference.mean,
+            "low": found.difference.low,
+            "high": found.difference.high,
+            "p_holm": found.p_holm,
         }
         for quantity, found in row.judged.items()
     }
@@ -122,9 +115,5 @@ def _plain(row: ComparedRuns) -> dict[str, Any]:
 def _run(record: Record | None) -> dict[str, Any] | None:
     if record is None:
         return None
-    numbers = {quantity: _number(value(record, quantity)) for quantity in LIMITS}
+    numbers = {quantity: value(record, quantity) for quantity in LIMITS}
     return {"status": record.status, **numbers, "machine": record.provenance.machine}
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -3,10 +3,12 @@
 import math
 import re
 import textwrap
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 
 EMPTY = "–"
+Values = Mapping[str, Mapping[str, Mapping[int, float]]]  # by QuantityColumn.key, scene and seed; NaN: not measured
 
 
 @dataclass(frozen=True)
@@ -17,6 +19,12 @@ class QuantityColumn:
     title: str
     digits: int | None  # decimals; None: two below ten, otherwise one
     paper: str = ""  # the field of PaperRow with the same quantity
+    better: str = ""  # "higher" or "lower"; empty if models are not ranked by the quantity
+
+    @property
+    def name(self) -> str:
+        """Return the key without a remark such as "(leaks)"."""
+        return self.key.partition(" ")[0]
 
     def show(self, mean: float, std: float = math.nan) -> str:
         """Format a number as ``mean``, as ``mean ± std`` if a spread is given, or as a dash if the mean is NaN."""
@@ -34,6 +42,8 @@ class Row:
     cells: dict[str, str]  # by QuantityColumn.key
     seeds: str = ""  # number of seeds
     best: bool = False  # whether its first column (PSNR) has the best measured value
+    values: Values = field(default_factory=dict)  # of a measured row: the numbers behind its cells
+    paper: bool = False  # whether the numbers are the paper's own
 
 
 @dataclass(frozen=True)

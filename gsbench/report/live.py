@@ -59,7 +59,7 @@ def _written(folder: Path, train: bool, reload: int) -> str:
         records, faults = tables.load(folder)
         if not records:
             return f"no record can be read: {faults[0]}"
-        tables.write(records, folder, train=train)
+        tables.write(records, folder, tables.build(records, train=train))
         page = build.write(records, folder, faults, reload=reload)
     except (InputError, OSError) as error:
         return one_line(error)

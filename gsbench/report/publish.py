@@ -33,7 +33,7 @@ def publish(folder: Path, to: Path) -> str:
     published, left_out = tables.load(to)
     for fault in left_out:
         print(f"gsbench.report: left out: {fault}", file=sys.stderr)
-    tables.write(published, to)
+    tables.write(published, to, tables.build(published))
     return (
         f"Published: {len(records)} records in {to}, which has {len(published)}; {to / 'table.md'}, {to / 'table.csv'}"
     )

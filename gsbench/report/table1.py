@@ -144,7 +144,7 @@ class _Table1Builder:
         if theirs:
             shown = {c.key: c.show(theirs[c.key]) for c in COLUMNS}
             shown["lpips_alex"] += f" {self._mark(tables.PAPER_LPIPS)}"
-            rows.append(Row(f"paper {self._mark(PAPER)}", shown))
+            rows.append(Row(f"paper {self._mark(PAPER)}", shown, paper=True))
             rows.append(Row("difference", {c.key: _signed(c, delta[c.key]) for c in COLUMNS}))
         line: Line = {"table": self.kind, "dataset": self.dataset, "experiment": one.experiment, "scene": scene}
         line |= {"scenes": len(runs), "model": one.model, "recipe": one.recipe, "seeds": seeds}

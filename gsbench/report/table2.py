@@ -66,7 +66,7 @@ def _published(dataset: str, lines: list[Line], marks: list[str]) -> list[Row]:
         leaks = source == "table 1" or name in NAMES.values()
         values = {"psnr": psnr, LEAKS: psnr if leaks else math.nan, "ssim": _number(ssim), "lpips_alex": _number(lpips)}
         cells = {c.key: c.show(values.get(c.key, math.nan)) for c in COLUMNS}
-        rows.append(Row(f"{name} ({marks.index(SOURCES[source]) + 1})", cells))
+        rows.append(Row(f"{name} ({marks.index(SOURCES[source]) + 1})", cells, paper=True))
         line: Line = {"dataset": dataset, "method": name, "source": f"paper, {source}", "recipe": "", "seeds": ""}
         lines.append(line | {c.key: values.get(c.key, math.nan) for c in COLUMNS})
     return rows

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -17,28 +18,29 @@ from gsbench.report.cells import cell
 from gsbench.report.conditions import conditions
 from gsbench.report.configurations import groups
 from gsbench.report.intervals import over_seeds
-from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
+from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table, Values
 
 LEAKS = "psnr_best_on_test (leaks)"  # the title says that test views leak into the choice of the iteration
 COLUMNS = (  # their keys are columns of `tidy`
-    QuantityColumn("psnr", "PSNR", 2, "psnr"),
-    QuantityColumn("ssim", "SSIM", 3, "ssim"),
-    QuantityColumn("lpips_alex", "LPIPS-Alex", 3, "lpips"),
-    QuantityColumn("train_min", "train min", None, "train_min"),
-    QuantityColumn("fps", "FPS", None, "fps"),
-    QuantityColumn("num_gaussians", "#Gaussians", 0, "num_gaussians"),
+    QuantityColumn("psnr", "PSNR", 2, "psnr", "higher"),
+    QuantityColumn("ssim", "SSIM", 3, "ssim", "higher"),
+    QuantityColumn("lpips_alex", "LPIPS-Alex", 3, "lpips", "lower"),
+    QuantityColumn("train_min", "train min", None, "train_min", "lower"),
+    QuantityColumn("fps", "FPS", None, "fps", "higher"),
+    QuantityColumn("num_gaussians", "#Gaussians", 0, "num_gaussians", "lower"),
 )
 OF_THE_MACHINE = ("train_min", "fps")  # columns that can be compared only between runs on one machine
 COSTS = ("fps", "num_gaussians", "bytes", "peak_memory", "train_cpu_s", "load")  # costs that are copied from a record
 TRAIN = QuantityColumn("psnr_train", "PSNR train", 2)  # shown on request
 REGIONS = {  # beside PSNR, if a run has them; by the names of `Record.regions`
-    "moving": QuantityColumn("psnr_moving", "PSNR moving", 2),
-    "object": QuantityColumn("psnr_object", "PSNR object", 2),
+    "moving": QuantityColumn("psnr_moving", "PSNR moving", 2, better="higher"),
+    "object": QuantityColumn("psnr_object", "PSNR object", 2, better="higher"),
 }
 EXTRA_COLUMNS = (  # if a run has them
-    QuantityColumn("lpips_vgg", "LPIPS-VGG", 3),
+    QuantityColumn("lpips_vgg", "LPIPS-VGG", 3, better="lower"),
     QuantityColumn(LEAKS, LEAKS, 2),
 )
+CHOICES = {c.name: c for c in (COLUMNS[0], TRAIN, *REGIONS.values(), *COLUMNS[1:], *EXTRA_COLUMNS)}
 
 PAPER = (
     "Table 1 of the 7DGS paper (ICCV 2025): 30,000 iterations at half resolution (Technicolor: full), PSNR is the best "
@@ -104,15 +106,19 @@ def quantities(r: Record) -> dict[str, Any]:
     return flat | {name: getattr(r.provenance, name) for name in names} | {"machine": r.provenance.machine}
 
 
-def build(records: list[Record], *, train: bool = False, machine: str | None = None) -> list[Table]:
+def build(
+    records: list[Record], *, train: bool = False, machine: str | None = None, columns: Sequence[str] = ()
+) -> list[Table]:
     """Make a result table for every experiment and data set in `records`, sorted by name.
 
     Args:
         records: the run records of one or more experiments.
         train: whether to show PSNR on training views too.
         machine: the machine whose training times and FPS are shown; None for the machine of most runs in each table.
+        columns: the names in CHOICES of the columns to show; empty for those that the runs have.
     """
-    return [_TableBuilder(group.records, train, machine or group.machine).table() for group in groups(records)]
+    chosen = [CHOICES[name] for name in columns]
+    return [_TableBuilder(group.records, train, machine or group.machine, chosen).table() for group in groups(records)]
 
 
 def of_one_machine(records: list[Record], machine: str) -> list[str]:
@@ -137,7 +143,9 @@ def of_one_machine(records: list[Record], machine: str) -> list[str]:
 class _TableBuilder:
     """Makes the result table of one experiment on one data set, and collects the footnotes of its cells."""
 
-    def __init__(self, records: list[Record], train: bool, machine: str) -> None:
+    def __init__(
+        self, records: list[Record], train: bool, machine: str, columns: Sequence[QuantityColumn] = ()
+    ) -> None:
         self.records = records
         self.machine = machine
         self.scenes = sorted({r.scene for r in records})
@@ -148,23 +156,25 @@ class _TableBuilder:
         regions, extra = (
             [c for c in some if any(q[c.key] is not None for q in flat)] for some in (REGIONS.values(), EXTRA_COLUMNS)
         )
-        self.columns = [COLUMNS[0], *([TRAIN] if train else []), *regions, *COLUMNS[1:], *extra]
+        found = [COLUMNS[0], *([TRAIN] if train else []), *regions, *COLUMNS[1:], *extra]
+        self.columns = list(columns or found)
         finished: dict[tuple[str, str], list[dict[str, Any]]] = {}
         for q, name in zip(flat, map(self._name, records), strict=True):
             if q["status"] == "ok":
                 finished.setdefault((q["scene"], name), []).append(q)
-        self.values = {  # by scene and model, then column: a value for each seed, NaN where it is missing
+        self.values = {  # by scene and model, then column and seed; NaN where it is missing
             run: {c.key: self._values(c, seeds) for c in self.columns} for run, seeds in finished.items()
         }
         self.marks: list[str] = []
 
-    def _values(self, column: QuantityColumn, seeds: list[dict[str, Any]]) -> list[float]:
-        """Return the values of a column for the runs of a model, or NaN if there are none.
+    def _values(self, column: QuantityColumn, seeds: list[dict[str, Any]]) -> dict[int, float]:
+        """Return the values of a column for the runs of a model by seed, or NaN if there are none.
 
         Training times and FPS are only taken from runs on the machine whose times the table shows.
         """
         counted = [q for q in seeds if column.key not in OF_THE_MACHINE or q["machine"] == self.machine]
-        return [math.nan if q[column.key] is None else float(q[column.key]) for q in counted] or [math.nan]
+        found = {q["seed"]: math.nan if q[column.key] is None else float(q[column.key]) for q in counted}
+        return found or dict.fromkeys((q["seed"] for q in seeds), math.nan)
 
     def _name(self, record: Record) -> str:
         """Return the name of a run's row: the model, and its settings if the runs of the table differ in them."""
@@ -197,17 +207,17 @@ class _TableBuilder:
         """Make the rows of a scene: each model's mean, each run that did not finish, and the paper's results."""
         rows: list[Row] = []
         notes = []
-        leader = _leader([self.values[scene, model] for model in self.models if (scene, model) in self.values])
+        leader = self._leader([self._of([scene], model) for model in self.models if (scene, model) in self.values])
         for model in self.models:
             runs = [r for r in self.records if (r.scene, self._name(r)) == (scene, model)]
             finished = [r for r in runs if r.status == "ok"]
             if finished:
                 cells = {c.key: self._cell(c, finished) for c in self.columns}
-                best = _shown_psnr(self.values[scene, model]) == leader
-                rows.append(Row(model, cells, str(len(finished)), best))
+                values = self._of([scene], model)
+                rows.append(Row(model, cells, str(len(finished)), _shown_psnr(values) == leader, values))
             for run in runs:
                 if run.status != "ok":
-                    rows.append(Row(f"{model} seed {run.seed}", {"psnr": run.status}))
+                    rows.append(Row(f"{model} seed {run.seed}", {self.columns[0].key: run.status}))
                     notes.append(f"{model} seed {run.seed} {run.status}: {printable(run.reason)}")
             if runs:
                 rows += self._paper_row([scene], model)
@@ -231,7 +241,7 @@ class _TableBuilder:
 
     def _cell(self, column: QuantityColumn, finished: list[Record]) -> str:
         """Format the mean and the interval over seeds; if a run lacks the number, return a dash with a footnote."""
-        values = self.values[finished[0].scene, self._name(finished[0])][column.key]
+        values = list(self.values[finished[0].scene, self._name(finished[0])][column.key].values())
         if not math.isnan(fmean(values)):
             return column.show(fmean(values), over_seeds(values).half)
         if column.key in OF_THE_MACHINE:
@@ -251,17 +261,14 @@ class _TableBuilder:
         title = f"average over {len(covered)} of {len(self.scenes)} scenes"
         if not covered:
             return Section(title, [], [*notes, "there is no scene that every model has finished"])
-        averages = {
-            model: {c.key: [fmean(self.values[scene, model][c.key]) for scene in covered] for c in self.columns}
-            for model in models
-        }
-        if any(math.isnan(fmean(values[c.key])) for values in averages.values() for c in self.columns):
+        averages = {model: self._of(covered, model) for model in models}
+        if any(math.isnan(_mean(values, c.key)) for values in averages.values() for c in self.columns):
             notes.append(f"{EMPTY} stands where a scene lacks the number")
-        leader = _leader(list(averages.values()))
+        leader = self._leader(list(averages.values()))
         rows = []
         for model, values in averages.items():
-            cells = {c.key: c.show(fmean(values[c.key])) for c in self.columns}
-            rows.append(Row(model, cells, best=_shown_psnr(values) == leader))
+            cells = {c.key: c.show(_mean(values, c.key)) for c in self.columns}
+            rows.append(Row(model, cells, "", _shown_psnr(values) == leader, values))
             rows += self._paper_row(covered, model)
         return Section(f"{title}: {', '.join(covered)}", rows, notes)
 
@@ -278,37 +285,47 @@ class _TableBuilder:
         theirs = all(r.protocol.get("paper_dataset") == r.dataset for r in runs)
         label = f"paper {self._mark(PAPER)}" if theirs else f"paper, other data {self._mark(PAPER_OTHER_DATA)}"
         cells = {c.key: EMPTY for c in self.columns}
-        for column in COLUMNS:
+        for column in (c for c in COLUMNS if c.key in cells):
             values = [getattr(row, column.paper) for row in rows]
             if None not in values:
                 cells[column.key] = column.show(fmean(values))
-        cells["lpips_alex"] += f" {self._mark(PAPER_LPIPS)}"
-        return [Row(label, cells)]
+        if "lpips_alex" in cells:
+            cells["lpips_alex"] += f" {self._mark(PAPER_LPIPS)}"
+        return [Row(label, cells, paper=True)]
+
+    def _of(self, scenes: list[str], model: str) -> Values:
+        """Return the values of a row: those of a model on some scenes."""
+        return {c.key: {scene: self.values[scene, model][c.key] for scene in scenes} for c in self.columns}
+
+    def _leader(self, rows: list[Values]) -> str | None:
+        """Return the highest mean PSNR as the table shows it; None if no row or not the first column has a PSNR.
+
+        Rows that look equal after rounding are all marked as the best.
+        """
+        if self.columns[0] != COLUMNS[0]:
+            return None
+        means = [mean for mean in (_mean(values, COLUMNS[0].key) for values in rows) if not math.isnan(mean)]
+        return COLUMNS[0].show(max(means)) if means else None
 
 
-def _shown_psnr(values: dict[str, list[float]]) -> str:
-    """Format a mean PSNR with as many digits as the table shows."""
-    return COLUMNS[0].show(fmean(values[COLUMNS[0].key]))
+def _mean(values: Values, key: str) -> float:
+    """Return the mean over scenes of the mean over seeds; NaN if a number is missing."""
+    return fmean(fmean(seeds.values()) for seeds in values[key].values())
 
 
-def _leader(rows: list[dict[str, list[float]]]) -> str | None:
-    """Return the highest mean PSNR as the table shows it; None if no row has a PSNR.
-
-    Rows that look equal after rounding are all marked as the best.
-    """
-    means = [mean for mean in (fmean(values[COLUMNS[0].key]) for values in rows) if not math.isnan(mean)]
-    return COLUMNS[0].show(max(means)) if means else None
+def _shown_psnr(values: Values) -> str:
+    """Format a mean PSNR with as many digits as the table shows; empty if the table has no PSNR."""
+    key = COLUMNS[0].key
+    return COLUMNS[0].show(_mean(values, key)) if key in values else ""
 
 
-def write(records: list[Record], folder: Path, *, train: bool = False) -> list[Table]:
-    """Write result tables to ``table.md`` and all quantities to ``table.csv`` in `folder`, and return the tables.
+def write(records: list[Record], folder: Path, built: list[Table]) -> None:
+    """Write result tables to ``table.md`` and all quantities of the runs to ``table.csv``.
 
     Args:
         records: the run records of one or more experiments.
         folder: the folder for the two files.
-        train: whether to show PSNR on training views too.
+        built: the tables of these records.
     """
-    tables = build(records, train=train)
-    write_atomically(folder / "table.md", layout.markdown(tables).encode())
+    write_atomically(folder / "table.md", layout.markdown(built).encode())
     write_atomically(folder / "table.csv", tidy(records).map(cell).rename(columns=cell).to_csv(index=False).encode())
-    return tables

@@ -12,9 +12,11 @@ from gsbench.measure.curve import Point
 from gsbench.measure.record import Cost, Effects, Provenance, Record, Region, ViewScore
 from gsbench.measure.speed import RenderTimes
 from gsbench.report import layout, tables
+from gsbench.report.latex import latex
 
 GOLDEN = Path(__file__).parent / "golden" / "table.md"
 GOLDEN_TERMINAL = GOLDEN.with_suffix(".txt")
+GOLDEN_LATEX = GOLDEN.with_suffix(".tex")
 NO_REGIONS = {
     "psnr_moving": "needs 3 evaluated views with the same camera",
     "psnr_object": "needs masks, or images with alpha",
@@ -119,3 +121,4 @@ if __name__ == "__main__":
     GOLDEN.parent.mkdir(exist_ok=True)
     GOLDEN.write_text(layout.markdown(tables.build(records())))
     GOLDEN_TERMINAL.write_text(layout.terminal(tables.build(records())))
+    GOLDEN_LATEX.write_text(latex(tables.build(records())))

@@ -12,7 +12,7 @@ from typing import Any
 from make_golden import EFFECTS, GOLDEN, make
 
 from gsbench.measure.record import Effects, Record
-from gsbench.report.paper_tables import write
+from gsbench.report.paper_tables import build, write
 
 GOLDEN_1 = GOLDEN.with_name("table1.md")
 GOLDEN_2 = GOLDEN.with_name("table2.md")
@@ -78,6 +78,6 @@ def records() -> list[Record]:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
-        write(records(), Path(folder))
+        write(build(records()), Path(folder))
         for golden in (GOLDEN_1, GOLDEN_2, GOLDEN_3):
             golden.write_text((Path(folder) / golden.name).read_text())

@@ -12,12 +12,12 @@ from gsbench.report import paper, table1
 from gsbench.report.__main__ import main
 from gsbench.report.conditions import conditions
 from gsbench.report.paper_protocol import departure, sort
-from gsbench.report.paper_tables import NAMES, write
+from gsbench.report.paper_tables import NAMES, build, write
 
 
 def test_the_golden_pages(tmp_path):
     """Would catch any change of the pages nobody meant. If it is meant: run make_golden_paper.py and read it."""
-    write(records(), tmp_path)
+    write(build(records()), tmp_path)
     assert (tmp_path / "table1.md").read_text() == GOLDEN_1.read_text()
     assert (tmp_path / "table2.md").read_text() == GOLDEN_2.read_text()
     assert (tmp_path / "table_successors.md").read_text() == GOLDEN_3.read_text()
@@ -28,7 +28,7 @@ def test_the_difference_is_of_like_with_like(tmp_path):
 
     Seeds of 30 and 31 dB have mean 30.5 and, by t with one degree of freedom, half an interval of 12.706 x 0.5.
     """
-    write([at_paper(seed=0, psnr=30.0), at_paper(seed=1, psnr=31.0)], tmp_path)
+    write(build([at_paper(seed=0, psnr=30.0), at_paper(seed=1, psnr=31.0)]), tmp_path)
     line = pd.read_csv(tmp_path / "table1.csv").iloc[0]
     assert line["psnr"] == 30.5
     assert line["psnr ±"] == pytest.approx(12.7062 * 0.5, abs=1e-3)
@@ -46,7 +46,7 @@ def test_seconds_of_two_machines_are_never_averaged(tmp_path):
     other = dataclasses.replace(runs[2].provenance, device="another CPU")
     cost = dataclasses.replace(runs[2].cost, train_s=6.0)
     runs[2] = dataclasses.replace(runs[2], provenance=other, cost=cost)
-    write(runs, tmp_path)
+    write(build(runs), tmp_path)
     line = pd.read_csv(tmp_path / "table1.csv").iloc[0]
     assert line["psnr"] == 31.0
     assert line["train_min"] == pytest.approx((runs[0].cost.train_s + runs[1].cost.train_s) / 120)
@@ -72,7 +72,7 @@ def test_no_other_protocol_beside_the_papers_row(change, named, tmp_path):
     """Would catch 200x200 or a stand-in shown as if it were what the paper measured."""
     run = at_paper(**change)
     assert departure(run) == named
-    write([run], tmp_path)
+    write(build([run]), tmp_path)
     text = (tmp_path / "table1.md").read_text()
     assert "| paper" not in text
     assert "| difference" not in text
@@ -117,8 +117,9 @@ def test_what_is_missing_is_said_in_one_line():
 
 def test_another_recipe_has_its_own_row(tmp_path):
     """Would catch the paper's learning rates averaged with gsbench's, and one training counted as two seeds."""
-    write([at_paper(psnr=30.0), at_paper(psnr=20.0, variant="recipe=paper"),
-           at_paper(psnr=30.0, variant="best_on_test=true")], tmp_path)  # fmt: skip
+    runs = [at_paper(psnr=30.0), at_paper(psnr=20.0, variant="recipe=paper"),
+            at_paper(psnr=30.0, variant="best_on_test=true")]  # fmt: skip
+    write(build(runs), tmp_path)
     lines = pd.read_csv(tmp_path / "table1.csv", keep_default_na=False)
     assert lines[["recipe", "seeds", "psnr"]].values.tolist() == [["", 1, 30.0], ["recipe=paper", 1, 20.0]]
 
@@ -131,7 +132,7 @@ def test_the_protocol_of_dgs_shares_no_mean_with_gsbenchs(tmp_path):
     assert [len(pool.runs) for pool in sort(runs).other_protocol] == [2]  # one pool is shown, the other is named
     (left,) = sort(runs).left_out["D-NeRF"]
     assert "400x400 by pillow" in left
-    write(runs, tmp_path)
+    write(build(runs), tmp_path)
     assert pd.read_csv(tmp_path / "table1.csv")["seeds"].tolist() == [1, 2]
     said = conditions([at_paper(), at_paper(seed=1, **{**own, "variant": ""})])
     assert any("WARNING: the rows differ in resize: area" in line and "pillow" in line for line in said)
@@ -159,7 +160,9 @@ def test_scenes_of_two_sizes_share_a_table():
 @pytest.mark.parametrize("odd", [["D-NeRF"], {"a": 1}, None, 3, "9" * 5000 + "x1"])
 def test_odd_values_in_a_record_stop_nothing(odd, tmp_path):
     """Would catch a stack trace for a record whose protocol is valid JSON and nonsense."""
-    write([at_paper(paper_dataset=odd), at_paper(resolution=odd, seed=1), at_paper(frames=odd, seed=2)], tmp_path)
+    write(
+        build([at_paper(paper_dataset=odd), at_paper(resolution=odd, seed=1), at_paper(frames=odd, seed=2)]), tmp_path
+    )
     assert "OTHER PROTOCOL" in (tmp_path / "table1.md").read_text()
 
 
@@ -169,9 +172,9 @@ def test_an_average_stands_in_table_2_only_if_it_is_whole(tmp_path):
     whole = [
         at_paper(scene=s, psnr=30.0 + i, eval_split="val" if s == "lego" else "test") for i, s in enumerate(scenes)
     ]
-    write(whole, tmp_path)
+    write(build(whole), tmp_path)
     assert "| measured: 7dgs | 33.50 | 34.00 |" in (tmp_path / "table2.md").read_text()
-    write(whole[1:], tmp_path)
+    write(build(whole[1:]), tmp_path)
     text = (tmp_path / "table2.md").read_text()
     assert "| measured: 7dgs, 7 of 8 scenes | – |" in text
     assert "33.50" not in text
@@ -182,7 +185,7 @@ def test_hostile_names_stay_text(tmp_path):
     hostile = "=1+1|x\n# head <script>alert(1)</script> [a](http://b)"
     run = make(dataset=hostile, protocol=at_paper().protocol)
     broken = dataclasses.replace(at_paper(), status="failed", reason="| \n# out", metrics=None, missing={}, cost=None)
-    write([run, broken], tmp_path)
+    write(build([run, broken]), tmp_path)
     text = (tmp_path / "table1.md").read_text()
     assert not any(line.startswith(("# head", "# out")) for line in text.splitlines())
     assert "\\<script>" in text

@@ -326,7 +326,7 @@ def test_a_cell_of_csv_is_no_formula(tmp_path):
     """Would catch a text that a spreadsheet computes, and a negative number that is made a text."""
     run = dataclasses.replace(failed(reason="=1+1"), protocol={**make().protocol, "name": "@SUM(A1)", "frames": "-2+3"})
     psnr = dataclasses.replace(make(), metrics={**make().metrics, "psnr": -1.5})
-    tables.write([run, psnr], tmp_path)
+    tables.write([run, psnr], tmp_path, tables.build([run, psnr]))
     frame = pd.read_csv(tmp_path / "table.csv")
     lost, kept = frame[frame.status == "failed"].iloc[0], frame[frame.status == "ok"].iloc[0]
     assert (lost.reason, lost.protocol_name, lost.protocol_frames) == ("'=1+1", "'@SUM(A1)", "'-2+3")
@@ -349,7 +349,7 @@ def test_the_terminal_form_fits(width):
 
 def test_the_csv_reads_back(tmp_path):
     """Would catch a CSV that rounds, or whose cells move: one row a run, numbers to the last digit."""
-    tables.write(records(), tmp_path)
+    tables.write(records(), tmp_path, tables.build(records()))
     frame = pd.read_csv(tmp_path / "table.csv", dtype={"psnr": str})
     assert [float(psnr) for psnr in frame["psnr"].dropna()] == [r.metrics["psnr"] for r in records() if r.metrics]
     assert frame["seed"].tolist() == [r.seed for r in records()]

@@ -1,6 +1,7 @@
 """Build the HTML report of a folder of run records: collect its sections, render the template, write report.html."""
 
 import functools
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -17,7 +18,7 @@ from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import Group, groups
 from gsbench.report.family import Family
 from gsbench.report.page import against as other
-from gsbench.report.page import cost, evidence, messages, on_demand, time_to_quality, worth
+from gsbench.report.page import cost, evidence, figures, messages, on_demand, time_to_quality, worth
 from gsbench.report.page.content import Canvas, DataTable, PageSection, Runs
 from gsbench.report.page.gallery import GalleryView, gallery
 from gsbench.report.page.palette import DARK, LIGHT, STAGES_DARK, STAGES_LIGHT, Style, styles
@@ -75,13 +76,8 @@ def render(
     against: Comparison | None = None,
 ) -> str:
     """Return the HTML report as text; the arguments are those of `write`."""
-    found = groups(records)
-    look = styles(sorted({name for group in found for name in group.series}))
-    runs, scenes = Runs(), MOST_SCENES // len(found)
-    canvases = [
-        Canvas(f"g{i}", runs, {name: look[name] for name in group.series}, scenes) for i, group in enumerate(found)
-    ]
-    chapters = [_chapter(group, folder, canvas) for group, canvas in zip(found, canvases, strict=True)]
+    found, runs = groups(records), Runs()
+    chapters = _chapters(found, folder, runs)
     for group, chapter in zip(found, chapters, strict=True):
         chapter.sections[-1:-1] = [other.against_section(against, group)] if against else []
     return _template().render(
@@ -97,6 +93,38 @@ def render(
         js=_own("page.js"),
         marker=lambda style: Markup(marker(style.marker, style.colour)),
     )
+
+
+def write_figures(records: list[Record], folder: Path, out: Path) -> list[Path]:
+    """Write the figures of the HTML report as PDF and SVG to the folder `out`, and return the paths of the files.
+
+    Args:
+        records: the run records to show, at least one.
+        folder: the folder that has the records.
+        out: the folder of the files, which is made if it does not exist.
+    """
+    written: list[Path] = []
+    found, stems = groups(records), Counter[str]()
+    for group, chapter in zip(found, _chapters(found, folder, Runs()), strict=True):
+        for section in chapter.sections:
+            legend: list[figures.LegendEntry] = [*(chapter.legend if section.legend else []), *section.swatches]
+            for tab in section.tabs:
+                for drawing in tab.drawings:
+                    stem = figures.file_name(group.experiment, group.dataset, section.key, tab.label, drawing.caption)
+                    stems[stem] += 1
+                    name = stem if stems[stem] == 1 else f"{stem}-{stems[stem]}"
+                    written += figures.write(drawing.panel, legend, out / name)
+    return written
+
+
+def _chapters(found: list[Group], folder: Path, runs: Runs) -> list[Chapter]:
+    """Make the chapter of each experiment; a model has the same style in all of them."""
+    look = styles(sorted({name for group in found for name in group.series}))
+    return [
+        _chapter(group, folder, Canvas(f"g{i}", runs, {name: look[name] for name in group.series}, scenes))
+        for scenes in [MOST_SCENES // len(found)]
+        for i, group in enumerate(found)
+    ]
 
 
 @functools.cache

@@ -4,12 +4,14 @@ import base64
 import csv
 import io
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from gsbench.measure.record import Record
 from gsbench.report.cells import cell
 from gsbench.report.configurations import Configuration, Group
 from gsbench.report.page import messages
 from gsbench.report.page.palette import Style
+from gsbench.report.page.svg import Panel
 
 Value = str | float | int | None
 MOST_ROWS = 60  # rows of a table that the report shows; the CSV file has all
@@ -69,10 +71,17 @@ def show(value: Value, column: Column) -> str:
 
 @dataclass(frozen=True)
 class PageFigure:
-    """A figure of the HTML report as SVG, with its caption."""
+    """A figure of the HTML report with its caption."""
 
     caption: str
-    svg: str
+    panel: Panel
+    name: str  # prefix of its SVG ids, different for each figure of a page
+    alt: str  # a description for readers who cannot see it
+
+    @cached_property
+    def svg(self) -> str:
+        """Return the figure as an SVG element of the page."""
+        return self.panel.svg(self.name, self.alt)
 
 
 @dataclass(frozen=True)

@@ -184,9 +184,8 @@ def _frontier_tab(group: Group, canvas: Canvas, key: str, label: str, scenes: li
         if drawn:
             named = messages.listing([p.configuration.name for p in points][:20])
             alt = f"PSNR in dB against {title} of {named}, {label}"
-            drawings.append(
-                PageFigure(f"PSNR against {title}", charts.frontier(drawn, title).svg(canvas.name + key + cost, alt))
-            )
+            panel = charts.frontier(drawn, title)
+            drawings.append(PageFigure(f"PSNR against {title}", panel, canvas.name + key + cost, alt))
     return Tab(label, drawings)
 
 

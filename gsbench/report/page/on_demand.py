@@ -164,7 +164,7 @@ def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
         ("Harmonics by degree, of the Gaussians left", "d", degrees, [stage_colour(_stage(i)) for i in range(DEGREES)]),
     )
     return [
-        PageFigure(title, charts.bars(bars, hues, "%").svg(f"{canvas.name}o{key}", f"{title}: {whose}"))
+        PageFigure(title, charts.bars(bars, hues, "%"), f"{canvas.name}o{key}", f"{title}: {whose}")
         for title, key, bars, hues in drawn
     ]
 

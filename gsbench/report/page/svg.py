@@ -119,7 +119,7 @@ class Panel:
         body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.S)
         body = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{name}-", body)
         body = re.sub(r"font: (?:(bold) )?([\d.]+)px [^;\"]*", _font, body)
-        body = re.sub(r"#0[123]0[0-9a-f]{3}", lambda found: f"var(--{_variable(found[0])})", body)
+        body = re.sub(r"#0[123]0[0-9a-f]{3}", lambda found: f"var(--{variable(found[0]) or 'ink'})", body)
         body = re.sub(r">\s+<", "><", body)
         view = f'viewBox="0 0 {self.width} {self.height}"'
         return f'<svg {view} role="img" aria-label="{escape(alt, quote=True)}">{body}{circles}</svg>'
@@ -134,10 +134,10 @@ def _font(found: re.Match[str]) -> str:
     return f"font-size: {found[2]}px" + ("; font-weight: 600" if found[1] else "")
 
 
-def _variable(colour: str) -> str:
-    """Return the name of the CSS variable that replaces a placeholder colour."""
-    kind = {"02": "model-", "03": "stage-"}.get(colour[1:3])
-    return f"{kind}{int(colour[5:], 16)}" if kind else VARIABLES.get(colour, "ink")
+def variable(colour: str) -> str:
+    """Return the name of the CSS variable that replaces a placeholder colour; empty for any other colour."""
+    kind = {"#0200": "model-", "#0300": "stage-"}.get(colour[:5])
+    return f"{kind}{int(colour[5:], 16)}" if kind else VARIABLES.get(colour, "")
 
 
 def marker(shape: Marker, colour: int) -> str:

@@ -26,7 +26,7 @@ def quality_section(group: Group, canvas: Canvas) -> PageSection:
         "quality",
         "Time to quality",
         _quality_words(targets, models),
-        [Tab("", [PageFigure("Targets reached within a factor of the fastest", panel.svg(f"{canvas.name}q", alt))])],
+        [Tab("", [PageFigure("Targets reached within a factor of the fastest", panel, f"{canvas.name}q", alt)])],
         DataTable("time_to_quality.csv", columns, rows),
         beside=True,
         legend=True,
@@ -82,7 +82,7 @@ def anytime_section(group: Group, canvas: Canvas) -> PageSection:
                 tails.setdefault(configuration.model, []).append(max(psnr) - psnr[-1])
         if curves and i < max(1, canvas.scenes):
             alt = f"PSNR on val against training seconds on {scene}, one curve for each of {len(curves)} models"
-            drawings.append(PageFigure(scene, charts.anytime(curves).svg(f"{canvas.name}a{i}", alt)))
+            drawings.append(PageFigure(scene, charts.anytime(curves), f"{canvas.name}a{i}", alt))
     if not rows:
         return PageSection("anytime", "While training", ["No finished run has a curve of PSNR on val."])
     columns = [Column("scene"), Column("model"), Column("iteration"), Column("seconds", 2), Column("PSNR val dB", 2)]

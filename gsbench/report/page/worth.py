@@ -54,9 +54,8 @@ def effects_section(group: Group, family: Family, canvas: Canvas) -> PageSection
         rows = [_row(price, unit, digits) for price in shown if price.costs[unit].scenes]
         if rows:
             alt = f"Change in {title} of {messages.listing([row.label for row in rows])}"
-            drawings.append(
-                PageFigure(f"in {title}", charts.differences(rows, title).svg(f"{canvas.name}e{unit}", alt))
-            )
+            panel = charts.differences(rows, title)
+            drawings.append(PageFigure(f"in {title}", panel, f"{canvas.name}e{unit}", alt))
     columns = [Column("effect"), Column("computed from")]
     for _, title, digits in UNITS:
         columns += [Column(title, digits), Column(f"{title}: 95 % low", digits), Column(f"{title}: high", digits)]
@@ -171,7 +170,7 @@ def stages_section(group: Group, canvas: Canvas) -> PageSection:
     text += f", then {others[0]} with {100 * share[others[0]]:.0f} %." if others else "."
     text += _slowest_words(parts, names)
     table = DataTable("stages.csv", columns, rows)
-    drawing = PageFigure("Seconds of training by stage", panel.svg(f"{canvas.name}s", alt))
+    drawing = PageFigure("Seconds of training by stage", panel, f"{canvas.name}s", alt)
     return PageSection(
         "stages",
         "Where the seconds go",
@@ -233,7 +232,7 @@ def pairs_section(group: Group, family: Family, canvas: Canvas) -> PageSection:
     columns = [Column("pair"), Column("dB", 2), Column("95 % low", 2), Column("95 % high", 2)]
     columns += [Column("ahead on % of views", 0), Column("p, Holm"), Column("told apart")]
     table = DataTable("pairs.csv", columns, [_pair_row(group, p) for p in found])
-    drawing = PageFigure("Difference in PSNR", charts.differences(rows, "dB").svg(f"{canvas.name}p", alt))
+    drawing = PageFigure("Difference in PSNR", charts.differences(rows, "dB"), f"{canvas.name}p", alt)
     first = found[0].difference
     notes = [
         f"Paired over the seeds and views that both have; each interval, over {messages.over(first)}, is of its pair "
