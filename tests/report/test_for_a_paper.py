@@ -90,7 +90,7 @@ def test_text_of_a_record_is_no_latex_command():
     assert r"\textbackslash{}input\{/etc/passwd\} \% \$x\_1\textasciicircum{}2\$ \& \#\textasciitilde{}" in text
     assert all(line.startswith("%") for line in text.splitlines() if "\\input" in line)
     assert text.count("\n\\end{table*}") == 1
-    assert escape("±–") == r"$\pm$--"
+    assert escape("±–\n") == r"$\pm$--\textbackslash{}n"
 
 
 # ---- the command
