@@ -62,6 +62,10 @@ def main() -> None:
     if "--version" in sys.argv[1:]:  # Hydra would print its own
         print(f"gsbench {__version__}")
         return
+    if sys.argv[1:2] == ["doctor"]:
+        from gsbench.doctor import main as doctor
+
+        sys.exit(doctor(sys.argv[2:]))
     try:
         sys.argv[1:] = expand(sys.argv[1:])
         broken = see_through(entry, started)

@@ -1,0 +1,219 @@
+"""Check an installation: what is there, what is missing, and what to do about it (`python -m gsbench doctor`).
+
+torch is imported only by the checks that need it, so that an installation without torch is told what it lacks.
+"""
+
+import argparse
+import importlib.util
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+from gsbench.as_json import as_json
+from gsbench.errors import one_line, printable
+from gsbench.measure.machine import hardware
+from gsbench.measure.provenance import git_commit
+from gsbench.version import __version__
+
+OK, ABSENT, BROKEN = "ok", "absent", "broken"  # absent: an optional part that is not there
+LEAST_DISK = 1 << 30  # bytes; a run of D-NeRF writes less than a tenth of this
+LEAST_MEMORY = 1 << 30
+TIMEOUT = 10  # seconds for the compiler to say its version
+COMPILERS = ("c++", "g++", "clang++")
+INSTALL = "pip install -c constraints.txt . (docs/install.md)"
+LARGEST_ERROR = 1e-4  # between the images of two backends, as in docs/adding_a_kernel.md
+
+
+@dataclass(frozen=True)
+class Check:
+    """The result of one check: what was found, and what to do if it is not ok."""
+
+    name: str
+    state: str  # OK, ABSENT or BROKEN
+    found: str
+    todo: str = ""
+
+    @property
+    def line(self) -> str:
+        """Return the check as one line of text."""
+        return printable(f"{self.state:7} {self.name:11} {self.found}" + (f" -> {self.todo}" if self.todo else ""))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the checks of this installation; return 1 if a part is broken, otherwise 0."""
+    parser = argparse.ArgumentParser(prog="python -m gsbench doctor", description=__doc__.partition("\n")[0])
+    parser.add_argument("--json", action="store_true", help="print the checks as JSON")
+    options = parser.parse_args(arguments)
+    checks = [check for look in CHECKS for check in _looked(look)]
+    print(as_json({"checks": checks}) if options.json else "\n".join(check.line for check in checks))
+    return 1 if any(check.state == BROKEN for check in checks) else 0
+
+
+def _looked(look: Callable[[], Iterator[Check]]) -> list[Check]:
+    """Return the results of a check; an error that the check did not expect is a result too."""
+    try:
+        return list(look())
+    except Exception as error:
+        return [Check(look.__name__.strip("_"), BROKEN, f"{type(error).__name__}: {one_line(error)}", INSTALL)]
+
+
+def _gsbench() -> Iterator[Check]:
+    commit = git_commit()
+    whence = f"commit {commit[:12]}{commit[40:]}" if commit else "from a wheel"
+    yield Check("gsbench", OK, f"{__version__}, {whence}, in {Path(__file__).parent}")
+    yield Check("python", OK, f"{platform.python_version()}, {sys.prefix}")
+
+
+def _packages() -> Iterator[Check]:
+    """Name the versions of the core packages, and which extras are complete."""
+    core, extras = _requirements()
+    missing = [name for name in core if _version(name) is None]
+    found = ", ".join(f"{name} {_version(name)}" for name in ("torch", "numpy", "hydra-core"))
+    if missing:
+        yield Check("packages", BROKEN, f"missing: {', '.join(missing)}", INSTALL)
+    else:
+        yield Check("packages", OK, f"{found} and {len(core) - 3} more")
+    there = [extra for extra, names in extras.items() if all(map(_version, names))]
+    lacking = [extra for extra in extras if extra not in there]
+    yield Check("extras", OK if there else ABSENT, ", ".join(there) or "none",
+                f"pip install 'gsbench[NAME]' of {', '.join(lacking)}" if lacking else "")  # fmt: skip
+
+
+def _requirements() -> tuple[list[str], dict[str, list[str]]]:
+    """Return the names of the required packages, and those of each extra for users."""
+    core: list[str] = []
+    extras: dict[str, list[str]] = {}
+    for line in metadata.requires("gsbench") or []:
+        name = re.match(r"[\w.-]+", line)[0]  # type: ignore[index]
+        extra = re.search(r"extra == ['\"](\w+)['\"]", line)
+        if extra is None:
+            core.append(name)
+        elif extra[1] not in ("dev", "docs"):
+            extras.setdefault(extra[1], []).append(name)
+    return core, extras
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _machine() -> Iterator[Check]:
+    import torch
+
+    here, free = hardware(), _free_memory()
+    usable = len(os.sched_getaffinity(0))
+    yield Check("processor", OK, f"{here.processor}, {here.cores} cores, {usable} for this process")
+    threads = torch.get_num_threads()
+    few = threads <= usable
+    yield Check("threads", OK if few else BROKEN, f"{threads} of torch and the kernels",
+                "" if few else f"set OMP_NUM_THREADS={usable}: more threads than cores are slow")  # fmt: skip
+    if free is not None:
+        enough = free >= LEAST_MEMORY
+        yield Check("memory", OK if enough else BROKEN, f"{free / 2**30:.1f} of {here.memory_gib} GiB free",
+                    "" if enough else "end other programs")  # fmt: skip
+
+
+def _free_memory() -> int | None:
+    from gsbench.process.memory import available
+
+    return available()
+
+
+def _disk() -> Iterator[Check]:
+    free = shutil.disk_usage(Path.cwd()).free
+    enough = free >= LEAST_DISK
+    yield Check("disk", OK if enough else BROKEN, f"{free / 2**30:.1f} GiB free in {Path.cwd()}",
+                "" if enough else "free a GiB, or set results=FOLDER on another disk")  # fmt: skip
+
+
+def _compiler() -> Iterator[Check]:
+    named = os.environ.get("CXX", "")
+    path = next(filter(None, map(shutil.which, filter(None, (named, *COMPILERS)))), None)
+    if path is None:
+        yield Check("compiler", ABSENT, "none", "to build from source: apt-get install g++ python3-dev")
+        return
+    done = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    yield Check("compiler", OK, f"{(done.stdout.splitlines() or [path])[0]}")
+
+
+def _kernels() -> Iterator[Check]:
+    from gsbench import kernels
+
+    if not kernels.available():
+        yield Check("kernels", BROKEN, "not built: the CPU renders by the slow reference",
+                    "install a C++20 compiler, then reinstall (docs/install.md)")  # fmt: skip
+        return
+    error = _difference()
+    right = error <= LARGEST_ERROR
+    used = f"{kernels.instruction_set()} (here: {', '.join(kernels.native().instruction_sets())})"
+    yield Check("kernels", OK if right else BROKEN,
+                f"for the CPU, instruction set {used}; an image differs by {error:.0e} from the reference",
+                "" if right else "build again: make clean && make setup")  # fmt: skip
+
+
+def _difference() -> float:
+    """Return the largest difference between images of a few Gaussians by the CPU kernels and by the reference."""
+    import torch
+
+    from gsbench.raster import rasterize
+
+    random = torch.Generator().manual_seed(0)
+    means = torch.randn(50, 3, generator=random) * 0.5 + torch.tensor([0.0, 0.0, 4.0])
+    factors = torch.eye(3).expand(50, 3, 3) * 0.1
+    intrinsics = torch.tensor([[[50.0, 0.0, 32.0], [0.0, 50.0, 32.0], [0.0, 0.0, 1.0]]])
+    inputs = (means, factors, torch.full((50,), 0.7), torch.rand(50, 3, generator=random), torch.eye(4)[None])
+    images = [rasterize(*inputs, intrinsics, 64, 64, backend=name).image for name in ("cpu", "reference")]
+    return float((images[0] - images[1]).abs().max())
+
+
+def _gpu() -> Iterator[Check]:
+    import torch
+
+    from gsbench.kernels import cuda
+
+    if not torch.cuda.is_available():
+        driver = shutil.which("nvidia-smi") is not None
+        why = "a driver is there, but this torch sees no device" if driver else "none; the CPU trains"
+        yield Check("gpu", BROKEN if driver else ABSENT, why,
+                    "install torch with CUDA for this driver (docs/gpu.md)" if driver else "")  # fmt: skip
+        return
+    device = torch.cuda.get_device_properties(0)
+    name = f"{device.name}, {device.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}"
+    if cuda.built():
+        yield Check("gpu", OK, f"{name}, kernels built")
+    else:
+        yield Check("gpu", BROKEN, f"{name}, kernels not built: the GPU renders by the slow reference",
+                    "install nvcc, then reinstall (docs/gpu.md)")  # fmt: skip
+
+
+def _weights() -> Iterator[Check]:
+    from gsbench.measure.perceptual import BACKBONES, is_here
+
+    for backbone, chosen in BACKBONES.items():
+        there = is_here(backbone)
+        yield Check(f"lpips {backbone}", OK if there else ABSENT, f"{chosen.file}{'' if there else ' is not here'}",
+                    "" if there else f"python -m gsbench.fetch lpips-{backbone}")  # fmt: skip
+
+
+def _data() -> Iterator[Check]:
+    from gsbench.fetch.sources import sources
+
+    found = [source for source in sources(Path("data")).values() if source.is_archive]
+    there = [str(source.target) for source in found if source.target.exists()]
+    absent = [source.name for source in found if not source.target.exists()]
+    embedded = importlib.util.find_spec("gsbench.scenes.sample") is not None
+    yield Check("data", OK if embedded else BROKEN, ", ".join(["the embedded scenes" if embedded else "none", *there]),
+                f"for more: python -m gsbench.fetch {' '.join(absent)}" if absent else "")  # fmt: skip
+
+
+CHECKS = (_gsbench, _packages, _machine, _disk, _compiler, _kernels, _gpu, _weights, _data)

@@ -1,0 +1,106 @@
+"""The doctor: every line says what is there, and what to do where something is not."""
+
+import json
+import shutil
+from importlib import metadata
+
+import pytest
+import torch
+from tiny_run import main_here
+
+from gsbench import doctor, kernels
+from gsbench.doctor import ABSENT, BROKEN, OK, Check
+from gsbench.kernels import cuda
+from gsbench.measure import perceptual
+
+
+def checks(capsys, status: int = 0) -> dict[str, Check]:
+    """The checks that `python -m gsbench doctor --json` prints, by name."""
+    assert main_here("doctor", "--json") == status
+    return {found["name"]: Check(**found) for found in json.loads(capsys.readouterr().out)["checks"]}
+
+
+def test_one_screen_names_every_part(capsys):
+    """Catches a part that is not looked at, a screen that scrolls, and a part that is absent without advice."""
+    assert main_here("doctor") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 20
+    found = checks(capsys)
+    assert lines == [check.line for check in found.values()]
+    assert found.keys() == {"gsbench", "python", "packages", "extras", "processor", "threads", "memory", "disk",
+                            "compiler", "kernels", "gpu", "lpips alex", "lpips vgg", "data"}  # fmt: skip
+    assert torch.__version__ in found["packages"].found
+    assert all(check.todo for check in found.values() if check.state == ABSENT and check.name != "gpu")
+
+
+@pytest.mark.parametrize("name", ["kernels", "disk", "threads"])
+def test_a_part_that_is_broken_is_status_1_with_advice(name, capsys, monkeypatch):
+    """Catches an exit status of 0 for an installation that renders by the slow reference, or cannot write."""
+    monkeypatch.setattr(kernels, "_native", None if name == "kernels" else kernels._native)
+    monkeypatch.setattr(doctor, "LEAST_DISK", 1 << 60 if name == "disk" else 0)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 4096 if name == "threads" else 1)
+    found = checks(capsys, status=1)
+    assert {check.name for check in found.values() if check.state == BROKEN} == {name}
+    assert found[name].todo
+
+
+def test_kernels_that_render_something_else_are_found(capsys, monkeypatch):
+    """Catches kernels that are only looked for: a build for another machine may load and compute nonsense."""
+    monkeypatch.setattr(doctor, "_difference", lambda: 0.5)
+    assert checks(capsys, status=1)["kernels"].state == BROKEN
+
+
+def test_the_image_of_the_check_is_not_empty():
+    """Catches Gaussians outside of the image, on which all backends agree."""
+    assert 0 < doctor._difference() < 1e-5
+
+
+def test_missing_packages_and_an_unforeseen_error_are_lines(capsys, monkeypatch):
+    """Catches a stack trace, and checks that end at the first of them that fails."""
+
+    def version(package: str) -> str:
+        if package in ("scipy", "viser"):
+            raise metadata.PackageNotFoundError(package)
+        return "1.0"
+
+    def crash() -> None:
+        raise OSError("the disk\nis gone")
+
+    monkeypatch.setattr(metadata, "version", version)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: crash())
+    found = checks(capsys, status=1)
+    assert found["packages"].found == "missing: scipy"
+    assert "view" in found["extras"].todo
+    assert "view" not in found["extras"].found
+    assert (found["disk"].state, found["disk"].found) == (BROKEN, "OSError: the disk")
+    assert found["data"].state == OK
+
+
+@pytest.mark.parametrize("built", [True, False])
+def test_a_gpu_is_named_with_its_kernels(built, capsys, monkeypatch):
+    """Catches a GPU that renders by the slow reference without a word."""
+    device = type("Device", (), {"name": "Invented GPU", "total_memory": 80 << 30})
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: device)
+    monkeypatch.setattr(cuda, "_cuda", torch if built else None)
+    found = checks(capsys, status=0 if built else 1)["gpu"]
+    assert "Invented GPU, 80 GiB" in found.found
+    assert (found.state == OK) == built == (not found.todo)
+
+
+def test_a_driver_without_a_device_is_told(capsys, monkeypatch):
+    """Catches a torch without CUDA that is taken for a machine without a GPU."""
+    which = shutil.which
+    monkeypatch.setattr(shutil, "which", lambda name: "/usr/bin/nvidia-smi" if name == "nvidia-smi" else which(name))
+    assert checks(capsys, status=1)["gpu"].state == BROKEN
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    found = checks(capsys)
+    assert (found["gpu"].state, found["compiler"].state) == (ABSENT, ABSENT)
+
+
+def test_weights_that_are_here_need_no_advice(capsys, monkeypatch):
+    """Catches advice to fetch what is there."""
+    monkeypatch.setattr(perceptual, "is_here", lambda backbone: backbone == "alex")
+    found = checks(capsys)
+    assert (found["lpips alex"].state, found["lpips alex"].todo) == (OK, "")
+    assert found["lpips vgg"].todo == "python -m gsbench.fetch lpips-vgg"
