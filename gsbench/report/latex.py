@@ -42,7 +42,7 @@ def _lines(table: Table, number: int) -> Iterator[str]:
     ranked = any(row.values for section in table.sections for row in section.rows)
     caption = " ".join([f"{_capital(table.title)}.", SPREAD, *([RULE] if ranked else [])])
     yield r"\begin{table*}"
-    yield r"\centering"
+    yield r"\centering\small"
     yield rf"\caption{{{escape(caption)}}}"
     yield rf"\label{{tab:gsbench-{number}}}"
     yield rf"\begin{{tabular}}{{l{'r' * (len(table.columns) + 1)}}}"
