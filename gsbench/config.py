@@ -190,6 +190,7 @@ class Config:
     optim: str = "adam"  # or sparse_adam: updates only visible Gaussians
     results: str = "results"  # folder of all results
     resume: bool = True  # false: start over
+    log: str | None = None  # also send the curve to tensorboard, wandb or mlflow
     model: ModelConfig = field(default_factory=ModelConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     data: DataConfig = field(default_factory=DataConfig)

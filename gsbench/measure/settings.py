@@ -14,14 +14,14 @@ Plain = dict[str, Any]  # a resolved config in plain JSON
 # Settings of measuring, and the places of data and results, change no training. `best_on_test` and `eval_split` are
 # not here: the best iteration is found while the model trains.
 MEASURING = (
-    "experiment", "results", "resume", "launch", "data.dataset", "data.paper_dataset", "data.published", "data.root",
-    "data.scenes", "init.ply", "scene.released_as", "train.checkpoint_minutes", "protocol.name", "protocol.quantise",
-    "protocol.lpips_alex", "protocol.lpips_vgg", "protocol.renders", "protocol.pictures",
+    "experiment", "results", "resume", "log", "launch", "data.dataset", "data.paper_dataset", "data.published",
+    "data.root", "data.scenes", "init.ply", "scene.released_as", "train.checkpoint_minutes", "protocol.name",
+    "protocol.quantise", "protocol.lpips_alex", "protocol.lpips_vgg", "protocol.renders", "protocol.pictures",
 )  # fmt: skip
 # The places among them: no number of a record depends on them, as LPIPS weights are checked by their hash.
 PLACES = (
-    "results", "resume", "launch", "data.root", "data.published", "data.scenes", "init.ply", "scene.released_as",
-    "train.checkpoint_minutes", "protocol.lpips_alex", "protocol.lpips_vgg",
+    "results", "resume", "log", "launch", "data.root", "data.published", "data.scenes", "init.ply",
+    "scene.released_as", "train.checkpoint_minutes", "protocol.lpips_alex", "protocol.lpips_vgg",
 )  # fmt: skip
 # Keys that are missing in older configs, with the value that all older runs had.
 ALWAYS = {

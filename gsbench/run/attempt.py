@@ -14,6 +14,7 @@ from gsbench.models import GaussianModel
 from gsbench.run import fitting, measuring
 from gsbench.run.checks import check_config, check_scene, evaluated_views, trained_start
 from gsbench.run.identity import Run
+from gsbench.run.log import RunLog
 from gsbench.run.resolve import Resolved, before_scene, is_auto, plain, resolve, with_candidate
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Scene
@@ -31,6 +32,7 @@ class Attempt:
         self.model: GaussianModel | None = None
         self.scene: Scene | None = None
         self.start: TrainedGaussians | None = None  # trained Gaussians to start from; None to start from points
+        self.log: RunLog | None = None  # from the first step on
         self._images: dict[str, Pixels] = {}
 
     def prepare(self) -> tuple[GaussianModel, Scene]:
@@ -55,13 +57,16 @@ class Attempt:
     def fit(self, model: GaussianModel, scene: Scene) -> Trainer:
         """Train to the last step; for model=auto, a test of the scene first chooses a model with or without time.
 
-        It raises the same errors as `gsbench.run.fitting.fit`.
+        It raises the same errors as `gsbench.run.fitting.resume` and `fit`.
         """
         if is_auto(self.this.config):
             self.resolved = resolve(self.this, scene)
             self.model = model = build(self.resolved.config)
         trainer = self.trainer(model, scene)
-        fitting.fit(trainer, self.this, self.resolved, plain(self.this, self.resolved.config))
+        fitting.resume(trainer, self.this, self.resolved)
+        self.log = RunLog(self.this, trainer)
+        config = self.resolved.config
+        fitting.fit(trainer, self.this, config, plain(self.this, config), self.log.follow)
         return trainer
 
     def trainer(self, model: GaussianModel, scene: Scene) -> Trainer:

@@ -1,7 +1,9 @@
-"""Train a model: initialise it, train it from step 0 or from a checkpoint, and stop when a signal asks for it."""
+"""Train a model: initialise it, continue from a checkpoint if there is one, and stop when a signal asks for it."""
 
 import signal
 import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -45,24 +47,21 @@ def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: Traine
     return Trainer(model, scene, evaluated_views(scene, config.scene.eval_split), config)
 
 
-def fit(trainer: Trainer, this: Run, resolved: Resolved, plain: dict[str, Any]) -> None:
-    """Train to the last step, starting from the checkpoint in the run's folder if there is one.
+def resume(trainer: Trainer, this: Run, resolved: Resolved) -> None:
+    """Continue from the checkpoint in the run's folder if there is one that the settings allow to use.
 
     Args:
         trainer: the trainer at step 0.
         this: the run to train, with its folder.
         resolved: the settings of the run after model=auto was replaced by a model; the seconds of this choice count as
             training.
-        plain: the settings as plain values, for the checkpoint.
 
     Raises:
-        InputError: the checkpoint is damaged, or no Gaussian is left.
-        DivergedError: a loss or gradient was not finite.
-        Stopped: a signal asked the process to end; the checkpoint is saved.
+        InputError: the checkpoint is damaged.
     """
     config = resolved.config
     reset_peak_memory(config.device)
-    path, hashes = this.folder / checkpoint.FILE_NAME, (training_hash(this.plain), trainer.scene.fingerprint)
+    path, hashes = _checkpoint_of(this, trainer)
     state = checkpoint.load(path, *hashes, config.device) if config.resume else None
     if state is not None:
         trainer.load_state_dict(state)
@@ -70,11 +69,35 @@ def fit(trainer: Trainer, this: Run, resolved: Resolved, plain: dict[str, Any]) 
     elif resolved.screen is not None:
         trainer.stages.add("screen", resolved.screen.seconds)
         trainer.effort.add(resolved.effort)
+
+
+def _checkpoint_of(this: Run, trainer: Trainer) -> tuple[Path, tuple[str, str]]:
+    """Return the path of a run's checkpoint, and the hashes of the settings and of the data that it must have."""
+    return this.folder / checkpoint.FILE_NAME, (training_hash(this.plain), trainer.scene.fingerprint)
+
+
+def fit(trainer: Trainer, this: Run, config: Config, plain: dict[str, Any], follow: Callable[[], None]) -> None:
+    """Train to the last step.
+
+    Args:
+        trainer: the trainer at its first step.
+        this: the run to train, with its folder.
+        config: the settings of the run after model=auto was replaced by a model.
+        plain: the settings as plain values, for the checkpoint.
+        follow: a function that is called after every step.
+
+    Raises:
+        InputError: no Gaussian is left.
+        DivergedError: a loss or gradient was not finite.
+        Stopped: a signal asked the process to end; the checkpoint is saved.
+    """
+    path, hashes = _checkpoint_of(this, trainer)
     about = plain, plain_description(trainer.scene)
     with stop.requested() as request:
         report = progress.Reporter(this.folder, this.overrides, config.train.iterations)
 
         def goes_on() -> bool:
+            follow()
             if report.is_due():
                 report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
             return request.signal is None

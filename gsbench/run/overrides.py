@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from gsbench.measure.renamed import present_override
 
-UNNAMED = ("results", "resume", "launch")  # groups and keys that change no number of a run
+UNNAMED = ("results", "resume", "log", "launch")  # groups and keys that change no number of a run
 _UNNAMED = re.compile(rf"[+~]*({'|'.join(UNNAMED)})\b")
 _LAUNCH = re.compile(r"[+~]*launch\b")
 

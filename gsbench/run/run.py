@@ -53,11 +53,15 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
     mine = Progress(this.overrides)
     if not _is_claimed(this, mine):
         return None
+    attempt, record = Attempt(this), None
     try:
         remove_leftovers(this.folder)
-        return _done(Attempt(this))
+        record = _done(attempt)
     finally:
         claim.release(this.folder, mine)
+        if attempt.log is not None:
+            attempt.log.end(record)
+    return record
 
 
 def _is_claimed(this: Run, mine: Progress) -> bool:

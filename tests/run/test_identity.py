@@ -63,7 +63,8 @@ def test_a_folder_says_what_is_not_the_experiments_own(words: list[str], folder:
 @pytest.mark.parametrize(
     "word",
     ["protocol.pictures=1", "protocol.quantise=true", "protocol.renders=60", "data.published=there", "data.root=/x",
-     "train.checkpoint_minutes=9", "protocol.lpips_alex=weights.npz", "results=elsewhere", "resume=false"],
+     "train.checkpoint_minutes=9", "protocol.lpips_alex=weights.npz", "results=elsewhere", "resume=false",
+     "log=wandb"],
 )  # fmt: skip
 def test_measuring_is_not_training(word: str) -> None:
     """Catches a training that is repeated because its images are measured in another way."""

@@ -107,6 +107,9 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, whole:
     assert scores[0].metrics == scores[1].metrics
     assert scores[1].cost.train_cpu_s > spent > 0, "CPU-seconds of the last attempt alone"
     assert [p.psnr_val for p in scores[0].curve] == [p.psnr_val for p in scores[1].curve]
+    (log,) = (tmp_path / "broken").rglob("curve.jsonl")
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [line["iteration"] for line in lines] == [p.iteration for p in scores[1].curve]
 
 
 def test_a_reloaded_checkpoint_measures_the_same(square: Path, whole: Path, tmp_path: Path) -> None:
