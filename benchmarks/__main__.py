@@ -1,12 +1,11 @@
 """Measure every row, print a table as it grows, and write results/benchmarks/<name>.json and .md."""
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import torch
 
@@ -15,6 +14,7 @@ from benchmarks.roofline import UNITS, Limits, limits
 from benchmarks.rows import SECTIONS
 from benchmarks.timing import Row, measure
 from gsbench import kernels
+from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.machine import processor_name
@@ -30,31 +30,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("results/benchmarks"), help="folder of the results")
     parser.add_argument("--name", default="cpu", help="of the two files")
     parser.add_argument("--against", metavar="COMMIT", help="build it too, time it in turns, and show the ratios to it")
+    parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and the table on stderr")
     options = parser.parse_args(arguments)
+    table = sys.stderr if options.json else sys.stdout
     sections = options.sections or list(SECTIONS)
     try:
         if options.against is None:
-            measure_all(sections, options.out, options.name, None)
+            content = measure_all(sections, options.out, options.name, None, table)
         else:
             with built(options.against, options.out / "against.log") as other:
-                measure_all(sections, options.out, options.name, other)
+                content = measure_all(sections, options.out, options.name, other, table)
     except InputError as error:
         print(one_line(error), file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
+    if options.json:
+        print(as_json(content))
     return 0
 
 
-def measure_all(sections: Sequence[str], out: Path, name: str, other: Built | None) -> None:
-    """Time the sections of this tree, each after that of the `other` commit, so that a slow minute hits both."""
+def measure_all(
+    sections: Sequence[str], out: Path, name: str, other: Built | None, table: TextIO = sys.stdout
+) -> dict[str, Any]:
+    """Time the sections of this tree, each after that of the `other` commit, so that a slow minute hits both.
+
+    The table is printed to `table` as it grows. What is written as JSON is returned.
+    """
     torch.set_num_threads(1)
     bounds = limits()
     lines = []
 
     def tell(*more: str) -> None:
         lines.extend(more)
-        print("\n".join(more), flush=True)
+        print("\n".join(more), file=table, flush=True)
 
     tell("# What the kernels cost", "", *conditions(bounds), "")
     results: list[dict[str, Any]] = []
@@ -77,9 +86,10 @@ def measure_all(sections: Sequence[str], out: Path, name: str, other: Built | No
                "instruction_set": kernels.native().active(), "versions": versions(), "git_commit": git_commit(),
                "against": other and other.commit, "limits": bounds._asdict()}  # fmt: skip
     out.mkdir(parents=True, exist_ok=True)
-    content = json.dumps({"machine": machine, "rows": results}, indent=1)
-    write_atomically(out / f"{name}.json", content.encode())
+    content = {"machine": machine, "rows": results}
+    write_atomically(out / f"{name}.json", as_json(content).encode())
     write_atomically(out / f"{name}.md", "\n".join(lines).encode())
+    return content
 
 
 def conditions(bounds: Limits) -> list[str]:

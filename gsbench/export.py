@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 
+from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.models.query import Query
@@ -35,14 +36,18 @@ def main(arguments: list[str] | None = None) -> int:
     """Write the PLY, the video or the images of the command line; return 0, or 2 after an error message."""
     try:
         asked = prepare(parser().parse_args(arguments))
-        if asked.options.ply:
-            write_ply(asked, asked.options.ply)
+        said = write_ply(asked, asked.options.ply) if asked.options.ply else []
+        if said and not asked.options.json:
+            print("\n".join(said))
         if asked.options.video:
             with closing(film.frames(asked.run, shots(asked))) as images:  # closes the progress bar too
                 film.write_video(images, asked.options.video, asked.options.fps)
         if asked.options.images:
             with closing(film.frames(asked.run, shots(asked))) as images:
                 film.write_images(images, asked.options.images)
+        if asked.options.json:
+            written = {name: getattr(asked.options, name) for name in ("ply", "video", "images")}
+            print(as_json({"written": written, "notes": said}))
     except (InputError, OSError) as error:
         print(f"gsbench.export: {one_line(error)}", file=sys.stderr)
         return 2
@@ -72,6 +77,7 @@ def parser() -> argparse.ArgumentParser:
         help="that registers the run's model",
     )
     made.add_argument("--device", default="cpu", help="cpu or cuda")
+    made.add_argument("--json", action="store_true", help="print what was written as JSON")
     return made
 
 
@@ -96,8 +102,8 @@ def prepare(options: argparse.Namespace) -> ExportRequest:
     return ExportRequest(run, scene_of(run, options.data_root) if needed else None, options)
 
 
-def write_ply(asked: ExportRequest, path: Path) -> None:
-    """Write a model's 3D Gaussians for one camera and time as a PLY file; print their number, time and colours."""
+def write_ply(asked: ExportRequest, path: Path) -> list[str]:
+    """Write a model's 3D Gaussians for one camera and time as a PLY file; return their number, time and colours."""
     run, options = asked.run, asked.options
     query, keep = slice_place(asked)
     trained = trained_of(run.model, query, keep_harmonics=keep)
@@ -106,11 +112,12 @@ def write_ply(asked: ExportRequest, path: Path) -> None:
     when = "" if query.time is None else f" at time {float(query.time):g}"
     whence = f"camera {options.camera}" if options.camera is not None else f"direction {options.direction}"
     colours = f"harmonics of degree {run.model.active.sh_degree}" if keep else f"as seen from {whence}"
-    print(f"{path}: {len(trained)} Gaussians{when}, colours {colours}; {culled} of {len(run.model)} are left out, as "
-          f"their opacity there is below 1/255")  # fmt: skip
+    said = [f"{path}: {len(trained)} Gaussians{when}, colours {colours}; {culled} of {len(run.model)} are left out, as "
+            f"their opacity there is below 1/255"]  # fmt: skip
     if has_profiles(run.model, query):
-        print(f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of 3DGS "
-              f"has no field for b; --images and --video keep the profiles")  # fmt: skip
+        said.append(f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of "
+                    f"3DGS has no field for b; --images and --video keep the profiles")  # fmt: skip
+    return said
 
 
 def slice_place(asked: ExportRequest) -> tuple[Query, bool]:

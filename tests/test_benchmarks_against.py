@@ -137,3 +137,5 @@ def test_the_table_shows_ratios_where_the_commit_has_the_row(
     written = json.loads((tmp_path / "cpu.json").read_text())
     assert [row["against_ms"] for row in written["rows"]] == [4.0, None, None, None]
     assert written["machine"]["against"] == "0123456789"
+    assert command.main(["--out", str(tmp_path), "--against", "abc", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"] == written["rows"]

@@ -6,17 +6,19 @@ python -m gsbench.effects --picture RUN_FOLDER --out FILE.png [--camera 0] [--ti
 """
 
 import argparse
-import json
 import math
 import sys
-from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from gsbench import scenes
+from gsbench.as_json import as_json
 from gsbench.effects import messages
 from gsbench.effects.choose import screen
 from gsbench.errors import InputError, one_line
 from gsbench.models.registry import import_models
+
+Answer = tuple[dict[str, Any], list[str]]  # the result of a command for JSON, and as lines
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -51,14 +53,16 @@ def main(arguments: list[str] | None = None) -> int:
             raise InputError(f"--budget-db: expected 0 to 10 dB, got {asked.budget_db}")
         import_models(asked.model_module)
         if asked.checkpoint is not None:
-            return _gate(asked.checkpoint, asked.budget_db, asked.data_root)
-        if asked.picture is not None:
-            return _draw(asked.picture, asked.camera, asked.time, asked.data_root, asked.out)
-        found = screen(scenes.load(asked.scene), asked.seed)
+            result, lines = _gate(asked.checkpoint, asked.budget_db, asked.data_root)
+        elif asked.picture is not None:
+            result, lines = _draw(asked.picture, asked.camera, asked.time, asked.data_root, asked.out)
+        else:
+            found = screen(scenes.load(asked.scene), asked.seed)
+            result, lines = {"time": found}, [messages.of_screen(found)]
     except (InputError, OSError) as error:
         print(f"gsbench.effects: {one_line(error)}", file=sys.stderr)
         return 2
-    print(json.dumps({"time": asdict(found)}) if asked.json else messages.of_screen(found))
+    print(as_json(result) if asked.json else "\n".join(lines))
     return 0
 
 
@@ -70,23 +74,20 @@ def _whole(text: str) -> int:
         raise argparse.ArgumentTypeError(f"expected a whole number, got {text[:30]!r}") from None
 
 
-def _gate(folder: Path, budget_db: float, data_root: str | None) -> int:
+def _gate(folder: Path, budget_db: float, data_root: str | None) -> Answer:
     from gsbench.run.regate import gate_run  # imported here, because the test for time needs no training code
 
     record, new = gate_run(folder, budget_db, data_root)
-    for line in messages.lines(record.on_demand) if record.on_demand else []:
-        print(line)
-    print(f"Written: {new}")
-    return 0
+    said = messages.lines(record.on_demand) if record.on_demand else []
+    return {"on_demand": record.on_demand, "written": new}, [*said, f"Written: {new}"]
 
 
-def _draw(folder: Path, camera: int, time: float | None, data_root: str | None, out: Path) -> int:
+def _draw(folder: Path, camera: int, time: float | None, data_root: str | None, out: Path) -> Answer:
     from gsbench.measure.images import write_png
     from gsbench.run.picture import draw_run
 
     write_png(draw_run(folder, camera, time, data_root), out)
-    print(f"Written: {out}")
-    return 0
+    return {"written": out}, [f"Written: {out}"]
 
 
 if __name__ == "__main__":

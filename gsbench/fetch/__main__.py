@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line, printable
 from gsbench.fetch.sources import Source, find, sources
 
@@ -16,16 +17,23 @@ def main(arguments: list[str] | None = None) -> int:
     made = argparse.ArgumentParser(prog="python -m gsbench.fetch", description=__doc__)
     made.add_argument("names", nargs="*", metavar="NAME", help="dnerf, pbr, lpips-alex or lpips-vgg")
     made.add_argument("--list", action="store_true", help="print what can be fetched, and what is there")
+    made.add_argument("--json", action="store_true", help="print --list as JSON")
     made.add_argument("--dry-run", action="store_true", help="print what would be fetched, from where and to where")
     made.add_argument("--to", type=Path, default=Path("data"), metavar="FOLDER", help="of data sets (data)")
     options = made.parse_args(arguments)
     if not options.names and not options.list:
         made.error("expected a NAME, or --list")
+    if options.json and not options.list:
+        made.error("--json: expected --list beside it")
     try:
         known = sources(folder_of(options.to))
     except InputError as error:
         print(f"gsbench.fetch: {one_line(error)}", file=sys.stderr)
         return 2
+    if options.json:
+        print(as_json([{"name": one.name, "what": one.what, "target": one.target, "there": one.target.exists()}
+                       for one in known.values()]))  # fmt: skip
+        return 0
     failed = 0
     for name in list(known) if options.list else options.names:
         try:

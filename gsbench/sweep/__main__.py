@@ -5,16 +5,15 @@ python -m gsbench.sweep retry results/EXP [launch.memory=16G ...]
 """
 
 import argparse
-import json
 import os
 import shlex
 import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
+from gsbench.as_json import as_json
 from gsbench.errors import InputError, printable
 from gsbench.sweep.plan import identity
 from gsbench.sweep.status import BROKEN, GOING, STATES, RunStatus, read, status
@@ -58,11 +57,11 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
 
 
-def _show(folder: Path, as_json: bool) -> list[RunStatus]:
+def _show(folder: Path, in_json: bool) -> list[RunStatus]:
     experiment = read(folder)
     runs = status(experiment)
-    if as_json:
-        print(json.dumps([asdict(run) for run in runs], indent=1))
+    if in_json:
+        print(as_json(runs))
     else:
         print("\n".join(lines(folder, runs, experiment.queue.silent)), flush=True)
     return runs
@@ -110,11 +109,11 @@ def _duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
 
 
-def _watch(folder: Path, as_json: bool) -> int:
+def _watch(folder: Path, in_json: bool) -> int:
     while True:
         if sys.stdout.isatty():
             print("\033[H\033[2J", end="")
-        runs = _show(folder, as_json)
+        runs = _show(folder, in_json)
         if not any(run.state in GOING for run in runs):
             return _verdict(runs)
         time.sleep(WATCH_SECONDS)

@@ -1,6 +1,7 @@
 """Gates in a training, model=auto, and the gate of a finished run, as a user meets them."""
 
 import copy
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -242,12 +243,16 @@ def test_auto_and_a_gate_after_the_fact(
     kept = {path.name: path.read_bytes() for path in old.iterdir()}
     halves: list[bool] = []
     monkeypatch.setattr(gating, "probe", lambda *x, **y: (halves.append(y["by_halves"]), probe(*x, **y))[1])
-    assert command.main(["--checkpoint", str(old), "--budget-db", "1"]) == 0
+    capsys.readouterr()
+    assert command.main(["--checkpoint", str(old), "--budget-db", "1", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
     assert halves == [True]  # a finished model has the time
     assert {path.name: path.read_bytes() for path in old.iterdir()} == kept
     (new,) = tmp_path.glob("dnerf/square/7dgs,*,gate=end,budget_db=1.0/seed0")
     gated = record.read(new / record.FILE_NAME)
     assert gated.on_demand is not None
+    assert answer["written"] == str(new)
+    assert [gate["rows"] for gate in answer["on_demand"]["gates"]] == [gate.rows for gate in gated.on_demand.gates]
     assert len(gated.on_demand.gates) + len(gated.on_demand.notes) >= 1
     assert len(load_run(new).model) <= len(load_run(old).model)
     capsys.readouterr()

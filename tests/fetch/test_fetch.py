@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import json
 import threading
 import zipfile
 from collections.abc import Iterator
@@ -225,6 +226,10 @@ def test_a_dry_run_fetches_nothing(
     assert [*tmp_path.iterdir()] == []
     assert fetched(address, tmp_path, monkeypatch, "--list") == 0
     assert len(capsys.readouterr().out.splitlines()) == 4
+    assert fetched(address, tmp_path, monkeypatch, "--list", "--json") == 0
+    listed = {one["name"]: (one["target"], one["there"]) for one in json.loads(capsys.readouterr().out)}
+    assert len(listed) == 4
+    assert listed["dnerf"] == (f"{tmp_path}/data/dnerf", False)
 
 
 def test_what_cannot_be_fetched_is_told(

@@ -1,5 +1,6 @@
 """The command `python -m gsbench.export`: what it writes, and everything that can be asked wrong."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,10 @@ def test_a_ply_says_what_it_holds(
     said = capsys.readouterr().out
     assert f": {kept} Gaussians at time" in said
     assert f"{total - kept} of {total} are left out" in said
+    assert main([str(folder), "--ply", str(tmp_path / "a.ply"), *place, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["written"] == {"ply": str(tmp_path / "a.ply"), "video": None, "images": None}
+    assert printed["notes"] == said.splitlines()
 
 
 def test_a_ply_says_that_it_has_no_profiles(
