@@ -1,7 +1,6 @@
 """Estimate how long Table 1 of the paper takes: time steps on this machine, and add up 57 trainings."""
 
 import argparse
-import heapq
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from benchmarks.training import training_step
 from gsbench.measure.machine import processor_name
 from gsbench.measure.provenance import git_commit
 from gsbench.report.paper import AVERAGE, PROTOCOLS, paper_row
+from gsbench.sweep.estimate import span
 
 COUNTS = 30_000, 150_000  # Gaussians for which a step is timed
 FIRST = 100_000  # Gaussians at the start, as `data.initial_points`
@@ -82,14 +82,6 @@ def step_cost(run: Run, time: Callable[[Run, int, int], Cost] = time_step) -> St
     few, many, shared = time(run, COUNTS[0], 1), time(run, COUNTS[1], 1), time(run, COUNTS[1], THREADS)
     each = (many.median - few.median) / (COUNTS[1] - COUNTS[0])
     return StepCost(few.median - each * COUNTS[0], each, many.wall / shared.wall)
-
-
-def span(hours: Sequence[float], at_once: int) -> float:
-    """Return when all runs are done, if so many run at once and the longest begin first."""
-    ends = [0.0] * at_once
-    for one in sorted(hours, reverse=True):
-        heapq.heapreplace(ends, ends[0] + one)
-    return max(ends)
 
 
 def estimate(runs: Sequence[Run], iterations: int, time: Callable[[Run, int, int], Cost] = time_step) -> Iterator[str]:

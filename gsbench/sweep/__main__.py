@@ -1,6 +1,7 @@
-"""Show the state of an experiment's runs, or launch again the runs that did not finish.
+"""Show the state of an experiment's runs, estimate the time they need, or launch again those that did not finish.
 
 python -m gsbench.sweep status results/EXP [--watch] [--json]
+python -m gsbench.sweep estimate results/EXP [--at-once 2] [--json]
 python -m gsbench.sweep retry results/EXP [launch.memory=16G ...]
 """
 
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from gsbench.as_json import as_json
 from gsbench.errors import InputError, printable
+from gsbench.sweep import estimate
 from gsbench.sweep.plan import identity
 from gsbench.sweep.status import BROKEN, GOING, STATES, RunStatus, read, status
 
@@ -35,6 +37,10 @@ def main(arguments: list[str] | None = None) -> int:
     shown.add_argument("experiment", type=Path, metavar="results/EXP")
     shown.add_argument("--watch", action="store_true", help="repeat until no run is running or waiting")
     shown.add_argument("--json", action="store_true", help="print all runs as JSON, also those that are done")
+    timed = commands.add_parser("estimate", help="estimate how long the runs that are not done will train")
+    timed.add_argument("experiment", type=Path, metavar="results/EXP")
+    timed.add_argument("--at-once", type=int, default=1, metavar="N", help="runs at a time (1)")
+    timed.add_argument("--json", action="store_true", help="print the estimate of each run as JSON")
     again = commands.add_parser("retry", help="launch again the runs that failed, are lost or never started")
     again.add_argument("experiment", type=Path, metavar="results/EXP")
     again.add_argument("launch", nargs="*", metavar="launch.KEY=VALUE", help="launch settings to change")
@@ -44,6 +50,8 @@ def main(arguments: list[str] | None = None) -> int:
             raise InputError(f"{options.experiment}: expected the folder of an experiment, such as results/mini")
         if options.command == "retry":
             return _retry(options.experiment, options.launch)
+        if options.command == "estimate":
+            return _estimate(options.experiment, options.at_once, options.json)
         if options.watch:
             return _watch(options.experiment, options.json)
         return _verdict(_show(options.experiment, options.json))
@@ -65,6 +73,14 @@ def _show(folder: Path, in_json: bool) -> list[RunStatus]:
     else:
         print("\n".join(lines(folder, runs, experiment.queue.silent)), flush=True)
     return runs
+
+
+def _estimate(folder: Path, at_once: int, in_json: bool) -> int:
+    if at_once < 1:
+        raise InputError(f"--at-once: expected at least 1, got {at_once}")
+    found = estimate.estimate(status(read(folder)))
+    print(as_json(found) if in_json else "\n".join(estimate.lines(found, at_once)))
+    return 0
 
 
 def lines(experiment: Path, runs: Sequence[RunStatus], silent: str | None = None) -> list[str]:
