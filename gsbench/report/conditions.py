@@ -15,7 +15,7 @@ _UNSAID = {"resize": "area", "repaired": "none", "val_every": "none"}
 # The scenes on which gsbench's own settings were chosen; what is found on them may not hold on others.
 TUNED = frozenset((
     "bouncingballs", "cloud", "moving-matte", "static-glossy", "static-matte", "suzanne",  # conf/exp/tuning.yaml
-    "lego", "trex",
+    "lego", "static-lego", "trex",
     "scene1_close_proximity", "scene4_occlusion", "scene7_deformation", "scene10_texture",
 ))  # fmt: skip
 SPREAD = (
