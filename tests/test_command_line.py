@@ -51,7 +51,7 @@ def test_help_lists_what_there_is_without_torch() -> None:
         (["+exp=mini", "scene=suzanne", f"+init.ply={__file__}"], ["test_command_line.py", "expected a PLY"]),
         (["+exp=mini", "data.scenes=[]"], ["data.scenes", "empty list"]),
         (["+exp=mini", "model=1e400"], ["model '1e400'", "Valid: 3dgs"]),
-        (["model=7dgs"], ["+exp=NAME", "ablation, dnerf, frontier, mini, pbr, stability"]),
+        (["model=7dgs"], ["+exp=NAME", "ablation, colmap, dnerf, frontier, mini, pbr, stability"]),
         (["+exp=dnerf", "scene=trex"], ["data.root", "transforms_", "albertpumarola/D-NeRF"]),
         (["+exp=dnerf", "scene=trex", "data.root=/nowhere"], ["/nowhere/trex", "transforms_", "D-NeRF"]),
         (["+exp=mini", "scene=custom", "scene.name=../sample"], ["scene: expected a name", "../sample"]),

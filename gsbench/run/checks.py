@@ -220,8 +220,8 @@ def scene_folder(config: Config) -> Path:
             return folder
     published = f"; {data.dataset} is published at: {data.published}" if data.published else ""
     raise InputError(
-        f"data.root={data.root}: expected a folder {' or '.join(map(repr, names))} with "
-        f"transforms_{{train,val,test}}.json and the images they name, looked for {' and '.join(map(str, folders))}"
+        f"data.root={data.root}: expected a folder {' or '.join(map(repr, names))} with a scene, such "
+        f"as transforms_{{train,val,test}}.json and the images they name, looked for {' and '.join(map(str, folders))}"
         f"{published}"
     )
 

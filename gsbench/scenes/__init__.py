@@ -37,6 +37,11 @@ _LAYOUTS = (
         "authors of Sabater et al. 2017)",
         "technicolor",
     ),
+    _Layout(
+        "sparse",
+        "images/*.png beside a COLMAP model in sparse/0 (your own capture: docs/data.md)",
+        "captured",
+    ),
 )
 
 
@@ -49,7 +54,7 @@ def load(
     frames: Sequence[int] | None = None,
     repair: Sequence[str] | None = None,
 ) -> Scene:
-    """Load a scene from a folder in the Blender layout (NeRF-synthetic, D-NeRF) or the Technicolor layout.
+    """Load a scene from a folder in the layout of Blender (NeRF-synthetic, D-NeRF), Technicolor or COLMAP.
 
     RGBA images are composited over the background, then reduced. Tensors are float32 on the CPU; cameras have OpenCV
     axes (x right, y down, z forward). The images of a large scene stay in 8 bits until they are used.

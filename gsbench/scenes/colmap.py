@@ -1,33 +1,118 @@
-"""Read the points of a COLMAP sparse model from points3D.bin or points3D.txt; the files are checked."""
+"""Read a COLMAP sparse model (cameras, images, points3D; .bin or .txt); the files are checked."""
 
+import math
 import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.reading import read_file
+from gsbench.scenes.lens import Lens
 from gsbench.scenes.scene import Points
 
 _MAX_FILE = 1 << 32  # bytes
-_POINT = struct.Struct("<Q3d3BdQ")  # id, position, colour, error, length of the track (COLMAP, "Output format")
+# COLMAP, "Output format": the fixed parts of the records of its binary files.
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")  # id, number of the model, width, height; then the parameters of the model
+_IMAGE = struct.Struct("<I4d3dI")  # id, quaternion (w first), translation, id of the camera; then name and keypoints
+_POINT = struct.Struct("<Q3d3BdQ")  # id, position, colour, error, length of the track
+_KEYPOINT = 24  # bytes of a keypoint of an image
 _TRACK = 8  # bytes of an element of a track: the number of the image and that of the keypoint
+_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+           "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE")  # fmt: skip
+_PARAMETERS = {  # of the models that are read: f or fx fy, the principal point, the distortion
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+}
+_LARGEST = 1e9  # the largest number in a model
+_SMALLEST = 1e-6  # pixels; smaller focal lengths become zero in single precision
+_UNIT = 1e-3  # tolerance of the length of quaternions
 
 
-def read_points(folder: Path) -> Points:
-    """Read positions and colours of the points of a COLMAP model, whose folder is for example sparse/0.
+class ModelFile(NamedTuple):
+    """Hold the path and the content of a file of a model."""
+
+    path: Path
+    data: bytes
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """Hold the name, the pose and the camera of an image that COLMAP registered."""
+
+    name: str  # relative to the folder of the images
+    viewmat: NDArray[np.float64]  # [4, 4] world to camera, OpenCV axes
+    camera: int  # key of `read_cameras`
+
+
+def read_part(folder: Path, part: str) -> ModelFile:
+    """Read one of the parts `cameras`, `images` and `points3D` of a model, whose folder is for example sparse/0.
 
     Raises:
-        InputError: the folder has neither points3D.bin nor points3D.txt, or the file is damaged or has no points.
+        InputError: the folder has neither <part>.bin nor <part>.txt, or the file cannot be read.
     """
-    for name, parse in (("points3D.bin", _parse_binary), ("points3D.txt", _parse_text)):
-        path = folder / name
+    for path in (folder / f"{part}.bin", folder / f"{part}.txt"):
         if path.exists():
-            rows = parse(read_file(path, str(path), _MAX_FILE), path)
-            break
-    else:
-        raise InputError(f"{folder}: expected points3D.bin or points3D.txt of COLMAP, found neither")
+            return ModelFile(path, read_file(path, str(path), _MAX_FILE))
+    raise InputError(f"{folder}: expected {part}.bin or {part}.txt of COLMAP, found neither")
+
+
+def read_cameras(file: ModelFile) -> dict[int, Lens]:
+    """Return the cameras of a model by their numbers.
+
+    Raises:
+        InputError: the file is damaged, or a camera has a lens model that is not read, such as a fisheye.
+    """
+    rows = _text_cameras(file) if file.path.suffix == ".txt" else _binary_cameras(file)
+    found = {}
+    for number, model, width, height, values in rows:
+        if number in found:
+            raise InputError(f"{file.path}: camera {number} appears twice: write the model again")
+        found[number] = _lens(model, width, height, values, f"{file.path}: camera {number}")
+    return found
+
+
+def read_images(file: ModelFile) -> list[PosedImage]:
+    """Return the registered images of a model.
+
+    Raises:
+        InputError: the file is damaged, has no image, or names one twice.
+    """
+    rows = _text_images(file) if file.path.suffix == ".txt" else _binary_images(file)
+    found: dict[str, PosedImage] = {}
+    for name, pose, camera in rows:
+        where = f"{file.path}: image {name[:80]!a}"
+        if name in found:
+            raise InputError(f"{where} appears twice: write the model again")
+        if not all(abs(value) < _LARGEST for value in pose) or abs(math.hypot(*pose[:4]) - 1) > _UNIT:
+            raise InputError(f"{where}: expected a unit quaternion qw qx qy qz and a translation, got {pose}")
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix()  # scipy has w last
+        viewmat[:3, 3] = pose[4:]
+        found[name] = PosedImage(name, viewmat, camera)
+    if not found:
+        raise InputError(f"{file.path}: expected at least one image")
+    return list(found.values())
+
+
+def read_points(file: ModelFile) -> Points:
+    """Return positions and colours of the points of a model.
+
+    Raises:
+        InputError: the file is damaged or has no points.
+    """
+    path = file.path
+    rows = _text_points(file) if path.suffix == ".txt" else _binary_points(file)
     values = np.array(rows, np.float64).reshape(-1, 6)
     if not len(values):
         raise InputError(f"{path}: expected at least one point")
@@ -39,32 +124,104 @@ def read_points(folder: Path) -> Points:
     return Points(tensor[:, :3].contiguous(), tensor[:, 3:] / 255)
 
 
-def _parse_binary(data: bytes, path: Path) -> list[tuple[float, ...]]:
-    """Parse points3D.bin and return (x, y, z, r, g, b) of each point.
+def _lens(model: str, width: int, height: int, values: tuple[float, ...], where: str) -> Lens:
+    """Check the numbers of a camera and return its intrinsics and distortion."""
+    names = _PARAMETERS[model]
+    if len(values) != len(names) or not all(abs(value) < _LARGEST for value in values):
+        raise InputError(f"{where}: expected {model} with {' '.join(names)}, got {values}")
+    given = dict(zip(names, values, strict=True))
+    fx, fy = (given.get(name, given.get("f", 0.0)) for name in ("fx", "fy"))
+    if not (min(fx, fy) > _SMALLEST and min(width, height) > 0):
+        raise InputError(f"{where}: expected positive focal lengths and sizes, got {fx} {fy} for {width}x{height}")
+    K = np.array([[fx, 0, given["cx"]], [0, fy, given["cy"]], [0, 0, 1]])
+    k1, k2, p1, p2 = (given.get(name, 0.0) for name in ("k1", "k2", "p1", "p2"))
+    return Lens(width, height, K, (k1, k2, p1, p2))
 
-    The file has the number of points, then the points, whose lengths differ because each has a track of keypoints.
-    """
+
+def _known(model: str, where: str) -> str:
+    """Return the name of a lens model; raise InputError if it is not read."""
+    if model not in _PARAMETERS:
+        raise InputError(f"{where}: expected a camera {', '.join(_PARAMETERS)}, got {model[:40]!a}: undo its "
+                         "distortion by `colmap image_undistorter`, which writes PINHOLE")  # fmt: skip
+    return model
+
+
+_CameraRow = tuple[int, str, int, int, tuple[float, ...]]  # number, model, width, height, parameters
+_ImageRow = tuple[str, tuple[float, ...], int]  # name, quaternion (w first) and translation, number of the camera
+
+
+def _binary_cameras(file: ModelFile) -> Iterator[_CameraRow]:
+    """Yield the cameras of cameras.bin."""
+    reader = _Reader(file)
+    for _ in range(reader.unpack(_COUNT)[0]):
+        number, model, width, height = reader.unpack(_CAMERA)
+        known = _MODELS[model] if 0 <= model < len(_MODELS) else f"model {model}"
+        names = _PARAMETERS[_known(known, f"{file.path}: camera {number}")]
+        yield number, known, width, height, reader.unpack(struct.Struct(f"<{len(names)}d"))
+    reader.finish()
+
+
+def _text_cameras(file: ModelFile) -> Iterator[_CameraRow]:
+    """Yield the cameras of cameras.txt, whose lines have an id, a model, width, height and the model's parameters."""
+    for number, line in _lines(file):
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = line.split()
+        where = f"{file.path}: line {number}"
+        try:
+            one, width, height = int(words[0]), int(words[2]), int(words[3])
+            values = tuple(float(word) for word in words[4:])
+        except (ValueError, IndexError):
+            raise InputError(f"{where}: expected a camera's id, model, width, height and parameters, "
+                             f"got {line[:60]!a}") from None  # fmt: skip
+        yield one, _known(words[1], where), width, height, values
+
+
+def _binary_images(file: ModelFile) -> Iterator[_ImageRow]:
+    """Yield the images of images.bin, whose lengths differ because each has a name and keypoints."""
+    reader = _Reader(file)
+    for _ in range(reader.unpack(_COUNT)[0]):
+        _, *pose, camera = reader.unpack(_IMAGE)
+        name = reader.text()
+        reader.skip(_KEYPOINT * reader.unpack(_COUNT)[0])
+        yield name, tuple(pose), camera
+    reader.finish()
+
+
+def _text_images(file: ModelFile) -> Iterator[_ImageRow]:
+    """Yield the images of images.txt, each of which has two lines: the second lists keypoints and may be empty."""
+    lines = _lines(file)
+    for number, line in lines:
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = line.split(maxsplit=9)
+        try:
+            yield words[9].strip(), tuple(float(word) for word in words[1:8]), int(words[8])
+        except (ValueError, IndexError):
+            raise InputError(f"{file.path}: line {number}: expected an image's id, qw qx qy qz tx ty tz, camera and "
+                             f"name, got {line[:60]!a}") from None  # fmt: skip
+        next(lines, None)
+
+
+def _binary_points(file: ModelFile) -> list[tuple[float, ...]]:
+    """Return (x, y, z, r, g, b) of each point of points3D.bin, whose lengths differ because each has a track."""
+    reader = _Reader(file)
     rows: list[tuple[float, ...]] = []
-    count = struct.unpack_from("<Q", data)[0] if len(data) >= 8 else -1
-    at = 8
-    for _ in range(min(count, len(data) // _POINT.size)):
-        if at + _POINT.size > len(data):
-            break
-        _, x, y, z, red, green, blue, _, track = _POINT.unpack_from(data, at)
+    for _ in range(reader.unpack(_COUNT)[0]):
+        _, x, y, z, red, green, blue, _, track = reader.unpack(_POINT)
+        reader.skip(_TRACK * track)
         rows.append((x, y, z, red, green, blue))
-        at += _POINT.size + _TRACK * track
-    if len(rows) != count or at != len(data):
-        raise InputError(f"{path}: expected {count} points of COLMAP, got {len(rows)} in {len(data)} bytes: truncated?")
+    reader.finish()
     return rows
 
 
-def _parse_text(data: bytes, path: Path) -> list[tuple[float, ...]]:
-    """Parse points3D.txt and return (x, y, z, r, g, b) of each point.
+def _text_points(file: ModelFile) -> list[tuple[float, ...]]:
+    """Return (x, y, z, r, g, b) of each point of points3D.txt.
 
     A line of the file has an id, x, y, z, r, g, b, an error and a track of keypoints.
     """
     rows = []
-    for number, line in enumerate(data.decode("ascii", "replace").splitlines(), 1):
+    for number, line in _lines(file):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -73,5 +230,44 @@ def _parse_text(data: bytes, path: Path) -> list[tuple[float, ...]]:
             if len(rows[-1]) < 6:
                 raise ValueError
         except ValueError:
-            raise InputError(f"{path}: line {number}: expected an id, x y z and a colour, got {line[:60]!a}") from None
+            raise InputError(
+                f"{file.path}: line {number}: expected an id, x y z and a colour, got {line[:60]!a}"
+            ) from None
     return rows
+
+
+def _lines(file: ModelFile) -> Iterator[tuple[int, str]]:
+    """Return the lines of a text file with their numbers from 1."""
+    return iter(enumerate(file.data.decode("utf-8", "replace").split("\n"), 1))
+
+
+class _Reader:
+    """Reads the records of a binary file one after another; raises InputError at the end of a truncated file."""
+
+    def __init__(self, file: ModelFile) -> None:
+        self._path, self._data, self._at = file.path, file.data, 0
+
+    def unpack(self, record: struct.Struct) -> tuple[Any, ...]:
+        """Read a record of fixed length."""
+        self.skip(record.size)
+        return record.unpack_from(self._data, self._at - record.size)
+
+    def text(self) -> str:
+        """Read a text that ends with a zero byte."""
+        end = self._data.find(b"\0", self._at)
+        start = self._at
+        self.skip((end if end >= 0 else len(self._data)) + 1 - start)
+        return self._data[start:end].decode("utf-8", "replace")
+
+    def skip(self, size: int) -> None:
+        """Advance by `size` bytes."""
+        self._at += size
+        if self._at > len(self._data):
+            raise InputError(f"{self._path}: truncated, its records need more than its {len(self._data)} bytes: "
+                             "copy it again")  # fmt: skip
+
+    def finish(self) -> None:
+        """Raise InputError unless all bytes were read."""
+        if self._at != len(self._data):
+            raise InputError(f"{self._path}: expected {self._at} bytes for its records, got {len(self._data)}: "
+                             "copy it again")  # fmt: skip

@@ -108,19 +108,23 @@ class Scene:
         """
         if self.val:
             raise InputError(f"scene.val_every: expected no views of val, {self.name} has {len(self.val)}")
-        held = set(range(every - 1, len(self.train), every))
-        if not held or len(held) == len(self.train):
+        train, val = hold_out(self.train, every)
+        if not train or not val:
             raise InputError(
                 f"scene.val_every: expected views for train and for val, "
                 f"got every {every} of {len(self.train)} training views of {self.name}"
             )
-        train = [view for i, view in enumerate(self.train) if i not in held]
-        return replace(self, train=train, val=[self.train[i] for i in sorted(held)])
+        return replace(self, train=train, val=val)
 
     def to(self, device: str) -> "Scene":
         """Return a copy of the scene whose views are on `device`."""
         train, val, test = ([view.to(device) for view in views] for views in (self.train, self.val, self.test))
         return replace(self, train=train, val=val, test=test)
+
+
+def hold_out(views: list[View], every: int) -> tuple[list[View], list[View]]:
+    """Return two lists: the views that stay, and every n-th view, from the n-th on."""
+    return [view for i, view in enumerate(views, 1) if i % every], views[every - 1 :: every]
 
 
 def to_floats(

@@ -261,6 +261,6 @@ def _check_damaged(data: bytes, image: _Image) -> None:
 def _points(root: Path) -> Points | None:
     """Read initial points from the COLMAP model in sparse/0 or from points3d.ply; None if neither exists."""
     if (root / "sparse" / "0").is_dir():
-        return colmap.read_points(root / "sparse" / "0")
+        return colmap.read_points(colmap.read_part(root / "sparse" / "0", "points3D"))
     ply = root / "points3d.ply"
     return read_ply(ply) if ply.exists() else None

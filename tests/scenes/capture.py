@@ -1,0 +1,78 @@
+"""Write small COLMAP captures: images, and a model of their cameras as .bin or .txt."""
+
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+COLOR = (140, 128, 102)  # RGB of the points
+
+
+@dataclass
+class Capture:
+    """A model of one camera and the images it took."""
+
+    model: str
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+    names: list[str]
+    viewmats: np.ndarray  # [N, 4, 4]
+    points: np.ndarray = field(
+        default_factory=lambda: np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    )  # [P, 3]
+
+    def poses(self) -> list[list[float]]:
+        """Quaternion (w first) and translation of each image."""
+        quaternions = Rotation.from_matrix(self.viewmats[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+        return np.concatenate([quaternions, self.viewmats[:, :3, 3]], 1).tolist()
+
+    def write(self, root: Path, kind: str) -> Path:
+        """Write sparse/0 of the folder `root`; kind: bin or txt. Return `root`."""
+        folder = root / "sparse" / "0"
+        folder.mkdir(parents=True, exist_ok=True)
+        for part, data in (self.binary() if kind == "bin" else self.text()).items():
+            (folder / f"{part}.{kind}").write_bytes(data)
+        return root
+
+    def binary(self) -> dict[str, bytes]:
+        """The three files; each image has a keypoint, each point a track of two."""
+        camera = struct.pack("<QIiQQ", 1, 7, MODELS[self.model], self.width, self.height)
+        camera += struct.pack(f"<{len(self.parameters)}d", *self.parameters)
+        images = struct.pack("<Q", len(self.names))
+        for i, (name, pose) in enumerate(zip(self.names, self.poses(), strict=True), 1):
+            images += struct.pack("<I7dI", i, *pose, 7) + name.encode() + b"\0" + struct.pack("<Q2dq", 1, 3.0, 4.0, -1)
+        points = struct.pack("<Q", len(self.points))
+        for i, xyz in enumerate(self.points, 1):
+            points += struct.pack("<Q3d3BdQ4I", i, *xyz, *COLOR, 0.5, 2, 1, 0, 2, 0)
+        return {"cameras": camera, "images": images, "points3D": points}
+
+    def text(self) -> dict[str, bytes]:
+        """The same; every second image has no keypoint, so that its second line is empty."""
+        camera = f"# comment\n7 {self.model} {self.width} {self.height} {' '.join(map(repr, self.parameters))}\n"
+        images = "# comment\n"
+        for i, (name, pose) in enumerate(zip(self.names, self.poses(), strict=True), 1):
+            images += f"{i} {' '.join(map(repr, pose))} 7 {name}\n{'3.0 4.0 -1' if i % 2 else ''}\n"
+        red, green, blue = COLOR
+        points = "".join(
+            f"{i} {x} {y} {z} {red} {green} {blue} 0.5 1 0 2 0\n" for i, (x, y, z) in enumerate(self.points, 1)
+        )
+        return {"cameras": camera.encode(), "images": images.encode(), "points3D": points.encode()}
+
+
+def circle(count: int) -> np.ndarray:  # [count, 4, 4]
+    """Cameras around the origin that look at it from a distance of 4."""
+    viewmats = np.tile(np.eye(4), (count, 1, 1))
+    viewmats[:, :3, :3] = Rotation.from_rotvec(np.linspace(0, 5, count)[:, None] * [0, 1, 0]).as_matrix()
+    viewmats[:, 2, 3] = 4
+    return viewmats
+
+
+def write_image(path: Path, rgb: np.ndarray) -> None:
+    """Write RGB or grey as PNG by OpenCV, whose order is BGR."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), rgb[..., ::-1] if rgb.ndim == 3 else rgb)
