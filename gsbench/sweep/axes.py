@@ -44,7 +44,8 @@ def expand(words: Sequence[str]) -> list[str]:
         scenes = scenes_of([word for word in words if word.partition("=")[0].lstrip("+") in SCENES_DEPEND_ON])
         if scenes is not None:
             if not scenes:
-                raise InputError("data.scenes: expected the names of scenes, got an empty list")
+                raise InputError("data.scenes: expected the names of scenes, got an empty list: set them, or "
+                                 "scene=custom scene.name=FOLDER")  # fmt: skip
             words = [*(word for word in words if not word.startswith("scene=")), f"scene={','.join(scenes)}"]
             multirun = True
     return ["--multirun", *words] if multirun else words

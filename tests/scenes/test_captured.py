@@ -12,10 +12,11 @@ import torch
 from capture import COLOR, Capture, circle, write_image
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_run import run_here
+from tiny_run import main_here
 
 from gsbench import scenes
 from gsbench.errors import InputError
+from gsbench.measure import record
 from gsbench.scenes import colmap
 from gsbench.scenes.sample import folder
 
@@ -71,13 +72,13 @@ def test_an_embedded_scene_comes_back(tmp_path: Path, blender: scenes.Scene, kin
 def test_it_is_trained(tmp_path: Path, blender: scenes.Scene) -> None:
     """Catches a scene that the loader accepts and a run does not, and cameras that do not belong to the images."""
     write_embedded(tmp_path / "own", blender, "bin")
-    record, _ = run_here(
-        "+exp=colmap", "model=4dgs", f"data.root={tmp_path}", "scene.name=own", "scene.downscale=4",
+    assert not main_here(
+        "+exp=colmap", "model=4dgs", f"data.root={tmp_path}", "scene=custom", "scene.name=own", "scene.downscale=4",
         "train.iterations=50", "train.curve_points=1", f"results={tmp_path / 'results'}",
     )  # fmt: skip
-    assert record.status == "ok", record.reason
-    assert record.dataset == "colmap"
-    assert record.metrics["psnr"] > 14.7  # 15.5; 13.8 where cameras have the images of others
+    (found,) = map(record.read, record.find(tmp_path / "results"))
+    assert found.dataset == "colmap"
+    assert found.metrics["psnr"] > 14.7  # 15.5; 13.8 where cameras have the images of others
 
 
 def rays(K: np.ndarray) -> np.ndarray:  # [H, W, 2]
