@@ -15,13 +15,14 @@ from gsbench.models.query import Query
 from gsbench.models.registry import import_models
 from gsbench.run.checks import check_device, evaluated_views
 from gsbench.run.load import LoadedRun, load_run, scene_of
-from gsbench.scenes import Scene, View
+from gsbench.scenes import Camera, Scene, View
 from gsbench.scenes.trained import ply_of
 from gsbench.view import film, paths
 from gsbench.view.gaussians import has_profiles, trained_of
 
 PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
 MOST_FRAMES = 100_000
+MOST_SIDE = 16_384  # pixels of a rendered image, before --supersample reduces it
 
 
 class ExportRequest(NamedTuple):
@@ -40,10 +41,12 @@ def main(arguments: list[str] | None = None) -> int:
         if said and not asked.options.json:
             print("\n".join(said))
         if asked.options.video:
-            with closing(film.frames(asked.run, shots(asked))) as images:  # closes the progress bar too
+            with closing(
+                film.frames(asked.run, shots(asked), asked.options.supersample)
+            ) as images:  # closes the progress bar too
                 film.write_video(images, asked.options.video, asked.options.fps)
         if asked.options.images:
-            with closing(film.frames(asked.run, shots(asked))) as images:
+            with closing(film.frames(asked.run, shots(asked), asked.options.supersample)) as images:
                 film.write_images(images, asked.options.images)
         if asked.options.json:
             written = {name: getattr(asked.options, name) for name in ("ply", "video", "images")}
@@ -70,6 +73,11 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--fps", type=float, default=30, help="frames a second (30)")
     made.add_argument("--seconds", type=float, default=4, help="length of an orbit or a spiral (4)")
+    made.add_argument("--width", type=int, metavar="PIXELS", help="of the frames (the training's)")
+    made.add_argument("--height", type=int, metavar="PIXELS", help="of the frames (in proportion to --width)")
+    made.add_argument(
+        "--supersample", type=int, default=1, metavar="N", help="render N times as large, and average (1)"
+    )
     made.add_argument("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
     made.add_argument(
         "--model-module",
@@ -90,6 +98,13 @@ def prepare(options: argparse.Namespace) -> ExportRequest:
     if not 0 < options.fps <= 1000 or not 1 <= options.fps * options.seconds <= MOST_FRAMES:
         raise InputError(f"--fps, --seconds: expected 1 to {MOST_FRAMES} frames of at most 1000 a second, got "
                          f"{options.fps} x {options.seconds}")  # fmt: skip
+    sides = [options.supersample * side for side in (1, options.width, options.height) if side is not None]
+    if not all(0 < side <= MOST_SIDE for side in (options.supersample, *sides)):
+        raise InputError(f"--width, --height, --supersample: expected at least 1 and at most {MOST_SIDE} rendered "
+                         f"pixels a side, got {options.width}, {options.height}, {options.supersample}")  # fmt: skip
+    if options.video and any(side is not None and side % 2 for side in (options.width, options.height)):
+        raise InputError(f"--width, --height: expected even numbers for --video, as VP9 encodes no others, got "
+                         f"{options.width}, {options.height}")  # fmt: skip
     for path in (path for path in (options.ply, options.video, options.images) if path):
         film.check_parent(path)
     check_device(options.device)
@@ -149,6 +164,20 @@ def direction(text: str) -> torch.Tensor:
 
 
 def shots(asked: ExportRequest) -> list[paths.Shot]:
+    """Return the camera, in the size of --width and --height, and the time of each frame of a video."""
+    return [(of_size(camera, asked.options.width, asked.options.height), time) for camera, time in path_of(asked)]
+
+
+def of_size(camera: Camera, width: int | None, height: int | None) -> Camera:
+    """Return a camera with an image of the given size; a side that is None follows from the other one, and is even."""
+    if width is not None:
+        return paths.resized(camera, width, height or 2 * max(1, round(camera.height * width / camera.width / 2)))
+    if height is not None:
+        return paths.resized(camera, 2 * max(1, round(camera.width * height / camera.height / 2)), height)
+    return camera
+
+
+def path_of(asked: ExportRequest) -> list[paths.Shot]:
     """Return the camera and the time of each frame of a video; time runs from 0 to 1, or has the value of --time."""
     options = asked.options
     count = round(options.fps * options.seconds)

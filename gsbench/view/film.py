@@ -13,21 +13,23 @@ from gsbench.errors import InputError
 from gsbench.measure.images import Pixels, to_bytes, write_png
 from gsbench.models.render import render
 from gsbench.run.load import LoadedRun
-from gsbench.view.paths import Shot
+from gsbench.view.paths import Shot, resized
 
 CODEC = "vp09"  # VP9, which browsers play; the encoder comes with OpenCV's wheel, unlike one for H.264
 
 
-def frames(run: LoadedRun, shots: list[Shot]) -> Generator[Pixels, None, None]:
+def frames(run: LoadedRun, shots: list[Shot], supersample: int = 1) -> Generator[Pixels, None, None]:
     """Yield rendered images, one for each shot (a camera and a time), as uint8 [H, W, 3] RGB.
 
-    A progress bar is shown on stderr.
+    Each pixel is the mean of supersample x supersample rendered ones. A progress bar is shown on stderr.
     """
     background = torch.tensor(run.scene.background).to(run.config.device)
     with torch.inference_mode(), tqdm(shots, desc=run.scene.name, unit="frame") as bar:
         for camera, time in bar:
-            image = render(run.model, camera.to(run.config.device), time, background, run.config.raster.antialias)
-            yield to_bytes(image.cpu().numpy())
+            width, height, n = camera.width, camera.height, supersample
+            fine = resized(camera, n * width, n * height).to(run.config.device)
+            image = render(run.model, fine, time, background, run.config.raster.antialias)
+            yield to_bytes(image.reshape(height, n, width, n, 3).mean((1, 3)).cpu().numpy())
 
 
 def write_video(images: Iterable[Pixels], path: Path, fps: float) -> None:

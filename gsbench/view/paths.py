@@ -69,6 +69,18 @@ def around(run: LoadedRun, azimuth: float, elevation: float) -> Camera:
     return Camera(look_at(target + run.scene.extent * towards, target), intrinsics(*size), *size)
 
 
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """Return a camera with another image size and the same horizontal field of view.
+
+    Pixels stay as wide as high: with another aspect ratio, the image shows less or more above and below.
+    """
+    scale = width / camera.width
+    K = camera.K.clone()
+    K[:2] *= scale
+    K[1, 2] += (height - scale * camera.height) / 2
+    return Camera(camera.viewmat, K, width, height)
+
+
 def orbit(run: LoadedRun, frames: int) -> list[Camera]:
     """Return cameras on one full circle around a model; the last camera does not repeat the first."""
     return [around(run, 2 * math.pi * i / frames, ELEVATION) for i in range(frames)]

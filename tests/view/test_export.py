@@ -17,7 +17,7 @@ from gsbench.run.load import load_run
 from gsbench.run.setup import load_scene
 from gsbench.scenes import Points
 from gsbench.scenes.trained import read_trained
-from gsbench.view import paths
+from gsbench.view import film, paths
 
 SHORT = ("--seconds", "0.5", "--fps", "8")
 
@@ -96,6 +96,40 @@ def test_time_runs_once_unless_it_stands_still(folder: Path, tmp_path: Path) -> 
         assert any((image != first).any() for image in others) == differ
 
 
+@pytest.mark.parametrize(
+    ("words", "size"),
+    [
+        (("--width", "34"), (34, 34)),
+        (("--height", "24"), (24, 24)),
+        (("--width", "40", "--height", "20", "--supersample", "3"), (40, 20)),
+    ],
+)
+def test_frames_have_the_size_that_is_asked_for(
+    words: tuple[str, ...], size: tuple[int, int], folder: Path, tmp_path: Path
+) -> None:
+    """Catches sides that are swapped, and one that has not the proportion of the training's images."""
+    assert main([str(folder), "--video", str(tmp_path / "a.mp4"), "--images", str(tmp_path / "a"), *SHORT, *words]) == 0
+    assert {cv2.imread(str(file)).shape for file in (tmp_path / "a").iterdir()} == {(size[1], size[0], 3)}
+    read, frame = cv2.VideoCapture(str(tmp_path / "a.mp4")).read()
+    assert read
+    assert frame.shape == (size[1], size[0], 3)
+
+
+def test_another_size_shows_the_same(folder: Path) -> None:
+    """Catches a larger image that is a crop, a wide one that is stretched, and a centre that moves."""
+    run = load_run(folder)
+    (camera,) = paths.orbit(run, 1)
+    plain, fine, wide, averaged = (
+        torch.from_numpy(next(film.frames(run, [(one, 0.5)], n))).double() / 255
+        for one, n in ((camera, 1), (paths.resized(camera, 48, 48), 1), (paths.resized(camera, 16, 8), 1), (camera, 3))
+    )
+    blocks = fine.reshape(16, 3, 16, 3, 3).mean((1, 3))
+    assert (plain - plain.mean((0, 1))).abs().mean() > 0.02
+    torch.testing.assert_close(averaged, blocks, rtol=0, atol=1 / 255)
+    torch.testing.assert_close(wide, plain[4:12], rtol=0, atol=1 / 255)
+    assert (plain - blocks).abs().mean() < 0.02
+
+
 def test_an_orbit_looks_at_the_model(folder: Path) -> None:
     """Catches cameras that look away, stand on their heads or are left-handed."""
     run = load_run(folder)
@@ -145,6 +179,11 @@ def test_the_middle_is_a_median_by_opacity() -> None:
         (("--video", "a.mp4", "--fps", "0"), "--fps"),
         (("--video", "a.mp4", "--seconds", "inf"), "--seconds"),
         (("--ply", "a.ply", "--device", "gpu"), "device"),
+        (("--video", "a.mp4", "--width", "0"), "--width"),
+        (("--video", "a.mp4", "--height", "-1"), "--height"),
+        (("--video", "a.mp4", "--width", "9000", "--supersample", "2"), "at most 16384"),
+        (("--video", "a.mp4", "--supersample", "0"), "--supersample"),
+        (("--video", "a.mp4", "--width", "33"), "even numbers"),
     ],
 )
 def test_what_is_asked_wrong_is_told_in_one_line(
