@@ -1,5 +1,6 @@
 """Make 8-bit images, error maps and comparison images (render | ground truth | error), and write PNG files."""
 
+import base64
 from pathlib import Path
 
 import cv2
@@ -80,6 +81,12 @@ def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB
     if not done:
         raise InputError(f"{path}: expected an image that PNG can hold, got {image.shape} of {image.dtype}")
     write_atomically(path, data.tobytes())
+
+
+def data_url(image: Pixels) -> str:  # [H, W, 3] RGB
+    """Return an image as PNG in a `data:` URL, which HTML can hold."""
+    data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+    return f"data:image/png;base64,{base64.b64encode(data).decode()}"
 
 
 def _beside(images: list[Pixels], factor: int) -> Pixels:

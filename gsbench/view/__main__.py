@@ -14,6 +14,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the viewer until Ctrl-C; return 0, or 2 after an error, which is printed on stderr in one line."""
     made = argparse.ArgumentParser(prog="python -m gsbench.view", description=__doc__)
     made.add_argument("runs", nargs="+", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
+    made.add_argument("--page", type=Path, metavar="OUT.html", help="write a page that compares two runs, and end")
     made.add_argument("--host", default="localhost", help="the address to listen on (localhost: this machine only)")
     made.add_argument("--port", type=int, default=8080, help="to listen on, or the next free one (8080)")
     made.add_argument("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
@@ -35,25 +36,34 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def serve(options: argparse.Namespace) -> None:
-    """Load the models of the given runs, and show them in the viewer until the user ends it.
+    """Load the models of the given runs, and show them in the viewer until the user ends it, or write --page.
 
     Raises:
         InputError: viser is not installed, a folder has no checkpoint, or the runs are of different scenes.
         KeyboardInterrupt: the user ends the viewer with Ctrl-C.
     """
-    if importlib.util.find_spec("viser") is None:
+    if options.page is None and importlib.util.find_spec("viser") is None:
         raise InputError("the viewer needs viser: pip install 'gsbench[view]'")
     if not 0 < options.port < 65536:
         raise InputError(f"--port: expected 1 to 65535, got {options.port}")
     from gsbench.models.registry import import_models
     from gsbench.run.checks import check_device
     from gsbench.run.load import load_run
-    from gsbench.view.viewer import Viewer
+    from gsbench.view.film import check_parent
+    from gsbench.view.side_by_side import write_page
 
+    if options.page is not None:
+        check_parent(options.page)
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # viser's, when a browser leaves
     check_device(options.device)
     import_models(options.model_module)
     runs = [load_run(run, options.device) for run in options.runs]
+    if options.page is not None:
+        write_page(runs, options.page, options.data_root)
+        print(f"Written: {options.page}")
+        return
+    from gsbench.view.viewer import Viewer
+
     viewer = Viewer(runs, options.host, options.port, options.data_root)
     for renderer in viewer.renderers:
         print(f"{renderer.run.folder}: {len(renderer.run.model)} Gaussians")

@@ -1,16 +1,14 @@
 """Write the HTML of the viewer's panel: milliseconds by stage, colour legend, and errors against a training view."""
 
-import base64
 import html
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from gsbench.effects.messages import EFFECT_SETS
 from gsbench.effects.picture import COLOURS
-from gsbench.measure.images import ERROR_SCALE, inferno
+from gsbench.measure.images import ERROR_SCALE, data_url, inferno
 from gsbench.view.controls import ShownImage
 from gsbench.view.frame import CLASS, COST, FrameCost
 from gsbench.view.nearest import Nearest, ViewComparison
@@ -99,6 +97,4 @@ def _gradient(low: str, high: str) -> str:
 
 def _image(image: npt.NDArray[np.uint8]) -> str:
     """Embed an image as PNG in HTML at the full width of the panel; enlarged pixels stay sharp."""
-    data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
-    source = f"data:image/png;base64,{base64.b64encode(data).decode()}"
-    return f'<img src="{source}" style="width:100%;display:block;image-rendering:pixelated">'
+    return f'<img src="{data_url(image)}" style="width:100%;display:block;image-rendering:pixelated">'

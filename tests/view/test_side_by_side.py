@@ -1,0 +1,52 @@
+"""The page that compares two runs: what it shows, that it needs nothing else, and what is asked wrong."""
+
+import html
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gsbench.errors import InputError
+from gsbench.measure import record
+from gsbench.run.load import load_run
+from gsbench.view.__main__ import main
+from gsbench.view.side_by_side import write_page
+
+
+def test_it_shows_both_runs_and_their_errors(folder: Path, other_folder: Path, tmp_path: Path) -> None:
+    """Catches runs that are swapped, a PSNR that is not the record's, a missing image, and a request of the network."""
+    path = tmp_path / "a.html"
+    assert main([str(folder), str(other_folder), "--page", str(path)]) == 0
+    text = path.read_text()
+    scores = [record.read(run / record.FILE_NAME).per_view for run in (folder, other_folder)]
+    shown = re.findall(r"<figcaption>error of (\w+).*?, ([\d.]+) dB", text)
+    names = ("7dgs", "4dgs")
+    expected = [(names[i], f"{pair[i].psnr:.2f}") for pair in zip(*scores, strict=True) for i in (0, 1)]
+    assert shown == expected
+    assert text.count('<img src="data:image/png;base64,') == 6 * len(scores[0])
+    assert text.count('type="range"') == len(scores[0])
+    assert not re.search(r"https?://|<script", text)
+    assert [*tmp_path.iterdir()] == [path]
+
+
+def test_names_are_escaped(folder: Path, other_folder: Path, tmp_path: Path) -> None:
+    """Catches a page that runs what a record of others names its scene."""
+    run, other = load_run(folder), load_run(other_folder)
+    bad = "<script>alert(1)</script>"
+    run = replace(run, scene=replace(run.scene, name=bad))
+    write_page([run, other], tmp_path / "a.html")
+    assert bad not in (tmp_path / "a.html").read_text()
+    assert html.escape(bad) in (tmp_path / "a.html").read_text()
+
+
+def test_what_cannot_be_compared_is_refused(folder: Path, other_folder: Path, tmp_path: Path) -> None:
+    """Catches images of two scenes beside each other, and a third run that is left out without a word."""
+    run, other = load_run(folder), load_run(other_folder)
+    with pytest.raises(InputError, match="expected two runs"):
+        write_page([run], tmp_path / "a.html")
+    elsewhere = replace(other, scene=replace(other.scene, fingerprint="0"))
+    with pytest.raises(InputError, match="runs of one scene"):
+        write_page([run, elsewhere], tmp_path / "a.html")
+    assert main([str(folder), str(other_folder), "--page", str(tmp_path / "nowhere" / "a.html")]) == 2
+    assert [*tmp_path.iterdir()] == []
