@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from gsbench.view.frusta import Frusta
 PLAYED_S = 4.0  # seconds in which the time goes from 0 to 1
 ONE, SIDE, WIPE = "one image", "side by side", "wipe"
 NEAREST = "nearest training view"
+NARROW = 576  # pixels; in a narrower window viser shows the panel on the image, as on a phone
 PANEL = {"x": 15.0, "y": -15.0, "width": 400.0}  # position in pixels from the left and the bottom
 
 
@@ -46,11 +48,18 @@ class Controls:
         self._frozen: torch.Tensor | None = None  # viewpoint for which Gaussians are computed; None: the camera
         self._held: float | None = None  # time for which Gaussians are computed; None: the slider's
         self._played_at = time.monotonic()
-        self.costs = client.gui.add_html("")
+        with self._folded("milliseconds"):
+            self.costs = client.gui.add_html("")
         self._add_time()
-        self._add_effects()
-        self._add_images()
-        self._add_views(scene)
+        with self._folded("controls"):
+            self._add_effects()
+            self._add_images()
+            self._add_views(scene)
+
+    def _folded(self, name: str) -> AbstractContextManager[object]:
+        """Return a folder, closed at first, for a narrow window, where the panel lies on the image; otherwise none."""
+        narrow = self.client.camera.image_width < NARROW
+        return self.client.gui.add_folder(name, expand_by_default=False) if narrow else nullcontext()
 
     def _add_time(self) -> None:
         """Add a slider for the time, and a check box that plays the scene."""

@@ -123,6 +123,19 @@ def test_it_opens_and_stays_on_this_machine(visit, viewer):
             socket.create_connection((address, viewer.server.get_port()), timeout=5)
 
 
+def test_on_a_phone_the_panel_leaves_the_image_free(browser, viewer):
+    """Catches a panel that hides the picture, and controls that a phone cannot reach."""
+    context = browser.new_context(viewport={"width": 390, "height": 844})
+    page = context.new_page()
+    page.goto(f"http://localhost:{viewer.server.get_port()}/?fixedDpr=1")
+    page.wait_for_selector("text=controls", timeout=60_000)
+    assert page.locator("text=gsbench: square").bounding_box()["y"] > 0.7 * 844
+    assert not page.locator("text=freeze direction").is_visible()
+    page.locator("text=controls").click()
+    page.wait_for_selector("text=freeze direction", state="visible", timeout=10_000)
+    context.close()
+
+
 def test_the_time_slider_changes_the_picture_unless_time_is_frozen(visit):
     """Catches a slider without effect, and frozen time that goes on."""
     page = visit()
