@@ -30,6 +30,31 @@ struct TileLists {
 };
 GSB_FIELDS(TileLists, OUTPUTS, offsets, ids)
 
+// Projected Gaussians in float64 and the results of the kernels in float32, to render the exact image of one camera.
+struct ExactArgs {
+    int64_t N;
+    int D;
+    bool beta;
+    const double* exact;   // [N, 8]: x, y, p, q, r of math/projection.h, opacity (0: culled), exponent, depth
+    // [N, 11]: x, y, p, q, r, opacity and exponent in float32; half sizes (0: culled); whether float32 surely draws it;
+    // the error of the depth
+    const double* single;
+    const double *colors, *color_errors, *background;  // [N, D] [N, D] [D]
+    const float *means2d, *half_sizes;                 // [N, 2]: boxes that contain those of float64 and float32
+    const int32_t *offsets, *ids;                      // each tile's list, by exact depth
+    int width, height;
+    int threads;
+};
+GSB_FIELDS(ExactArgs, INPUTS, N, D, beta, exact, single, colors, color_errors, background, means2d, half_sizes, offsets,
+           ids, width, height, threads)
+
+struct ExactPicture {
+    double *image, *bound;  // [H, W, D] [H, W]: the largest error of a channel of the image in float32
+    int32_t* culprit;       // [H, W] the Gaussian with the largest share of the bound; -1: none
+    bool* undecided;        // [H, W] whether float32 may decide otherwise what is blended, or in which order
+};
+GSB_FIELDS(ExactPicture, OUTPUTS, image, bound, culprit, undecided)
+
 // Adam on several whole parameters; on a GPU torch's own Adam does this.
 struct AdamAllArgs {
     int count;
@@ -51,6 +76,7 @@ GSB_FIELDS(AdamAllState, OUTPUTS, parameters, means, squares)
     GSB_KERNELS(kernel)                            \
     kernel(count_tiles, BinArgs, TileOffsets)      \
     kernel(fill_tiles, BinArgs, TileLists)         \
+    kernel(exact_image, ExactArgs, ExactPicture)   \
     kernel(adam_all, AdamAllArgs, AdamAllState)
 
 namespace gsb {
