@@ -1,9 +1,9 @@
 """Render an image in float64, and bound for each pixel the error of the same image in float32.
 
-The Gaussians are given twice: computed in float64, and computed in float32. The reference projects those of float64; the
-kernels project those of float32, and what rounding does to each projected Gaussian is the difference. A kernel blends
-the exact image and carries the differences, the rounding of blending itself, and the jumps of undecided branches to the
-pixels (`gsbench/kernels/cpu/exact.cpp`).
+The Gaussians are given twice: computed in float64, and computed in float32. The reference projects those of float64,
+the kernels project those of float32, and what rounding does to each projected Gaussian is the difference. A kernel
+blends the exact image and carries the differences, the rounding of blending itself, and the jumps of undecided branches
+to the pixels (`gsbench/kernels/cpu/exact.cpp`).
 """
 
 from typing import NamedTuple
@@ -22,6 +22,10 @@ RANKS = 1 << 24  # integers that float32 counts exactly
 BEYOND = 32.0  # pixels outside of the image where boxes end; and the margin that covers the rounding of boxes
 MARGIN = 0.05
 
+# What rounding may decide: whether a Gaussian is blended whose alpha is near 1/255, or that may be culled; where a
+# pixel ends; and the order of Gaussians of equal depth (`Branch` of gsbench/kernels/cpu/kernels.h).
+SKIPPED, STOPPED, ORDERED = 1, 2, 4
+
 # Means [N, 3], factors [N, 3, 3], opacities [N], colours [N, D], and exponents of Beta profiles [N] or None.
 Gaussians = tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]
 
@@ -32,7 +36,12 @@ class ExactImage(NamedTuple):
     image: Tensor  # [H, W, D] float64
     bound: Tensor  # [H, W] float64: no channel of the image by the CPU kernels is farther than this from `image`
     culprit: Tensor  # [H, W] int32: the Gaussian with the largest share of the bound; -1: none
-    undecided: Tensor  # [H, W] bool: rounding may decide which Gaussians are blended here, or their order
+    branches: Tensor  # [H, W] uint8: what rounding may decide here, a sum of SKIPPED, STOPPED and ORDERED
+
+    @property
+    def undecided(self) -> Tensor:
+        """Whether rounding may decide which Gaussians are blended in a pixel, or their order, [H, W] bool."""
+        return self.branches > 0
 
 
 @torch.no_grad()
@@ -90,7 +99,7 @@ def exact_image(
         torch.empty(height, width, D, dtype=torch.float64),
         torch.empty(height, width, dtype=torch.float64),
         torch.empty(height, width, dtype=torch.int32),
-        torch.empty(height, width, dtype=torch.bool),
+        torch.empty(height, width, dtype=torch.uint8),
     )
     kept = {"exact": true[:, :8].contiguous(), "single": table, "colors": colors.contiguous(), "color_errors": errors,
             "background": background.double(), "means2d": boxes.means2d, "half_sizes": boxes.half_sizes,

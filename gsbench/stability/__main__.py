@@ -1,7 +1,7 @@
-"""Run the numerical stability audit (`python -m gsbench.stability`) and write its results.
+"""Run the numerical stability audit (`python -m gsbench.stability`), or measure how exact a model's images are.
 
 The audit computes numerically hard inputs with every model and backend. The exit code is 1 if the error of a default
-setting exceeds its bound.
+setting exceeds its bound. With a run folder or a PLY, the images of this model in float32 are compared with float64.
 """
 
 import argparse
@@ -10,18 +10,23 @@ import os
 import sys
 from pathlib import Path
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, one_line
 
 EXTRA = ("matplotlib", "mpmath")  # the packages of gsbench[stability]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the tests of numerical errors, or measure the condition numbers in the checkpoint given by `--checkpoint`.
+    """Run the tests of numerical errors, or measure a trained model.
 
-    Return the exit code: 0, or 1 if a default setting exceeds its error bound, or 2 if a package is missing or the file
-    is not a checkpoint.
+    Return the exit code: 0, or 1 if a default setting exceeds its error bound, or 2 if a package is missing or the
+    model cannot be read.
     """
     parser = argparse.ArgumentParser(prog="python -m gsbench.stability", description=__doc__)
+    parser.add_argument("model", nargs="?", type=Path, metavar="RUN_FOLDER|FILE.ply",
+                        help="no audit: the error of float32 in this model's images")  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print the errors of RUN_FOLDER|FILE.ply as JSON")
+    parser.add_argument("--data-root", metavar="FOLDER", help="of the run's data set, where it has moved")
+    parser.add_argument("--model-module", metavar="MODULE", help="that registers the run's model")
     parser.add_argument("--out", type=Path, default=Path("results/stability"), help="folder of the results")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--short", action="store_true", help="the defaults alone, in a minute; writes no page")
@@ -37,6 +42,8 @@ def main(arguments: list[str] | None = None) -> int:
     os.environ.setdefault("MPLBACKEND", "Agg")
     if options.checkpoint:
         return show_spectrum(options.checkpoint, options.out)
+    if options.model:
+        return show_exactness(options)
     from gsbench.stability import audit, page  # imports torch
 
     found = audit.run(long=options.long, short=options.short)
@@ -68,6 +75,32 @@ def show_spectrum(checkpoint: Path, folder: Path) -> int:
     for scheme, (share, worst) in failures.items():
         print(f"{scheme} in float32: {100 * share:.2f} % indefinite, 99th percentile of the error {worst:.1e}")
     print(f"Written: {spectrum.draw(found, folder, '/'.join(checkpoint.parts[-4:-1]))}")
+    return 0
+
+
+def show_exactness(options: argparse.Namespace) -> int:
+    """Print and draw how exact the images of a run's model or of a PLY are.
+
+    Return the exit code: 0, or 2 if the model cannot be read.
+    """
+    from gsbench.models.registry import import_models
+    from gsbench.stability import frame, frame_report, subjects
+
+    try:
+        import_models(options.model_module)
+        subject = subjects.load(options.model, options.out, options.data_root)
+        found = frame.measure(subject.model, subject.shots, subject.background, subject.title, subject.antialias)
+        frame_report.draw(found, subject.picture)
+    except (InputError, OSError) as error:
+        print(f"gsbench.stability: error: {one_line(error)}", file=sys.stderr)
+        return 2
+    if options.json:
+        print(frame_report.json_of(found))
+        return 0
+    if subject.note:
+        print(f"{subject.note}\n")
+    print(frame_report.text(found))
+    print(f"Written: {subject.picture}")
     return 0
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from gsbench.measure.atomic import write_atomically
 from gsbench.stability.audit import Audit
@@ -59,6 +60,11 @@ def save(path: Path, draw: Callable[[Axes], None], size: tuple[float, float] = (
     """Create a figure with one pair of axes, plot on these with `draw`, and write the figure as PNG."""
     figure, axes = plt.subplots(figsize=size, layout="constrained")
     draw(axes)
+    save_figure(figure, path)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a matplotlib figure as PNG, and close it."""
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=110)
     plt.close(figure)

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models.factors import Triangle, rotation4d, sizes
 from gsbench.models.slicing import reduce, subtract
+from gsbench.stability.joint import joint_factors
 from gsbench.stability.plots import save
 from gsbench.stability.population import Floats
 from gsbench.train import checkpoint
@@ -28,9 +28,9 @@ def measure(path: Path) -> dict[str, Floats]:
     Raises:
         InputError: the file is not a checkpoint, or its model is 3DGS, which has no conditional Gaussians.
     """
-    joint, k = joint_factors(_splats(path), path)
-    sliced = reduce(joint).T_pp
-    return {f"joint factor, {3 + k} x {3 + k}": _condition(joint), "sliced factor, 3 x 3": _condition(sliced)}
+    joint = _joint(path)
+    sliced, size = reduce(joint).T_pp, joint.shape[-1]
+    return {f"joint factor, {size} x {size}": _condition(joint), "sliced factor, 3 x 3": _condition(sliced)}
 
 
 def failures(path: Path) -> dict[str, tuple[float, float]]:
@@ -39,7 +39,7 @@ def failures(path: Path) -> dict[str, tuple[float, float]]:
     Both methods compute conditional covariances by a subtraction. Return, for each of them, the share of indefinite
     conditional covariances and the 99th percentile of relative errors.
     """
-    joint, _ = joint_factors(_splats(path), path)
+    joint = _joint(path)
     exact = reduce(joint).T_pp
     exact = exact @ exact.mT
     found = {}
@@ -50,25 +50,13 @@ def failures(path: Path) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _splats(path: Path) -> dict[str, Tensor]:
+def _joint(path: Path) -> Tensor:
     state: dict[str, Any] = checkpoint.read(path).state.get("model", {})
-    return {name.removeprefix("splats."): value.double() for name, value in state.items() if name[:7] == "splats."}
-
-
-def joint_factors(splats: dict[str, Tensor], path: Path) -> tuple[Tensor, int]:
-    """Return the covariance factors [N, 3+k, 3+k] of a trained 4DGS, 6DGS or 7DGS, and k.
-
-    The first three rows are position, and the k others time and direction. The model must store its factors in the
-    default row order.
-    """
-    if "log_diagonal" in splats:
-        k = splats["log_diagonal"].shape[1] - 3
-        L = Triangle("dddtppp" if k == 4 else "dddppp").factor(splats["log_diagonal"], splats)
-        return torch.cat([L[:, k:], L[:, :k]], 1), k
-    if "left_quats" in splats:
-        R = rotation4d(splats["left_quats"], splats["right_quats"])
-        return R * sizes(splats["scales"])[:, None, :], 1
-    raise InputError(f"{path}: expected a checkpoint of 4dgs, 6dgs or 7dgs, got parameters {sorted(splats)}")
+    splats = {name.removeprefix("splats."): value.double() for name, value in state.items() if name[:7] == "splats."}
+    joint = joint_factors(splats)
+    if joint is None:
+        raise InputError(f"{path}: expected a checkpoint of 4dgs, 6dgs or 7dgs, got parameters {sorted(splats)}")
+    return joint
 
 
 def report(found: dict[str, Floats]) -> str:

@@ -9,49 +9,16 @@ import math
 import torch
 from torch import Tensor
 
-from gsbench.models.base import GaussianModel
+from gsbench.models import cameras
+from gsbench.models.cameras import ELEVATION
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
 
-UP = (0.0, 0.0, 1.0)  # of Blender's layout: D-NeRF, 7DGS-PBR, the embedded scenes
-ELEVATION = math.radians(25)  # of an orbit above the horizon
 HIGHEST = math.radians(60)  # elevation at the end of a spiral
 TURNS = 2  # of a spiral
-FIELD_OF_VIEW = 0.69  # radians, horizontal; D-NeRF's camera_angle_x
 FAR_AWAY = 1e4  # in scene extents; view directions then differ by at most about 1e-4 radians
 
 Shot = tuple[Camera, float | None]  # a frame of a film: its camera and its time
-
-
-def middle(model: GaussianModel) -> Tensor:
-    """Return the middle of a model, [3]: the median of the Gaussians' means, weighted by opacity."""
-    means = model.splats["means"].detach().cpu()
-    order = means.argsort(0)
-    weights = torch.sigmoid(model.splats["opacities"].detach().cpu())[order].cumsum(0)  # [N, 3]
-    half = (weights < weights[-1] / 2).sum(0, keepdim=True)
-    return means.gather(0, order.gather(0, half.clamp(max=len(means) - 1)))[0]
-
-
-def look_at(eye: Tensor, target: Tensor) -> Tensor:
-    """Return the viewmat [4, 4] of an upright camera at `eye` [3] that looks at `target` [3]."""
-    forward = torch.nn.functional.normalize(target - eye, dim=0)
-    up = torch.tensor(UP).to(eye)
-    if torch.linalg.cross(forward, up).norm() < 1e-3:  # straight up or down
-        up = up.roll(1)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
-    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    viewmat = torch.eye(4).to(eye)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-    return viewmat
-
-
-def intrinsics(width: int, height: int) -> Tensor:
-    """Return the intrinsic matrix K [3, 3] for an image of the given size.
-
-    The horizontal field of view is 0.69 radians, as in D-NeRF.
-    """
-    focal = width / 2 / math.tan(FIELD_OF_VIEW / 2)
-    return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
 
 
 def around(run: LoadedRun, azimuth: float, elevation: float) -> Camera:
@@ -62,11 +29,8 @@ def around(run: LoadedRun, azimuth: float, elevation: float) -> Camera:
         azimuth: the angle about the axis `UP`, radians.
         elevation: the angle above the horizon, radians.
     """
-    flat = math.cos(elevation)
-    towards = torch.tensor([flat * math.sin(azimuth), -flat * math.cos(azimuth), math.sin(elevation)])
-    target = middle(run.model)
     size = run.scene.width, run.scene.height
-    return Camera(look_at(target + run.scene.extent * towards, target), intrinsics(*size), *size)
+    return cameras.around(run.model, run.scene.extent, *size, azimuth, elevation)
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
@@ -94,4 +58,4 @@ def spiral(run: LoadedRun, frames: int) -> list[Camera]:
 
 def far_along(run: LoadedRun, direction: Tensor) -> Tensor:
     """Return a viewpoint [3] that is so far away that all Gaussians are seen along the same `direction` [3]."""
-    return middle(run.model) - FAR_AWAY * run.scene.extent * torch.nn.functional.normalize(direction, dim=0)
+    return cameras.middle(run.model) - FAR_AWAY * run.scene.extent * torch.nn.functional.normalize(direction, dim=0)

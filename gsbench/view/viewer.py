@@ -10,6 +10,7 @@ import viser
 
 from gsbench.effects.gate import most_cost
 from gsbench.errors import InputError
+from gsbench.models import cameras
 from gsbench.run.load import LoadedRun, scene_of
 from gsbench.scenes import Scene
 from gsbench.view import paths
@@ -63,12 +64,12 @@ class Viewer:
 
     def _stand(self, run: LoadedRun) -> None:
         """Place the first camera of every browser at the start of an orbit around the model."""
-        camera = paths.around(run, 0.0, paths.ELEVATION)
-        self.server.scene.set_up_direction(paths.UP)
+        camera = paths.around(run, 0.0, cameras.ELEVATION)
+        self.server.scene.set_up_direction(cameras.UP)
         start = self.server.initial_camera
         start.position = camera.center.double().numpy()
-        start.look_at = paths.middle(run.model).double().numpy()
-        start.up = np.array(paths.UP)
+        start.look_at = cameras.middle(run.model).double().numpy()
+        start.up = np.array(cameras.UP)
         start.fov = 2 * float(np.arctan(camera.height / 2 / float(camera.K[1, 1])))
 
     def _in_turn(self, callback: Callable[[viser.ClientHandle], None]) -> Callable[[viser.ClientHandle], Any]:

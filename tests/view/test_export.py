@@ -11,7 +11,7 @@ import torch
 
 from gsbench.export import direction, main
 from gsbench.measure.images import to_bytes
-from gsbench.models import GaussianModel, Gaussians3D, Query, build
+from gsbench.models import GaussianModel, Gaussians3D, Query, build, cameras
 from gsbench.models.render import render
 from gsbench.run.load import load_run
 from gsbench.run.setup import load_scene
@@ -137,8 +137,8 @@ def test_an_orbit_looks_at_the_model(folder: Path) -> None:
         rotation = camera.viewmat[:3, :3]
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
         assert torch.linalg.det(rotation) > 0
-        assert rotation[1] @ torch.tensor(paths.UP) < 1e-3  # y points down
-        center = camera.viewmat[:3, :3] @ paths.middle(run.model) + camera.viewmat[:3, 3]
+        assert rotation[1] @ torch.tensor(cameras.UP) < 1e-3  # y points down
+        center = camera.viewmat[:3, :3] @ cameras.middle(run.model) + camera.viewmat[:3, 3]
         torch.testing.assert_close(center, torch.tensor([0, 0, run.scene.extent]), atol=1e-3, rtol=1e-3)
 
 
@@ -147,9 +147,9 @@ def test_the_middle_is_a_median_by_opacity() -> None:
     model = build("3dgs")
     means = torch.tensor([0.0, 1, 2, 3, 100])[:, None].expand(5, 3)
     model.initialise(Points(means, means), 1.0, torch.Generator())
-    torch.testing.assert_close(paths.middle(model), torch.full((3,), 2.0))
+    torch.testing.assert_close(cameras.middle(model), torch.full((3,), 2.0))
     model.splats["opacities"].data[:] = torch.tensor([-9.0, -9, -9, 2, 1])
-    torch.testing.assert_close(paths.middle(model), torch.full((3,), 3.0))
+    torch.testing.assert_close(cameras.middle(model), torch.full((3,), 3.0))
 
 
 @pytest.mark.parametrize(

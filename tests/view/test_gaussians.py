@@ -10,13 +10,13 @@ from plyfile import PlyData
 
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query
+from gsbench.models.cameras import intrinsics, look_at
 from gsbench.models.render import render
 from gsbench.raster import rasterize
 from gsbench.scenes import Camera
 from gsbench.scenes.trained import ply_of
 from gsbench.schedule import ActiveComponents
 from gsbench.view.gaussians import decompose, trained_of
-from gsbench.view.paths import intrinsics, look_at
 
 SIZE = 48
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])

@@ -9,10 +9,10 @@ import torch
 from gsbench.effects.gate import most_cost
 from gsbench.measure.images import error_image, to_bytes
 from gsbench.measure.quality import psnr, quantise
+from gsbench.models import cameras
 from gsbench.models.render import render
 from gsbench.run.load import load_run, scene_of
 from gsbench.scenes import Camera, Scene, View
-from gsbench.view import paths
 from gsbench.view.frame import FrameRenderer, FrameRequest
 from gsbench.view.nearest import MOST_WIDTH, TrainingViews, compare
 
@@ -22,7 +22,7 @@ EXTENT = 4.0
 def camera(x: float, *, towards: float = 0.0) -> Camera:
     """At x on a line, looking along y and as far aside."""
     eye = torch.tensor([x, -5.0, 0.0])
-    return Camera(paths.look_at(eye, eye + torch.tensor([towards, 1.0, 0.0])), paths.intrinsics(8, 8), 8, 8)
+    return Camera(cameras.look_at(eye, eye + torch.tensor([towards, 1.0, 0.0])), cameras.intrinsics(8, 8), 8, 8)
 
 
 def scene(*seen: tuple[Camera, float | None]) -> Scene:
@@ -80,7 +80,7 @@ def test_large_images_are_made_smaller_after_they_are_measured(folder: Path) -> 
     """Catches megabytes for each movement of the camera, and a PSNR of images that were made smaller."""
     run = load_run(folder)
     small = scene_of(run).train[0]
-    wide = Camera(small.camera.viewmat, paths.intrinsics(960, 32), 960, 32)
+    wide = Camera(small.camera.viewmat, cameras.intrinsics(960, 32), 960, 32)
     truth = torch.rand(32, 960, 3, generator=torch.Generator().manual_seed(0))
     view = replace(small, camera=wide, pixels=truth)
     compared = compare(FrameRenderer(run, most_cost(run.model)), view, FrameRequest(view.time))

@@ -43,13 +43,14 @@ struct Entry {
     double share;      // of the bound, over all channels
 };
 
-// The memory of a thread.
+// The memory of a thread; the arrays of a block have room for the longest list of a tile, `stride`.
 struct Scratch {
-    double* arrays;      // [BLOCK_ARRAYS, most]
-    int32_t* ids;        // [most] of the block
-    uint8_t* kept;       // [most]
-    Entry* entries;      // [most]
-    double *behind, *sums, *total, *low, *high, *color;  // [D]
+    const double* reaches;  // [N, 2] of all threads: the power at which alpha is 1/255, in float64 and float32
+    double* arrays;         // [BLOCK_ARRAYS, stride]
+    int32_t* ids;
+    uint8_t* kept;
+    Entry* entries;
+    double *behind, *sums, *total, *low, *high, *rest;  // [D]
     int64_t stride;
 
     double* array(BlockArray which) const { return arrays + which * stride; }
@@ -85,7 +86,7 @@ public:
         }
         out.bound[at] = bound;
         out.culprit[at] = culprit;
-        out.undecided[at] = undecided;
+        out.branches[at] = branches;
     }
 
 private:
@@ -94,7 +95,7 @@ private:
     const double x, y;
     int64_t listed = 0;
     double left_most = 1;  // transmittance behind the last Gaussian, at most
-    bool undecided = false;
+    uint8_t branches = 0;
 
     // Marks the Gaussians whose alpha may be at least 1/255 here, in float64 or float32.
     void keep(int64_t count) {
@@ -167,7 +168,7 @@ private:
                 finished = true;
                 continue;
             }
-            undecided |= c.undecided || ended || may_stop;
+            branches |= (c.undecided ? SKIPPED : 0) | (ended || may_stop ? STOPPED : 0);
             entry.ended = ended;
             entry.may_stop = may_stop && !ended;
             entry.alpha = ended ? 0 : c.alpha;
@@ -188,7 +189,7 @@ private:
     // Sums the largest changes of the pixel, with the exact colour behind each Gaussian.
     void back_to_front() {
         for (int k = 0; k < a.D; ++k) s.behind[k] = a.background[k];
-        for (int k = 0; k < a.D; ++k) s.color[k] = s.sums[k];
+        for (int k = 0; k < a.D; ++k) s.rest[k] = s.sums[k];
         for (int64_t i = listed - 1; i >= 0; --i) {
             Entry& e = s.entries[i];
             const double *color = color_of(e.id), *color_error = error_of(e.id);
@@ -197,10 +198,10 @@ private:
                 const double size = magnitude(color[k]) + color_error[k], behind = s.behind[k];
                 double term = change * magnitude(color[k] - behind) + e.high * color_error[k];
                 term += e.high * size * 2.01 * U + 2.01 * U * magnitude(behind);
-                term = term * e.left + U * s.color[k];
+                term = term * e.left + U * s.rest[k];
                 s.behind[k] = e.alpha * color[k] + (1 - e.alpha) * behind;
                 if (e.may_stop) term += e.left * magnitude(s.behind[k] - a.background[k]);
-                s.color[k] -= e.left * e.high * size;
+                s.rest[k] -= e.left * e.high * size;
                 s.total[k] += term;
                 e.share += term;
             }
@@ -222,7 +223,7 @@ private:
     }
 
     void group(int64_t first, int64_t end, double loose) {
-        undecided = true;
+        branches |= ORDERED;
         bool stops = false;
         for (int64_t i = first; i < end; ++i) stops |= s.entries[i].may_stop || s.entries[i].ended;
         const double left = s.entries[first].left;
@@ -265,7 +266,7 @@ private:
     const double* error_of(int32_t id) const { return a.color_errors + static_cast<int64_t>(id) * a.D; }
 };
 
-// The largest power at which alpha is at least 1/255, a little enlarged.
+// Returns the largest power at which alpha is at least 1/255, a little enlarged; -1 if there is none.
 template <class Profile>
 double reach_of(double opacity, double shape) {
     const double above = opacity * 255;
@@ -275,7 +276,6 @@ double reach_of(double opacity, double shape) {
 }
 
 // Copies the Gaussians that may touch the block at (left, top) to the scratch memory; returns their number.
-template <class Profile>
 int64_t gather_block(const ExactArgs& a, const Scratch& s, int64_t tile, int left, int top) {
     const float x = static_cast<float>(left) + 0.5f * BLOCK, y = static_cast<float>(top) + 0.5f * BLOCK;
     int64_t count = 0;
@@ -286,8 +286,8 @@ int64_t gather_block(const ExactArgs& a, const Scratch& s, int64_t tile, int lef
         const double *exact = a.exact + id * EXACT_COLUMNS, *single = a.single + id * SINGLE_COLUMNS;
         for (int k = 0; k < 5; ++k) s.array(static_cast<BlockArray>(X + k))[count] = exact[k];
         for (int k = 0; k < 5; ++k) s.array(static_cast<BlockArray>(SX + k))[count] = single[k];
-        s.array(REACH)[count] = exact[5] > 0 ? reach_of<Profile>(exact[5], exact[6]) : -1;
-        const double reach = single[7] > 0 ? reach_of<Profile>(single[5], single[6]) : -1;
+        s.array(REACH)[count] = s.reaches[id * 2];
+        const double reach = s.reaches[id * 2 + 1];
         s.array(SREACH)[count] = reach < 0 ? -1e300 : reach;
         s.array(SROOT)[count] = reach < 0 ? 0 : 2 * std::sqrt(reach);
         s.ids[count++] = static_cast<int32_t>(id);
@@ -301,7 +301,7 @@ void exact_tile(const ExactArgs& a, const Scratch& s, int64_t tile, const ExactP
     const int left = static_cast<int>(tile % across) * TILE, top = static_cast<int>(tile / across) * TILE;
     for (int by = top; by < top + TILE && by < a.height; by += BLOCK) {
         for (int bx = left; bx < left + TILE && bx < a.width; bx += BLOCK) {
-            const int64_t count = gather_block<Profile>(a, s, tile, bx, by);
+            const int64_t count = gather_block(a, s, tile, bx, by);
             for (int py = by; py < by + BLOCK && py < a.height; ++py) {
                 for (int px = bx; px < bx + BLOCK && px < a.width; ++px) {
                     Pixel<Profile>(a, s, px + 0.5, py + 0.5).run(count, static_cast<int64_t>(py) * a.width + px, out);
@@ -316,17 +316,28 @@ void exact_tile(const ExactArgs& a, const Scratch& s, int64_t tile, const ExactP
 void exact_image(const ExactArgs& a, const ExactPicture& out) {
     const int64_t tiles = static_cast<int64_t>(tiles_along(a.width)) * tiles_along(a.height);
     int64_t longest = 1;
-    for (int64_t t = 0; t < tiles; ++t) longest = most(longest, a.offsets[t + 1] - a.offsets[t]);
+    for (int64_t t = 0; t < tiles; ++t) {
+        const int64_t count = a.offsets[t + 1] - a.offsets[t];
+        longest = count > longest ? count : longest;
+    }
     const size_t n = static_cast<size_t>(longest);
+    Buffer<double> reaches(static_cast<size_t>(a.N) * 2);
 #pragma omp parallel num_threads(a.threads)
     {
+#pragma omp for schedule(static)
+        for (int64_t i = 0; i < a.N; ++i) {
+            const double *exact = a.exact + i * EXACT_COLUMNS, *single = a.single + i * SINGLE_COLUMNS;
+            double* reach = &reaches[static_cast<size_t>(i) * 2];
+            reach[0] = a.beta ? reach_of<Beta>(exact[5], exact[6]) : reach_of<Gaussian>(exact[5], exact[6]);
+            reach[1] = single[7] <= 0 ? -1 : a.beta ? reach_of<Beta>(single[5], single[6]) : reach_of<Gaussian>(single[5], single[6]);
+        }
         Buffer<double> arrays(n * BLOCK_ARRAYS), channels(static_cast<size_t>(a.D) * 6);
         Buffer<int32_t> ids(n);
         Buffer<uint8_t> kept(n);
         Buffer<Entry> entries(n);
         double* c = channels.data();
-        const Scratch s{arrays.data(), ids.data(), kept.data(), entries.data(), c,          c + a.D,
-                        c + 2 * a.D,   c + 3 * a.D, c + 4 * a.D, c + 5 * a.D,   longest};
+        const Scratch s{reaches.data(), arrays.data(), ids.data(),  kept.data(), entries.data(), c,
+                        c + a.D,        c + 2 * a.D,   c + 3 * a.D, c + 4 * a.D, c + 5 * a.D,    longest};
 #pragma omp for schedule(dynamic, 4)
         for (int64_t tile = 0; tile < tiles; ++tile) {
             a.beta ? exact_tile<Beta>(a, s, tile, out) : exact_tile<Gaussian>(a, s, tile, out);

@@ -51,9 +51,11 @@ GSB_FIELDS(ExactArgs, INPUTS, N, D, beta, exact, single, colors, color_errors, b
 struct ExactPicture {
     double *image, *bound;  // [H, W, D] [H, W]: the largest error of a channel of the image in float32
     int32_t* culprit;       // [H, W] the Gaussian with the largest share of the bound; -1: none
-    bool* undecided;        // [H, W] whether float32 may decide otherwise what is blended, or in which order
+    uint8_t* branches;      // [H, W] what float32 may decide otherwise, a sum of Branch
 };
-GSB_FIELDS(ExactPicture, OUTPUTS, image, bound, culprit, undecided)
+GSB_FIELDS(ExactPicture, OUTPUTS, image, bound, culprit, branches)
+
+enum Branch : uint8_t { SKIPPED = 1, STOPPED = 2, ORDERED = 4 };  // alpha at 1/255, or culling; the early stop; equal depths
 
 // Adam on several whole parameters; on a GPU torch's own Adam does this.
 struct AdamAllArgs {

@@ -1,0 +1,144 @@
+"""The exact image and its bound: no float32 image is farther from it than the bound says, and the bound says something."""
+
+import copy
+from collections.abc import Iterable
+from typing import Any
+
+import hard_scenes
+import pytest
+import torch
+from torch import Tensor
+
+from benchmarks.scene import camera, model
+from gsbench import kernels
+from gsbench.errors import InputError
+from gsbench.models import Query
+from gsbench.raster import rasterize
+from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, Gaussians, exact_image
+from gsbench.stability import brute, picture_cases
+from gsbench.stability.cases import CASES
+
+NAMES = ("means", "factors", "opacities", "colors", "shapes")
+LOOSEST = 100  # largest ratio of the bound to the error in the median pixel
+
+pytestmark = pytest.mark.skipif(not kernels.available(), reason="the kernels are not built")
+
+
+def images(arguments: dict[str, Any], noise: float = 0.0, seed: int = 0) -> tuple[Tensor, ExactImage, Tensor]:
+    """The image in float32, the exact one, and that of the reference in float64.
+
+    With noise, float32 has other Gaussians than float64, as after slicing: numbers differ by this part of them.
+    """
+    rest = {name: value for name, value in arguments.items() if name not in NAMES}
+    viewmats, Ks, width, height = (rest.pop(name) for name in ("viewmats", "Ks", "width", "height"))
+    single = tuple(arguments.get(name) for name in NAMES)
+    g = torch.Generator().manual_seed(seed)
+    exact = [None if x is None else x.double() * (1 + noise * (2 * torch.rand(x.shape, generator=g).double() - 1))
+             for x in single]  # fmt: skip
+    exact[2] = exact[2].clamp(0, 1)
+    cameras = viewmats, Ks, width, height
+    image = rasterize(*single[:4], *cameras, shapes=single[4], backend="cpu", **rest).image[0]
+    found = exact_image(tuple(exact), single, viewmats[0], Ks[0], width, height, **rest)
+    if rest.get("background") is not None:
+        rest["background"] = rest["background"].double()
+    cameras = viewmats.double(), Ks.double(), width, height
+    true = rasterize(*exact[:4], *cameras, shapes=exact[4], backend="reference", **rest).image[0]
+    return image, found, true
+
+
+def check(seeds: Iterable[int]) -> None:
+    ratios = []
+    for seed in seeds:
+        image, found, true = images(hard_scenes.scene(seed), 6e-8 * (seed % 2), seed)
+        error = (image.double() - found.image).abs().amax(-1)
+        assert (error <= found.bound).all(), seed
+        assert (found.image - true).abs().max() <= 1e-12 * max(1.0, float(true.abs().max())), seed
+        decided = (error > 0) & ~found.undecided
+        ratios.append((found.bound / error)[decided])
+    assert torch.cat(ratios).median() <= LOOSEST
+
+
+@pytest.mark.parametrize("instruction_set", kernels.native().instruction_sets() if kernels.available() else [])
+def test_no_error_is_above_its_bound(instruction_set: str) -> None:
+    """Catches an error that the analysis leaves out, in any instruction set, and a bound that says nothing."""
+    best = kernels.native().instruction_sets()[-1]
+    kernels.use_instruction_set(instruction_set)
+    try:
+        check(range(100))
+    finally:
+        kernels.use_instruction_set(best)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_no_error_of_2000_scenes_is_above_its_bound() -> None:
+    """The same, 2,000 times."""
+    check(range(100, 2_100))
+
+
+@pytest.mark.parametrize("name", ["3dgs", "4dgs", "6dgs", "7dgs", "7dgs_agr", "ubs", "dbs", "freetime"])
+def test_errors_of_slicing_are_in_the_bound(name: str) -> None:
+    """Catches a slice, a colour or a shape whose rounding is not carried to the pixels."""
+    made = model(name.removesuffix("_agr"), 2_000, agr=name.endswith("_agr"), sigma=0.05)
+    viewmat, K = (x[0] for x in camera(32))
+    with torch.no_grad():
+        query = Query.at(-viewmat[:3, 3], 0.4)
+        single = made.slice(query)
+        exact = copy.deepcopy(made).double().slice(Query.at(query.center.double(), 0.4))
+        image = rasterize(*single[:4], viewmat[None], K[None], 32, 32, shapes=single.shapes).image[0]
+        found = exact_image(exact, single, viewmat, K, 32, 32)
+    error = (image.double() - found.image).abs().amax(-1)
+    assert (error <= found.bound).all()
+    assert 0 < found.bound.median() < 1e-3
+    wrong = single._replace(colors=single.colors + 1e-3)
+    assert exact_image(exact, wrong, viewmat, K, 32, 32).bound.median() > 3e-4
+
+
+def test_the_exact_image_is_that_of_brute_force() -> None:
+    """Catches a box, a tile or a stop that leaves out a pixel of the exact image."""
+    for name in ("ordinary_crowd", "beta_crowd", "opaque_stack", "equal_depths"):
+        (arguments,) = CASES[name]()
+        doubles = {k: x.double() if isinstance(x, Tensor) else x for k, x in arguments.items()}
+        true = brute.render(**doubles).image[0]
+        assert (images(arguments)[1].image - true).abs().max() <= 1e-12, name
+
+
+@pytest.mark.parametrize(("name", "branch"), [("alpha_at_its_limits", SKIPPED), ("transmittance_at_the_stop", STOPPED),
+                                              ("equal_depths", ORDERED)])  # fmt: skip
+def test_a_branch_that_rounding_decides_is_named(name: str, branch: int) -> None:
+    """Catches a pixel that may jump and is not counted, and one that is counted where nothing can jump."""
+    for severity, undecided in ((1.0, True), (0.4, False)):
+        found = images(CASES[name](severity)[0])[1]
+        assert bool((found.branches & branch).any()) == undecided, severity
+        assert float(found.bound.max()) > 1e-5 or not undecided
+
+
+def test_the_culprit_is_the_gaussian_with_the_error() -> None:
+    """Catches a culprit that is only the brightest, the nearest or the last Gaussian."""
+    arguments = picture_cases.crowd(torch.Generator().manual_seed(0), 40, 1.0)
+    single: Gaussians = tuple(arguments.get(name) for name in NAMES)
+    exact = tuple(None if x is None else x.double() for x in single)
+    single[0][7, 0] += 1e-3
+    found = exact_image(exact, single, arguments["viewmats"][0], arguments["Ks"][0], 16, 12)
+    assert (found.culprit == 7).double().mean() > 0.9
+
+
+def test_without_gaussians_the_image_is_the_background() -> None:
+    """Catches an error where a scene, or a tile, has no Gaussian."""
+    for arguments in CASES["no_gaussians"]():
+        image, found, _ = images(arguments)
+        assert torch.equal(found.image.float(), image)
+        assert (found.culprit == -1).all()
+        assert found.bound.max() < 1e-6
+
+
+def test_other_gaussians_are_refused() -> None:
+    """Catches float64 taken for float32, and two sets of Gaussians that differ in number."""
+    arguments = picture_cases.crowd(torch.Generator().manual_seed(0), 4, 1.0)
+    single = tuple(arguments.get(name) for name in NAMES)
+    exact = tuple(None if x is None else x.double() for x in single)
+    place = arguments["viewmats"][0], arguments["Ks"][0], 16, 12
+    with pytest.raises(InputError, match="expected Gaussians of torch.float64 on the CPU, got torch.float32"):
+        exact_image(single, single, *place)
+    with pytest.raises(InputError, match="as many Gaussians in float32 as in float64"):
+        exact_image(exact, tuple(None if x is None else x[:3] for x in single), *place)
