@@ -16,7 +16,7 @@ from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS
 from gsbench.stability import colors, curves, pictures, population, slices, trainings
 from gsbench.stability.cases import CASES, Bound, Case, Cell, backends_with, device_of, of_area
-from gsbench.stability.training_cases import DRIFTING, LONG_DRIFT_STEPS, LONG_STEPS
+from gsbench.stability.training_cases import DRIFT_STEPS, DRIFTING, LONG_DRIFT_STEPS, LONG_STEPS
 
 BACKENDS = ("cpu", "cuda", "reference")
 MILLION = 1_000_000
@@ -123,9 +123,8 @@ def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Step]]:
         more = {"steps": LONG_STEPS} if long and case.name == "learning_rates_times_30" else {}
         add(case.name, audit.cells, partial(trainings.judge, case, fastest, **more))
     for case in of_area("drift"):
-        more = {"steps": LONG_DRIFT_STEPS} if long else {}
-        some = case if long else only(case, *DRIFTING)
-        add(case.name, audit.cells, partial(trainings.drift, some, fastest, **more))
+        some, count = (case, LONG_DRIFT_STEPS) if long else (only(case, *DRIFTING), DRIFT_STEPS)
+        add(case.name, audit.cells, partial(trainings.drift, some, fastest, steps=count))
     for order in FACTOR_ORDERS:
         count = million if long or order == DEFAULT_ORDER else min(million, NOT_DEFAULT)
         steps.append((f"hard slices, {order}", partial(hard_slices, audit, order, count)))

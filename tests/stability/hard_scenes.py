@@ -38,9 +38,8 @@ def scene(seed: int) -> dict[str, Any]:
 def _harden(made: dict[str, Any], kinds: Tensor, g: Generator) -> None:
     """Change the Gaussians of each kind in place."""
     means, factors, opacities, N = made["means"], made["factors"], made["opacities"], len(kinds)
-    thin = (
-        torch.linalg.qr(torch.randn(N, 3, 3, generator=g))[0] * 2 * 10 ** (-4 * _rand(g, N, 1, 3) * _rand(g, N, 1, 1))
-    )
+    axes = torch.linalg.qr(torch.randn(N, 3, 3, generator=g))[0]
+    thin = 2 * axes * 10 ** (-4 * _rand(g, N, 1, 3) * _rand(g, N, 1, 1))
     away = 10 ** (3 * _rand(g, N, 1))
     nearly = 1 + 1e-7 * torch.randint(-3, 4, (N,), generator=g)  # within a few units in the last place
     factors[kinds == FLAT] = thin[kinds == FLAT]

@@ -1,4 +1,4 @@
-"""The exact image and its bound: no float32 image is farther from it than the bound says, and the bound says something."""
+"""The exact image and its bound: no float32 image is farther from it than the bound says, and few are much nearer."""
 
 import copy
 from collections.abc import Iterable
@@ -147,7 +147,7 @@ def test_other_gaussians_are_refused() -> None:
     single = tuple(arguments.get(name) for name in NAMES)
     exact = tuple(None if x is None else x.double() for x in single)
     place = arguments["viewmats"][0], arguments["Ks"][0], 16, 12
-    with pytest.raises(InputError, match="expected Gaussians of torch.float64 on the CPU, got torch.float32"):
+    with pytest.raises(InputError, match=r"expected Gaussians of torch\.float64 on the CPU, got torch\.float32"):
         exact_image(single, single, *place)
     with pytest.raises(InputError, match="as many Gaussians in float32 as in float64"):
         exact_image(exact, tuple(None if x is None else x[:3] for x in single), *place)
