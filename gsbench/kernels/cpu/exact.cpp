@@ -37,9 +37,11 @@ struct Entry {
     int32_t id;
     bool may_stop;     // float32 may end the pixel here, where float64 goes on
     bool ended;        // float64 has ended the pixel
+    bool behind;       // float32 has ended it too, but a tie in depth may bring the Gaussian before the end
     double alpha, low, high;
-    double left;       // the largest transmittance before it in float32
+    double left;       // the largest transmittance before it in float32, in any order of equal depths
     double near, far;  // interval of its depth in float32
+    double nearest;    // the smallest `near` of it and all behind it
     double share;      // of the bound, over all channels
 };
 
@@ -65,11 +67,9 @@ public:
     void run(int64_t count, int64_t at, const ExactPicture& out) {
         keep(count);
         front_to_back(count, out.image + at * a.D);
-        for (int k = 0; k < a.D; ++k) s.total[k] = 0;
-        if (listed) {
-            back_to_front();
-            ties();
-        }
+        for (int k = 0; k < a.D; ++k) s.total[k] = s.sums[k] = 0;
+        ties();
+        back_to_front();
         double bound = 0;
         for (int k = 0; k < a.D; ++k) {
             const double last = U * (s.sums[k] + 3 * magnitude(a.background[k]) * left_most);
@@ -144,22 +144,21 @@ private:
 
     // Blends the exact image, and lists what float64 or float32 blends until both have ended the pixel.
     void front_to_back(int64_t count, double* image) {
-        double left = 1, least_left = 1, far = -1, group_left = 1;
+        double left = 1, least_left = 1, far = -1;
         bool ended = false, finished = false;
-        for (int k = 0; k < a.D; ++k) image[k] = s.sums[k] = 0;
+        for (int k = 0; k < a.D; ++k) image[k] = 0;
         for (int64_t i = 0; i < count; ++i) {
             if (!s.kept[i]) continue;
             const int32_t id = s.ids[i];
             const double depth = a.exact[static_cast<int64_t>(id) * EXACT_COLUMNS + 7];
             const double error = a.single[static_cast<int64_t>(id) * SINGLE_COLUMNS + 10];
-            if (finished && depth - error > far) break;
+            if (finished && depth - a.depth_error > far) break;
             const Shown c = show(id);
             if (c.alpha == 0 && c.high == 0) continue;
-            if (depth - error > far) group_left = left_most;
-            far = most(far, depth + error);
+            if (!finished || depth - error <= far) far = most(far, depth + error);
             Entry& entry = s.entries[listed++];
-            entry = {id, false, true, 0, 0, 0, group_left, depth - error, depth + error, 0};
-            if (finished) continue;  // it may take the place of a Gaussian of the same depth that ended the pixel
+            entry = {id, false, true, finished, 0, 0, 0, left_most, depth - error, depth + error, 0, 0};
+            if (finished) continue;
             if (!ended && c.alpha > 0 && left * (1 - c.alpha) < LEAST_LEFT) ended = true;
             const double after_most = left_most * (1 - c.low) + 2 * U * left_most;
             const double after_least = most(least_left * (1 - c.high) - 2 * U * least_left, 0);
@@ -174,11 +173,8 @@ private:
             entry.alpha = ended ? 0 : c.alpha;
             entry.low = c.low;
             entry.high = c.high;
-            const double *color = color_of(id), *color_error = error_of(id);
-            for (int k = 0; k < a.D; ++k) {
-                image[k] += left * entry.alpha * color[k];
-                s.sums[k] += group_left * c.high * (magnitude(color[k]) + color_error[k]);
-            }
+            const double* color = color_of(id);
+            for (int k = 0; k < a.D; ++k) image[k] += left * entry.alpha * color[k];
             left *= 1 - entry.alpha;
             left_most = least(after_most, left_most);
             least_left = after_least;
@@ -208,16 +204,28 @@ private:
         }
     }
 
-    // Adds what the order of Gaussians can change whose depths are equal within their errors in float32.
+    // Adds what the order of Gaussians can change whose depths are equal within their errors in float32, and sums the
+    // size of what is blended.
     void ties() {
         double loose = 1;  // of the other errors, on which the order acts too
-        for (int64_t i = 0; i < listed; ++i) loose += s.entries[i].high - s.entries[i].low;
+        for (int64_t i = listed - 1; i >= 0; --i) {
+            Entry& e = s.entries[i];
+            loose += e.high - e.low;
+            if (i + 1 < listed) e.nearest = least(e.near, s.entries[i + 1].nearest);
+            else e.nearest = e.near;
+        }
         int64_t first = 0;
         while (first < listed) {
             double far = s.entries[first].far;
             int64_t end = first + 1;
-            while (end < listed && s.entries[end].near <= far) far = most(far, s.entries[end++].far);
-            if (end - first > 1) group(first, end, loose);
+            while (end < listed && s.entries[end].nearest <= far) far = most(far, s.entries[end++].far);
+            if (end - first > 1 && !s.entries[first].behind) group(first, end, loose);
+            for (int64_t i = first; i < end; ++i) {
+                Entry& e = s.entries[i];
+                e.left = s.entries[first].left;
+                const double *color = color_of(e.id), *error = error_of(e.id);
+                for (int k = 0; k < a.D; ++k) s.sums[k] += e.left * e.high * (magnitude(color[k]) + error[k]);
+            }
             first = end;
         }
     }
