@@ -18,6 +18,7 @@ from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
 
 LARGEST_SHIFT = 4.0  # the exponent at which a variable has its full effect on the mean
+FADED = 20.0  # a 2 y^2 at which ln(1 - tanh(y^2)) is below BETA_LOG_MIN
 VIEW_BETA = -3.0  # initial `betas` of direction in a model with time: exponents of 0.2, so directions start weak
 
 
@@ -103,13 +104,14 @@ def shift_weights(betas: Tensor) -> Tensor:
 def opacity_factor(white: Tensor, betas: Tensor) -> Tensor:
     """Compute the opacity factor prod_i (1 - tanh(y_i^2))^b_i, [N], as in UBS.
 
-    With ln(1 - tanh(x)) = ln 2 - ln(1 + e^2x) it neither cancels nor overflows.
+    With x = y^2, ln(1 - tanh(x)) = -ln(1 + (e^2x - 1) / 2) loses no digits of a small x, which a large b multiplies.
 
     Args:
         white: whitened distances y of the direction and time of a query from their means, [N, C].
         betas: the parameters of the exponents, [N, 1 + C]; the first is that of the alpha profile.
     """
-    logs = (math.log(2) - F.softplus(2 * white.square())).clamp(min=BETA_LOG_MIN)
+    doubled = (2 * white.square()).clamp(max=FADED)
+    logs = (-torch.log1p(torch.expm1(doubled) / 2)).clamp(min=BETA_LOG_MIN)
     return (exponents(betas[:, 1:]) * logs).sum(-1).exp()
 
 

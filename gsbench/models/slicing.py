@@ -176,10 +176,11 @@ def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
         square = (x * x).sum(-1, keepdim=True)
         length = torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
         signed = torch.where(x[:, :1] < 0, -length, length)
-        v = torch.cat([x[:, :1] + signed, x[:, 1:]], -1)
-        vv = (v * v).sum(-1, keepdim=True)
-        step = v * (2 / torch.where(vv > 0, vv, 1.0))  # zero for a row of zeros, which does not change
-        rest = rest - (rest * v[:, None]).sum(-1, keepdim=True) * step[:, None]
+        # I - tau u u^T with u_0 = 1: its numbers are of order one, so that no square of a short row underflows.
+        first = x[:, :1] + signed
+        u = torch.cat([torch.ones_like(first), x[:, 1:] / torch.where(square > 0, first, 1.0)], -1)
+        tau = first / torch.where(square > 0, signed, 1.0)  # zero for a row of zeros, which does not change
+        rest = rest - (rest * u[:, None]).sum(-1, keepdim=True) * (tau * u)[:, None]
         # Row i is now (+-|x|, 0, ..) up to rounding. The zeros are written, so that T is exactly triangular.
         columns.append(torch.cat([torch.zeros_like(rest[:, :i, 0]), -signed, rest[:, i + 1 :, 0]], -1))
         rest = rest[..., 1:]

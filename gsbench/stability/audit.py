@@ -14,14 +14,16 @@ from gsbench.errors import InputError
 from gsbench.kernels.backends import resolve
 from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS
-from gsbench.stability import colors, curves, pictures, population, slices, trainings
+from gsbench.stability import colors, curves, moving_population, pictures, population, slices, trainings
 from gsbench.stability.cases import CASES, Bound, Case, Cell, backends_with, device_of, of_area
+from gsbench.stability.slicing_cases import ALL
 from gsbench.stability.training_cases import DRIFT_STEPS, DRIFTING, LONG_DRIFT_STEPS, LONG_STEPS
 
 BACKENDS = ("cpu", "cuda", "reference")
 MILLION = 1_000_000
 NOT_DEFAULT = 100_000  # Gaussians that are sliced in the factor order that is not the default
 SUBTRACTING = 50_000  # Gaussians that are sliced by the schemes that subtract covariances
+MOVING = 20_000  # Gaussians of dGS, dBS, UBS and FreeTimeGS each
 DEFAULT_ORDER = "conditioned_first"
 SEED = 0
 # The short audit: random Gaussians per factor order, training steps, and the test case that is left out.
@@ -36,7 +38,7 @@ class Audit:
 
     backends: list[str]
     cells: list[Cell] = field(default_factory=list)
-    verified: dict[str, float] = field(default_factory=dict)  # errors of float64 against mpmath, by factor order
+    verified: dict[str, float] = field(default_factory=dict)  # errors of float64 against mpmath, by order or model
     conditions: list[curves.ConditionCurve] = field(default_factory=list)
     accuracy: list[curves.AccuracyPoint] = field(default_factory=list)
     safety: list[curves.SliceTime] = field(default_factory=list)
@@ -84,8 +86,9 @@ def _short_steps(audit: Audit) -> list[tuple[str, Step]]:
     fastest = audit.backends[0]
     judged: list[tuple[Case, Callable[[Case], Iterable[Cell]]]] = []
     for case in of_area("slicing"):
-        some = only(case, *(model for model in case.subjects if model != "6dgs"))  # 6DGS is 7DGS without time
-        judged.append((some, partial(slices.judge, backends=audit.backends, schemes=["square_root"])))
+        some = [model for model in case.subjects if model in ALL and model != "6dgs"]  # 6DGS is 7DGS without time
+        judge_slices = partial(slices.judge, backends=audit.backends, schemes=["square_root"], copies=1)
+        judged.append((only(case, *(some or case.subjects[:1])), judge_slices))
     for area, judge in (("colour", colors.judge), ("projection", pictures.judge), ("blending", pictures.judge)):
         judged += [(case, partial(judge, backends=audit.backends)) for case in of_area(area) if case.name != SLOWEST]
     driven, drifting = (only(CASES[name], "7dgs") for name in ("learning_rates_times_30", "single_against_double"))
@@ -95,7 +98,9 @@ def _short_steps(audit: Audit) -> list[tuple[str, Step]]:
         (drifting, partial(trainings.drift, backend=fastest, seeds=trainings.SEEDS[:1], steps=SHORT_STEPS)),
     ]
     steps: list[tuple[str, Step]] = [(case.name, partial(_extend, audit.cells, judge, case)) for case, judge in judged]
-    return steps + [(f"hard slices, {order}", partial(hard_slices, audit, order, FEW)) for order in FACTOR_ORDERS]
+    steps += [(f"hard slices, {order}", partial(hard_slices, audit, order, FEW)) for order in FACTOR_ORDERS]
+    models = moving_population.MODELS
+    return steps + [(f"hard slices, {model}", partial(moving_slices, audit, model, FEW)) for model in models]
 
 
 def only(case: Case, *subjects: str) -> Case:
@@ -128,6 +133,8 @@ def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Step]]:
     for order in FACTOR_ORDERS:
         count = million if long or order == DEFAULT_ORDER else min(million, NOT_DEFAULT)
         steps.append((f"hard slices, {order}", partial(hard_slices, audit, order, count)))
+    for model in moving_population.MODELS:
+        steps.append((f"hard slices, {model}", partial(moving_slices, audit, model, min(million, MOVING))))
     add("error by condition number", audit.conditions, curves.by_condition)
     add("error by time", audit.accuracy, partial(curves.accuracy_for_time, audit.backends))
     add("cost of safety", audit.safety, partial(curves.safety, audit.backends))
@@ -154,3 +161,9 @@ def hard_slices(audit: Audit, order: str, N: int) -> None:
                 Cell("population", f"hard_slices_{order}", "7dgs", scheme, backend, forward, gradient,
                      float(errors.bad.mean()), ms, Bound(), f"{count} slices")
             )  # fmt: skip
+
+
+def moving_slices(audit: Audit, model: str, N: int) -> None:
+    """Measure the errors of N random slices of dGS, dBS, UBS or FreeTimeGS."""
+    cells, audit.verified[model] = moving_population.judge(model, N, audit.backends)
+    audit.cells += cells

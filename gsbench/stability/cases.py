@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+TORCH_ONLY = ("dgs_interpolated", "dgs_o")  # models without a kernel
 AREAS = ("slicing", "colour", "projection", "blending", "training", "drift")
 
 
@@ -85,11 +86,11 @@ def device_of(backend: str) -> str:
 def backends_with(scheme: str, model: str, backends: list[str]) -> list[str]:
     """Return the backends that implement a slicing scheme, which computes the conditional 3D Gaussian.
 
-    All backends implement `square_root`. `cholesky` runs in torch, and for 6D and 7D also in the CPU kernels. `schur`
-    runs in torch only.
+    All backends implement `square_root`, and the only one of a model without schemes ("-"). `cholesky` runs in torch,
+    and for 6D and 7D also in the CPU kernels. `schur` runs in torch only.
     """
-    if scheme == "square_root":
-        return backends
+    if scheme in ("square_root", "-"):
+        return [name for name in backends if name == "reference" or model not in TORCH_ONLY]
     if scheme == "cholesky" and model != "4dgs":
         return [backend for backend in backends if backend != "cuda"]
     return ["reference"]

@@ -66,9 +66,9 @@ def slice_triangular(x: Vector, layout: dict[str, int], order: str, half: float,
         time: the time at which to slice; None for 6DGS.
         relative: whether off-diagonal entries between position rows are in units of their row's diagonal entry.
     """
-    raw = _unpack(x, layout)
+    raw = unpack(x, layout)
     n = len(order)
-    L = [[mpf(0)] * i + [_size(raw["log_diagonal"][i])] for i in range(n)]
+    L = [[mpf(0)] * i + [size_of(raw["log_diagonal"][i])] for i in range(n)]
     kinds = {0: iter(raw["coupling"]), 1: iter(raw["motion"]), 2: iter(raw["shape"])}  # by how many of two are p
     for i in range(n):
         for j in range(i):
@@ -79,12 +79,12 @@ def slice_triangular(x: Vector, layout: dict[str, int], order: str, half: float,
     p, d, t = ([i for i in range(n) if order[i] == name] for name in "pdt")
     direction = unit([m - mpf(c) for m, c in zip(raw["means"], center, strict=True)])
     delta = [a - b for a, b in zip(direction, raw["directions"], strict=True)]
-    exponent = half * mp.exp(mpf(log_lambda["direction"])) * _mahalanobis(_block(S, d, d), delta)
+    exponent = half * mp.exp(mpf(log_lambda["direction"])) * _mahalanobis(block(S, d, d), delta)
     if time is not None:
         delta = [*delta, mpf(time) - raw["times"][0]]
         exponent += mp.exp(mpf(log_lambda["time"])) * delta[3] ** 2 / S[t[0]][t[0]] / 2
     mean, cov = _condition(S, p, d + t, raw["means"], delta)
-    return [*mean, *cov, mp.exp(-exponent) * _sigmoid(raw["opacities"][0])]
+    return [*mean, *cov, mp.exp(-exponent) * sigmoid(raw["opacities"][0])]
 
 
 def slice_rotated(x: Vector, layout: dict[str, int], log_lambda: dict[str, float], time: float) -> Vector:
@@ -93,18 +93,18 @@ def slice_rotated(x: Vector, layout: dict[str, int], log_lambda: dict[str, float
     The 4D covariance is (R s)(R s)^T with the diagonal matrix s of the four sizes. Two quaternions l and r give the
     rotation R = M_left(l) M_right(r) (4DGS eq. 5 to 9).
     """
-    raw = _unpack(x, layout)
-    a, b, c, d = _normalised(raw["left_quats"])
-    p, q, r, s = _normalised(raw["right_quats"])
+    raw = unpack(x, layout)
+    a, b, c, d = normalised(raw["left_quats"])
+    p, q, r, s = normalised(raw["right_quats"])
     left = [[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]]
     right = [[p, q, r, s], [-q, p, -s, r], [-r, s, p, -q], [-s, -r, q, p]]
-    size = [_size(x) for x in raw["scales"]]
+    size = [size_of(x) for x in raw["scales"]]
     F = [[mp.fdot(left[i], [row[j] for row in right]) * size[j] for j in range(4)] for i in range(4)]
     S = [[mp.fdot(a, b) for b in F] for a in F]
     delta = mpf(time) - raw["times"][0]
     f_temp = mp.exp(-mp.exp(mpf(log_lambda["time"])) * delta**2 / S[3][3] / 2)
     mean, cov = _condition(S, [0, 1, 2], [3], raw["means"], [delta])
-    return [*mean, *cov, f_temp * _sigmoid(raw["opacities"][0]) if f_temp > TIME_OPACITY_FACTOR_MIN else mpf(0)]
+    return [*mean, *cov, f_temp * sigmoid(raw["opacities"][0]) if f_temp > TIME_OPACITY_FACTOR_MIN else mpf(0)]
 
 
 def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vector) -> tuple[Vector, Vector]:
@@ -112,8 +112,8 @@ def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vecto
 
     Here p are the rows of position, q those of time and direction, and delta is the given q minus mu_q.
     """
-    S_pq = _block(S, p, q)
-    K = _solve(_block(S, q, q), S_pq)
+    S_pq = block(S, p, q)
+    K = solve(block(S, q, q), S_pq)
     moved = [m + mp.fdot(k, delta) for m, k in zip(mean, K, strict=True)]
     return moved, [S[p[i]][p[j]] - mp.fdot(K[i], S_pq[j]) for i in range(3) for j in range(3)]
 
@@ -190,7 +190,7 @@ def colors(x: Vector, layout: dict[str, int], center: Sequence[float], waves: in
         waves: the number of frequencies in time, including frequency 0.
         time: the time at which to compute the colour.
     """
-    raw = _unpack(x, layout)
+    raw = unpack(x, layout)
     dx, dy, dz = unit([m - mpf(c) for m, c in zip(raw["means"], center, strict=True)])
     defined = any((dx, dy, dz))
     basis = [_harmonic(degree, order, dx, dy, dz) if defined or degree == 0 else mpf(0)
@@ -229,20 +229,24 @@ def unit(v: Vector) -> Vector:
     return [x / mp.sqrt(square) for x in v] if square > UNDEFINED else [mpf(0)] * 3
 
 
-def _size(log: Any) -> Any:
+def size_of(log: Any) -> Any:
+    """Return exp of a log size, which is limited to +-LOG_SIZE_MAX."""
     return mp.exp(min(max(log, mpf(-LOG_SIZE_MAX)), mpf(LOG_SIZE_MAX)))
 
 
-def _sigmoid(x: Any) -> Any:
+def sigmoid(x: Any) -> Any:
+    """Return 1 / (1 + exp(-x))."""
     return 1 / (1 + mp.exp(-x))
 
 
-def _normalised(q: Vector) -> Vector:
+def normalised(q: Vector) -> Vector:
+    """Normalise the vector q; if it is shorter than 1e-12, divide it by 1e-12."""
     length = max(mp.sqrt(mp.fdot(q, q)), mpf("1e-12"))  # as torch's normalize
     return [x / length for x in q]
 
 
-def _unpack(x: Vector, layout: dict[str, int]) -> dict[str, Vector]:
+def unpack(x: Vector, layout: dict[str, int]) -> dict[str, Vector]:
+    """Return the parameters in x by name; `layout` has their names and lengths. Further entries of x are ignored."""
     parts, first = {}, 0
     for name, count in layout.items():
         parts[name] = x[first : first + count]
@@ -250,15 +254,16 @@ def _unpack(x: Vector, layout: dict[str, int]) -> dict[str, Vector]:
     return parts
 
 
-def _block(S: Matrix, rows: list[int], columns: list[int]) -> Matrix:
+def block(S: Matrix, rows: list[int], columns: list[int]) -> Matrix:
+    """Return the given rows and columns of S."""
     return [[S[i][j] for j in columns] for i in rows]
 
 
 def _mahalanobis(S: Matrix, delta: Vector) -> Any:
-    return mp.fdot(delta, _solve(S, [delta])[0])
+    return mp.fdot(delta, solve(S, [delta])[0])
 
 
-def _solve(A: Matrix, B: Matrix) -> Matrix:
+def solve(A: Matrix, B: Matrix) -> Matrix:
     """Solve A x = b by Gaussian elimination for each row b of B, for a positive definite matrix A; return the rows x.
 
     No pivoting is needed, because the arithmetic has many digits.

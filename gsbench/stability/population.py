@@ -266,9 +266,10 @@ def _judge(
 def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
     """Return which conditional covariances [N] have a negative eigenvalue or are not finite.
 
-    The scheme `square_root` returns a factor F of the covariance F F^T, which has no negative eigenvalue.
+    The scheme `square_root` returns a factor F of the covariance F F^T, which has no negative eigenvalue, as models
+    without schemes do.
     """
-    scheme: str = model.scheme  # type: ignore[assignment]  # every model that slices has one
+    scheme = str(getattr(model, "scheme", "square_root"))
     if scheme == "square_root":
         return torch.zeros(len(raw["means"]), dtype=torch.bool)
     cov = subtract(model.factors(raw), scheme)[1].double()  # type: ignore[operator]

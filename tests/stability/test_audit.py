@@ -33,6 +33,8 @@ def test_the_short_audit_passes(
     monkeypatch.setattr(audit, "run", lambda **words: found.append(run(**words)) or found[0])
     assert command.main(["--short", "--out", str(tmp_path / "none")]) == 0, capsys.readouterr().out
     assert {cell.case for cell in found[0].cells} >= CASES.keys() - LONG
+    assert {*audit.moving_population.MODELS} < found[0].verified.keys()
+    assert max(found[0].verified.values()) < 1e-6, "the float64 slices that others are held to"
     assert not (tmp_path / "none").exists(), "a page of half the cases"
 
 

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from gsbench.kernels.backends import BACKENDS
 from gsbench.models import GaussianModel, Query
-from gsbench.models.sliced import tensors_of
 from gsbench.raster import rasterize
 from gsbench.stability import colors, picture_cases, pictures, slices  # noqa: F401  # their cases enter the list
 from gsbench.stability.audit import present
@@ -38,12 +37,14 @@ def whole_path(model: GaussianModel, raw: dict[str, Tensor], center: Tensor, tim
     """Slice, draw, compare with a photograph, and differentiate; everything must be finite."""
     inputs = {name: value.clone().requires_grad_() for name, value in raw.items()}
     moment = torch.tensor(time)
-    means, factors, opacities = tensors_of(model.slice_geometry(inputs, Query(center, moment)))
+    means, factors, opacities, shapes = model.slice_geometry(inputs, Query(center, moment))
     shown = model.shade(inputs, means, opacities, Query(center, moment))
     viewmat = torch.eye(4)
     viewmat[:3, 3] = -center
     K = torch.tensor([[20.0, 0, WIDTH / 2], [0, 20.0, HEIGHT / 2], [0, 0, 1]])
-    image = rasterize(means, factors, opacities, shown, viewmat[None], K[None], WIDTH, HEIGHT, backend=backend).image[0]
+    image = rasterize(
+        means, factors, opacities, shown, viewmat[None], K[None], WIDTH, HEIGHT, backend=backend, shapes=shapes
+    ).image[0]
     target = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
     loss = photometric(image, target, 0.2, BACKENDS[backend])
     assert loss.isfinite()

@@ -55,22 +55,12 @@ struct DirectBetaGaussian {
 
     const Parameters& raw;
     Still still;
-    T exponents[K];  // over 4
+    BetaExponents<T, K> beta;
     CoupledMotion<T, K> motion;
-    T logs[K], falls[K], opacity_factor;  // logs: ln(1 - tanh(white^2)); falls: their derivative by white, negative
+    BetaFading<T, K> fading;
 
     GSB_HD DirectBetaGaussian(const Parameters& raw, const ViewPoint& view)
-        : raw(raw), still(raw.still), motion(moved(view)) {
-        const T zero(0.0f), least(BETA_LOG_MIN);
-        T sum = zero;
-        GSB_UNROLL for (int k = 0; k < K; ++k) {
-            const T x = motion.white[k] * motion.white[k] * 2.0f, free = T(LN_2) - softplus(x);
-            logs[k] = max(free, least);
-            falls[k] = select(free < least, zero, motion.white[k] * 4.0f * sigmoid(x));
-            sum = sum + exponents[k] * logs[k];
-        }
-        opacity_factor = exp(sum * 4.0f);
-    }
+        : raw(raw), still(raw.still), beta(raw.betas), motion(moved(view)), fading(motion.white, beta.exponents) {}
 
     GSB_HD Seen observe() const {
         Seen out;
@@ -78,24 +68,20 @@ struct DirectBetaGaussian {
             out.mean[i] = raw.mean[i] + motion.mean_size * motion.shift[i];
             GSB_UNROLL for (int j = 0; j < 3; ++j) out.factor[i][j] = still.factor[i][j];
         }
-        out.opacity = still.opacity * opacity_factor;
+        out.opacity = still.opacity * fading.factor;
         out.shape = still.shape;
         return out;
     }
 
     GSB_HD void vjp(const Seen& g, Parameters& out) const {
-        const T zero(0.0f), one(1.0f), third(1.0f / 3.0f);
-        const T g_sum = g.opacity * still.opacity * opacity_factor * 4.0f;
-        T g_white[K], g_weights[K], g_delta[K];
-        GSB_UNROLL for (int k = 0; k < K; ++k) g_white[k] = zero - g_sum * exponents[k] * falls[k];
+        const T zero(0.0f), third(1.0f / 3.0f);
+        T g_white[K], g_exponents[K], g_weights[K], g_delta[K];
+        fading.vjp(motion.white, beta.exponents, g.opacity * still.opacity, g_white, g_exponents);
         const T g_size = motion.vjp(g.mean, g_white, out.motion, g_weights, g_delta) * third;
-        GSB_UNROLL for (int k = 0; k < K; ++k) {
-            const T g_exponent = g_sum * logs[k] + select(exponents[k] <= one, g_weights[k], zero);
-            out.betas[k] = size_vjp(raw.betas[k], exponents[k], g_exponent);
-        }
+        beta.vjp(raw.betas, g_exponents, g_weights, out.betas);
         GSB_UNROLL for (int i = 0; i < 3; ++i) out.direction[i] = zero - g_delta[i];
         if constexpr (K > 3) out.time = zero - g_delta[3];
-        still.vjp(g.factor, g.opacity * opacity_factor, g.shape, out.still);
+        still.vjp(g.factor, g.opacity * fading.factor, g.shape, out.still);
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
             out.mean[i] = g.mean[i];
             const T g_scale = bounded_softplus_vjp(raw.still.scales[i], still.size[i], g_size);
@@ -104,18 +90,14 @@ struct DirectBetaGaussian {
     }
 
 private:
-    GSB_HD CoupledMotion<T, K> moved(const ViewPoint& view) {
+    GSB_HD CoupledMotion<T, K> moved(const ViewPoint& view) const {
         const Vec3<T> d = direction_to(raw.mean, view);
-        T delta[K], weights[K];
+        T delta[K];
         delta[0] = d.x - raw.direction[0];
         delta[1] = d.y - raw.direction[1];
         delta[2] = d.z - raw.direction[2];
         if constexpr (K > 3) delta[3] = T(view.time) - raw.time;
-        GSB_UNROLL for (int k = 0; k < K; ++k) {
-            exponents[k] = size_of(raw.betas[k]);
-            weights[k] = min(exponents[k], T(1.0f));
-        }
-        return {raw.motion, delta, weights, (still.size[0] + still.size[1] + still.size[2]) * (1.0f / 3.0f)};
+        return {raw.motion, delta, beta.weights, (still.size[0] + still.size[1] + still.size[2]) * (1.0f / 3.0f)};
     }
 };
 

@@ -181,8 +181,10 @@ struct UniversalGaussian {
     Reflection<T, 3> reflections[K];
     Reduced<T, K> t;
     Vec3<T> offset;  // camera to mean
-    T white[K], weight[K], root[K], exponent[K], dimmed[K];  // y, B, (I - B)^(1/2), b, ln(1 - tanh(y^2))
-    T opacity, opacity_factor, rows[3][3 + K];
+    BetaExponents<T, K> beta;
+    T white[K], root[K];  // y, (I - B)^(1/2)
+    BetaFading<T, K> fading;
+    T opacity, rows[3][3 + K];
 
     GSB_HD UniversalGaussian(const ViewPoint& view, const Parameters& raw) : view(view), raw(raw) {}
 
@@ -197,19 +199,15 @@ struct UniversalGaussian {
         delta[2] = d.z - raw.direction[2];
         if constexpr (TIME) delta[3] = T(view.time) - raw.time;
         whiten(t, delta, white);
-        T shift[K], sum = zero;
+        beta = BetaExponents<T, K>(raw.betas + 1);
+        T shift[K];
         GSB_UNROLL for (int i = 0; i < K; ++i) {
-            exponent[i] = size_of(raw.betas[1 + i]) * 4.0f;
-            weight[i] = min(exponent[i] * 0.25f, one);
-            const T left = one - weight[i];
+            const T left = one - beta.weights[i];
             root[i] = select(left > zero, sqrt(select(left > zero, left, one)), zero);
-            shift[i] = weight[i] * white[i];
-            dimmed[i] = max(T(LN_2) - softplus(doubled_square(i)), T(BETA_LOG_MIN));
-            sum = sum + exponent[i] * dimmed[i];
+            shift[i] = beta.weights[i] * white[i];
         }
+        fading = BetaFading<T, K>(white, beta.exponents);
         opacity = sigmoid(raw.opacity);
-        opacity_factor = exp(max(sum, T(-EXPONENT_MAX)));
-        opacity_factor = select(sum < T(-EXPONENT_MAX), zero, opacity_factor);
 
         ObservedBeta<T> out;
         const Vec3<T> moved = moved_mean(t, {raw.mean[0], raw.mean[1], raw.mean[2]}, shift);
@@ -224,7 +222,7 @@ struct UniversalGaussian {
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
             GSB_UNROLL for (int j = 0; j < 3; ++j) out.factor[i][j] = triangle.factor[i][j];
         }
-        out.opacity = opacity * opacity_factor;
+        out.opacity = opacity * fading.factor;
         out.shape = size_of(raw.betas[0]) * 4.0f;
         return out;
     }
@@ -238,30 +236,28 @@ struct UniversalGaussian {
         g_t.zero();
         T shift[K], g_white[K];
         GSB_UNROLL for (int i = 0; i < K; ++i) {
-            shift[i] = weight[i] * white[i];
+            shift[i] = beta.weights[i] * white[i];
             g_white[i] = zero;  // at first the gradient of the shift
         }
         moved_mean_vjp(t, shift, {g.mean[0], g.mean[1], g.mean[2]}, g_white, g_t);
-        out.opacity = g.opacity * opacity_factor * opacity * (one - opacity);
-        const T g_sum = g.opacity * opacity * opacity_factor;
+        out.opacity = g.opacity * fading.factor * opacity * (one - opacity);
         const T shape = size_of(raw.betas[0]) * 4.0f;
         out.betas[0] = size_vjp(raw.betas[0], shape, g.shape);
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
             GSB_UNROLL for (int j = 0; j < 3; ++j) g_t.pp[i][j] = g_rows[i][j];
             GSB_UNROLL for (int j = 0; j < K; ++j) g_t.pq[i][j] = g_t.pq[i][j] + g_rows[i][3 + j] * root[j];
         }
+        T g_faded[K], g_exponents[K], g_weights[K];
+        fading.vjp(white, beta.exponents, g.opacity * opacity, g_faded, g_exponents);
         GSB_UNROLL for (int i = 0; i < K; ++i) {
             T g_root = zero;
             GSB_UNROLL for (int j = 0; j < 3; ++j) g_root = g_root + g_rows[j][3 + i] * t.pq[j][i];
             // The derivative of the root is infinite at zero; there it counts as zero.
             const auto some = root[i] > zero;
-            T g_weight = g_white[i] * white[i];
-            g_weight = g_weight - select(some, g_root * 0.5f / select(some, root[i], one), zero);
-            const T g_exponent = g_sum * dimmed[i] + select(exponent[i] * 0.25f <= one, g_weight * 0.25f, zero);
-            out.betas[1 + i] = size_vjp(raw.betas[1 + i], exponent[i], g_exponent);
-            const T g_dimmed = select(dimmed[i] > T(BETA_LOG_MIN), g_sum * exponent[i], zero);
-            g_white[i] = g_white[i] * weight[i] - g_dimmed * sigmoid(doubled_square(i)) * white[i] * 4.0f;
+            g_weights[i] = g_white[i] * white[i] - select(some, g_root * 0.5f / select(some, root[i], one), zero);
+            g_white[i] = g_white[i] * beta.weights[i] + g_faded[i];
         }
+        beta.vjp(raw.betas + 1, g_exponents, g_weights, out.betas + 1);
         whiten_vjp(t, white, g_white, g_t);  // now that of delta
         const Vec3<T> g_offset = Unit<T>(offset).vjp({g_white[0], g_white[1], g_white[2]});
         out.mean[0] = g.mean[0] + g_offset.x;
@@ -276,9 +272,6 @@ struct UniversalGaussian {
 private:
     // Returns the place in `lower` of the first entry of row i of q: three of L_qp, and then i of L_q.
     GSB_HD static constexpr int place(int i) { return 3 * i + i * (i - 1) / 2; }
-
-    // Returns 2 y_i^2, at most so large that 1 - tanh(y_i^2) is at its least anyway.
-    GSB_HD T doubled_square(int i) const { return min(white[i] * white[i] * 2.0f, T(EXPONENT_MAX)); }
 
     // Computes the factor and reduces it. With the columns of q before those of p, its rows are [L_q L_qp] and
     // [0 (I + A) S_p]. Since L_q is triangular, the reflection of row i only changes column i and those of p.
