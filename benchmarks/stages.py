@@ -19,6 +19,7 @@ from gsbench.scenes import View
 from gsbench.train.losses import photometric
 
 MODELS = {"7dgs_noagr": ("7dgs", False), "7dgs": ("7dgs", True), "4dgs": ("4dgs", False)}  # name: model, AGR
+SUCCESSORS = ("dgs", "dbs", "ubs", "freetime")  # of which only the slice is timed; other stages cost as above
 STAGES = {"refine": "AGR", "slice_triangular": "slice", "slice_rotated": "slice", "show_colors": "colours",
           "project": "project", "blend": "blend"}  # fmt: skip
 
@@ -107,9 +108,20 @@ def recorded(fitted: GaussianModel, view: View) -> dict[str, Call]:
 
 
 def stages(N: int = 150_000, size: int = 400) -> Iterator[Row]:
-    """Every stage of a training step of 150,000 Gaussians and one view of 400 x 400, and the whole step."""
+    """Every stage of a training step of 150,000 Gaussians and one view of 400 x 400; of later models the slice."""
     for name in MODELS:
         yield from stages_of(name, N, size)
+    for name in SUCCESSORS:
+        yield from slice_of(name, N, size)
+
+
+def slice_of(name: str, N: int, size: int) -> Iterator[Row]:
+    """The slice of one model and its gradients, of which a view shows as many Gaussians as in training."""
+    calls = recorded(trained(name, N), one_view(size, size))
+    (call,) = (call for key, call in calls.items() if key.startswith("slice"))
+    forward, backward = floors(call, calls["project"], N)
+    yield Row("stages", f"{name} slice forward", call.forward_again, floor=forward)
+    yield Row("stages", f"{name} slice backward", call.backward_again, floor=backward)
 
 
 def stages_of(name: str, N: int, size: int) -> Iterator[Row]:

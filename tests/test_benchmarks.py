@@ -7,7 +7,7 @@ import torch
 
 from benchmarks import rows, scene
 from benchmarks.__main__ import HEADER, line
-from benchmarks.stages import MODELS, blended_alphas, recorded, stages
+from benchmarks.stages import MODELS, SUCCESSORS, blended_alphas, recorded, stages
 from benchmarks.training import one_view
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import Query
@@ -38,11 +38,14 @@ def test_every_stage_is_timed_once_and_has_a_floor() -> None:
         agr = {"AGR forward", "AGR backward"} if name == "7dgs" else set()
         found = [row.name.removeprefix(f"{name} ") for row in stage_rows if row.name.startswith(f"{name} ")]
         assert sorted(found) == sorted(expected | agr)
+    for name in SUCCESSORS:
+        found = [row.name for row in stage_rows if row.name.startswith(f"{name} ")]
+        assert found == [f"{name} slice forward", f"{name} slice backward"]
 
 
 def test_a_trained_model_shows_a_part_of_its_rows_in_order() -> None:
     """Catches stages that are timed with every Gaussian visible, or with visible ones far apart."""
-    for name in ("4dgs", "7dgs"):
+    for name in ("4dgs", "7dgs", "dgs", "dbs", "freetime"):
         fitted, view = scene.trained(name, 1600), one_view(32, 32)
         seen = fitted.slice(Query.of(view.camera, view.time)).opacities >= ALPHA_MIN
         assert abs(float(seen.float().mean()) - scene.VISIBLE) < 0.02
