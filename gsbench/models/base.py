@@ -196,6 +196,10 @@ class GaussianModel(nn.Module, ABC):
     def __len__(self) -> int:
         return len(self.splats["means"]) if "means" in self.splats else 0
 
+    def raw_of(self, rows: Tensor) -> Raw:
+        """Return the raw parameters of the Gaussians `rows` [M], without gradients."""
+        return {name: value.detach()[rows] for name, value in self.splats.items()}
+
     @torch.no_grad()
     def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
         """Place an isotropic Gaussian of opacity 0.1, or `initial_opacity`, at each point (3DGS, section 5.1).

@@ -68,7 +68,7 @@ class BetaModel(GaussianModel):
 
     def spread(self, rows: Tensor) -> Tensor:
         """Return the factors of the conditional covariances of the Gaussians `rows` [M], [M, 3, 3]."""
-        return self.factors({name: value.detach()[rows] for name, value in self.splats.items()})
+        return self.factors(self.raw_of(rows))
 
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
         """Do nothing: the authors relocate without a change of size, because the factors are those of Gaussians."""

@@ -75,8 +75,7 @@ class Gaussians3DModel(GatedModel):
 
     def spread(self, rows: Tensor) -> Tensor:
         """Return the factors R S of the covariances of the Gaussians `rows`, [M, 3, 3]."""
-        raw = {name: value.detach()[rows] for name, value in self.splats.items()}
-        return self.factors(raw)
+        return self.factors(self.raw_of(rows))
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Sample the means of children from the parent Gaussian, with scales 1.6 times smaller (3DGS, section 5.2)."""

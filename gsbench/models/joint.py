@@ -21,8 +21,7 @@ class JointModel(GatedModel):
 
     def spread(self, rows: Tensor) -> Tensor:
         """Return factors of the conditional 3D covariances of the Gaussians `rows` [M], [M, 3, 3]."""
-        raw = {name: value.detach()[rows] for name, value in self.splats.items()}
-        return reduce(self.factors(raw)).T_pp
+        return reduce(self.factors(self.raw_of(rows))).T_pp
 
     def durations(self) -> Tensor | None:
         """Return the standard deviation in time of each Gaussian, [N]; None for a model without time."""

@@ -11,7 +11,14 @@ from torch import Tensor
 from gsbench.kernels.backends import BACKENDS
 from gsbench.models import GaussianModel, Query
 from gsbench.raster import rasterize
-from gsbench.stability import colors, picture_cases, pictures, slices  # noqa: F401  # their cases enter the list
+from gsbench.stability import (
+    colors,  # noqa: F401  # its cases enter the list
+    moving_population,
+    picture_cases,  # noqa: F401
+    pictures,
+    slices,
+    slicing_cases,
+)
 from gsbench.stability.audit import present
 from gsbench.stability.cases import CASES, of_area
 from gsbench.stability.slicing_cases import COUNT, Observed
@@ -63,7 +70,8 @@ def check_case(which: tuple[str, str], severity: float, seed: int, backend: str)
 
 def check_any_numbers(model_name: str, values: list[float], seed: int, backend: str) -> None:
     """Raw parameters replaced at random by numbers that no recipe would give."""
-    observed: Observed = CASES["ordinary_gaussians"](1.0, seed, model=model_name)
+    case = "ordinary_gaussians" if model_name in slicing_cases.ALL else "ordinary_moving_gaussians"
+    observed: Observed = CASES[case](1.0, seed, model=model_name)
     model, raw = slices.load(observed, "square_root", backend)
     raw = {name: value.detach() for name, value in raw.items()}
     g = torch.Generator().manual_seed(seed)
@@ -91,9 +99,12 @@ def searched(examples: int) -> tuple[Any, Any, Any]:
         given(st.sampled_from(SLICES), severities, seeds, backends)(check_case)
     )
     wild = settings(max_examples=examples // 4, deadline=None)(
-        given(st.sampled_from(["4dgs", "6dgs", "7dgs"]), st.lists(raw_values, max_size=12), seeds, backends)(
-            check_any_numbers
-        )
+        given(
+            st.sampled_from([*slicing_cases.ALL, *moving_population.MODELS]),
+            st.lists(raw_values, max_size=12),
+            seeds,
+            backends,
+        )(check_any_numbers)
     )
     drawn = settings(max_examples=examples // 4, deadline=None)(
         given(st.sampled_from(PICTURES), severities, seeds, backends)(check_picture)
