@@ -18,7 +18,7 @@ from gsbench.run.load import LoadedRun, load_run, scene_of
 from gsbench.scenes import Camera, Scene, View
 from gsbench.scenes.trained import ply_of
 from gsbench.view import film, paths
-from gsbench.view.gaussians import has_profiles, trained_of
+from gsbench.view.gaussians import trained_of
 
 PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
 MOST_FRAMES = 100_000
@@ -129,7 +129,7 @@ def write_ply(asked: ExportRequest, path: Path) -> list[str]:
     colours = f"harmonics of degree {run.model.active.sh_degree}" if keep else f"as seen from {whence}"
     said = [f"{path}: {len(trained)} Gaussians{when}, colours {colours}; {culled} of {len(run.model)} are left out, as "
             f"their opacity there is below 1/255"]  # fmt: skip
-    if has_profiles(run.model, query):
+    if trained.from_profiles:
         said.append(f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of "
                     f"3DGS has no field for b; --images and --video keep the profiles")  # fmt: skip
     return said

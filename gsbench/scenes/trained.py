@@ -5,7 +5,7 @@ logit, and the rotation is a quaternion wxyz. The columns `f_rest_*` are the SH 
 of the red channel, then green, then blue.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +40,7 @@ class TrainedGaussians:
     logits: Tensor  # [N] logits of opacities
     dc: Tensor  # [N, 3] SH coefficients of degree 0: colour = 0.5 + Y_00 dc
     rest: Tensor  # [N, K - 1, 3] SH coefficients above degree 0, in the order of 3DGS
+    from_profiles: bool = False  # whether they stand for Beta profiles that look like them; a PLY does not say it
 
     def __len__(self) -> int:
         return len(self.means)
@@ -82,9 +83,9 @@ def ply_of(trained: TrainedGaussians) -> bytes:
     N, K = len(trained), (MAX_DEGREE + 1) ** 2
     if trained.rest.shape[1] > K - 1:
         raise InputError(f"PLY: expected harmonics up to degree {MAX_DEGREE}, got {trained.rest.shape[1]} above 0")
-    for field in fields(trained):
-        if not getattr(trained, field.name).isfinite().all():
-            raise InputError(f"PLY: expected finite {field.name}, some are not: has the training diverged?")
+    for name in (*_COLUMNS, "rest"):
+        if not getattr(trained, name).isfinite().all():
+            raise InputError(f"PLY: expected finite {name}, some are not: has the training diverged?")
     rest = torch.zeros(N, K - 1, 3)
     rest[:, : trained.rest.shape[1]] = trained.rest
     parts = [trained.means, torch.zeros(N, 3), trained.dc, rest.mT.flatten(1), trained.logits[:, None],

@@ -49,13 +49,9 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
         raise InputError("expected finite Gaussians, some are not: has the training diverged?")
     log_scales, quats = decompose(factors[drawn])
     logits = torch.logit(opacities[drawn].double().clamp(max=LARGEST_OPACITY)).float()
-    return TrainedGaussians(means[drawn], log_scales, quats, logits, sh[:, 0], sh[:, 1:])
-
-
-def has_profiles(model: GaussianModel, query: Query) -> bool:
-    """Tell whether the slice at a camera and time has alpha profiles other than Gaussians, which no PLY can carry."""
-    with torch.no_grad():
-        return model.slice(query).shapes is not None
+    return TrainedGaussians(
+        means[drawn], log_scales, quats, logits, sh[:, 0], sh[:, 1:], from_profiles=seen.shapes is not None
+    )
 
 
 def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:

@@ -18,7 +18,7 @@ from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.render import rasterize_slice, render
 from gsbench.models.sliced import Conditioned, joined_shapes, tensors_of
 from gsbench.scenes.scene import Camera, Points
-from gsbench.view.gaussians import has_profiles, trained_of
+from gsbench.view.gaussians import trained_of
 
 N = 6
 SEEN = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
@@ -108,6 +108,7 @@ def test_a_slice_without_shapes_is_as_before() -> None:
 def test_a_ply_leaves_the_shapes_out() -> None:
     """Catches shapes that are taken for colours, and a model whose shapes are lost without being told."""
     model = made(Shaped)
-    assert len(trained_of(model, HERE)) == N
-    assert has_profiles(model, HERE)
-    assert not has_profiles(made(Gaussians3DModel), HERE)
+    trained = trained_of(model, HERE)
+    assert len(trained) == N
+    assert trained.from_profiles
+    assert not trained_of(made(Gaussians3DModel), HERE).from_profiles
