@@ -82,16 +82,15 @@ def slice_universal(x: Vector, layout: dict[str, int], center: Sequence[float], 
     n, lower = len(sizes), iter(raw["lower"])
     F = [[a * s for a, s in zip(row, sizes, strict=False)] + [mpf(0)] * (n - 3) for row in _turn(raw["skew"])]
     F += [[next(lower) for _ in range(i)] + [sizes[i]] + [mpf(0)] * (n - 1 - i) for i in range(3, n)]
-    below = [[mp.fdot(F[i], F[j]) for j in range(i + 1)] for i in range(n)]
+    below = [[mp.fdot(F[i][: max(3, j + 1)], F[j]) for j in range(i + 1)] for i in range(n)]  # the rest of F[j] is zero
     S = [[below[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
     p, q = list(range(3)), list(range(3, n))
     T = _cholesky(block(S, q, q))
     white, *P = solve(T, [delta, *block(S, p, q)])
     shape, *exponents = (4 * size_of(beta) for beta in raw["betas"])
-    B = [min(b / 4, mpf(1)) for b in exponents]
-    mean = [m + mp.fsum(a * w * y for a, w, y in zip(row, B, white, strict=True))
-            for m, row in zip(raw["means"], P, strict=True)]  # fmt: skip
-    cov = [S[i][j] - mp.fsum(a * w * b for a, w, b in zip(P[i], B, P[j], strict=True)) for i in p for j in p]
+    PB = [[a * min(b / 4, mpf(1)) for a, b in zip(row, exponents, strict=True)] for row in P]
+    mean = [m + mp.fdot(row, white) for m, row in zip(raw["means"], PB, strict=True)]
+    cov = [S[i][j] - mp.fdot(PB[i], P[j]) for i in p for j in p]
     return [*mean, *cov, sigmoid(raw["opacities"][0]) * _beta_fading(white, exponents), shape]
 
 
