@@ -71,7 +71,8 @@ def read_trained(path: Path) -> TrainedGaussians:
         raise InputError(f"{path}: rot_0..3: expected quaternions, some are zero")
     channels = _table(vertices, rest, path) if rest else torch.zeros(len(vertices), 0)
     read["logits"] = read["logits"][:, 0]
-    return TrainedGaussians(**read, rest=channels.view(len(vertices), 3, count // 3).mT.contiguous())
+    higher = channels.view(len(vertices), 3, count // 3).mT.contiguous()
+    return TrainedGaussians(read["means"], read["log_scales"], read["quats"], read["logits"], read["dc"], higher)
 
 
 def ply_of(trained: TrainedGaussians) -> bytes:
