@@ -16,6 +16,7 @@ import published as published_blocks
 import pytest
 import readme_blocks
 import results_blocks
+import suite_blocks
 from tiny_run import ROOT, environment
 
 DEAD = "http://127.0.0.1:9"  # a proxy that nothing listens at
@@ -81,6 +82,21 @@ def test_the_sign_of_a_price_follows_from_the_records(tmp_path: Path) -> None:
             path.write_text(json.dumps(record))
         published_blocks.experiments.cache_clear()
         assert ("memorises" in results_blocks.effects(tmp_path)) == said
+
+
+def test_the_tables_of_the_suite_follow_from_the_records(tmp_path: Path) -> None:
+    """Catches a best model, or a loss of choosing another one, that stays when the records change."""
+    without_pictures(ROOT / "results" / "published", tmp_path, "suite")
+    before = suite_blocks.choices(tmp_path)
+    for path in tmp_path.glob("suite/suzanne/3dgs/seed*/record.json"):
+        record = json.loads(path.read_text())
+        record["metrics"]["psnr"] += 20
+        path.write_text(json.dumps(record))
+    published_blocks.experiments.cache_clear()
+    (row,) = (line for line in suite_blocks.scenes(tmp_path).splitlines() if line.startswith("| suzanne |"))
+    assert row.split(" | ")[2].startswith("**4")
+    lost = [float(re.findall(r"\| 7DGS \| (-\d+\.\d+) ", text)[0]) for text in (before, suite_blocks.choices(tmp_path))]
+    assert lost[0] - lost[1] == pytest.approx((20 + 20.91 - 24.61) / 10, abs=0.02)
 
 
 def test_the_tables_name_every_model_and_key(tables: ModuleType) -> None:

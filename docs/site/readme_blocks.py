@@ -6,6 +6,7 @@ record that changes changes the sentence.
 
 from pathlib import Path
 
+import suite_blocks
 from published import (
     MODELS,
     NAMES,
@@ -16,16 +17,12 @@ from published import (
     gated,
     machine,
     metric,
-    number,
     overfitted,
-    prices,
-    signed,
     span,
     successors,
     table,
 )
 
-from gsbench.report.compare import Price
 from gsbench.report.page.messages import count, listing
 from gsbench.report.paper import paper_row
 
@@ -60,33 +57,9 @@ def cost(published: Path) -> str:
 
 
 def worth(published: Path) -> str:
-    """Return README's table of what time, direction and AGR gain, with intervals over seeds and over scenes."""
-    found = experiment(published, "frontier")
-    priced = prices(found)
-    asked = {
-        "time": ("time alone", "time, with AGR"),
-        "direction, given time": ("direction, with time", "direction, with time and AGR"),
-        "AGR, given time and direction": (None, "AGR, with time and direction"),
-    }
-    cells = [[name, *(_worth(priced[key]) if key else "" for key in keys)] for name, keys in asked.items()]
-    shown = {key: priced[key].costs["psnr"] for keys in asked.values() for key in keys if key}
-    unsure = [key for key, gain in shown.items() if gain.half_over_scenes > abs(gain.mean)]
-    scenes = count(min(gain.scenes for gain in shown.values()), "scene")
-    said = (
-        "Cells show how PSNR (95 % interval over seeds and views) and seconds of training change if time, direction or "
-        "AGR is added. Bold changes are significant after Holm's correction "
-        f"([the rule](docs/statistics.md#the-rule)). All are of {scenes}."
-    )
-    if unsure:
-        said += f" Over scenes like these, the intervals of {len(unsure)} of {count(len(shown), 'change')} contain "
-        said += "zero, so on another scene the sign may differ."
-    return f"{table(['', 'without AGR', 'with AGR'], cells)}\n\n{said}"
-
-
-def _worth(price: Price) -> str:
-    gain, seconds = price.costs["psnr"], price.costs["seconds"].mean
-    mean = f"**{signed(gain.mean)} dB**" if price.told["psnr"] else f"{signed(gain.mean)} dB"
-    return f"{mean} ({number(gain.low)} to {number(gain.high)}), {signed(seconds, 1)} s"
+    """Return README's table of what time, direction and AGR change, by kind of scene."""
+    cells = suite_blocks.kinds(published)
+    return f"{cells} All models trained for 1,000 iterations ([each scene](docs/results.md#over-scenes))."
 
 
 def trex(published: Path) -> str:

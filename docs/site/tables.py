@@ -15,6 +15,7 @@ from typing import Any
 import hydra
 import readme_blocks
 import results_blocks
+import suite_blocks
 import torch
 from omegaconf import MISSING, DictConfig
 
@@ -110,7 +111,7 @@ TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
     "README.md": readme_blocks.BLOCKS,
     "docs/models.md": {"models": lambda _: models()},
     "docs/config.md": {"config": lambda _: config()},
-    "docs/results.md": results_blocks.BLOCKS,
+    "docs/results.md": results_blocks.BLOCKS | suite_blocks.BLOCKS,
 }
 
 

@@ -1,0 +1,211 @@
+"""Write the blocks of docs/results.md about the suite: each scene, effects by kind of scene, what foretells them."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from operator import itemgetter
+from pathlib import Path
+from statistics import fmean
+
+from published import MODELS, NAMES, Experiment, experiments, number, signed, table
+from scipy import stats
+
+from gsbench.measure.record import Record
+from gsbench.report.intervals import estimate
+from gsbench.report.page.messages import count
+
+MOVING = ("monocular", "rig", "array")
+EFFECTS = {
+    "time, given direction": ("7dgs_noagr", "6dgs"),
+    "direction": ("6dgs", "3dgs"),
+    "direction, given time": ("7dgs_noagr", "7dgs_nodir"),
+    "AGR, given time and direction": ("7dgs", "7dgs_noagr"),
+    "7DGS instead of 4DGS": ("7dgs", "4dgs"),
+    "`model=auto` instead of 7DGS": ("auto", "7dgs"),
+}
+Choice = Callable[[dict[str, Record]], Record]
+
+
+def scenes(published: Path) -> str:
+    """Return the table of PSNR of every model on every scene of the suite."""
+    rows, seeds = [], set()
+    for found in experiments(published / "suite"):
+        for scene in found.group.scenes:
+            psnr = {model: found.group.sample(found.configuration(model), scene, "psnr") for model in MODELS}
+            known = {m: estimate([values[:, None]], generalise=False) for m, values in psnr.items() if len(values)}
+            seeds |= {of.seeds for of in known.values()}
+            highest = max(of.mean for of in known.values())
+            shown = {m: f"**{of.mean:.2f}**" if of.mean == highest else f"{of.mean:.2f}" for m, of in known.items()}
+            rows.append([scene, found.group.dataset, *(shown.get(model, "–") for model in MODELS)])
+    said = (
+        f"Each number is the mean of {min(seeds)} seeds; bold: the highest of a row; –: the model does not train there."
+    )
+    return f"{table(['scene', 'kind', *MODELS], rows, left=2)}\n\n{said}"
+
+
+def kinds(published: Path) -> str:
+    """Return the table of what each effect changes in PSNR, by kind of scene, and what its cells say."""
+    suite = {found.group.dataset: found for found in experiments(published / "suite")}
+    columns = {
+        "one moving camera": ["monocular"],
+        "fixed cameras": ["rig"],
+        "all that move": list(MOVING),
+        "static": ["static"],
+    }
+    rows = []
+    for name, (model, other) in EFFECTS.items():
+        cells = []
+        for included in columns.values():
+            of = estimate([values for kind in included for values in suite[kind].contrast(model, other)])
+            mean = f"**{signed(of.mean)}**" if of.half_over_scenes < abs(of.mean) else signed(of.mean)
+            cells.append(f"{mean} ± {number(of.half_over_scenes)}, {of.gaining} of {of.scenes}")
+        rows.append([name, *cells])
+    said = (
+        "A cell has the mean change of PSNR in dB, half the width of its 95 % interval over scenes (bold: without "
+        "zero; not corrected for the number of cells), and on how many scenes PSNR rises."
+    )
+    return f"{table(['change', *columns], rows)}\n\n{said}"
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Something known before or early in a training that might tell what an effect is worth on a scene."""
+
+    name: str
+    effect: str  # of EFFECTS
+    value: Callable[[Experiment, str], float]  # of a scene; NaN: not known
+
+
+def forecasts(published: Path) -> str:
+    """Return the table of rank correlations between early statistics and prices of effects, over the moving scenes."""
+    suite = [found for found in experiments(published / "suite") if found.group.dataset in MOVING]
+    asked = [
+        Forecast("the time screen's z", "AGR, given time and direction", _of_auto(_z)),
+        Forecast("the time screen's z", "direction, given time", _of_auto(_z)),
+        Forecast("loss without direction at the end of `auto`", "direction, given time", _of_auto(_probe)),
+        Forecast("share of Gaussians that `auto` refines", "AGR, given time and direction", _of_auto(_refined)),
+        *(Forecast("the same change on val after 30 % of the training", effect, _early(effect))
+          for effect in ("direction, given time", "AGR, given time and direction")),
+    ]  # fmt: skip
+    rows, unsure = [], 0
+    for one in asked:
+        pairs = [
+            (one.value(found, scene), float(values.mean()))
+            for found in suite
+            for scene, values in zip(found.group.scenes, found.contrast(*EFFECTS[one.effect]), strict=True)
+        ]
+        known = [pair for pair in pairs if not math.isnan(pair[0])]
+        rank = float(stats.spearmanr(*zip(*known, strict=True)).statistic)
+        low, high = _interval(rank, len(known))
+        unsure += low <= 0 <= high
+        rows.append(
+            [one.name, one.effect, f"{signed(rank)} ({signed(low)} to {signed(high)})", count(len(known), "scene")]
+        )
+    text = table(["known early", "change in PSNR by", "rank correlation", "over"], rows, left=2)
+    return f"{text}\n\nThe intervals of {unsure} of {len(rows)} contain zero."
+
+
+def choices(published: Path) -> str:
+    """Return the table of what choices of a model lose in PSNR to the best model of each scene that moves."""
+    lost: dict[str, list[float]] = {}
+    left_out = []
+    for found in (found for found in experiments(published / "suite") if found.group.dataset in MOVING):
+        for scene in found.group.scenes:
+            by_seed = _by_seed(found, scene)
+            if any(math.isnan(_val(run, 1)) for runs in by_seed for run in runs.values()):
+                left_out.append(scene)
+                continue
+            for name, choose in RULES.items():
+                losses = [_psnr(choose(runs)) - max(map(_psnr, _whole(runs).values())) for runs in by_seed]
+                lost.setdefault(name, []).append(fmean(losses))
+    rows = [
+        [name, signed(fmean(losses)), signed(min(losses)), f"{sum(loss >= -0.1 for loss in losses)} of {len(losses)}"]
+        for name, losses in lost.items()
+    ]
+    text = table(["choice", "mean, dB", "worst scene, dB", "within 0.1 dB on"], rows)
+    return f"{text}\n\nLeft out, as it has no val: {', '.join(left_out)}." if left_out else text
+
+
+def _whole(runs: dict[str, Record]) -> dict[str, Record]:
+    """Return the runs whose effects are chosen by the user, which are all but model=auto."""
+    return {model: run for model, run in runs.items() if model != "auto"}
+
+
+def _best_on_val(part: float, runs: dict[str, Record]) -> Record:
+    return max(_whole(runs).values(), key=lambda run: _val(run, part))
+
+
+RULES: dict[str, Choice] = {
+    **{NAMES[model]: itemgetter(model) for model in ("4dgs", "7dgs_noagr", "7dgs", "auto")},
+    **{f"the best model on val after {100 * part:.0f} % of the training": partial(_best_on_val, part)
+       for part in (0.3, 0.5, 0.7, 1.0)},
+}  # fmt: skip
+
+
+def _by_seed(found: Experiment, scene: str) -> list[dict[str, Record]]:
+    """Return the runs of all models that train on a scene, for each seed."""
+    runs: dict[int, dict[str, Record]] = {}
+    for model in MODELS:
+        for run in found.configuration(model).runs.get(scene, []):
+            runs.setdefault(run.seed, {})[model] = run
+    return list(runs.values())
+
+
+def _val(run: Record, part: float) -> float:
+    """Return PSNR on val after a part of the training; NaN without val."""
+    value = run.curve[round(part * len(run.curve)) - 1][2]
+    return math.nan if value is None else value
+
+
+def _psnr(run: Record) -> float:
+    value = (run.metrics or {}).get("psnr")
+    return math.nan if value is None else value
+
+
+def _interval(rank: float, n: int) -> tuple[float, float]:
+    """Return the 95 % interval of Spearman's rank correlation of n pairs (Bonett and Wright 2000)."""
+    half = 1.96 * math.sqrt((1 + rank**2 / 2) / (n - 3))
+    middle = math.atanh(min(max(rank, -0.999), 0.999))
+    return math.tanh(middle - half), math.tanh(middle + half)
+
+
+def _of_auto(value: Callable[[Record], float | None]) -> Callable[[Experiment, str], float]:
+    """Average a number of the records of model=auto over the seeds of a scene."""
+
+    def mean(found: Experiment, scene: str) -> float:
+        values = [value(run) for run in found.configuration("auto").runs[scene]]
+        return fmean(math.nan if one is None else one for one in values)
+
+    return mean
+
+
+def _z(run: Record) -> float | None:
+    screen = run.on_demand.screen if run.on_demand else None
+    return screen.z if screen else None
+
+
+def _probe(run: Record) -> float | None:
+    direction = run.on_demand.direction if run.on_demand else None
+    return direction.loss_db if direction else None
+
+
+def _refined(run: Record) -> float | None:
+    if not run.on_demand or not run.on_demand.gates:
+        return None
+    rows = run.on_demand.gates[-1].rows
+    return rows["refined"] / sum(number for name, number in rows.items() if name != "removed")
+
+
+def _early(effect: str) -> Callable[[Experiment, str], float]:
+    """Return what an effect has changed in PSNR on val after 30 % of the training, by experiment and scene."""
+    model, other = EFFECTS[effect]
+
+    def mean(found: Experiment, scene: str) -> float:
+        first, second = (fmean(_val(run, 0.3) for run in found.configuration(m).runs[scene]) for m in (model, other))
+        return first - second
+
+    return mean
+
+
+BLOCKS = {"suite_scenes": scenes, "suite_kinds": kinds, "suite_choices": choices, "suite_forecasts": forecasts}
