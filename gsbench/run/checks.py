@@ -19,7 +19,6 @@ from gsbench.measure.record import MAX_POINTS, run_path
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
 from gsbench.models.gated import as_gated
-from gsbench.run import trackers
 from gsbench.run.identity import hash_of
 from gsbench.scenes import RESIZES, Scene, View
 from gsbench.scenes.trained import TrainedGaussians, read_trained
@@ -75,7 +74,6 @@ def check_config(config: Config) -> None:
     """Raise InputError if a setting is invalid, or if this machine lacks the device, backend or LPIPS weights."""
     check_values(config)
     check_device(config.device)
-    trackers.check(config.log)
     resolve(config.raster.backend, torch.device(config.device).type)
     for backbone, file in lpips_weights(config).items():
         perceptual.load(backbone, file, config.device)

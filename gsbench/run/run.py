@@ -15,7 +15,7 @@ from gsbench.measure import record as records
 from gsbench.measure.atomic import remove_leftovers
 from gsbench.measure.record import Record
 from gsbench.process.memory import is_out_of_memory
-from gsbench.run import claim
+from gsbench.run import claim, trackers
 from gsbench.run.attempt import Attempt
 from gsbench.run.checks import check_folder
 from gsbench.run.finished import STALE, finished, where
@@ -44,12 +44,14 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
         The record, which is also on disk, even if the run failed. None if another process does this run.
 
     Raises:
-        InputError: a name is not a valid folder name, or the run's folder cannot be written.
+        InputError: a name is not a valid folder name, the run's folder cannot be written, or `log` is not known or
+            not installed.
         UnrecordedError: the record cannot be written.
         Stopped: a signal asked the process to end; the checkpoint is saved.
     """
     this = identify(composed, choices, overrides)
     check_folder(this.folder)
+    trackers.check(this.config.log)
     mine = Progress(this.overrides)
     if not _is_claimed(this, mine):
         return None

@@ -3,6 +3,7 @@
 import importlib.machinery
 import json
 import math
+import re
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -260,11 +261,10 @@ def test_a_run_with_a_server_that_is_down_is_ok(
 def test_what_is_not_installed_or_known_is_refused_at_the_door(
     name: str, said: str, square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a run that trains for hours before it says that its tracker is missing."""
+    """Catches a run that trains for hours before it says so, or a finished run whose record becomes a failed one."""
+    _, folder = run_here(*overrides(square, tmp_path, "model=3dgs"))
+    record = (folder / "record.json").read_bytes()
     monkeypatch.setattr(trackers.importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(InputError):
-        trackers.check(name)
-    record, folder = run_here(*overrides(square, tmp_path, "model=3dgs", f"log={name}"))
-    assert record.status == "failed"
-    assert said in str(record.reason)
-    assert not (folder / FILE_NAME).exists()
+    with pytest.raises(InputError, match=re.escape(said)):
+        run_here(*overrides(square, tmp_path, "model=3dgs", f"log={name}"))
+    assert (folder / "record.json").read_bytes() == record
