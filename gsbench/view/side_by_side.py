@@ -21,7 +21,7 @@ _PAGE = """<!doctype html>
 <title>{title}</title>
 <style>
 body {{ font: 15px/1.4 system-ui, sans-serif; margin: 1em auto; max-width: 75em; padding: 0 0.7em }}
-section {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 15em), 1fr)); gap: 0.5em }}
+section {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(12em, 1fr)); gap: 0.5em }}
 h2 {{ font-size: 1em; margin: 1.2em 0 0.3em }}
 figure {{ margin: 0 }}
 img {{ width: 100%; display: block; image-rendering: pixelated }}
@@ -86,8 +86,9 @@ def _view(view: View, one: ViewComparison, two: ViewComparison) -> str:
         f"<figure>{_image(image, caption)}<figcaption>{caption}</figcaption></figure>"
         for caption, image in others.items()
     )
-    gain = two.psnr - one.psnr
-    return f"<h2>{html.escape(view.name)}{when}: {gain:+.2f} dB of {names[1]}</h2><section>{wipe}{figures}</section>"
+    better, gain = names[two.psnr > one.psnr], abs(two.psnr - one.psnr)
+    heading = f"{html.escape(view.name)}{when}: {better} is {gain:.2f} dB better"
+    return f"<h2>{heading}</h2><section>{wipe}{figures}</section>"
 
 
 def _image(image: Pixels, alternative: str) -> str:
