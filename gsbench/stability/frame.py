@@ -13,6 +13,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.raster import Viewport
 from gsbench.measure.quality import psnr
 from gsbench.models import GaussianModel, Query
+from gsbench.models.joint import JointModel
 from gsbench.models.render import rasterize_slice
 from gsbench.models.sliced import Gaussians3D
 from gsbench.models.slicing import subtract
@@ -20,7 +21,6 @@ from gsbench.raster import EPS2D, FAR, NEAR
 from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, U, exact_image
 from gsbench.raster.reference import project
 from gsbench.scenes.scene import Camera
-from gsbench.stability.joint import joint_factors
 
 STEPS = 255  # of 8 bits between black and white
 WORST = 10  # Gaussians that are listed
@@ -196,9 +196,7 @@ def by_published_formula(model: GaussianModel, rows: Tensor) -> Iterable[bool]:
     That formula, cov = S_pp - K S_pq^T, subtracts covariances (docs/stability.md). AGR is left out. A model without
     such a covariance has none that is indefinite.
     """
-    splats = {name: value[rows] for name, value in model.splats.items()}
-    joint = joint_factors(splats)
-    if joint is None or not len(rows):
+    if not isinstance(model, JointModel) or not len(rows):
         return [False] * len(rows)
-    cov = subtract(joint.float(), "schur")[1].double()
+    cov = subtract(model.factors(model.raw_of(rows)).float(), "schur")[1].double()
     return (torch.linalg.eigvalsh(cov)[:, 0] < 0).tolist()

@@ -9,14 +9,15 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.models.factors import Triangle, rotation4d, sizes
 from gsbench.models.slicing import reduce, subtract
-from gsbench.stability.joint import joint_factors
 from gsbench.stability.plots import save
 from gsbench.stability.population import Floats
 from gsbench.train import checkpoint
 
 FILE_NAME = "spectrum.png"
 PERCENTILES = (50, 90, 99, 99.9, 100)
+OBSERVED = {1: "t", 3: "ddd", 4: "dddt"}  # time and direction in the default order of rows, by their number
 
 
 def measure(path: Path) -> dict[str, Floats]:
@@ -53,10 +54,26 @@ def failures(path: Path) -> dict[str, tuple[float, float]]:
 def _joint(path: Path) -> Tensor:
     state: dict[str, Any] = checkpoint.read(path).state.get("model", {})
     splats = {name.removeprefix("splats."): value.double() for name, value in state.items() if name[:7] == "splats."}
-    joint = joint_factors(splats)
+    joint = _joint_factors(splats)
     if joint is None:
         raise InputError(f"{path}: expected a checkpoint of 4dgs, 6dgs or 7dgs, got parameters {sorted(splats)}")
     return joint
+
+
+def _joint_factors(splats: dict[str, Tensor]) -> Tensor | None:
+    """Return the factors [N, 3+k, 3+k] from the raw parameters of a model; None if it has no such covariance.
+
+    The first three rows are position, and the k others time and direction. The model must store its factors in the
+    default row order.
+    """
+    if "log_diagonal" in splats:
+        k = splats["log_diagonal"].shape[1] - 3
+        L = Triangle(OBSERVED[k] + "ppp").factor(splats["log_diagonal"], splats)
+        return torch.cat([L[:, k:], L[:, :k]], 1)
+    if "left_quats" in splats:
+        R = rotation4d(splats["left_quats"], splats["right_quats"])
+        return R * sizes(splats["scales"])[:, None, :]
+    return None
 
 
 def report(found: dict[str, Floats]) -> str:

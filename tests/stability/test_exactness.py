@@ -101,13 +101,14 @@ def test_why_a_gaussian_is_hard() -> None:
     assert all("far" in words for words in moved)
 
 
-def test_the_papers_formula_is_indefinite_for_correlated_gaussians() -> None:
+@pytest.mark.parametrize(("name", "motion"), [("7dgs", 300), ("7dgs_nodir", 3000)])
+def test_the_papers_formula_is_indefinite_for_correlated_gaussians(name: str, motion: int) -> None:
     """Catches a Gaussian whose published covariance is indefinite in float32 and is not named, or the reverse."""
-    model = build("7dgs", sh_degree=0, lambda_t=0.5, lambda_d=0.5)
+    model = build(name, sh_degree=0, lambda_t=0.5, **({"lambda_d": 0.5} if name == "7dgs" else {}))
     g = torch.Generator().manual_seed(0)
     model.initialise(Points(torch.rand(20, 3, generator=g), torch.rand(20, 3, generator=g)), 1.0, g)
     with torch.no_grad():
-        model.splats["motion"][10:] = 300 * torch.randn(10, 12, generator=g)
+        model.splats["motion"][10:] = motion * torch.randn(10, model.splats["motion"].shape[1], generator=g)
     found = list(frame.by_published_formula(model.double(), torch.arange(20)))
     assert not any(found[:10])
     assert any(found[10:])
