@@ -39,7 +39,8 @@ def _table(table: Table) -> dict[str, Any]:
 
 
 def _section(section: Section, table: Table) -> dict[str, Any]:
-    rows = [_row(row) for row in section.rows]
+    names = {column.key: column.name for column in table.columns}
+    rows = [_row(row, names) for row in section.rows]
     for column in table.columns:
         for row, place in zip(rows, ranks(section.rows, column), strict=True):
             if column.name in row["numbers"]:
@@ -47,10 +48,10 @@ def _section(section: Section, table: Table) -> dict[str, Any]:
     return {"title": section.title, "rows": rows, "notes": section.notes}
 
 
-def _row(row: Row) -> dict[str, Any]:
-    """Return the cells of a row as shown, and its numbers by column; only measured rows have numbers."""
-    found = {key.partition(" ")[0]: (mean(runs), runs) for key, runs in row.values.items()}
-    shown = {key.partition(" ")[0]: text for key, text in row.cells.items()}
+def _row(row: Row, names: dict[str, str]) -> dict[str, Any]:
+    """Return the cells of a row as shown, and its numbers, by `names` of columns; only measured rows have numbers."""
+    found = {names[key]: (mean(runs), runs) for key, runs in row.values.items()}
+    shown = {names[key]: text for key, text in row.cells.items()}
     return {
         "label": row.label,
         "of_the_paper": row.paper,

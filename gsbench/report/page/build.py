@@ -21,7 +21,17 @@ from gsbench.report.page import against as other
 from gsbench.report.page import cost, evidence, figures, messages, on_demand, time_to_quality, worth
 from gsbench.report.page.content import Canvas, DataTable, PageSection, Runs
 from gsbench.report.page.gallery import GalleryView, gallery
-from gsbench.report.page.palette import DARK, LIGHT, STAGES_DARK, STAGES_LIGHT, Style, styles
+from gsbench.report.page.palette import (
+    DARK,
+    LIGHT,
+    PAGE_DARK,
+    PAGE_LIGHT,
+    STAGES_DARK,
+    STAGES_LIGHT,
+    Style,
+    styles,
+    variables,
+)
 from gsbench.report.page.svg import marker
 
 FILE_NAME = "report.html"
@@ -87,8 +97,8 @@ def render(
         faults=[messages.shorten(fault) for fault in faults[:MOST_FAULTS]],
         more_faults=max(0, len(faults) - MOST_FAULTS),
         reload=reload,
-        light=_variables(LIGHT, STAGES_LIGHT),
-        dark=_variables(DARK, STAGES_DARK),
+        light=_definitions(variables(PAGE_LIGHT, LIGHT, STAGES_LIGHT)),
+        dark=_definitions(variables(PAGE_DARK, DARK, STAGES_DARK)),
         css=_own("page.css"),
         js=_own("page.js"),
         marker=lambda style: Markup(marker(style.marker, style.colour)),
@@ -146,10 +156,9 @@ def _own(name: str) -> Markup:
     return Markup((resources.files(__package__) / name).read_text())
 
 
-def _variables(models: tuple[str, ...], stages: tuple[str, ...]) -> Markup:
-    """Return the colours of models and of training stages as definitions of CSS variables."""
-    named = [f"--model-{i}:{c}" for i, c in enumerate(models)] + [f"--stage-{i}:{c}" for i, c in enumerate(stages)]
-    return Markup(";".join(named))
+def _definitions(colours: dict[str, str]) -> Markup:
+    """Return colours by name as definitions of CSS variables."""
+    return Markup(";".join(f"--{name}:{colour}" for name, colour in colours.items()))
 
 
 def _chapter(group: Group, folder: Path, canvas: Canvas) -> Chapter:

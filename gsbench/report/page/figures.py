@@ -16,15 +16,11 @@ from matplotlib.text import Text
 
 from gsbench.measure.atomic import write_atomically
 from gsbench.report.page.content import Swatch
-from gsbench.report.page.palette import LIGHT, STAGES_LIGHT, Style
+from gsbench.report.page.palette import LIGHT, PAGE_LIGHT, STAGES_LIGHT, Style, variables
 from gsbench.report.page.svg import RC, Panel, variable
 
 LONGEST = 120  # letters of a file name
-COLOURS = {  # by variable of the style sheet
-    "ink": "#1b1d21", "muted": "#565b63", "line": "#dfe1e4", "paper": "#ffffff",
-    **{f"model-{i}": colour for i, colour in enumerate(LIGHT)},
-    **{f"stage-{i}": colour for i, colour in enumerate(STAGES_LIGHT)},
-}  # fmt: skip
+COLOURS = variables(PAGE_LIGHT, LIGHT, STAGES_LIGHT)  # by variable of the style sheet
 PARTS = ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor")  # properties that hold colours
 FILES: dict[Any, Any] = {**RC, "pdf.fonttype": 42}  # TrueType, which publishers ask for
 LegendEntry = tuple[str, Style] | Swatch

@@ -5,6 +5,7 @@ Each hue is darkened for a white page and lightened for a black page, so that it
 markers distinguish the models without colour.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,6 +19,10 @@ EFFECT_SET_LIKE = {  # a Gaussian has the colour of the model with the same effe
     "direction": "4dgs",
     "static": "3dgs",
 }
+PAGE_LIGHT = {"ink": "#1b1d21", "muted": "#565b63", "line": "#dfe1e4", "paper": "#ffffff", "raised": "#f6f7f8",
+              "focus": "#0069a8"}  # fmt: skip
+PAGE_DARK = {"ink": "#eceef1", "muted": "#a9afb8", "line": "#33373d", "paper": "#141619", "raised": "#1d2024",
+             "focus": "#5cbcf2"}  # fmt: skip
 LIGHT = ("#5c6066", "#0069a8", "#00734f", "#b34700", "#9c3d82", "#7d6608", "#1f6f78", "#4b4fa3", "#8c2d2d", "#3d6b1f",
          "#b0185a", "#6a4a2f", "#2e5cb8", "#8a5a00", "#7a1fa2", "#00708f", "#b3261e")  # fmt: skip
 DARK = ("#b9bec6", "#5cbcf2", "#3ccb9f", "#ff9454", "#eb9fd0", "#e3cc4a", "#6fd0da", "#a9adff", "#ff9c9c", "#a8d672",
@@ -44,6 +49,12 @@ MARKERS: tuple[Marker, ...] = (
 # Stages of a training step are shades of one hue, stages that occur once a run have two other hues, the rest is grey.
 STAGES_LIGHT = ("#22476b", "#3b6b96", "#6390b8", "#8fb2d1", "#b7cfe3", "#d7e4ef", "#b9770e", "#efc06a", "#9a9da3")
 STAGES_DARK = ("#c9e0f5", "#a3c6e6", "#7ba8cf", "#588ab3", "#3f6e95", "#2c5373", "#f0b35a", "#96651f", "#7d828b")
+
+
+def variables(page: dict[str, str], models: Sequence[str], stages: Sequence[str]) -> dict[str, str]:
+    """Return the colours of a theme by the names of their CSS variables: the page, the models, the stages."""
+    named = {f"model-{i}": colour for i, colour in enumerate(models)}
+    return page | named | {f"stage-{i}": colour for i, colour in enumerate(stages)}
 
 
 @dataclass(frozen=True)
