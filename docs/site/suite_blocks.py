@@ -8,10 +8,11 @@ from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 
-from published import MODELS, NAMES, Experiment, experiments, number, signed, table
+from published import MODELS, NAMES, Experiment, best, experiments, number, signed, table
 from scipy import stats
 
 from gsbench.measure.record import Record
+from gsbench.report.configurations import QUANTITIES
 from gsbench.report.intervals import estimate
 from gsbench.report.page.messages import count
 
@@ -33,10 +34,9 @@ def scenes(published: Path) -> str:
     for found in experiments(published / "suite"):
         for scene in found.group.scenes:
             psnr = {model: found.group.sample(found.configuration(model), scene, "psnr") for model in MODELS}
-            known = {m: estimate([values[:, None]], generalise=False) for m, values in psnr.items() if len(values)}
-            seeds |= {of.seeds for of in known.values()}
-            highest = max(of.mean for of in known.values())
-            shown = {m: f"**{of.mean:.2f}**" if of.mean == highest else f"{of.mean:.2f}" for m, of in known.items()}
+            means = {model: float(values.mean()) for model, values in psnr.items() if len(values)}
+            seeds |= {len(values) for values in psnr.values() if len(values)}
+            shown = dict(zip(means, best([*means.values()], [f"{x:.2f}" for x in means.values()]), strict=True))
             rows.append([scene, found.group.dataset, *(shown.get(model, "–") for model in MODELS)])
     said = (
         f"Each number is the mean of {min(seeds)} seeds; bold: the highest of a row; –: the model does not train there."
@@ -109,7 +109,7 @@ def forecasts(published: Path) -> str:
 def choices(published: Path) -> str:
     """Return the table of what choices of a model lose in PSNR to the best model of each scene that moves."""
     lost: dict[str, list[float]] = {}
-    left_out = []
+    left_out, psnr = [], QUANTITIES["psnr"]
     for found in (found for found in experiments(published / "suite") if found.group.dataset in MOVING):
         for scene in found.group.scenes:
             by_seed = _by_seed(found, scene)
@@ -117,7 +117,7 @@ def choices(published: Path) -> str:
                 left_out.append(scene)
                 continue
             for name, choose in RULES.items():
-                losses = [_psnr(choose(runs)) - max(map(_psnr, _whole(runs).values())) for runs in by_seed]
+                losses = [psnr(choose(runs)) - max(map(psnr, _whole(runs).values())) for runs in by_seed]
                 lost.setdefault(name, []).append(fmean(losses))
     rows = [
         [name, signed(fmean(losses)), signed(min(losses)), f"{sum(loss >= -0.1 for loss in losses)} of {len(losses)}"]
@@ -155,11 +155,6 @@ def _by_seed(found: Experiment, scene: str) -> list[dict[str, Record]]:
 def _val(run: Record, part: float) -> float:
     """Return PSNR on val after a part of the training; NaN without val."""
     value = run.curve[round(part * len(run.curve)) - 1][2]
-    return math.nan if value is None else value
-
-
-def _psnr(run: Record) -> float:
-    value = (run.metrics or {}).get("psnr")
     return math.nan if value is None else value
 
 
