@@ -110,23 +110,19 @@ def _version(package: str) -> str | None:
 def _machine() -> Iterator[Check]:
     import torch
 
-    here, free = hardware(), _free_memory()
+    from gsbench.process.memory import available
+
+    here, free = hardware(), available()
     usable = len(os.sched_getaffinity(0))
     yield Check("processor", OK, f"{here.processor}, {here.cores} cores, {usable} for this process")
     threads = torch.get_num_threads()
-    few = threads <= usable
-    yield Check("threads", OK if few else BROKEN, f"{threads} of torch and the kernels",
-                "" if few else f"set OMP_NUM_THREADS={usable}: more threads than cores are slow")  # fmt: skip
+    fit = threads <= usable
+    yield Check("threads", OK if fit else BROKEN, f"{threads} of torch and the kernels",
+                "" if fit else f"set OMP_NUM_THREADS={usable}: more threads than cores are slow")  # fmt: skip
     if free is not None:
         enough = free >= LEAST_MEMORY
         yield Check("memory", OK if enough else BROKEN, f"{free / 2**30:.1f} of {here.memory_gib} GiB free",
                     "" if enough else "end other programs")  # fmt: skip
-
-
-def _free_memory() -> int | None:
-    from gsbench.process.memory import available
-
-    return available()
 
 
 def _disk() -> Iterator[Check]:
