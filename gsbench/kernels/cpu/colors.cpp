@@ -82,6 +82,7 @@ constexpr int PIECE_BASES = 5;
 
 struct Piece {
     int at, floats, wave;           // where in the row it begins, and how many floats it has
+    int basis;                      // its first
     alignas(64) int32_t spread[LANES];   // each lane's basis
     alignas(64) int32_t bases_at[LANES]; // for a lane that is a basis of this piece, where its first channel lies
     Mask bases;                     // these lanes
@@ -101,6 +102,7 @@ struct Pieces {
                 p.at = (wave * a.bases - 1 + basis) * 3;
                 p.floats = n * 3;
                 p.wave = wave;
+                p.basis = basis;
                 width = p.at + p.floats;
                 for (int i = 0; i < LANES; ++i) {
                     p.spread[i] = basis + i / 3 < LANES ? basis + i / 3 : LANES - 1;
@@ -114,26 +116,33 @@ struct Pieces {
 };
 
 alignas(64) constexpr int32_t CHANNELS[LANES] = {0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 3};  // lane 3 is zero
-alignas(64) constexpr int32_t NEXT[LANES] = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 15};
-alignas(64) constexpr int32_t AFTER_NEXT[LANES] = {2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 15, 15};
 
 // Everything that the colours of sixteen Gaussians need except coefficients.
 struct Shades {
     Unit<Vec> unit;
-    Vec Y[LANES];                                                   // a Gaussian's harmonics in each vector
+    alignas(64) float Y[LANES + 1][LANES];                          // a Gaussian's harmonics in each row; `spread` reads on
     alignas(64) float cosines[MAX_WAVES][LANES], sines[MAX_WAVES][LANES];
 
     GSB_HD Shades(const ColorArgs& a, const Rows& rows) : unit(offset(a, rows)) {
         static_assert(MAX_BASIS == LANES);
-        for (auto& y : Y) y = Vec(0.0f);
-        harmonics(unit.direction, a.degree, Y);
-        transpose(Y);
+        Vec y[LANES];
+        for (auto& basis : y) basis = Vec(0.0f);
+        harmonics(unit.direction, a.degree, y);
+        transpose(y);
+        for (int i = 0; i < LANES; ++i) y[i].store(Y[i]);
+        Vec(0.0f).store(Y[LANES]);
         Vec cosine[MAX_WAVES], sine[MAX_WAVES];
         waves_of(a.times ? Vec(*a.time) - rows.load(a.times, rows.ones) : Vec(0.0f), a.waves, cosine, sine);
         for (int wave = 0; wave < a.waves; ++wave) {
             cosine[wave].store(cosines[wave]);
             sine[wave].store(sines[wave]);
         }
+    }
+
+    // Returns the weight of each coefficient of a piece of row i.
+    GSB_HD Vec weight(int i, const Piece& p) const {
+        const Vec y = spread(Y[i], p.basis, p.spread);
+        return p.wave ? y * Vec(cosines[p.wave][i]) : y;
     }
 
     // Computes the colour channels before they are clamped.
@@ -145,8 +154,7 @@ struct Shades {
             Vec total(0.0f);
             for (int k = 0; k < pieces.count; ++k) {
                 const Piece& p = pieces.piece[k];
-                const Vec weight = p.wave ? Y[i] * Vec(cosines[p.wave][i]) : Y[i];
-                total += load_some(row + p.at, p.floats) * permute(weight, p.spread);
+                total += load_some(row + p.at, p.floats) * weight(i, p);
             }
             sums[i] = total;
         }
@@ -276,13 +284,11 @@ GSB_HD inline void backward_rows(const ColorArgs& a, const Pieces& pieces, const
         g_Y[i] = g_time[i] = zero;
         for (int k = 0; k < pieces.count; ++k) {
             const Piece& p = pieces.piece[k];
-            const Vec cosine(s.cosines[p.wave][i]), weight = p.wave ? s.Y[i] * cosine : s.Y[i];
-            add(permute(weight, p.spread) * g, g_row + p.at, p.floats);
+            add(s.weight(i, p) * g, g_row + p.at, p.floats);
             const Vec product = load_some(row + p.at, p.floats) * g;
-            const Vec channels = product + permute(product, NEXT) + permute(product, AFTER_NEXT);
-            const Vec along = select(p.bases, permute(channels, p.bases_at), zero);
-            g_Y[i] += p.wave ? along * cosine : along;
-            if (p.wave) g_time[i] += along * s.Y[i] * (s.sines[p.wave][i] * (TURN * static_cast<float>(p.wave)));
+            const Vec along = select(p.bases, sum_threes(product, p.bases_at), zero);
+            g_Y[i] += p.wave ? along * Vec(s.cosines[p.wave][i]) : along;
+            if (p.wave) g_time[i] += along * Vec::load(s.Y[i]) * (s.sines[p.wave][i] * (TURN * static_cast<float>(p.wave)));
         }
     }
     for (int i = rows.count; i < LANES; ++i) g_Y[i] = g_time[i] = zero;

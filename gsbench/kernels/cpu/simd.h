@@ -27,7 +27,7 @@ GSB_HD inline T exp2_fraction(T r) {
 #if defined(__AVX512F__)
 #include "simd_avx512.h"
 #else
-#include "simd_halves.h"
+#include "simd_moves.h"
 #endif
 
 namespace gsb {
@@ -60,6 +60,19 @@ GSB_HD inline Vec log2(Vec x) {
     y = y * s2 + 1.0f;
     return e + s * y * (2.0f * LOG2_E);
 }
+
+// The moves of colours, whose rows have three channels for each basis; simd_moves_avx2.h has faster ones.
+#if defined(__AVX512F__) || !defined(__AVX2__)
+// Returns y[at[i]] in lane i; at[i] is start + i / 3, at most 15.
+GSB_HD inline Vec spread(const float* y, int, const int32_t* at) { return permute(Vec::load(y), at); }
+
+// Returns x[j] + x[j + 1] + x[j + 2] in lane i, where j = at[i] is at most 12.
+GSB_HD inline Vec sum_threes(Vec x, const int32_t* at) {
+    alignas(64) constexpr int32_t next[LANES] = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 15};
+    alignas(64) constexpr int32_t after[LANES] = {2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 15, 15};
+    return permute(x + permute(x, next) + permute(x, after), at);
+}
+#endif
 
 // Returns the sum of the lanes, always in the same order.
 GSB_HD inline float sum(Vec x) {

@@ -13,7 +13,7 @@
 // unrolling would gain nothing and take minutes to compile.
 #if defined(__CUDACC__)
 #define GSB_UNROLL _Pragma("unroll")
-#elif defined(__AVX512F__) && !defined(__clang__)
+#elif (defined(__AVX512F__) || defined(__AVX2__)) && !defined(__clang__)
 #define GSB_UNROLL _Pragma("GCC unroll 16")
 #else
 #define GSB_UNROLL
