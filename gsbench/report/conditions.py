@@ -73,7 +73,7 @@ def _stated(records: list[Record], spread: str) -> list[str]:
     notes += _load(records)
     if any(_commit(r).endswith("-dirty") for r in records):
         notes.append(f"{WARNING}: files differed from their commit (-dirty): it does not reproduce these numbers.")
-    notes += [_seeds(records, spread), *DEFINITIONS]
+    notes += [*_rounding(records), _seeds(records, spread), *DEFINITIONS]
     return sorted(notes, key=lambda note: not note.startswith(WARNING))
 
 
@@ -106,6 +106,16 @@ def _load(records: list[Record]) -> list[str]:
     ends = dict.fromkeys(f"{load:.1f}" for load in (min(loads), max(loads)))
     silent = f"; {len(costs) - len(loads)} of {len(costs)} runs do not say" if len(loads) < len(costs) else ""
     return [f"load of the machine during a training, these runs included: {' to '.join(ends)}{silent}"]
+
+
+def _rounding(records: list[Record]) -> list[str]:
+    """List a footnote on the change of PSNR by float32; the list is empty if no run measured it."""
+    changes = [(r.metrics or {}).get("psnr_float32") for r in records]
+    known = [change for change in changes if change is not None]
+    if not known:
+        return []
+    silent = f"; {len(changes) - len(known)} of {len(changes)} runs do not say" if len(known) < len(changes) else ""
+    return [f"float32 changes PSNR of a view by at most {max(known):.1e} dB (three views of each run{silent})."]
 
 
 def _commit(record: Record) -> str:

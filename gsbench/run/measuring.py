@@ -17,6 +17,7 @@ from gsbench.measure.regions import RegionScores
 from gsbench.measure.speed import peak_memory, synchroniser, time_renders
 from gsbench.models.cuda_graph import GraphedFrames
 from gsbench.run.checks import lpips_weights
+from gsbench.run.rounding import psnr_float32
 from gsbench.scenes import View
 from gsbench.train.loop import Trainer
 
@@ -75,6 +76,9 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
     metrics |= regions.metrics()
     missing |= regions.missing()
     metrics["psnr_train"] = trainer.psnr(evenly(trainer.scene.train, len(views)))
+    metrics["psnr_float32"], why = psnr_float32(trainer)
+    if why:
+        missing["psnr_float32"] = why
     images = {"pictures.png": strip(shown)} if shown else {}
     if shown and with_effect_sets:
         first, renderer = views[0], trainer.renderer

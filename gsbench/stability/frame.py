@@ -1,6 +1,5 @@
 """Measure how far the float32 images of a trained model are from the same images in float64, view by view."""
 
-import copy
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,13 +11,13 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.raster import Viewport
 from gsbench.measure.quality import psnr
-from gsbench.models import GaussianModel, Query
+from gsbench.models import GaussianModel
 from gsbench.models.joint import JointModel
-from gsbench.models.render import rasterize_slice
 from gsbench.models.sliced import Gaussians3D
 from gsbench.models.slicing import subtract
+from gsbench.models.twins import doubled, exact_model, render_twins
 from gsbench.raster import EPS2D, FAR, NEAR
-from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, U, exact_image
+from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, U
 from gsbench.raster.reference import project
 from gsbench.scenes.scene import Camera
 
@@ -98,31 +97,22 @@ def measure(
     """
     if not shots:
         raise InputError("expected at least one view to render, got none")
-    exact_model = copy.deepcopy(model).double()
+    double = exact_model(model)
     behind = torch.tensor(background, dtype=torch.float32)
     views, culprits, shown = [], [], None
-    with torch.inference_mode():
-        for shot in shots:
-            camera = shot.camera
-            single = model.slice(Query.of(camera, shot.time))
-            image = rasterize_slice(single, camera, behind, model.backend, antialias).image[0]
-            exact = exact_model.slice(Query.of(doubled(camera), shot.time))
-            found = exact_image(exact, single, camera.viewmat, camera.K, camera.width, camera.height,
-                                background=behind, antialias=antialias)  # fmt: skip
-            views.append(compare(shot, image, found))
-            culprits += blame(exact_model, exact, shot, found)
-            if shown is None or found.bound.max() > shown[2].bound.max():
-                shown = (shot.name, image, found)
+    for shot in shots:
+        twins = render_twins(model, double, shot.camera, shot.time, behind, antialias)
+        found = twins.exact
+        views.append(compare(shot, twins.image, found))
+        with torch.inference_mode():
+            culprits += blame(double, twins.gaussians, shot, found)
+        if shown is None or found.bound.max() > shown[2].bound.max():
+            shown = (shot.name, twins.image, found)
     assert shown is not None
     culprits.sort(key=lambda one: -one.bound)
     first = {one.index: one for one in reversed(culprits)}  # of each Gaussian its worst view
     worst = [one for one in culprits if first[one.index] is one][:WORST]
     return Exactness(title, len(model), views, worst, shown)
-
-
-def doubled(camera: Camera) -> Camera:
-    """Return a camera whose matrices are float64; its position is computed in float64 too."""
-    return Camera(camera.viewmat.double(), camera.K.double(), camera.width, camera.height)
 
 
 def compare(shot: Shot, image: Tensor, found: ExactImage) -> ViewExactness:

@@ -258,6 +258,14 @@ def test_the_load_is_told_as_far_as_it_is_known():
     assert list(tables.tidy([busy, silent]).load.isna()) == [False, True]
 
 
+def test_the_change_by_float32_is_told_as_far_as_it_is_known():
+    """Catches the smallest change instead of the largest, and runs without it that pass for measured ones."""
+    known = [make(seed=k, metrics={**make().metrics, "psnr_float32": change}) for k, change in enumerate((2e-6, 3e-7))]
+    assert "- float32 changes PSNR of a view by at most 2.0e-06 dB (three views of each run).\n" in page(*known)
+    assert "by at most 2.0e-06 dB (three views of each run; 1 of 3 runs do not say).\n" in page(*known, make("4dgs"))
+    assert "float32" not in page(make())
+
+
 def test_columns_that_leak_or_are_rare_say_so():
     """Would catch the best-on-test column without its warning, or an LPIPS-VGG that was measured and is not shown."""
     metrics = {**make().metrics, "lpips_vgg": 0.25, "psnr_best_on_test": 26.5}

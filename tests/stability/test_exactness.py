@@ -8,7 +8,7 @@ import torch
 from tiny_run import main_here, overrides, write_moving_square
 
 from gsbench import kernels
-from gsbench.models import GaussianModel, build
+from gsbench.models import GaussianModel, Query, build
 from gsbench.models.cameras import around
 from gsbench.scenes import Points
 from gsbench.scenes.trained import TrainedGaussians, ply_of
@@ -90,7 +90,7 @@ def test_why_a_gaussian_is_hard() -> None:
     """Catches a reason given to the wrong Gaussian."""
     model = hard_model()
     camera = around(model, 4.0, 32, 32, 0.0, 0.0)
-    exact = model.double().slice(frame.Query.of(frame.doubled(camera), None))
+    exact = model.double().slice(Query.of(frame.doubled(camera), None))
     far_away = exact._replace(means=exact.means + torch.tensor([1e6, 0.0, 0.0]))
     shift = torch.eye(4)
     shift[:3, 3] = camera.viewmat[:3, 3] - camera.viewmat[:3, :3] @ torch.tensor([1e6, 0.0, 0.0])

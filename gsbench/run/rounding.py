@@ -1,0 +1,31 @@
+"""Measure by how much float32 changes the PSNR of a trained model, on a few of the evaluated views."""
+
+import math
+
+from gsbench.errors import InputError, one_line
+from gsbench.measure.quality import evenly, psnr
+from gsbench.models.twins import exact_model, render_twins
+from gsbench.train.loop import Trainer
+
+VIEWS = 3  # evenly spaced; a view takes about twenty times as long as a frame
+
+
+def psnr_float32(trainer: Trainer) -> tuple[float | None, str]:
+    """Return the largest change of a view's PSNR by float32 in dB, or None and the reason why it is not measured.
+
+    The image of the CPU kernels is compared with the same image in float64 (docs/stability.md).
+    """
+    model, renderer = trainer.model, trainer.renderer
+    if model.backend.name != "cpu":
+        return None, f"needs raster.backend=cpu, whose images have a float64 twin; this run has {model.backend.name}"
+    changes = []
+    try:
+        exact = exact_model(model)
+        for view in evenly(trainer.views, VIEWS):
+            found = render_twins(model, exact, view.camera, view.time, renderer.background, renderer.antialias)
+            changes.append(abs(psnr(found.image, view.image) - psnr(found.exact.image, view.image)))
+    except (InputError, RuntimeError) as error:  # a user's model may compute in float32 alone
+        return None, f"the model has no image in float64: {one_line(error)}"
+    if not all(map(math.isfinite, changes)):
+        return None, "an image equals its view, so that its PSNR is infinite"
+    return max(changes), ""
