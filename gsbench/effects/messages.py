@@ -4,7 +4,7 @@ A simplified Gaussian is independent of time, direction or AGR (the neural refin
 This module does not import torch.
 """
 
-from gsbench.measure.record import Direction, Gate, OnDemand, TimeScreen
+from gsbench.measure.record import Direction, Gate, ModelComparison, OnDemand, TimeScreen
 
 EFFECT_SETS = {  # the names of gsbench.models.effect_sets, in the same order, and their names in the legend
     "refined": "refined by AGR",
@@ -30,6 +30,13 @@ def of_decision(screen: TimeScreen) -> str:
 def of_screen(screen: TimeScreen) -> str:
     """Return a message with the answer of the test whether the scene changes with time, and why it is the answer."""
     return f"{of_decision(screen)}: {screen.reason}"
+
+
+def of_comparison(found: ModelComparison) -> str:
+    """Return a message: the PSNR on val of each candidate of model=auto, and which of them was chosen."""
+    said = [f"{one.name} {'-' if one.psnr_val is None else format(one.psnr_val, '.2f')} dB" if one.reason is None
+            else f"{one.name} diverged" for one in found.candidates]  # fmt: skip
+    return f"PSNR on val after {found.iteration} iterations: {', '.join(said)}; {found.chosen} is trained to the end"
 
 
 def of_gate(gate: Gate) -> str:

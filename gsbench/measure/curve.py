@@ -38,6 +38,10 @@ class Curve:
             )
         self.points.append(Point(iteration, seconds, psnr_val if math.isfinite(psnr_val) else None))
 
+    def delay(self, seconds: float) -> None:
+        """Add the seconds of work that was done before this training to every evaluation."""
+        self.points = [p._replace(seconds=p.seconds + seconds) for p in self.points]
+
     @property
     def last(self) -> Point | None:
         """Return the latest evaluation, or None if there is none."""

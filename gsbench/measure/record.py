@@ -146,6 +146,25 @@ class Direction:
 
 
 @dataclass(frozen=True)
+class Candidate:
+    """One model of a comparison: its PSNR on val and the seconds of its training until the comparison."""
+
+    name: str  # the label of the model, such as "7dgs_noagr"
+    psnr_val: float | None  # dB; None: not finite, or the training diverged
+    seconds: float
+    reason: str | None = None  # why the training diverged
+
+
+@dataclass(frozen=True)
+class ModelComparison:
+    """The comparison on val by which model=auto chose a model, if the settings have `effects.compare=true`."""
+
+    iteration: int  # the iteration after which PSNR on val was measured
+    chosen: str  # the name of the candidate with the highest PSNR, which was trained to the end
+    candidates: list[Candidate]
+
+
+@dataclass(frozen=True)
 class OnDemand:
     """The decisions of a run to remove time, direction or AGR (a network) from Gaussians, with reasons."""
 
@@ -153,6 +172,7 @@ class OnDemand:
     gates: list[Gate] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)  # decisions that were not possible, and why
     direction: Direction | None = None  # None: the model has no view direction
+    comparison: ModelComparison | None = None  # None: no models were compared
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ PLACES = (
 ALWAYS = {
     "train.densify.kind": "gradient",
     "train.densify.noise": 5e5,  # older runs had no `mcmc`, which it is for
+    "effects.compare": False,
     **{f"train.penalties.{name}.{key}": 0 for name in ("opacity", "size", "strain") for key in ("weight", "start")},
 }
 _MOST_NAMED = 5  # the most differences that a message contains
@@ -35,10 +36,16 @@ _MOST_NAMED = 5  # the most differences that a message contains
 def training_part(plain: Plain) -> Plain:
     """Return the settings of a config that change the training."""
     part: Plain = {key: dict(value) if isinstance(value, dict) else value for key, value in plain.items()}
-    if part.get("effects", {}).get("gate") == "off":
+    effects = part.get("effects", {})
+    compares = effects.get("compare", False)
+    if effects.get("gate") == "off":
         del part["effects"]
+        if compares:
+            part["effects"] = {"compare": compares}
     if isinstance(part.get("model"), dict):
         part["model"].pop("gate", None)  # only the default of effects.gate
+        if not compares:
+            part["model"].pop("compared", None)
     for dotted in MEASURING:
         head, _, tail = dotted.partition(".")
         if not tail:

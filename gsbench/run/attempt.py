@@ -10,9 +10,11 @@ from gsbench.measure import record as records
 from gsbench.measure.images import Pixels, write_png
 from gsbench.measure.provenance import provenance
 from gsbench.measure.record import Effects, OnDemand, Record
+from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
 from gsbench.run import fitting, measuring
 from gsbench.run.checks import check_config, check_scene, evaluated_views, trained_start
+from gsbench.run.comparing import best_of, check_candidates, check_compare, reporter
 from gsbench.run.identity import Run
 from gsbench.run.log import RunLog
 from gsbench.run.resolve import Resolved, before_scene, is_auto, plain, resolve, with_candidate
@@ -42,6 +44,7 @@ class Attempt:
             InputError: the settings, the device or the data are invalid.
         """
         config = self.resolved.config
+        check_compare(self.this.config)
         check_config(config)
         self.model = build(config)
         self.start = trained_start(config)
@@ -49,6 +52,8 @@ class Attempt:
         if is_auto(self.this.config) and not scene.has_time:
             self.resolved = Resolved(config := with_candidate(self.this.config, "static"))
             self.model = build(config)
+        elif config.effects.compare:
+            check_candidates(self.this.config, scene)
         check_scene(self.model, scene, config)
         evaluated_views(scene, config.scene.eval_split)
         records.check(self.describe("failed", "not run"), "planned record")
@@ -57,16 +62,26 @@ class Attempt:
     def fit(self, model: GaussianModel, scene: Scene) -> Trainer:
         """Train to the last step; for model=auto, a test of the scene first chooses a model with or without time.
 
-        It raises the same errors as `gsbench.run.fitting.resume` and `fit`.
+        If the scene changes with time, `effects.compare` chooses the model by PSNR on val. It raises the same errors as
+        `gsbench.run.fitting.resume` and `fit`, and `gsbench.run.comparing.best_of`.
         """
-        if is_auto(self.this.config):
-            self.resolved = resolve(self.this, scene)
+        this = self.this
+        if is_auto(this.config):
+            self.resolved = resolve(this, scene)
             self.model = model = build(self.resolved.config)
-        trainer = self.trainer(model, scene)
-        fitting.resume(trainer, self.this, self.resolved)
-        self.log = RunLog(self.this, trainer)
-        config = self.resolved.config
-        fitting.fit(trainer, self.this, config, plain(self.this, config), self.log.follow)
+        screen, config = self.resolved.screen, self.resolved.config
+        if config.effects.compare and screen is not None and screen.decision != "off":
+            reset_peak_memory(config.device)
+            trainer = best_of(this, scene, self.start, self.resolved)
+            self.resolved, self.model = replace(self.resolved, config=trainer.config), trainer.model
+        else:
+            trainer = self.trainer(model, scene)
+            reset_peak_memory(config.device)
+            if not fitting.resume(trainer, this, fitting.saved_state(this, scene)) and screen is not None:
+                trainer.stages.add("screen", screen.seconds)
+                trainer.effort.add(self.resolved.effort)
+        self.log = RunLog(this, trainer)
+        fitting.fit(trainer, this, plain(this, trainer.config), reporter(this, trainer), self.log.follow)
         return trainer
 
     def trainer(self, model: GaussianModel, scene: Scene) -> Trainer:
@@ -90,7 +105,7 @@ class Attempt:
         screen, gating = self.resolved.screen, trainer.gating
         if screen is None and self.resolved.config.effects.gate == "off":
             return None
-        return OnDemand(screen, gating.gates, gating.notes, gating.direction)
+        return OnDemand(screen, gating.gates, gating.notes, gating.direction, trainer.comparison)
 
     def draw(self) -> None:
         """Write the measured renders as pictures.png, and the effects that Gaussians keep as effect_sets.png.

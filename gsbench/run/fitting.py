@@ -11,14 +11,12 @@ import torch
 from gsbench.config import Config, DataConfig
 from gsbench.errors import InputError
 from gsbench.measure.settings import training_hash
-from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
 from gsbench.models.start import start_from
 from gsbench.run import progress, stop
 from gsbench.run.checks import evaluated_views
 from gsbench.run.identity import Run
 from gsbench.run.load import plain_description
-from gsbench.run.resolve import Resolved
 from gsbench.scenes import Points, Scene
 from gsbench.scenes.points import frustum_points, random_points
 from gsbench.scenes.trained import TrainedGaussians
@@ -27,6 +25,10 @@ from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer
 from gsbench.train.seeding import generator
+
+
+class NoGaussianError(InputError):
+    """A training has pruned all Gaussians."""
 
 
 def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: TrainedGaussians | None) -> Trainer:
@@ -47,63 +49,76 @@ def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: Traine
     return Trainer(model, scene, evaluated_views(scene, config.scene.eval_split), config)
 
 
-def resume(trainer: Trainer, this: Run, resolved: Resolved) -> None:
-    """Continue from the checkpoint in the run's folder if there is one that the settings allow to use.
-
-    Args:
-        trainer: the trainer at step 0.
-        this: the run to train, with its folder.
-        resolved: the settings of the run after model=auto was replaced by a model; the seconds of this choice count as
-            training.
+def saved_state(this: Run, scene: Scene) -> dict[str, Any] | None:
+    """Return the state in the checkpoint of the run's folder; None if there is none that the settings allow to use.
 
     Raises:
         InputError: the checkpoint is damaged.
     """
-    config = resolved.config
-    reset_peak_memory(config.device)
-    path, hashes = _checkpoint_of(this, trainer)
-    state = checkpoint.load(path, *hashes, config.device) if config.resume else None
-    if state is not None:
-        trainer.load_state_dict(state)
-        print(f"{this.name}: continues from step {trainer.step} of {path}", file=sys.stderr)
-    elif resolved.screen is not None:
-        trainer.stages.add("screen", resolved.screen.seconds)
-        trainer.effort.add(resolved.effort)
+    path, hashes = _checkpoint_of(this, scene)
+    return checkpoint.load(path, *hashes, this.config.device) if this.config.resume else None
 
 
-def _checkpoint_of(this: Run, trainer: Trainer) -> tuple[Path, tuple[str, str]]:
+def resume(trainer: Trainer, this: Run, state: dict[str, Any] | None) -> bool:
+    """Continue from the `saved_state` of a run, and return whether there is one.
+
+    Raises:
+        InputError: the state belongs to another training.
+    """
+    if state is None:
+        return False
+    trainer.load_state_dict(state)
+    path = this.folder / checkpoint.FILE_NAME
+    print(f"{this.name}: continues from step {trainer.step} of {path}", file=sys.stderr)
+    return True
+
+
+def save(state: dict[str, Any], this: Run, scene: Scene, plain: dict[str, Any]) -> None:
+    """Write the checkpoint of a run: a trainer's state, with the settings as plain values."""
+    path, hashes = _checkpoint_of(this, scene)
+    checkpoint.save(path, Checkpoint(*hashes, state, plain, plain_description(scene)))
+
+
+def _checkpoint_of(this: Run, scene: Scene) -> tuple[Path, tuple[str, str]]:
     """Return the path of a run's checkpoint, and the hashes of the settings and of the data that it must have."""
-    return this.folder / checkpoint.FILE_NAME, (training_hash(this.plain), trainer.scene.fingerprint)
+    return this.folder / checkpoint.FILE_NAME, (training_hash(this.plain), scene.fingerprint)
 
 
-def fit(trainer: Trainer, this: Run, config: Config, plain: dict[str, Any], follow: Callable[[], None]) -> None:
-    """Train to the last step.
+def fit(
+    trainer: Trainer,
+    this: Run,
+    plain: dict[str, Any],
+    report: progress.Reporter,
+    follow: Callable[[], None] = lambda: None,
+    until: int | None = None,
+) -> None:
+    """Train to the last step, or to the step `until`.
 
     Args:
         trainer: the trainer at its first step.
-        this: the run to train, with its folder.
-        config: the settings of the run after model=auto was replaced by a model.
+        this: the run to train, with the folder of its checkpoint.
         plain: the settings as plain values, for the checkpoint.
+        report: reports the progress to other processes.
         follow: a function that is called after every step.
+        until: the number of finished steps at which the training stops; None for the last step.
 
     Raises:
-        InputError: no Gaussian is left.
+        NoGaussianError: no Gaussian is left.
         DivergedError: a loss or gradient was not finite.
         Stopped: a signal asked the process to end; the checkpoint is saved.
     """
-    path, hashes = _checkpoint_of(this, trainer)
-    about = plain, plain_description(trainer.scene)
+    path, last = this.folder / checkpoint.FILE_NAME, trainer.config.train.iterations
     with stop.requested() as request:
-        report = progress.Reporter(this.folder, this.overrides, config.train.iterations)
 
         def goes_on() -> bool:
             follow()
             if report.is_due():
                 report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
-            return request.signal is None
+            return request.signal is None and trainer.step != until
 
-        trainer.run(lambda state: checkpoint.save(path, Checkpoint(*hashes, state, *about)), this.name, goes_on)
-        if request.signal is not None and trainer.step < config.train.iterations:
+        if trainer.step != until:
+            trainer.run(lambda state: save(state, this, trainer.scene, plain), this.name, goes_on)
+        if request.signal is not None and (until is not None or trainer.step < last):
             report.end()
             if request.signal == signal.SIGUSR2:  # submitit's handler puts the job back into the queue, and ends it
                 request.hand_on(request.signal)
@@ -113,13 +128,13 @@ def fit(trainer: Trainer, this: Run, config: Config, plain: dict[str, Any], foll
 
 
 def _check_fitted(trainer: Trainer) -> None:
-    """Raise DivergedError if a parameter is not finite, and InputError if no Gaussian is left."""
+    """Raise DivergedError if a parameter is not finite, and NoGaussianError if no Gaussian is left."""
     for name, parameter in trainer.model.named_parameters():  # images would not show a colour of -inf, which is black
         if not parameter.isfinite().all():
             raise DivergedError(f"step {trainer.step}: '{name}' has values that are not finite")
     if not len(trainer.model):
-        raise InputError("no Gaussian is left: the training pruned all of them; look at train.densify, "
-                         "model.min_opacity and data.initial_half_width")  # fmt: skip
+        raise NoGaussianError("no Gaussian is left: the training pruned all of them; look at train.densify, "
+                              "model.min_opacity and data.initial_half_width")  # fmt: skip
 
 
 def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:

@@ -71,8 +71,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
         raise InputError("results: expected a folder, got '': results=. is this one")
     if config.init.ply is not None:
         config.init.ply_sha256 = plain["init"]["ply_sha256"] = config.init.ply_sha256 or hash_of(config.init.ply)
-    as_published = config.agr == config.model.published_with_agr
-    label = config.model.name + ("" if as_published else "_agr" if config.agr else "_noagr")
+    label = label_of(config)
     variant = name_variant(plain, choices) if choices else ""
     folder = records.run_path(
         Path(config.results), config.experiment, config.scene.name, label, config.seed, variant=variant
@@ -81,6 +80,12 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
         del plain[key]
     plain = _storable(plain)
     return Run(config, plain, folder, label, variant, deciding(overrides))
+
+
+def label_of(config: Config) -> str:
+    """Return the model's name, with _agr or _noagr if its use of AGR (a network) differs from the published method."""
+    as_published = config.agr == config.model.published_with_agr
+    return config.model.name + ("" if as_published else "_agr" if config.agr else "_noagr")
 
 
 def _rename_rates(composed: DictConfig) -> None:
@@ -119,7 +124,10 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
            for group, choice in [*((name, choices[name]) for name in OWN_NAMES), *groups.items()]]  # fmt: skip
     own += [f"seed={plain['seed']}", f"agr={str(plain['agr']).lower()}", f"scene.name={plain['scene']['name']}"]
     base: Plain = OmegaConf.to_container(hydra.compose("config", own), resolve=True)  # type: ignore[assignment]
-    theirs = {"effects.budget_db": base["effects"]["budget_db"]} | dict(flat(training_part(base)))
+    effects = base["effects"]
+    theirs = {"effects.budget_db": effects["budget_db"]} | dict(flat(training_part(
+        base | {"effects": effects | {"compare": plain["effects"]["compare"]}}  # so that both have model.compared
+    ))) | {"effects.compare": effects["compare"]}  # fmt: skip
     changed = {key: value for key, value in flat(training_part(plain)) if key not in theirs or value != theirs[key]}
     shorts = [key.removeprefix("model.options.").partition(".")[2] or key.rpartition(".")[2] for key in changed]
     for (key, value), short in zip(changed.items(), shorts, strict=True):

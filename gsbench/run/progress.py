@@ -49,10 +49,19 @@ def encode(progress: Progress) -> bytes:
 class Reporter:
     """Writes progress.json during the training of a run, at most once per interval (`EVERY` seconds)."""
 
-    def __init__(self, folder: Path, overrides: list[str], steps: int) -> None:
-        """Report that the run in `folder` has started, with `steps` steps to do."""
+    def __init__(self, folder: Path, overrides: list[str], steps: int, done: int = 0, seconds: float = 0.0) -> None:
+        """Report that the run in `folder` has started.
+
+        Args:
+            folder: the folder of the run.
+            overrides: the run's overrides, as in its record.
+            steps: the number of steps of the run; model=auto may train several candidates.
+            done: the steps of candidates that were trained before.
+            seconds: the seconds of these steps.
+        """
         self.folder = folder
-        self.progress = Progress(overrides, steps=steps)
+        self.done, self.seconds = done, seconds
+        self.progress = Progress(overrides, step=done, steps=steps, seconds=seconds)
         write(folder, self.progress)
         self._written = time.monotonic()
 
@@ -64,10 +73,10 @@ class Reporter:
         return time.monotonic() - self._written >= EVERY
 
     def __call__(self, step: int, seconds: float, last: Point | None) -> None:
-        """Report the number of finished steps, the seconds of training and the last point of the training curve."""
+        """Report the finished steps and the seconds of the present training, and the last point of its curve."""
         psnr = last.psnr_val if last else None
         self.progress = dataclasses.replace(
-            self.progress, step=step, seconds=seconds, psnr_val=psnr, updated=time.time()
+            self.progress, step=self.done + step, seconds=self.seconds + seconds, psnr_val=psnr, updated=time.time()
         )
         self._written = time.monotonic()
         try:

@@ -28,18 +28,29 @@ def is_auto(config: Config) -> bool:
 def with_candidate(config: Config, name: str) -> Config:
     """Return settings with one candidate of model=auto ("moving" or "static") as the model.
 
-    The static candidate has no AGR, because AGR (a network) moves Gaussians with time.
-
     Raises:
         InputError: the settings lack the candidate, or the candidate is not a model config.
     """
-    chosen = config.model.candidates.get(name)
+    return with_model(config, config.model.candidates.get(name), f"model.candidates.{name}")
+
+
+def with_model(config: Config, chosen: Any, key: str) -> Config:
+    """Return the settings of model=auto with another model, which has AGR only if its own settings ask for it.
+
+    Args:
+        config: the settings with model=auto.
+        chosen: the settings of the model, from `key`.
+        key: the config key, for messages.
+
+    Raises:
+        InputError: `chosen` is not a model config.
+    """
     try:
         typed = OmegaConf.merge(OmegaConf.structured(ModelConfig), chosen or {})
         model: ModelConfig = OmegaConf.to_object(typed)  # type: ignore[assignment]
     except (OmegaConfBaseException, ValueError, TypeError) as error:
-        raise InputError(f"model.candidates.{name}: {str(error).splitlines()[0]}") from None
-    return replace(config, model=replace(model, gate=config.model.gate), agr=config.agr and name == "moving")
+        raise InputError(f"{key}: {str(error).splitlines()[0]}") from None
+    return replace(config, model=replace(model, gate=config.model.gate), agr=config.agr and model.agr)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
@@ -14,6 +14,8 @@ from tqdm import tqdm
 from gsbench.config import Config
 from gsbench.errors import InputError, one_line
 from gsbench.measure.curve import Curve
+from gsbench.measure.record import ModelComparison
+from gsbench.measure.schema import parse
 from gsbench.measure.speed import Effort, StageClock
 from gsbench.models import GaussianModel
 from gsbench.scenes import Scene, View
@@ -91,6 +93,7 @@ class Trainer:
             self.optimizer.skip = self.finite_check.skip
         self.curve = Curve()
         self.best = Best()
+        self.comparison: ModelComparison | None = None  # by which model=auto chose this model
         self.step = 0
         self._is_full = False  # whether the largest allowed number of Gaussians was reached
 
@@ -258,6 +261,7 @@ class Trainer:
             "effort": self.effort.state_dict(),
             "curve": self.curve.state_dict(),
             "best": vars(self.best).copy(),
+            "comparison": asdict(self.comparison) if self.comparison else None,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -279,8 +283,19 @@ class Trainer:
             self.effort.load_state_dict(state.get("effort"))
             self.curve.load_state_dict(state["curve"])
             self.best = Best(**state["best"])
+            self.comparison = comparison_of(state)
         except (InputError, MemoryError):
             raise
         except Exception as error:  # a part may be of any type
             raise InputError(f"checkpoint: expected the state of this training: {one_line(error)!r:.200}") from None
         self.model.set_active(self.schedule.active(max(0, self.step - 1)))
+
+
+def comparison_of(state: dict[str, Any]) -> ModelComparison | None:
+    """Return the comparison by which model=auto chose the model of a `Trainer.state_dict`; None if there was none.
+
+    Raises:
+        InputError: the state does not hold a comparison as expected.
+    """
+    found = state.get("comparison")
+    return None if found is None else parse(ModelComparison, found, "checkpoint: comparison")
