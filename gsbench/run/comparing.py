@@ -31,8 +31,8 @@ def check_compare(config: Config) -> None:
         raise InputError(f"effects.compare=true: expected model=auto, whose candidates it compares, got "
                          f"model={config.model.name}: leave effects.compare out, or use model=auto")  # fmt: skip
     if config.scene.eval_split == "val":
-        raise InputError("effects.compare=true: expected results on test, got scene.eval_split=val: results on the views "
-                         "by which the model is chosen would be too high; name a model instead")  # fmt: skip
+        raise InputError("effects.compare=true: expected results on test, got scene.eval_split=val: results on the "
+                         "views by which the model is chosen would be too high; name a model instead")  # fmt: skip
 
 
 def check_candidates(config: Config, scene: Scene) -> None:
@@ -67,8 +67,8 @@ def best_of(this: Run, scene: Scene, start: TrainedGaussians | None, resolved: R
     """Return the trainer of the candidate with the highest PSNR on val, from which the run continues.
 
     The candidates are trained one after another, each with the settings and the seed of the run, so that the result is
-    bit-equal to a run of the chosen model alone. A checkpoint of each is kept until the choice is saved in the run's own
-    checkpoint. The seconds of the time screen and of the other candidates count as training.
+    bit-equal to a run of the chosen model alone. A checkpoint of each is kept until the choice is saved in the run's
+    own checkpoint. The seconds of the time screen and of the other candidates count as training.
 
     Args:
         this: the run with model=auto.
@@ -138,10 +138,7 @@ def _compared(parts: _Candidates, resolved: Resolved) -> Trainer:
         del trainer
     if len(errors) == len(found):
         raise errors[0]
-    left = [i for i, one in enumerate(found) if one.reason is None]
-    best = max(
-        left, key=lambda i: -math.inf if (psnr := found[i].psnr_val) is None else psnr
-    )  # the first of equal ones
+    best = max(range(len(found)), key=lambda i: _rank(found[i]))  # the first of equal ones
     comparison = ModelComparison(until, found[best].name, found)
     print(f"{parts.this.name}: {messages.of_comparison(comparison)}", file=sys.stderr)
     trainer = parts.trainer(comparison.chosen)
@@ -154,6 +151,11 @@ def _compared(parts: _Candidates, resolved: Resolved) -> Trainer:
     _add_costs(trainer, resolved, sum(one.seconds for i, one in enumerate(found) if i != best),
                [one for i, one in enumerate(efforts) if i != best])  # fmt: skip
     return trainer
+
+
+def _rank(found: Candidate) -> tuple[bool, float]:
+    """Return the value by which candidates are compared: none that diverged is above one that did not."""
+    return found.reason is None, -math.inf if found.psnr_val is None else found.psnr_val
 
 
 def _fit(parts: _Candidates, name: str, trainer: Trainer, before: list[Candidate]) -> None:

@@ -128,7 +128,10 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
     theirs = {"effects.budget_db": effects["budget_db"]} | dict(flat(training_part(
         base | {"effects": effects | {"compare": plain["effects"]["compare"]}}  # so that both have model.compared
     ))) | {"effects.compare": effects["compare"]}  # fmt: skip
-    changed = {key: value for key, value in flat(training_part(plain)) if key not in theirs or value != theirs[key]}
+    mine = dict(flat(training_part(plain)))
+    if "effects.gate" in theirs:
+        mine.setdefault("effects.gate", "off")
+    changed = {key: value for key, value in mine.items() if key not in theirs or value != theirs[key]}
     shorts = [key.removeprefix("model.options.").partition(".")[2] or key.rpartition(".")[2] for key in changed]
     for (key, value), short in zip(changed.items(), shorts, strict=True):
         words.append(f"{short if shorts.count(short) == 1 else key}={_printed(value)}")

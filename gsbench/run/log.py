@@ -43,6 +43,9 @@ class RunLog:
         self.tracker = Guarded(
             this.config.log, Subject(this.folder, this.name, this.config.experiment, settings, trainer.step)
         )
+        for point, line in zip(points, lines, strict=True):
+            if point not in known:  # measured before the run had a log, while candidates of model=auto were compared
+                self._send(point, line)
 
     def follow(self) -> None:
         """Write what was measured since the last call; called after every step."""
@@ -50,11 +53,15 @@ class RunLog:
             line = _line(point, self.trainer.finite_check.loss, len(self.trainer.model))
             with contextlib.suppress(OSError), self.path.open("a") as file:
                 file.write(_text(line))
-            self.tracker.add(point.iteration, _finite({
-                "val/psnr": line["psnr_val"], "train/loss": line["loss"], "train/seconds": line["seconds"],
-                "train/gaussians": line["gaussians"],
-            }))  # fmt: skip
+            self._send(point, line)
             self.written += 1
+
+    def _send(self, point: Point, line: Line) -> None:
+        """Send a line of curve.jsonl to the tracker."""
+        self.tracker.add(point.iteration, _finite({
+            "val/psnr": line["psnr_val"], "train/loss": line["loss"], "train/seconds": line["seconds"],
+            "train/gaussians": line["gaussians"],
+        }))  # fmt: skip
 
     def end(self, record: Record | None) -> None:
         """Send the results of the record and end the tracking; None if a signal has stopped the run."""

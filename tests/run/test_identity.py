@@ -51,6 +51,11 @@ def named(*words: str) -> Run:
         (["protocol=published"], "7dgs,protocol=published"),
         (["protocol=dgs2026"], "7dgs,protocol=dgs2026"),
         (["effects.gate=end", "effects.budget_db=0.2"], "7dgs,gate=end,budget_db=0.2"),
+        (["model=auto", "effects.gate=off"], "auto,gate=off"),
+        (["model=auto", "effects.compare=true"], "auto,compare=true"),
+        (["model=auto", "effects.gate=off", "effects.compare=true"], "auto,compare=true,gate=off"),
+        (["model=auto", "effects.compare=true", "model.compared.moving_4dgs.options.time_degree=1"],
+         "auto,compared.moving_4dgs.options.time_degree=1,compare=true"),
     ],
 )  # fmt: skip
 def test_a_folder_says_what_is_not_the_experiments_own(words: list[str], folder: str) -> None:
@@ -142,6 +147,25 @@ def test_a_cap_on_gaussians_is_training_and_none_changes_no_older_run() -> None:
     assert not training_differences(older, run.plain)
     assert not measuring_differences(older, run.plain)
     assert (run.variant, capped.variant) == ("", "densify.max_gaussians=50000")
+
+
+def test_a_comparison_is_training_and_none_changes_no_older_run() -> None:
+    """Catches model=auto that trains every finished run again, as its settings now have candidates to compare."""
+    run, words = named("model=auto"), ("model=auto", "effects.compare=true")
+    older = copy.deepcopy(run.plain)
+    del older["effects"]["compare"], older["model"]["compared"]
+    assert training_hash(older) == training_hash(run.plain)
+    assert not training_differences(older, run.plain)
+    assert not measuring_differences(older, run.plain)
+    others = [
+        named(*words),
+        named(*words, "effects.gate=off"),
+        named(*words, "model.compared.moving_4dgs.options.time_degree=1"),
+    ]
+    assert len({training_hash(one.plain) for one in (run, *others)}) == 4
+    assert training_hash(
+        named("model=auto", "model.compared.moving_4dgs.options.time_degree=1").plain
+    ) == training_hash(older)
 
 
 @pytest.mark.parametrize("word", ["experiment=published", "scene.name=published"])

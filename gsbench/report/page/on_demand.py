@@ -9,7 +9,7 @@ from collections import Counter
 from pathlib import Path
 from statistics import fmean
 
-from gsbench.effects.messages import EFFECT_SETS, of_decision
+from gsbench.effects.messages import EFFECT_SETS, of_comparison, of_decision
 from gsbench.measure.record import Record, TimeScreen
 from gsbench.report.configurations import Group
 from gsbench.report.intervals import Estimate
@@ -64,7 +64,7 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection
 
 def _sentence(one: Decided) -> str:
     """Describe which effects (time, view direction, the network AGR) a model and its Gaussians keep on a scene."""
-    parts = [_screen_words(one.runs), *_gate_words(one)]
+    parts = [_screen_words(one.runs), _comparison_words(one.runs), *_gate_words(one)]
     return f"On {one.scene}, {one.name}: {' '.join(part for part in parts if part)}"
 
 
@@ -89,6 +89,17 @@ def _screen_words(runs: list[Record]) -> str:
 
 def _screens(runs: list[Record]) -> list[TimeScreen]:
     return [r.on_demand.screen for r in runs if r.on_demand and r.on_demand.screen]
+
+
+def _comparison_words(runs: list[Record]) -> str:
+    """Say which model was best on val in the first run that compared models, and which other runs chose."""
+    found = [r.on_demand.comparison for r in runs if r.on_demand and r.on_demand.comparison]
+    if not found:
+        return ""
+    text = messages.shorten(of_comparison(found[0]), LONGEST_REASON)
+    others = Counter(one.chosen for one in found[1:] if one.chosen != found[0].chosen)
+    parts = [f"{messages.shorten(name, 20)} with {messages.count(n, 'seed')}" for name, n in sorted(others.items())]
+    return f"{text}; {messages.listing(parts)}." if parts else f"{text}."
 
 
 def _gate_words(one: Decided) -> list[str]:

@@ -47,8 +47,10 @@ MARKERS: tuple[Marker, ...] = (
     (6, 1, 0),
 )
 # Stages of a training step are shades of one hue, stages that occur once a run have two other hues, the rest is grey.
-STAGES_LIGHT = ("#22476b", "#3b6b96", "#6390b8", "#8fb2d1", "#b7cfe3", "#d7e4ef", "#b9770e", "#efc06a", "#9a9da3")
-STAGES_DARK = ("#c9e0f5", "#a3c6e6", "#7ba8cf", "#588ab3", "#3f6e95", "#2c5373", "#f0b35a", "#96651f", "#7d828b")
+STAGES_LIGHT = ("#22476b", "#3b6b96", "#6390b8", "#8fb2d1", "#b7cfe3", "#d7e4ef", "#b9770e", "#efc06a", "#7a4a00",
+                "#9a9da3")  # fmt: skip
+STAGES_DARK = ("#c9e0f5", "#a3c6e6", "#7ba8cf", "#588ab3", "#3f6e95", "#2c5373", "#f0b35a", "#96651f", "#f7dcae",
+               "#7d828b")  # fmt: skip
 
 
 def variables(page: dict[str, str], models: Sequence[str], stages: Sequence[str]) -> dict[str, str]:

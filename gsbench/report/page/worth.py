@@ -17,7 +17,7 @@ from gsbench.report.page import charts, messages
 from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, PageSection, Swatch, Tab, Value
 
 UNITS = (("psnr", "dB", 2), ("seconds", "training s", 1), ("ms", "ms a frame", 2), ("mb", "MB", 2))
-STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer", "screen", "gate")  # each has a colour
+STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer", "screen", "gate", "compare")  # with colours
 REST = "other"
 MOST_PAIRS = 28  # pairs that are drawn, as many as eight models have
 PARAMETRISATION = (
