@@ -74,7 +74,7 @@ class ModelConfig:
     min_opacity: float = 0.005  # Gaussians of lower opacity are pruned
     gate: str = "off"  # default of effects.gate
     candidates: dict[str, Any] = field(default_factory=dict)  # choices of model=auto
-    compared: dict[str, Any] = field(default_factory=dict)  # more choices, with effects.compare=true
+    compared: dict[str, Any] = field(default_factory=dict)  # more choices of it with effects.compare=true
     lr: dict[str, LearningRate] = field(default_factory=dict)  # learning rate of each parameter group
     options: dict[str, Any] = field(default_factory=dict)  # arguments of the model's class
 
@@ -162,7 +162,7 @@ class EffectsConfig:
 
     gate: str = "${model.gate}"  # off; end: after the training; both: also during it
     budget_db: float = 0.05  # dB of PSNR on val that the removal at the end may cost
-    compare: bool = False  # model=auto trains all its choices to 70 %, and the best on val to the end
+    compare: bool = False  # choose the model of model=auto by PSNR on val, after 70 % of the steps
 
 
 @dataclass

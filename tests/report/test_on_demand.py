@@ -11,7 +11,7 @@ from make_golden import make
 from many_records import frontier, gates, hostile, on_demand, write_all
 from test_page import Page, canvas, group
 
-from gsbench.measure.record import OnDemand, Record, TimeScreen
+from gsbench.measure.record import Candidate, ModelComparison, OnDemand, Record, TimeScreen
 from gsbench.report import compare
 from gsbench.report import frontier as points
 from gsbench.report.comparisons import comparisons
@@ -58,6 +58,20 @@ def test_three_seeds_in_words():
 def screened(record: Record, decision: str, reason: str = "so", **changes: object) -> Record:
     screen = TimeScreen(decision, reason, None, None, None, 0.5)
     return dataclasses.replace(record, on_demand=OnDemand(screen, **changes))
+
+
+def test_a_comparison_of_models_is_said():
+    """Catches a page that hides how a model was chosen, and seeds that chose another one."""
+    tried = [Candidate("7dgs", 22.836, 9.0), Candidate("4dgs", 22.4, 8.0), Candidate("6dgs", None, 1.0, "a NaN")]
+    runs = [
+        screened(one, "on", comparison=ModelComparison(700, chosen, tried))
+        for one, chosen in zip(on_demand(WHOLE), ("7dgs", "4dgs", "7dgs"), strict=True)
+    ]
+    assert sentences(runs) == [
+        "On suzanne, auto: time is on, as so; the same with all 3 seeds. PSNR on val after 700 iterations: 7dgs "
+        "22.84 dB, 4dgs 22.40 dB, 6dgs diverged; 7dgs is trained to the end; 4dgs with 1 seed. "
+        "No gate has changed a Gaussian."
+    ]
 
 
 def test_what_is_undecided_or_differs_is_said():

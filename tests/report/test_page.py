@@ -17,7 +17,7 @@ from many_records import EFFECTS, HOSTILE, frontier, hostile, on_demand, write_a
 from gsbench.config import TrainConfig
 from gsbench.measure.curve import Point
 from gsbench.measure.images import strip, write_png
-from gsbench.measure.record import Effects, OnDemand, Region, ViewScore
+from gsbench.measure.record import Candidate, Effects, ModelComparison, OnDemand, Region, ViewScore
 from gsbench.measure.speed import RenderTimes
 from gsbench.report import compare, live
 from gsbench.report.__main__ import main
@@ -477,11 +477,14 @@ def test_the_gallery_fits(tmp_path, monkeypatch):
     assert gallery.gallery(records, folder) == []
 
 
-def events_by_letter(train: TrainConfig, model: dict, effects: Effects) -> dict[str, list[int]]:
-    """The marks of a run with this recipe, model and effects."""
+def events_by_letter(
+    train: TrainConfig, model: dict, effects: Effects, comparison: ModelComparison | None = None
+) -> dict[str, list[int]]:
+    """The marks of a run with this recipe, model and effects, whose model a comparison may have chosen."""
     one = make()
     provenance = dataclasses.replace(one.provenance, config={"train": dataclasses.asdict(train), "model": model})
-    marks = events_of(dataclasses.replace(one, provenance=provenance, effects=effects))
+    chosen = OnDemand(comparison=comparison)
+    marks = events_of(dataclasses.replace(one, provenance=provenance, effects=effects, on_demand=chosen))
     return {letter: [step for step, letters in marks if letter in letters] for letter in "RDAL"}
 
 
@@ -511,6 +514,10 @@ def test_a_lambda_that_is_fixed_is_not_said_to_be_learned():
     assert events_by_letter(config, FIXED, moving)["L"] == []
     assert events_by_letter(config, both, moving)["L"] == events_by_letter(config, LEARNT, moving)["L"] != []
     assert events_by_letter(config, both, static)["L"] == []
+    both["compared"] = {"moving_4dgs": {"name": "4dgs"} | FIXED}
+    choices = {name: ModelComparison(1400, name, [Candidate(name, 20.0, 1.0)]) for name in ("4dgs", "7dgs_noagr")}
+    assert events_by_letter(config, both, moving, choices["4dgs"])["L"] == []
+    assert events_by_letter(config, both, moving, choices["7dgs_noagr"])["L"] != []
 
 
 def test_a_table_shows_its_first_rows_and_links_all():

@@ -52,7 +52,9 @@ def _rates(record: Record) -> dict[str, Any]:
     model = record.provenance.config["model"]
     if model.get("candidates"):
         found = record.on_demand.comparison if record.on_demand else None
-        choices = {one["name"]: one for group in ("compared", "candidates") for one in model.get(group, {}).values()}
+        choices = {
+            one.get("name"): one for group in ("compared", "candidates") for one in model.get(group, {}).values()
+        }
         by_screen = model["candidates"]["moving" if record.effects.time else "static"]
         model = choices.get(found.chosen, by_screen) if found else by_screen
     rates: dict[str, Any] = model["lr"]
