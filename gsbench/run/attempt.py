@@ -69,14 +69,14 @@ class Attempt:
         if is_auto(this.config):
             self.resolved = resolve(this, scene)
             self.model = model = build(self.resolved.config)
-        screen, config = self.resolved.screen, self.resolved.config
-        if config.effects.compare and screen is not None and screen.decision != "off":
-            reset_peak_memory(config.device)
+        screen, device = self.resolved.screen, this.config.device
+        if self.resolved.compares:
+            reset_peak_memory(device)
             trainer = best_of(this, scene, self.start, self.resolved)
             self.resolved, self.model = replace(self.resolved, config=trainer.config), trainer.model
         else:
             trainer = self.trainer(model, scene)
-            reset_peak_memory(config.device)
+            reset_peak_memory(device)
             if not fitting.resume(trainer, this, fitting.saved_state(this, scene)) and screen is not None:
                 trainer.stages.add("screen", screen.seconds)
                 trainer.effort.add(self.resolved.effort)

@@ -61,6 +61,11 @@ class Resolved:
     screen: TimeScreen | None = None  # the test that chose the model, for model=auto
     effort: Effort = field(default_factory=Effort)  # CPU time of this test
 
+    @property
+    def compares(self) -> bool:
+        """Return whether a comparison on val must still choose the model: `effects.compare`, if the scene may move."""
+        return self.config.effects.compare and self.screen is not None and self.screen.decision != "off"
+
 
 def before_scene(config: Config) -> Config:
     """Return settings to check before the scene is loaded: model=auto is replaced by its candidate with time."""
@@ -83,9 +88,11 @@ def resolve(this: Run, scene: Scene) -> Resolved:
     with effort:
         screen = choose.screen(scene, this.config.seed, this.config.raster.backend)
         config = with_candidate(this.config, "static" if screen.decision == "off" else "moving")
-    print(f"{this.name}: time is {screen.decision}: {screen.reason}; {config.model.name}"
-          f"{' with AGR' if config.agr else ''}", file=sys.stderr)  # fmt: skip
-    return Resolved(config, screen, effort)
+    found = Resolved(config, screen, effort)
+    model = f"{config.model.name}{' with AGR' if config.agr else ''}"
+    print(f"{this.name}: time is {screen.decision}: {screen.reason}; "
+          f"{'models are compared on val' if found.compares else model}", file=sys.stderr)  # fmt: skip
+    return found
 
 
 def plain(this: Run, config: Config) -> dict[str, Any]:

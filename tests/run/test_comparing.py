@@ -14,6 +14,7 @@ from gsbench.config import Config, TrainConfig
 from gsbench.effects import choose
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, ModelComparison, Record, TimeScreen
+from gsbench.run import trackers
 from gsbench.run.comparing import FOLDER, candidates, check_candidates, check_compare
 from gsbench.schedule import Schedule
 from gsbench.stability.training_cases import compose, moving_square
@@ -95,6 +96,8 @@ def test_the_best_on_val_is_trained_to_the_end_with_its_own_bits(
     assert record.cost.stage_s["compare"] == pytest.approx(others)
     assert record.cost.train_s > sum(one.seconds for one in found.candidates)
     assert record.curve[0].seconds > others, "a PSNR is reached only after the other candidates"
+    effort = checkpoint.read(folder / checkpoint.FILE_NAME).state["effort"]
+    assert effort["seconds"] > sum(one.seconds for one in found.candidates), "CPU-seconds of the best alone"
     assert record.effects.refinement is False
     assert not (folder / FOLDER).exists()
 
@@ -150,8 +153,19 @@ def test_a_finished_run_is_kept_and_measured_again_with_its_comparison(
     square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a second call that trains, and a record that loses the comparison when images are measured again."""
-    words = overrides(square, tmp_path, *COMPARED)
+    words, sent = overrides(square, tmp_path, *COMPARED, "log=json"), list[int]()
+
+    class Tracked:
+        def __init__(self, _: object) -> None: ...
+
+        def add(self, step: int, _: object) -> None:
+            sent.append(step)
+
+        def end(self, _: str) -> None: ...
+
+    monkeypatch.setitem(trackers.TRACKERS, "json", Tracked)
     record, folder = run_here(*words)
+    assert sent == [*(point.iteration for point in record.curve), STEPS], "a tracker lacks the steps of the comparison"
     monkeypatch.setattr(Trainer, "_descend", lambda _: pytest.fail("trained again"))
     again, _ = run_here(*words)
     assert again == record
@@ -160,6 +174,21 @@ def test_a_finished_run_is_kept_and_measured_again_with_its_comparison(
     measured, _ = run_here(*words)
     assert comparison_in(measured) == comparison_in(record)
     assert measured.metrics == record.metrics
+
+
+def test_resume_false_starts_every_candidate_over(
+    square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a candidate of an earlier attempt that is taken although the user said to start over."""
+    save = checkpoint.save
+    monkeypatch.setattr(checkpoint, "save", lambda *given: (save(*given), (_ for _ in ()).throw(Killed)))
+    with pytest.raises(Killed):
+        run_here(*overrides(square, tmp_path, *COMPARED))
+    monkeypatch.setattr(checkpoint, "save", save)
+    record, folder = run_here(*overrides(square, tmp_path, *COMPARED, "resume=false"))
+    assert comparison_in(record).chosen == "4dgs"
+    assert "continues from" not in capsys.readouterr().err
+    assert not (folder / FOLDER).exists()
 
 
 def test_a_candidate_that_diverges_loses(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
