@@ -35,7 +35,7 @@ def of_screen(screen: TimeScreen) -> str:
 def of_comparison(found: ModelComparison) -> str:
     """Return a message: the PSNR on val of each candidate of model=auto, and which of them was chosen."""
     said = [f"{one.name} {'-' if one.psnr_val is None else format(one.psnr_val, '.2f')} dB" if one.reason is None
-            else f"{one.name} diverged" for one in found.candidates]  # fmt: skip
+            else f"{one.name} failed" for one in found.candidates]  # fmt: skip
     return f"PSNR on val after {found.iteration} iterations: {', '.join(said)}; {found.chosen} is trained to the end"
 
 

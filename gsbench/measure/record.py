@@ -150,9 +150,9 @@ class Candidate:
     """One model of a comparison: its PSNR on val and the seconds of its training until the comparison."""
 
     name: str  # the label of the model, such as "7dgs_noagr"
-    psnr_val: float | None  # dB; None: not finite, or the training diverged
+    psnr_val: float | None  # dB; None: not finite, or the training failed
     seconds: float
-    reason: str | None = None  # why the training diverged
+    reason: str | None = None  # why the training failed: it diverged, or no Gaussian was left
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ def best_of(this: Run, scene: Scene, start: TrainedGaussians | None, resolved: R
 
     Raises:
         InputError: a checkpoint is damaged.
-        DivergedError: all candidates diverged.
+        DivergedError, NoGaussianError: all candidates failed; the error is that of the first.
         Stopped: a signal asked the process to end; the checkpoint of the present candidate is saved.
     """
     parts = _Candidates(this, scene, start, candidates(this.config))
@@ -154,7 +154,7 @@ def _compared(parts: _Candidates, resolved: Resolved) -> Trainer:
 
 
 def _rank(found: Candidate) -> tuple[bool, float]:
-    """Return the value by which candidates are compared: none that diverged is above one that did not."""
+    """Return the value by which candidates are compared: none that failed is above one that did not."""
     return found.reason is None, -math.inf if found.psnr_val is None else found.psnr_val
 
 

@@ -69,7 +69,7 @@ def test_a_comparison_of_models_is_said():
     ]
     assert sentences(runs) == [
         "On suzanne, auto: time is on, as so; the same with all 3 seeds. PSNR on val after 700 iterations: 7dgs "
-        "22.84 dB, 4dgs 22.40 dB, 6dgs diverged; 7dgs is trained to the end; 4dgs with 1 seed. "
+        "22.84 dB, 4dgs 22.40 dB, 6dgs failed; 7dgs is trained to the end; 4dgs with 1 seed. "
         "No gate has changed a Gaussian."
     ]
 
