@@ -15,7 +15,10 @@ CUDA := $(if $(shell nvidia-smi -L 2> /dev/null),auto,off)
 # The instruction sets that the kernels are built for: native, this machine's best, or all, which takes twice as long.
 LEVELS ?= native
 
-.PHONY: help table1 frontier tables test test-all stability stability-long bench gpu-check slurm-check sanitize lint format docs scenes setup locks clean
+# What builds images.
+DOCKER ?= docker
+
+.PHONY: help table1 frontier tables test test-all stability stability-long bench gpu-check slurm-check sanitize lint format docs scenes setup locks wheel image clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
@@ -131,6 +134,14 @@ locks:  ## resolve locks/ anew, after a change of pyproject.toml or constraints.
 	$(PYTHON) -m venv build/uv
 	build/uv/bin/pip install --quiet --disable-pip-version-check --no-deps --require-hashes --requirement locks/uv.txt
 	build/uv/bin/python locks/write.py
+
+wheel: setup  ## build a wheel with the kernels of every instruction set into dist/
+	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir dist \
+		--config-settings build-dir=build/wheel --config-settings cmake.define.CUDA=$(CUDA) .
+
+image: wheel  ## build an image of that wheel by Docker, Podman or Buildah: DOCKER=podman; docs/install.md
+	$(DOCKER) build --file containers/Dockerfile --tag gsbench \
+		$(if $(filter off,$(CUDA)),,--build-arg TORCH_INDEX=) $(ARGS) .
 
 clean:  ## remove what was built and installed; results stay
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,5 +1,6 @@
 """What a release says in several places: its version, and the Pythons that it runs on."""
 
+import fnmatch
 import re
 import tomllib
 from typing import Any
@@ -54,6 +55,34 @@ def test_a_wheel_is_made_for_every_python_and_tried() -> None:
     assert "skip" not in settings
     assert settings["test-command"].startswith("python {project}/")
     assert (ROOT / settings["test-command"].partition("{project}/")[2]).is_file()
+
+
+def test_the_image_is_of_a_wheel_of_this_project() -> None:
+    """Catches an image of another Python or without pins, one that runs as root, and one that Apptainer cannot find."""
+    folder = ROOT / "containers"
+    text = re.sub(r"\\\n\s*", "", (folder / "Dockerfile").read_text())
+    steps = [(word, rest) for word, rest in re.findall(r"^([A-Z]+) (.*)$", text, re.MULTILINE)]
+    said = dict(steps)  # the last of each
+    *sources, target = said["COPY"].split()
+    (wheel,) = (one for one in sources if one.endswith(".whl"))
+    assert fnmatch.fnmatch(f"dist/gsbench-{gsbench.__version__}-cp311-cp311-manylinux_2_28_x86_64.whl", wheel)
+    assert "3.11" in PYTHONS
+    assert "Python 3.11" in text  # of the base image
+    kept = [line[1:] for line in (folder / "Dockerfile.dockerignore").read_text().splitlines() if line[0] == "!"]
+    for source in sources:
+        assert any(fnmatch.fnmatch(source.replace("*", "x"), one) for one in kept), source
+        assert source == wheel or (ROOT / source).is_file()
+    (install,) = (rest for word, rest in steps if "pip install" in rest and word == "RUN")
+    assert f"--constraint {target}constraints.txt" in install
+    (extras,) = re.findall(r"\$wheel\[([a-z,]+)\]", install)
+    assert set(extras.split(",")) <= PYPROJECT["project"]["optional-dependencies"].keys()
+    assert [word for word, _ in steps].index("USER") > steps.index(("RUN", install))
+    assert said["USER"] not in ("root", "0")
+    assert said["ENTRYPOINT"] == '["python", "-m", "gsbench"]'
+    definition = (folder / "gsbench.def").read_text()
+    (archive,) = re.findall(r"^From: (.*)$", definition, re.MULTILINE)
+    assert f"docker save gsbench -o {archive}" in definition
+    assert "--file containers/Dockerfile --tag gsbench " in MAKEFILE
 
 
 @pytest.mark.parametrize("name", ["tests.yml", "wheels.yml"])
