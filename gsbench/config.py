@@ -178,6 +178,8 @@ class LaunchConfig:
     setup: str = ":"  # shell line before the run: `module load cuda`
     requeues: int = 20  # most jobs in which a run may continue
     signal_seconds: int = 120  # seconds before the time limit at which a job saves
+    container: str | None = None  # Apptainer image in which jobs run; None: none
+    container_command: str = "apptainer exec"  # what runs a command in it
     sbatch: dict[str, Any] = field(default_factory=dict)  # other options of sbatch: +launch.sbatch.account=NAME
 
 

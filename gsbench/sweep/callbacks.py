@@ -23,7 +23,7 @@ from omegaconf import DictConfig, open_dict, read_write
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME
 from gsbench.run.progress import born
-from gsbench.sweep import plan
+from gsbench.sweep import container, plan
 from gsbench.sweep.plan import Ended, Plan
 
 started: list[Path] = []  # the folders of the plans that this process wrote
@@ -38,8 +38,14 @@ class WritePlan(Callback):
         folder = Path(config.hydra.sweep.dir)
         plan.write(planned, folder)
         started.append(folder)
+        container.use(config, planned.runs)
         experiment = folder.parents[1]
         print(f"{len(planned.runs)} runs; their status: python -m gsbench.sweep status {experiment}", file=sys.stderr)
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Prepare the process of a job that runs in a container image."""
+        if config.launch.container is not None:
+            container.enter()
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Write the outcome of the run, which contains the path of its record.

@@ -20,7 +20,7 @@ from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError, printable
 from gsbench.measure.renamed import present_override
 from gsbench.run.overrides import launches
-from gsbench.sweep import plan
+from gsbench.sweep import container, plan
 from gsbench.sweep.axes import SCENES_DEPEND_ON, scenes_of
 from gsbench.sweep.callbacks import plan_of
 from gsbench.sweep.explain import explain
@@ -104,6 +104,7 @@ def _relaunch(
             config.hydra.runtime.output_dir = config.hydra.sweep.dir
         folder = Path(config.hydra.sweep.dir)
         plan.write(plan_of(runs, config), folder)
+        container.use(config, runs)
         print(f"{len(runs)} runs again, by {config.hydra.runtime.choices['hydra/launcher']}", file=sys.stderr)
         context = HydraContext(config_loader=GlobalHydra.instance().config_loader(), callbacks=Callbacks(config))
         launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=task, config=config)

@@ -190,12 +190,26 @@ def time_limit(check: Check) -> None:
     long = (*TINY, "scene=suzanne", "model=7dgs", "seed=0", "train.densify.max_gaussians=1000",
             f"train.iterations={round(STEPS * LONG_SECONDS / seconds)}")  # fmt: skip
     do_here(check.reference, long)
-    sweep = check.sweep("limit", *long, "launch.minutes=2", "launch.signal_seconds=60")
-    sweep.wait(600)
-    log = "".join(path.read_text() for path in sweep.results.rglob("*_log.err"))
-    check.say("time limit", "saved and requeued at Slurm's signal", "continues from step" in log,
-              f"{log.count('continues from step')} times", begin)  # fmt: skip
-    check.completed("time limit", sweep, 1, begin)
+    image = check.folder / "gsbench.sif"
+    image.touch()
+    in_image = (f"launch.container={image}", f"launch.container_command={apptainer(check.folder)} exec")
+    for name, launch in ("time limit", ()), ("time limit in a container image", in_image):
+        begin = time.monotonic()
+        sweep = check.sweep(name.replace(" ", "_"), *long, "launch.minutes=2", "launch.signal_seconds=60", *launch)
+        sweep.wait(600)
+        log = "".join(path.read_text() for path in sweep.results.rglob("*_log.err"))
+        check.say(name, "saved and requeued at Slurm's signal", "continues from step" in log,
+                  f"{log.count('continues from step')} times", begin)  # fmt: skip
+        check.completed(name, sweep, 1, begin)
+
+
+def apptainer(folder: Path) -> Path:
+    """Write a stand-in for Apptainer: it runs a command where Slurm's commands are not on PATH, as in an image."""
+    path = folder / "apptainer"
+    path.write_text("#!/bin/bash\n" 'while [ "${1%.sif}" = "$1" ]; do shift; done; shift\n'
+                    f'PATH={Path(sys.executable).parent} exec "$@"\n')  # fmt: skip
+    path.chmod(0o755)
+    return path
 
 
 def out_of_memory(check: Check) -> None:
