@@ -1,11 +1,15 @@
 """Claim a run for this process, so that only one of several identical commands trains.
 
 The claim is the file progress.json in the run's folder. It is created by a hard link, which succeeds in only one of
-several processes, on one or more hosts. If the process of a claim has ended, another process may take the claim. A file
-lock protects this step if the file system supports locks. The module does not import torch.
+several processes, on one or more hosts. If the process of a claim has ended, another process may take the claim: the
+one that has created a file with a name of that claim, by a hard link too. So no file lock is needed, and clients of NFS
+that see another's files late, or by a stale handle, do not take one run. Where the file system has file locks but no
+hard links, such as FAT, a lock protects these steps. The module does not import torch.
 """
 
+import errno
 import fcntl
+import hashlib
 import os
 import time
 from collections.abc import Iterator
@@ -20,8 +24,8 @@ from gsbench.run.progress import Progress
 
 LOCK = ".claim"
 PATIENCE = 5.0  # seconds to wait for the lock; a process that holds it longer is suspended, so go on without
-ATTEMPTS = 100
-NOTHING, DAMAGED = "nothing", "damaged"  # results of reading a claim that is no progress file
+ATTEMPTS, PAUSE = 100, 0.02  # attempts to claim, and seconds between two
+READS = 3  # attempts to read a claim; without hard links it may be half written, on NFS its handle may be stale
 
 
 def take(folder: Path, mine: Progress) -> Progress | None:
@@ -31,19 +35,39 @@ def take(folder: Path, mine: Progress) -> Progress | None:
 
     Raises:
         InputError: other processes claim and release the run repeatedly.
-        OSError: the claim cannot be written.
+        OSError: the claim cannot be read or written.
     """
     path = folder / progress.FILE_NAME
     with _alone(folder):
         for _ in range(ATTEMPTS):
-            other = _read(path)
-            if isinstance(other, Progress) and not _may_be_taken(other, mine):
+            content, other = _read(path)
+            if other is not None and not _may_be_taken(other, mine):
                 return other
-            if other is not NOTHING:
-                path.unlink(missing_ok=True)  # its process has ended, or the file is damaged
+            if content is not None:
+                _remove(path, content, mine)  # its process has ended, or the file is damaged
             if create_atomically(path, progress.encode(mine)):
                 return None
+            time.sleep(PAUSE)
     raise InputError(f"{path}: expected to claim the run, other processes claim it again and again: try later")
+
+
+def _remove(path: Path, content: bytes, mine: Progress) -> None:
+    """Remove the claim with this content, unless another process does so or has done so.
+
+    Only the process whose progress is in the file `heir` removes the claim, and only if the claim is still the one that
+    was read. An heir that was killed leaves this file. It is a claim too, and is removed in the same way.
+    """
+    heir = path.with_name(f"{LOCK}.{hashlib.sha256(content).hexdigest()[:16]}")
+    if not create_atomically(heir, progress.encode(mine)):
+        left, other = _read(heir)
+        if left is not None and (other is None or _may_be_taken(other, mine)):
+            _remove(heir, left, mine)
+        return
+    try:
+        if _content(path) == content:
+            path.unlink(missing_ok=True)
+    finally:
+        heir.unlink(missing_ok=True)
 
 
 def release(folder: Path, mine: Progress) -> None:
@@ -51,26 +75,43 @@ def release(folder: Path, mine: Progress) -> None:
     path = folder / progress.FILE_NAME
     try:
         with _alone(folder):
-            other = _read(path)
-            if isinstance(other, Progress) and _is_one(other, mine):
+            _, other = _read(path)
+            if other is not None and _is_one(other, mine):
                 path.unlink(missing_ok=True)
     except OSError:  # the folder cannot be written any more; the claim expires with this process
         return
 
 
-def _read(path: Path) -> Progress | str:
-    """Read a claim; return NOTHING if there is none, or DAMAGED if three attempts to read it fail.
-
-    Without file locks, another process may be writing the claim while it is read. Therefore one failure does not prove
-    that the claim is damaged.
-    """
-    for _ in range(3):
+def _read(path: Path) -> tuple[bytes | None, Progress | None]:
+    """Read a claim: its content, None if there is none, and its progress, None if the claim is damaged or missing."""
+    for _ in range(READS):
+        content = _content(path)
+        if content is None:
+            break
         try:
-            return progress.read(path)
+            return content, progress.decode(content, str(path))
         except InputError:
-            if not os.path.lexists(path):
-                return NOTHING
-    return DAMAGED
+            time.sleep(PAUSE)
+    return content, None
+
+
+def _content(path: Path) -> bytes | None:
+    """Return the bytes of a claim, or None if there is none.
+
+    Raises:
+        OSError: it cannot be read, which does not make it a damaged one.
+    """
+    for last in (*[False] * (READS - 1), True):
+        try:
+            with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:  # a pipe would be waited for
+                return file.read(progress.LARGEST)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            if error.errno != errno.ESTALE or last:
+                raise
+            time.sleep(PAUSE)
+    raise AssertionError("the last attempt returns or raises")
 
 
 def _is_one(other: Progress, mine: Progress) -> bool:

@@ -95,7 +95,16 @@ def read(path: Path) -> Progress:
     Raises:
         InputError: the file is invalid.
     """
-    return parse(Progress, parse_json(read_file(path, str(path), LARGEST), str(path)), str(path))
+    return decode(read_file(path, str(path), LARGEST), str(path))
+
+
+def decode(content: bytes, where: str) -> Progress:
+    """Return the progress in the content of a progress.json; `where` is its path, for the message.
+
+    Raises:
+        InputError: the content is invalid.
+    """
+    return parse(Progress, parse_json(content, where), where)
 
 
 def is_alive(progress: Progress) -> bool:

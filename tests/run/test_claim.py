@@ -4,10 +4,12 @@ import errno
 import multiprocessing
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
@@ -15,11 +17,13 @@ from pathlib import Path
 import pytest
 from tiny_run import ROOT, command, environment, overrides, write_moving_square
 
+from gsbench.errors import InputError
 from gsbench.measure import atomic
 from gsbench.run import claim, progress
 from gsbench.run.progress import Progress
 
 CROWD, ROUNDS = 6, 15
+HERE = socket.gethostname()
 
 
 def compete(folder: Path, start: Barrier, ended: Barrier) -> None:
@@ -39,27 +43,57 @@ def test_of_many_processes_one_has_the_run(
 ) -> None:
     """Catches a claim that is looked for and then made, so that several make it, and one that nobody takes over."""
     if not locks:
-        if left != "nothing":
-            pytest.skip("a claim that is left over is taken over by one process where the file system has locks")
         monkeypatch.setattr(claim, "_locked", without_locks)
+    one_of_many_has_each_run(tmp_path, [tmp_path], left)
+
+
+@pytest.mark.parametrize("left", ["nothing", "a dead claim", "half a claim"])
+def test_of_many_processes_on_two_mounts_one_has_the_run(left: str, two_mounts: list[Path], tmp_path: Path) -> None:
+    """Catches a run that two hosts do, as their mounts share no locks and show each other's files late."""
+    one_of_many_has_each_run(tmp_path / "disk", two_mounts, left)
+
+
+@pytest.fixture
+def two_mounts(tmp_path: Path) -> Iterator[list[Path]]:
+    """Two mounts of the folder `disk`, each with locks and a cache of names and attributes of its own, as on NFS."""
+    if shutil.which("bindfs") is None or not os.access("/dev/fuse", os.W_OK):
+        pytest.skip("needs bindfs and FUSE")
+    mounts = [tmp_path / name for name in ("one", "other")]
+    mounted = []
+    (tmp_path / "disk").mkdir()
+    try:
+        for mount in mounts:
+            mount.mkdir()
+            cached = "attr_timeout=5,entry_timeout=5"
+            if subprocess.run(["bindfs", "-o", cached, tmp_path / "disk", mount], check=False).returncode:
+                pytest.skip("FUSE cannot be mounted here")
+            mounted.append(mount)
+        yield mounts
+    finally:
+        for mount in mounted:
+            subprocess.run(["fusermount", "-u", "-z", mount], check=True)
+
+
+def one_of_many_has_each_run(disk: Path, mounts: list[Path], left: str) -> None:
+    """Let processes compete by several mounts of one disk, with what is left of an earlier claim."""
     for number in range(ROUNDS):
-        (tmp_path / str(number)).mkdir()
+        (disk / str(number)).mkdir()
         if left == "a dead claim":
-            progress.write(tmp_path / str(number), Progress(["seed=0"], born=1))
+            progress.write(disk / str(number), Progress(["seed=0"], born=1))
         elif left == "half a claim":
-            (tmp_path / str(number) / progress.FILE_NAME).write_text('{"overrides": [')
+            (disk / str(number) / progress.FILE_NAME).write_text('{"overrides": [')
     fork = multiprocessing.get_context("fork")
     start, ended = fork.Barrier(CROWD), fork.Barrier(CROWD)
-    crowd = [fork.Process(target=compete, args=(tmp_path, start, ended)) for _ in range(CROWD)]
+    crowd = [fork.Process(target=compete, args=(mounts[i % len(mounts)], start, ended)) for i in range(CROWD)]
     for one in crowd:
         one.start()
     for one in crowd:
         one.join(60)
         assert one.exitcode == 0
     for number in range(ROUNDS):
-        names = sorted(path.name for path in (tmp_path / str(number)).iterdir())
+        names = sorted(path.name for path in (disk / str(number)).iterdir())
         assert [name.partition(".")[0] for name in names] == ["progress", "won"], names
-        assert names[1] == f"won.{progress.read(tmp_path / str(number) / progress.FILE_NAME).pid}"
+        assert names[1] == f"won.{progress.read(disk / str(number) / progress.FILE_NAME).pid}"
 
 
 def without_locks(_: Path) -> None:
@@ -87,6 +121,57 @@ def test_a_claim_is_left_to_the_living_and_taken_from_the_dead(tmp_path: Path) -
     assert claim.take(tmp_path, mine) is None
     assert sorted(path.name for path in tmp_path.iterdir()) == [progress.FILE_NAME]
     claim.release(tmp_path / "gone", mine)
+
+
+@pytest.mark.parametrize("times", [2, 1000])
+def test_a_stale_handle_makes_no_claim_a_dead_one(times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a live claim that is removed because its file was replaced on the server while it was read."""
+    elsewhere = Progress([], host="elsewhere")
+    progress.write(tmp_path, elsewhere)
+    stale = iter(range(times))
+    opened = os.open
+
+    def open_stale(path: Path, *flags: int) -> int:
+        if Path(path).name == progress.FILE_NAME and next(stale, None) is not None:
+            raise OSError(errno.ESTALE, "Stale file handle", str(path))
+        return opened(path, *flags)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(claim.os, "open", open_stale)
+        if times == 2:
+            assert claim.take(tmp_path, Progress([])) == elsewhere
+        else:
+            with pytest.raises(OSError, match="Stale file handle"):
+                claim.take(tmp_path, Progress([]))
+            claim.release(tmp_path, elsewhere)
+    assert progress.read(tmp_path / progress.FILE_NAME) == elsewhere
+
+
+def test_a_dead_claim_that_is_seen_late_costs_no_live_one(tmp_path: Path) -> None:
+    """Catches a claim that is removed by a process which read the one before it."""
+    dead, mine = progress.encode(Progress([], born=1)), Progress([])
+    progress.write(tmp_path, mine)
+    claim._remove(tmp_path / progress.FILE_NAME, dead, Progress([], host="elsewhere"))
+    assert progress.read(tmp_path / progress.FILE_NAME) == mine
+    assert sorted(path.name for path in tmp_path.iterdir()) == [progress.FILE_NAME]
+
+
+@pytest.mark.parametrize("alive", [True, False])
+def test_one_process_alone_removes_a_dead_claim(alive: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches two processes that remove a claim in turn, and a run that none can do as one was killed at that."""
+    monkeypatch.setattr(claim, "PAUSE", 0)
+    progress.write(tmp_path, Progress([], born=1))
+    with monkeypatch.context() as patched:  # a process that is killed at this moment
+        patched.setattr(Path, "unlink", lambda *_, **__: None)
+        content = (tmp_path / progress.FILE_NAME).read_bytes()
+        claim._remove(tmp_path / progress.FILE_NAME, content, Progress([], host="elsewhere" if alive else HERE, born=1))
+    if alive:
+        with pytest.raises(InputError, match="claim it again and again"):
+            claim.take(tmp_path, Progress([]))
+        assert (tmp_path / progress.FILE_NAME).read_bytes() == content
+    else:
+        assert claim.take(tmp_path, Progress([])) is None
+        assert [path.name for path in tmp_path.iterdir() if not path.name.endswith(".tmp")] == [progress.FILE_NAME]
 
 
 def test_a_lock_that_is_held_for_ever_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
