@@ -36,6 +36,15 @@ def test_the_version_is_one() -> None:
     assert f'__version__ = "{gsbench.__version__}"' in (ROOT / source).read_text()
 
 
+def test_the_changelog_has_the_version_and_its_day() -> None:
+    """Catches a release without notes, or one cited with another day than its notes say."""
+    released = re.findall(
+        r"^## (\d+\.\d+\.\d+).*?(\d{4}-\d\d-\d\d)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE
+    )
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert released[0] == (gsbench.__version__, str(citation["date-released"]))
+
+
 def test_every_python_is_tested() -> None:
     """Catches a Python that is allowed and not tested, or tested and refused by make."""
     jobs = workflow("tests.yml")["jobs"]

@@ -1,0 +1,148 @@
+"""Write the tables of docs/licences.md from the metadata of installed packages, or print an SBOM with --sbom.
+
+    python docs/site/licences.py
+    python docs/site/licences.py --sbom > gsbench.cdx.json      # CycloneDX 1.6: what users install
+
+The tables say what is installed where they are written: run it in the .venv of `make test-all`, which has the versions
+of locks/.
+"""
+
+import json
+import re
+import sys
+import tomllib
+from collections.abc import Iterable, Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from packaging.requirements import Requirement
+
+from gsbench.version import __version__
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "licences.md"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+EXTRAS: dict[str, list[str]] = PROJECT["project"]["optional-dependencies"]
+OF_DEVELOPERS = ("docs", "dev")  # nothing of these is imported by gsbench
+# What no .venv of make has, as it would double its size.
+NOT_INSTALLED = {"tensorboard": "Apache-2.0", "wandb": "MIT", "mlflow": "Apache-2.0"}
+UNSAID = {"axe-playwright-python": "MIT"}  # packages whose metadata say nothing
+NOTES = {
+    "lpips": "its linear weights come in its wheel",
+    "opencv-contrib-python-headless": "its wheel brings FFmpeg under LGPL-2.1, as a library of its own",
+    "sphinx": "its docutils is public domain and BSD-2-Clause, except an Emacs mode under the GPL",
+    "nanobind": "linked into the kernels",
+    "axe-playwright-python": "axe itself is under MPL-2.0",
+    "plyfile": "tests only read files with it; gsbench writes and reads PLY by code of its own",
+}
+CUDA = re.compile(r"nvidia-|cuda-|triton$")  # what torch for CUDA brings: NVIDIA's own licence
+MARKS = "<!-- written by docs/site/licences.py -->", "<!-- end -->"
+SHORT = {
+    "Apache Software License": "Apache-2.0",
+    "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
+    "Python Software Foundation License": "PSF-2.0",
+    "ISC License (ISCL)": "ISC",
+    "GNU General Public License v3 or later (GPLv3+)": "GPL-3.0-or-later",
+}
+
+
+def name_of(requirement: str) -> str:
+    """Return the normalised name of a requirement."""
+    return re.sub(r"[-_.]+", "-", Requirement(requirement).name).lower()
+
+
+def installed(requirements: Iterable[str], seen: set[str]) -> Iterator[metadata.Distribution]:
+    """Yield what requirements bring along, as far as it is installed here and not in `seen`, which is added to."""
+    for requirement in requirements:
+        marker, name = Requirement(requirement).marker, name_of(requirement)
+        if name in seen or (marker and not marker.evaluate({"extra": ""})):
+            continue
+        seen.add(name)
+        try:
+            found = metadata.distribution(name)
+        except metadata.PackageNotFoundError:
+            continue
+        yield found
+        yield from installed(found.requires or [], seen)
+
+
+def of_users() -> list[str]:
+    """Return the requirements of gsbench and of all extras but those of developers."""
+    return [*PROJECT["project"]["dependencies"], *(one for extra in EXTRAS.keys() - {*OF_DEVELOPERS}
+            for one in EXTRAS[extra])]  # fmt: skip
+
+
+def direct() -> dict[str, str]:
+    """Return what gsbench itself depends on, and for what: the core, an extra, or the build."""
+    found: dict[str, str] = {}
+    groups = {"core": PROJECT["project"]["dependencies"], "build": PROJECT["build-system"]["requires"], **EXTRAS}
+    for group in (*(name for name in groups if name not in OF_DEVELOPERS), *OF_DEVELOPERS):
+        for requirement in groups[group]:
+            found.setdefault(name_of(requirement), group)
+    return found
+
+
+def licence_of(distribution: metadata.Distribution) -> str:
+    """Return what the metadata say: the SPDX expression, a licence field that is a name, else the classifiers."""
+    said = distribution.metadata
+    field = (said.get("License") or "").strip()
+    is_name = re.fullmatch(r"[A-Za-z0-9.+-]+( (AND|OR|WITH) [A-Za-z0-9.+-]+)*", field) and field != "UNKNOWN"
+    classifiers = [one.rpartition(" :: ")[2] for one in said.get_all("Classifier") or []
+                   if one.startswith("License :: OSI Approved ::") or one == "License :: Public Domain"]  # fmt: skip
+    short = ", ".join(SHORT.get(one, one.removesuffix(" License")) for one in classifiers)
+    unsaid = UNSAID.get(name_of(said["Name"]), field.partition("\n")[0])
+    return said.get("License-Expression") or (field if is_name else "") or short or unsaid
+
+
+def tables() -> str:
+    """Return the tables of the page: what gsbench depends on, and what that brings along to users."""
+    rows = ["| dependency | version | for | licence |", "| --- | --- | --- | --- |"]
+    for name, group in direct().items():
+        if name in NOT_INSTALLED:
+            version, licence = "", NOT_INSTALLED[name]
+        else:
+            found = metadata.distribution(name)
+            version, licence = found.version.partition("+")[0], licence_of(found)
+        licence = f"**{licence}**" if "GPL" in licence else licence
+        rows.append(f"| {name} | {version} | {group} | {'; '.join(filter(None, (licence, NOTES.get(name))))} |")
+    rows += ["", "These bring along, to users:", "", "| package | version | licence |", "| --- | --- | --- |"]
+    for one in along():
+        rows.append(f"| {name_of(one.metadata['Name'])} | {one.version} | {licence_of(one)} |")
+    return "\n".join(rows)
+
+
+def along() -> list[metadata.Distribution]:
+    """Return what users install that gsbench does not name, sorted by name; without what only torch for CUDA brings."""
+    named = direct()
+    found = {name_of(one.metadata["Name"]): one for one in installed(of_users(), set())}
+    return [found[name] for name in sorted(found) if name not in named and not CUDA.match(name)]
+
+
+def sbom() -> dict[str, Any]:
+    """Return what users install here as a bill of materials in the format CycloneDX 1.6."""
+
+    def component(kind: str, name: str, version: str, licence: str) -> dict[str, Any]:
+        return {"type": kind, "name": name, "version": version, "purl": f"pkg:pypi/{name}@{version}",
+                "licenses": [{"license": {"name": licence}}]}  # fmt: skip
+
+    found = {name_of(one.metadata["Name"]): one for one in installed(of_users(), set())}
+    return {
+        "bomFormat": "CycloneDX", "specVersion": "1.6", "version": 1,
+        "metadata": {"component": component("application", "gsbench", __version__, PROJECT["project"]["license"])},
+        "components": [component("library", name, one.version, licence_of(one)) for name, one in sorted(found.items())],
+    }  # fmt: skip
+
+
+def main(arguments: list[str]) -> None:
+    """Print an SBOM, or write the tables between the marks of the page."""
+    if arguments == ["--sbom"]:
+        print(json.dumps(sbom(), indent=1))
+        return
+    start, end = MARKS
+    head, _, rest = PAGE.read_text().partition(start)
+    PAGE.write_text(f"{head}{start}\n\n{tables()}\n\n{end}{rest.partition(end)[2]}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
