@@ -38,9 +38,8 @@ def test_the_version_is_one() -> None:
 
 def test_the_changelog_has_the_version_and_its_day() -> None:
     """Catches a release without notes, or one cited with another day than its notes say."""
-    released = re.findall(
-        r"^## (\d+\.\d+\.\d+).*?(\d{4}-\d\d-\d\d)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE
-    )
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    released = re.findall(r"^## (\d+\.\d+\.\d+) \((\d{4}-\d\d-\d\d)\)$", changes, re.MULTILINE)
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert released[0] == (gsbench.__version__, str(citation["date-released"]))
 
