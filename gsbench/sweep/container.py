@@ -19,6 +19,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from gsbench.config import CONF
 from gsbench.errors import InputError
 
 SCRIPT, REQUEUE = "container.sh", 99
@@ -102,7 +103,7 @@ def _write(config: DictConfig, runs: Sequence[Sequence[str]]) -> Path:
 
 def _binds(config: DictConfig, runs: Sequence[Sequence[str]]) -> set[str]:
     """Return the existing folders and files that the runs of a sweep read and write."""
-    found = {os.getcwd(), str(Path(config.hydra.sweep.dir).absolute())}
+    found = {os.getcwd(), str(Path(config.hydra.sweep.dir).absolute()), str(CONF)}  # Hydra composes a run in its job
     for overrides in {tuple(one for one in run if _DECIDE_PLACES.match(one)) for run in runs}:
         loader = GlobalHydra.instance().config_loader()
         found |= set(_places(loader.load_sweep_config(config, list(overrides))))

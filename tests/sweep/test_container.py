@@ -12,6 +12,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 from tiny_run import ROOT, gsbench, overrides, write_moving_square
 
+from gsbench.config import CONF
 from gsbench.errors import InputError
 from gsbench.sweep import container, status
 
@@ -75,7 +76,7 @@ def test_each_job_runs_in_the_image(log: Path, tmp_path: Path) -> None:
     one, other = asked(log)
     assert one == other
     binds = one[one.index("--bind") + 1].split(",")
-    assert {str(results), str(data), str(ROOT)} <= set(binds)
+    assert {str(results), str(data), str(ROOT), str(CONF)} <= set(binds)
     assert [*one[:3], *one[4:-1]] == [
         "exec", "--nv", "--bind", "--pwd", str(ROOT), str(image), f"python3.{sys.version_info.minor}", "-P", "-u",
         "-m", "submitit.core._submit",
