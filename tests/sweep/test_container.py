@@ -14,7 +14,9 @@ from tiny_run import ROOT, gsbench, overrides, write_moving_square
 
 from gsbench.config import CONF
 from gsbench.errors import InputError
-from gsbench.sweep import container, status
+from gsbench.sweep import container, plan, status
+from gsbench.sweep.plan import Plan
+from gsbench.sweep.retry import retry
 
 FAKES = {
     "sbatch": """
@@ -104,6 +106,21 @@ def config(folder: Path, image: str | None, command: str = "apptainer exec") -> 
     launch = {"container": image, "container_command": command, "gpus": None}
     hydra = {"sweep": {"dir": str(folder)}, "runtime": {"choices": {"hydra/launcher": "submitit_slurm"}}}
     return OmegaConf.create({"launch": launch, "hydra": hydra})
+
+
+def test_a_retry_runs_in_the_image(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a retry that leaves the image out, and so trains by other versions than the sweep did."""
+    monkeypatch.chdir(tmp_path)
+    words = ["+exp=mini", "scene=suzanne", "+launch=slurm", "launch.container=gone.sif"]
+    asked = Plan("submitit_slurm", [words], [], str(tmp_path), "elsewhere", 1, 1, 0.0)
+    plan.write(asked, tmp_path / "mini" / plan.FOLDER / "2026-11-22_00-00-00.000000")
+    assert retry(status.read(tmp_path / "mini"), [], print) == 1
+    assert (
+        f"expected an image, a file or folder that all nodes see, got '{tmp_path}/gone.sif'" in capsys.readouterr().err
+    )
+    assert not (log / "sbatch").exists()
 
 
 @pytest.mark.usefixtures("log")
