@@ -1,7 +1,7 @@
 """Write the blocks of docs/results.md about the suite: each scene, effects by kind of scene, what foretells them."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
@@ -11,7 +11,7 @@ from statistics import fmean
 from published import MODELS, NAMES, Experiment, best, experiments, number, signed, table
 from scipy import stats
 
-from gsbench.measure.record import Record
+from gsbench.measure.record import Record, model_folder
 from gsbench.report.configurations import QUANTITIES
 from gsbench.report.intervals import estimate
 from gsbench.report.page.messages import count
@@ -26,6 +26,7 @@ EFFECTS = {
     "`model=auto` instead of 7DGS": ("auto", "7dgs"),
 }
 Choice = Callable[[dict[str, Record]], Record]
+COMPARED = "auto,compare=true"  # model=auto that compares its candidates on val
 
 
 def scenes(published: Path) -> str:
@@ -108,28 +109,41 @@ def forecasts(published: Path) -> str:
 
 def choices(published: Path) -> str:
     """Return the table of what choices of a model lose in PSNR to the best model of each scene that moves."""
-    lost: dict[str, list[float]] = {}
-    left_out, psnr = [], QUANTITIES["psnr"]
+    rows = [
+        [name, signed(fmean(lost)), signed(min(lost)), f"{sum(loss >= -0.1 for loss in lost)} of {len(lost)}"]
+        for name, lost in ((name, [*losses(published, choose).values()]) for name, choose in RULES.items())
+    ]
+    said = [f"{scene} {why}" for scene, _, why in _moving(published) if why]
+    text = table(["choice", "mean, dB", "worst scene, dB", "within 0.1 dB on"], rows)
+    return f"{text}\n\nLeft out: {'; '.join(said)}." if said else text
+
+
+def losses(published: Path, choose: Choice) -> dict[str, float]:
+    """Return what a choice of a model loses in PSNR to the best model, dB, by scene that moves and has val and test."""
+    psnr = QUANTITIES["psnr"]
+    return {
+        scene: fmean(psnr(choose(runs)) - max(map(psnr, _whole(runs).values())) for runs in by_seed)
+        for scene, by_seed, why in _moving(published)
+        if not why
+    }
+
+
+def _moving(published: Path) -> Iterator[tuple[str, list[dict[str, Record]], str]]:
+    """Yield each scene that moves, its runs by seed and model, and why no model can be chosen on its val, or ""."""
     for found in (found for found in experiments(published / "suite") if found.group.dataset in MOVING):
         for scene in found.group.scenes:
             by_seed = _by_seed(found, scene)
-            if any(math.isnan(_val(run, 1)) for runs in by_seed for run in runs.values()):
-                left_out.append(scene)
-                continue
-            for name, choose in RULES.items():
-                losses = [psnr(choose(runs)) - max(map(psnr, _whole(runs).values())) for runs in by_seed]
-                lost.setdefault(name, []).append(fmean(losses))
-    rows = [
-        [name, signed(fmean(losses)), signed(min(losses)), f"{sum(loss >= -0.1 for loss in losses)} of {len(losses)}"]
-        for name, losses in lost.items()
-    ]
-    text = table(["choice", "mean, dB", "worst scene, dB", "within 0.1 dB on"], rows)
-    return f"{text}\n\nLeft out, as it has no val: {', '.join(left_out)}." if left_out else text
+            every = [run for runs in by_seed for run in runs.values()]
+            if any(math.isnan(_val(run, 1)) for run in every):
+                yield scene, by_seed, "has no val"
+            else:
+                on_val = any(run.protocol["eval_split"] == "val" for run in every)
+                yield scene, by_seed, "is measured on val" if on_val else ""
 
 
 def _whole(runs: dict[str, Record]) -> dict[str, Record]:
-    """Return the runs whose effects are chosen by the user, which are all but model=auto."""
-    return {model: run for model, run in runs.items() if model != "auto"}
+    """Return the runs whose effects are chosen by the user, which are all but those of model=auto."""
+    return {model: run for model, run in runs.items() if model not in ("auto", COMPARED)}
 
 
 def _best_on_val(part: float, runs: dict[str, Record]) -> Record:
@@ -138,16 +152,18 @@ def _best_on_val(part: float, runs: dict[str, Record]) -> Record:
 
 RULES: dict[str, Choice] = {
     **{NAMES[model]: itemgetter(model) for model in ("4dgs", "7dgs_noagr", "7dgs", "auto")},
+    "`model=auto effects.compare=true`": itemgetter(COMPARED),
     **{f"the best model on val after {100 * part:.0f} % of the training": partial(_best_on_val, part)
        for part in (0.3, 0.5, 0.7, 1.0)},
 }  # fmt: skip
 
 
 def _by_seed(found: Experiment, scene: str) -> list[dict[str, Record]]:
-    """Return the runs of all models that train on a scene, for each seed."""
+    """Return the runs of all models that train on a scene, and of COMPARED, for each seed."""
     runs: dict[int, dict[str, Record]] = {}
-    for model in MODELS:
-        for run in found.configuration(model).runs.get(scene, []):
+    by_name = {model_folder(c.model, c.variant): c for c in found.group.configurations}
+    for model in (name for name in (*MODELS, COMPARED) if name in by_name):
+        for run in by_name[model].runs.get(scene, []):
             runs.setdefault(run.seed, {})[model] = run
     return list(runs.values())
 
