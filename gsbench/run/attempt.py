@@ -81,7 +81,7 @@ class Attempt:
                 trainer.stages.add("screen", screen.seconds)
                 trainer.effort.add(self.resolved.effort)
         self.log = RunLog(this, trainer)
-        fitting.fit(trainer, this, plain(this, trainer.config), reporter(this, trainer), self.log.follow)
+        fitting.fit(trainer, this, plain(this, trainer.config), lambda: reporter(this, trainer), self.log.follow)
         return trainer
 
     def trainer(self, model: GaussianModel, scene: Scene) -> Trainer:

@@ -163,10 +163,10 @@ def _fit(parts: _Candidates, name: str, trainer: Trainer, before: list[Candidate
     this, run, until = parts.this, parts.run(name), trainer.schedule.compares_after
     fitting.resume(trainer, run, fitting.saved_state(run, parts.scene))
     steps = (len(parts.settings) - 1) * until + trainer.config.train.iterations
-    report = progress.Reporter(
-        this.folder, this.overrides, steps, len(before) * until, sum(one.seconds for one in before)
-    )
-    fitting.fit(trainer, run, run.plain, report, until=until)
+    done, seconds = len(before) * until, sum(one.seconds for one in before)
+    fitting.fit(trainer, run, run.plain, until=until, reporter=lambda: progress.Reporter(
+        this.folder, this.overrides, steps, done, seconds
+    ))  # fmt: skip
 
 
 def _add_costs(trainer: Trainer, resolved: Resolved, seconds: float, efforts: list[Effort]) -> None:

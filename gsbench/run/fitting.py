@@ -88,7 +88,7 @@ def fit(
     trainer: Trainer,
     this: Run,
     plain: dict[str, Any],
-    report: progress.Reporter,
+    reporter: Callable[[], progress.Reporter],
     follow: Callable[[], None] = lambda: None,
     until: int | None = None,
 ) -> None:
@@ -98,7 +98,7 @@ def fit(
         trainer: the trainer at its first step.
         this: the run to train, with the folder of its checkpoint.
         plain: the settings as plain values, for the checkpoint.
-        report: reports the progress to other processes.
+        reporter: starts to report the progress to other processes, once signals are handled.
         follow: a function that is called after every step.
         until: the number of finished steps at which the training stops; None for the last step.
 
@@ -109,6 +109,7 @@ def fit(
     """
     path, last = this.folder / checkpoint.FILE_NAME, trainer.config.train.iterations
     with stop.requested() as request:
+        report = reporter()
 
         def goes_on() -> bool:
             follow()
