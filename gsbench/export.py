@@ -1,4 +1,4 @@
-"""Export a trained model: as a PLY of 3DGS, as a video, as images (``python -m gsbench.export RUN_FOLDER ...``)."""
+"""Export a trained model: as PLY files of 3DGS, as a video, as images (``python -m gsbench.export RUN_FOLDER ...``)."""
 
 import argparse
 import sys
@@ -17,7 +17,7 @@ from gsbench.run.checks import check_device, evaluated_views
 from gsbench.run.load import LoadedRun, load_run, scene_of
 from gsbench.scenes import Camera, Scene, View
 from gsbench.scenes.trained import ply_of
-from gsbench.view import film, paths
+from gsbench.view import film, paths, sequence
 from gsbench.view.gaussians import trained_of
 
 PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
@@ -38,6 +38,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         asked = prepare(parser().parse_args(arguments))
         said = write_ply(asked, asked.options.ply) if asked.options.ply else []
+        if asked.options.plys:
+            said += write_sequence(asked, asked.options.plys)
         if said and not asked.options.json:
             print("\n".join(said))
         if asked.options.video:
@@ -49,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
             with closing(film.frames(asked.run, shots(asked), asked.options.supersample)) as images:
                 film.write_images(images, asked.options.images)
         if asked.options.json:
-            written = {name: getattr(asked.options, name) for name in ("ply", "video", "images")}
+            written = {name: getattr(asked.options, name) for name in ("ply", "plys", "video", "images")}
             print(as_json({"written": written, "notes": said}))
     except (InputError, OSError) as error:
         print(f"gsbench.export: {one_line(error)}", file=sys.stderr)
@@ -62,17 +64,18 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="python -m gsbench.export", description=__doc__)
     made.add_argument("run", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
     made.add_argument("--ply", type=Path, metavar="OUT.ply", help="write the 3D Gaussians of one slice")
+    made.add_argument("--plys", type=Path, metavar="FOLDER", help="write a slice for each frame of a clip over time")
     made.add_argument("--video", type=Path, metavar="OUT.mp4", help="write a video along --path")
     made.add_argument("--images", type=Path, metavar="FOLDER", help="write the frames of that video as PNG")
     made.add_argument("--time", type=float, help="of the slice, in [0, 1]; in a video time then stands still")
     seen = made.add_mutually_exclusive_group()
     seen.add_argument("--camera", metavar="I", help="a training view's number, or a view's name; it stands still")
-    seen.add_argument("--direction", metavar="X,Y,Z", help="of sight, for --ply: from a camera far away")
+    seen.add_argument("--direction", metavar="X,Y,Z", help="of sight, for --ply and --plys: from afar")
     made.add_argument(
         "--path", choices=[*PATHS, "test"], default="orbit", help="of the camera; test: the views it was measured on"
     )
     made.add_argument("--fps", type=float, default=30, help="frames a second (30)")
-    made.add_argument("--seconds", type=float, default=4, help="length of an orbit or a spiral (4)")
+    made.add_argument("--seconds", type=float, default=4, help="length of an orbit, a spiral or --plys (4)")
     made.add_argument("--width", type=int, metavar="PIXELS", help="of the frames (the training's)")
     made.add_argument("--height", type=int, metavar="PIXELS", help="of the frames (in proportion to --width)")
     made.add_argument(
@@ -91,8 +94,8 @@ def parser() -> argparse.ArgumentParser:
 
 def prepare(options: argparse.Namespace) -> ExportRequest:
     """Check the options of the export and load the run and its data set; raise InputError if this fails."""
-    if not (options.ply or options.video or options.images):
-        raise InputError("expected --ply OUT.ply, --video OUT.mp4 or --images FOLDER, got none of them")
+    if not (options.ply or options.plys or options.video or options.images):
+        raise InputError("expected --ply OUT.ply, --plys FOLDER, --video OUT.mp4 or --images FOLDER, got none of them")
     if options.time is not None and not 0 <= options.time <= 1:
         raise InputError(f"--time: expected a number in [0, 1], got {options.time}")
     if not 0 < options.fps <= 1000 or not 1 <= options.fps * options.seconds <= MOST_FRAMES:
@@ -107,41 +110,81 @@ def prepare(options: argparse.Namespace) -> ExportRequest:
                          f"{options.width}, {options.height}")  # fmt: skip
     for path in (path for path in (options.ply, options.video, options.images) if path):
         film.check_parent(path)
+    if options.plys:
+        check_sequence(options)
     check_device(options.device)
     import_models(options.model_module)
     run = load_run(options.run, options.device)
     if options.time is not None and not run.scene.has_time:
         raise InputError(f"--time: expected a scene with times, {run.scene.name} has none: leave it out")
+    if options.plys:
+        sequence.check_time(run)
     filming = options.video or options.images
     needed = options.camera is not None or (filming and options.path == "test")
     return ExportRequest(run, scene_of(run, options.data_root) if needed else None, options)
 
 
+def check_sequence(options: argparse.Namespace) -> None:
+    """Raise InputError if the options of --plys do not fit together, or if its folder has files."""
+    if options.time is not None:
+        raise InputError("--plys: expected no --time, as there is a file for each time: leave it out, or use --ply")
+    if frame_count(options) < sequence.LEAST_FILES:
+        raise InputError(f"--plys: expected at least {sequence.LEAST_FILES} files, --fps {options.fps:g} and --seconds "
+                         f"{options.seconds:g} give {frame_count(options)}: raise them, or use --ply")  # fmt: skip
+    sequence.check_folder(options.plys)
+
+
+def frame_count(options: argparse.Namespace) -> int:
+    """Return the number of frames of a clip."""
+    return round(options.fps * options.seconds)
+
+
 def write_ply(asked: ExportRequest, path: Path) -> list[str]:
     """Write a model's 3D Gaussians for one camera and time as a PLY file; return their number, time and colours."""
     run, options = asked.run, asked.options
-    query, keep = slice_place(asked)
+    query, keep = slice_place(asked, options.time)
     trained = trained_of(run.model, query, keep_harmonics=keep)
     write_atomically(path, ply_of(trained))
     culled = len(run.model) - len(trained)
     when = "" if query.time is None else f" at time {float(query.time):g}"
-    whence = f"camera {options.camera}" if options.camera is not None else f"direction {options.direction}"
-    colours = f"harmonics of degree {run.model.active.sh_degree}" if keep else f"as seen from {whence}"
-    said = [f"{path}: {len(trained)} Gaussians{when}, colours {colours}; {culled} of {len(run.model)} are left out, as "
-            f"their opacity there is below 1/255"]  # fmt: skip
-    if trained.from_profiles:
-        said.append(f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of "
-                    f"3DGS has no field for b; --images and --video keep the profiles")  # fmt: skip
-    return said
+    said = [f"{path}: {len(trained)} Gaussians{when}, colours {colours(asked, keep)}; {culled} of {len(run.model)} are "
+            f"left out, as their opacity there is below 1/255"]  # fmt: skip
+    return said + about_profiles(path, trained.from_profiles)
 
 
-def slice_place(asked: ExportRequest) -> tuple[Query, bool]:
-    """Return the camera centre and time of the exported 3D Gaussians, and whether the PLY keeps SH colours.
+def write_sequence(asked: ExportRequest, folder: Path) -> list[str]:
+    """Write a PLY file for each time of a clip, as one camera sees it; return their names, numbers and colours."""
+    places = [slice_place(asked, time) for time in paths.times(frame_count(asked.options))]
+    keep = places[0][1]
+    written = sequence.write_plys(asked.run.model, [query for query, _ in places], folder, keep_harmonics=keep)
+    said = [f"{folder}: {written.paths[0].name} to {written.paths[-1].name} at times 0 to 1, {min(written.counts)} to "
+            f"{max(written.counts)} Gaussians each, colours {colours(asked, keep)}"]  # fmt: skip
+    return said + about_profiles(folder, written.from_profiles)
 
-    If the user names a camera or a direction, each Gaussian has only the colour that is seen from there.
+
+def colours(asked: ExportRequest, keep: bool) -> str:
+    """Say which colours an exported slice has; `keep`: spherical harmonics."""
+    if keep:
+        return f"harmonics of degree {asked.run.model.active.sh_degree}"
+    camera, sight = asked.options.camera, asked.options.direction
+    return "as seen from " + (f"direction {sight}" if camera is None else f"camera {camera}")
+
+
+def about_profiles(path: Path, from_profiles: bool) -> list[str]:
+    """Say that Beta profiles became Gaussians, if there were any."""
+    if not from_profiles:
+        return []
+    return [f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of 3DGS has "
+            f"no field for b; --images and --video keep the profiles"]  # fmt: skip
+
+
+def slice_place(asked: ExportRequest, time: float | None) -> tuple[Query, bool]:
+    """Return the camera centre and time of exported 3D Gaussians, and whether the PLY keeps SH colours.
+
+    If the user names a camera or a direction, each Gaussian has only the colour that is seen from there. If `time` is
+    None, it is that of the named view, or 0.
     """
     run, options = asked.run, asked.options
-    time = options.time
     if asked.scene is not None and options.camera is not None:
         view = find_view(asked.scene, options.camera)
         return Query.of(view.camera.to(run.config.device), view.time if time is None else time), False
@@ -180,7 +223,7 @@ def of_size(camera: Camera, width: int | None, height: int | None) -> Camera:
 def path_of(asked: ExportRequest) -> list[paths.Shot]:
     """Return the camera and the time of each frame of a video; time runs from 0 to 1, or has the value of --time."""
     options = asked.options
-    count = round(options.fps * options.seconds)
+    count = frame_count(options)
     if asked.scene is not None and options.camera is not None:
         cameras = [find_view(asked.scene, options.camera).camera] * count
     elif asked.scene is not None:
@@ -190,7 +233,7 @@ def path_of(asked: ExportRequest) -> list[paths.Shot]:
         cameras = PATHS[options.path](asked.run, count)
     if not asked.run.scene.has_time:
         return [(camera, None) for camera in cameras]
-    times = [i / max(1, count - 1) if options.time is None else options.time for i in range(count)]
+    times = paths.times(count) if options.time is None else [options.time] * count
     return list(zip(cameras, times, strict=True))
 
 

@@ -11,7 +11,7 @@ from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models.base import GaussianModel
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.query import Query
-from gsbench.models.sliced import reach
+from gsbench.models.sliced import Gaussians3D, reach
 from gsbench.scenes.points import SH_C0
 from gsbench.scenes.trained import TrainedGaussians
 
@@ -34,24 +34,37 @@ def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = Fal
         InputError: spherical harmonics are requested from a model whose geometry or colours depend on the viewpoint in
             another way, no Gaussian is drawn, or one is not finite.
     """
-    if keep_harmonics and not has_harmonics(model):
-        raise InputError(f"expected --camera I or --direction X,Y,Z: a slice of {type(model).__name__} depends on it")
+    check_harmonics(model, keep_harmonics)
     with torch.no_grad():
         seen = model.slice(query)
         means, factors, opacities, colors = (part.detach().cpu() for part in seen[:4])
         if seen.shapes is not None:
             factors = factors / reach(seen.shapes).cpu()[:, None, None]
-        drawn = opacities >= ALPHA_MIN  # the rasterizer skips smaller alphas, and alpha is at most the opacity
-        if not drawn.any():
+        kept = drawn(seen).cpu()
+        if not kept.any():
             raise InputError("no Gaussian can be seen at this time and from this place: choose others")
-        sh = harmonics_at(model, query).cpu()[drawn] if keep_harmonics else (colors[drawn, None] - 0.5) / SH_C0
-    if not factors[drawn].isfinite().all():
+        sh = harmonics_at(model, query).cpu()[kept] if keep_harmonics else (colors[kept, None] - 0.5) / SH_C0
+    if not factors[kept].isfinite().all():
         raise InputError("expected finite Gaussians, some are not: has the training diverged?")
-    log_scales, quats = decompose(factors[drawn])
-    logits = torch.logit(opacities[drawn].double().clamp(max=LARGEST_OPACITY)).float()
+    log_scales, quats = decompose(factors[kept])
+    logits = torch.logit(opacities[kept].double().clamp(max=LARGEST_OPACITY)).float()
     return TrainedGaussians(
-        means[drawn], log_scales, quats, logits, sh[:, 0], sh[:, 1:], from_profiles=seen.shapes is not None
+        means[kept], log_scales, quats, logits, sh[:, 0], sh[:, 1:], from_profiles=seen.shapes is not None
     )
+
+
+def drawn(seen: Gaussians3D) -> Tensor:
+    """Tell which Gaussians of a slice are drawn, bool [N]: the rasterizer skips an alpha below `ALPHA_MIN`.
+
+    The alpha of a Gaussian is at most its opacity.
+    """
+    return seen.opacities >= ALPHA_MIN
+
+
+def check_harmonics(model: GaussianModel, keep_harmonics: bool) -> None:
+    """Raise InputError if colours shall stay spherical harmonics, but slices of the model depend on the viewpoint."""
+    if keep_harmonics and not has_harmonics(model):
+        raise InputError(f"expected --camera I or --direction X,Y,Z: a slice of {type(model).__name__} depends on it")
 
 
 def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:

@@ -52,8 +52,12 @@ def orbit(run: LoadedRun, frames: int) -> list[Camera]:
 
 def spiral(run: LoadedRun, frames: int) -> list[Camera]:
     """Return cameras on a spiral that goes twice around a model and rises from the horizon."""
-    parts = [i / max(1, frames - 1) for i in range(frames)]
-    return [around(run, 2 * math.pi * TURNS * part, HIGHEST * part) for part in parts]
+    return [around(run, 2 * math.pi * TURNS * part, HIGHEST * part) for part in times(frames)]
+
+
+def times(frames: int) -> list[float]:
+    """Return the times of a video's frames: 0 to 1 in equal steps."""
+    return [i / max(1, frames - 1) for i in range(frames)]
 
 
 def far_along(run: LoadedRun, direction: Tensor) -> Tensor:

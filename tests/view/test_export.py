@@ -34,7 +34,7 @@ def test_a_ply_says_what_it_holds(
     assert f"{total - kept} of {total} are left out" in said
     assert main([str(folder), "--ply", str(tmp_path / "a.ply"), *place, "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed["written"] == {"ply": str(tmp_path / "a.ply"), "video": None, "images": None}
+    assert printed["written"] == {"ply": str(tmp_path / "a.ply"), "plys": None, "video": None, "images": None}
     assert printed["notes"] == said.splitlines()
 
 
