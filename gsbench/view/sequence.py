@@ -74,10 +74,11 @@ def write_plys(model: GaussianModel, queries: list[Query], folder: Path, *, keep
         time = queries[counts.index(0)].time
         raise InputError(f"--plys: no Gaussian can be seen from this place at time {time:g}, and viewers read no PLY "
                          f"without any: choose another place")  # fmt: skip
-    size, free = sum(counts) * PLY_ROW + len(counts) * HEADER, shutil.disk_usage(folder.parent).free
+    disk = folder if folder.exists() else folder.parent
+    size, free = sum(counts) * PLY_ROW + len(counts) * HEADER, shutil.disk_usage(disk).free
     if size > free:
         raise InputError(f"--plys: {len(counts)} files need {size / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free "
-                         f"in {folder.parent}: lower --fps or --seconds")  # fmt: skip
+                         f"in {disk}: lower --fps or --seconds")  # fmt: skip
     paths = [folder / name for name in names(len(queries))]
     is_new, profiles = not folder.exists(), False
     folder.mkdir(exist_ok=True)

@@ -2,7 +2,9 @@
 
 import errno
 import json
+import os
 import re
+import stat
 from collections import namedtuple
 from dataclasses import replace
 from pathlib import Path
@@ -142,6 +144,21 @@ def test_a_full_disk_is_told_before_a_file_is_written(
     assert not (tmp_path / "b").exists()
     free = size + 4 * sequence.HEADER
     assert main([*words, str(tmp_path / "b")]) == 0
+
+
+def test_a_frame_appears_when_it_is_whole(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches half a frame after a kill: while a file is flushed, there are only the earlier frames, all whole."""
+    plain, seen = os.fsync, []
+
+    def watching(descriptor: int) -> None:
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            seen.append([len(read_trained(path)) for path in sorted((tmp_path / "clip").glob("*.ply"))])
+        plain(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watching)
+    assert main([str(folder), "--plys", str(tmp_path / "clip"), *ALONG, *FOUR]) == 0
+    assert [len(counts) for counts in seen] == [0, 1, 2, 3]
+    assert all(counts == seen[-1][: len(counts)] for counts in seen)
 
 
 @pytest.mark.parametrize("made", [True, False])
