@@ -11,6 +11,7 @@ from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 
 ERROR_SCALE = 0.2  # the error that has the brightest colour, equal for all images, so that they can be compared
+ROUNDING_SCALE = 1e-6, 1.0  # steps of 8 bits, 1/255: the ends of the log scale for errors of float32
 LEAST_WIDTH = 240  # pixels per column; a smaller image is enlarged by an integer factor, without smoothing
 HEADER = 44  # pixels
 GAP = 4  # pixels; grey, because the background is often white
@@ -69,6 +70,15 @@ def inferno(values: npt.NDArray[np.floating]) -> Pixels:  # [H, W]
     """Convert values in [0, 1] (clamped) to the colours [H, W, 3] of OpenCV's colour map "inferno", RGB."""
     levels = (np.clip(values, 0, 1) * 255).round().astype(np.uint8)
     return np.asarray(cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def rounding_image(values: npt.NDArray[np.float64]) -> Pixels:  # [H, W]
+    """Return an image of errors of float32, or of bounds on them, in steps of 8 bits, on the log scale of all images.
+
+    Black is an error of 1e-6 steps or less, bright yellow a whole step or more.
+    """
+    least, most = np.log(ROUNDING_SCALE)
+    return inferno((np.log(np.maximum(values, ROUNDING_SCALE[0])) - least) / (most - least))
 
 
 def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB

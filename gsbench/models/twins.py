@@ -49,6 +49,16 @@ def render_twins(
     single = model.slice(Query.of(camera, time))
     image = rasterize_slice(single, camera, background, model.backend, antialias).image[0]
     gaussians = exact.slice(Query.of(doubled(camera), time))
-    found = exact_image(gaussians, single, camera.viewmat, camera.K, camera.width, camera.height,
-                        background=background, antialias=antialias)  # fmt: skip
-    return Twins(image, gaussians, found)
+    return Twins(image, gaussians, exact_view(gaussians, single, camera, background, antialias))
+
+
+def exact_view(
+    exact: Gaussians3D,  # float64
+    single: Gaussians3D,  # float32
+    camera: Camera,
+    background: Tensor,  # [3] float32
+    antialias: bool,
+) -> ExactImage:
+    """Render 3D Gaussians in float64, and bound the error of their image in float32; see `exact_image`."""
+    return exact_image(exact, single, camera.viewmat, camera.K, camera.width, camera.height,
+                       background=background, antialias=antialias)  # fmt: skip

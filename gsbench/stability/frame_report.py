@@ -11,12 +11,11 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.colors import LogNorm
 
-from gsbench.measure.images import to_bytes
+from gsbench.measure.images import ROUNDING_SCALE, to_bytes
 from gsbench.stability.frame import STEPS, Exactness, ViewExactness
 from gsbench.stability.plots import save_figure
 
 ROUNDING = 1 / math.sqrt(12)  # RMS error of rounding to 8 bits, in steps
-LEAST, MOST = 1e-6, 1.0  # steps of 8 bits: the ends of the picture's colour scale
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")
 MEANINGS = {
     "flat": "its shortest axis is below 1/1000 of its longest",
@@ -90,9 +89,9 @@ def draw(found: Exactness, path: Path) -> None:
     error = STEPS * (image.double() - exact.image).abs().amax(-1)
     figure, axes = plt.subplots(1, 3, figsize=(12, 4), layout="constrained")
     axes[0].imshow(to_bytes(exact.image.float().numpy()))
-    scale = LogNorm(LEAST, MOST)
+    scale = LogNorm(*ROUNDING_SCALE)
     for pane, values in zip(axes[1:], (error, STEPS * exact.bound), strict=True):
-        drawn = pane.imshow(np.clip(values.numpy(), LEAST, MOST), norm=scale, cmap="inferno")
+        drawn = pane.imshow(np.clip(values.numpy(), *ROUNDING_SCALE), norm=scale, cmap="inferno")
     for pane, title in zip(axes, (f"{found.title}, {name}", "error of float32", "bound"), strict=True):
         pane.set(title=title, xticks=[], yticks=[])
     figure.colorbar(drawn, ax=axes[1:], label="steps of 8 bits")

@@ -3,7 +3,8 @@
 import html
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -13,14 +14,17 @@ from gsbench.errors import InputError
 from gsbench.models.factors import rotation
 from gsbench.scenes import Camera, Scene
 from gsbench.view.controls import SIDE, Controls
-from gsbench.view.frame import Frame, FrameRenderer, beside, wiped
+from gsbench.view.frame import FLOAT32, Frame, FrameRenderer, beside, wiped
 from gsbench.view.nearest import TrainingViews, compare
 from gsbench.view.panel import comparison, cost_table, legend
-from gsbench.view.resolution import Resolution
+from gsbench.view.resolution import ROUNDING_MS, Resolution
+from gsbench.view.rounding import Rounding
 from gsbench.view.stages import RASTER, SLICE
 
 REST_S = 0.2  # seconds without a change after which a frame is rendered with all pixels
 FRAME_S = 1 / 30  # seconds between two frames while the scene is played
+ROUNDING_FRAMES = 20  # the bound on the error of float32 takes about as long as so many frames (docs/stability.md)
+COMPUTED = "the bound is being computed; this is the image"
 QUALITY = {True: 75, False: 95}  # JPEG quality while something moves (True) and at rest (False)
 
 
@@ -40,10 +44,13 @@ class Client:
         """
         self.client = client
         self.controls = Controls(client, renderers, scene)
+        self._bounder = ThreadPoolExecutor(1)  # computes the bound on the error of float32
+        self._bounding: Future[tuple[Frame | None, dict[str, Rounding | str]]] | None = None  # if something rests
         self.changed = self.controls.changed
         self.left = False
-        self.rests = True  # whether the last frame has all pixels, and nothing has changed since
+        self.rests = True  # whether the last frame has all pixels (and its bounds), and nothing has changed since
         self.resolution = Resolution()
+        self._rounding_resolution = Resolution(ROUNDING_MS)
         self._views = None if isinstance(scene, str) else TrainingViews(scene)
         self._most_cost = most_cost
         client.camera.on_update(self._move)
@@ -66,7 +73,8 @@ class Client:
     def _work(self) -> None:
         """Render a frame after each change of controls or camera, until the browser disconnects.
 
-        When the changes stop, the frame is rendered again with all pixels.
+        When the changes stop, the frame is rendered again with all pixels, and once more where the browser requests
+        the bound on the error of float32. A change ends the wait for that bound.
         """
         while True:
             playing = self.controls.play.value
@@ -74,35 +82,86 @@ class Client:
             moving = changed or self.controls.play.value
             if moving:
                 self.rests = False
+                if self._bounding is not None:
+                    self._bounding.cancel()  # without effect if it has started; its result is not shown
+                    self._bounding = None
             self.changed.clear()
             if self.left:  # tested after `clear`, so that a later call of `leave` ends the next wait
+                self._bounder.shutdown(wait=False)
                 return
             self.controls.advance()
             try:
-                self._show(moving)
-                if not moving:
-                    self._compare()
+                if self._bounding is not None:
+                    self._end_rounding()
+                else:
+                    self._show(moving)
+                    if not moving:
+                        self._start_rounding()
+                        self._compare()
             except InputError as error:
                 self.controls.costs.content = html.escape(str(error))
-            self.rests = not moving
+            self.rests = not moving and self._bounding is None
 
     def _show(self, moving: bool) -> None:
         """Render a frame, and send it to the browser with its time and the legend of its colours."""
         camera, controls = self.client.camera, self.controls
         width, height = self.resolution.size(max(1, camera.image_width), max(1, camera.image_height), moving)
-        frame = self._frame(width, height)
+        frame = self._combined(width, height, self._rendered)
         self.resolution.took(width * height, frame.ms(SLICE), frame.ms(RASTER))
+        self._rounding_resolution.took(width * height, 0.0, ROUNDING_FRAMES * frame.ms(RASTER))
         self.client.scene.set_background_image(frame.image, format="jpeg", jpeg_quality=QUALITY[moving])
         controls.costs.content = cost_table(frame.costs, width, height)
-        said = legend(controls.shown(), self._most_cost)
-        if said != controls.legend.content:
-            controls.legend.content = said
+        self._explain({} if moving else dict.fromkeys((one.renderer.name for one in controls.shown()), COMPUTED))
 
-    def _frame(self, width: int, height: int) -> Frame:
+    def _start_rounding(self) -> None:
+        """Start to compute the bound on the error of float32 if the browser requests it; the image is shown meanwhile.
+
+        Another thread computes it, so that the browser is served if the user goes on.
+        """
+        if any(colours == FLOAT32 for _, colours in self.controls.shown()):
+            camera = self.client.camera
+            size = self._rounding_resolution.size(max(1, camera.image_width), max(1, camera.image_height), True)
+            self._bounding = self._bounder.submit(self._bounded, *size)
+
+    def _bounded(self, width: int, height: int) -> tuple[Frame | None, dict[str, Rounding | str]]:
+        """Render a frame with the bound on the error of float32, None if no shown model has one; and what to say."""
+        said: dict[str, Rounding | str] = {}
+
+        def render(renderer: FrameRenderer, colours: str, camera: Camera) -> Frame:
+            if colours == FLOAT32:
+                try:
+                    found = said[renderer.name] = renderer.rounding(camera, self.controls.request(colours))
+                    return Frame(found.image, ())
+                except InputError as error:
+                    said[renderer.name] = f"no bound: {error}"
+            return self._rendered(renderer, colours, camera)
+
+        frame = self._combined(width, height, render)
+        return frame if any(isinstance(one, Rounding) for one in said.values()) else None, said
+
+    def _end_rounding(self) -> None:
+        """Show the bound on the error of float32 if it is ready."""
+        if self._bounding is not None and self._bounding.done():
+            frame, said = self._bounding.result()
+            self._bounding = None
+            if frame is not None:
+                self.client.scene.set_background_image(frame.image, format="jpeg", jpeg_quality=QUALITY[False])
+            self._explain(said)
+
+    def _explain(self, said: Mapping[str, Rounding | str]) -> None:
+        """Show the legend of the colours, with what is known of the error of float32, by the name of the model."""
+        text = legend(self.controls.shown(), self._most_cost, said)
+        if text != self.controls.legend.content:
+            self.controls.legend.content = text
+
+    def _rendered(self, renderer: FrameRenderer, colours: str, camera: Camera) -> Frame:
+        return renderer.render(camera, self.controls.request(colours))
+
+    def _combined(self, width: int, height: int, render: Callable[[FrameRenderer, str, Camera], Frame]) -> Frame:
         """Render the image of one model, or an image that combines two models, as the controls say."""
         shown, mode = self.controls.shown(), self.controls.layout
         camera = self._camera(max(1, width // 2) if mode == SIDE else width, height)
-        first, *others = [renderer.render(camera, self.controls.request(colours)) for renderer, colours in shown]
+        first, *others = [render(renderer, colours, camera) for renderer, colours in shown]
         if not others:
             return first
         return beside(first, others[0]) if mode == SIDE else wiped(first, others[0], self.controls.wiped)

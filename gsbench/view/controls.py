@@ -13,7 +13,7 @@ import torch
 import viser
 
 from gsbench.scenes import Scene, View
-from gsbench.view.frame import CLASS, COLOURS, IMAGE, FrameRenderer, FrameRequest
+from gsbench.view.frame import CLASS, COLOURS, IMAGE, PLAIN, FrameRenderer, FrameRequest
 from gsbench.view.frusta import Frusta
 
 PLAYED_S = 4.0  # seconds in which the time goes from 0 to 1
@@ -24,10 +24,10 @@ PANEL = {"x": 15.0, "y": -15.0, "width": 400.0}  # position in pixels from the l
 
 
 class ShownImage(NamedTuple):
-    """An image on the screen: the model that it shows, and what the colours of its Gaussians mean."""
+    """An image on the screen: the model that it shows, and what its colours mean."""
 
     renderer: FrameRenderer  # of the model
-    colours: str  # the meaning of its Gaussians' colours
+    colours: str  # one of COLOURS
 
 
 class Controls:
@@ -90,7 +90,7 @@ class Controls:
         several = len(names) > 1
         self.mode = gui.add_dropdown("show", (ONE, SIDE, WIPE))
         first = gui.add_dropdown("model", names, visible=several)
-        colours = gui.add_dropdown("colours", COLOURS, hint="of the Gaussians: their own, or what they pay for")
+        colours = gui.add_dropdown("colours", COLOURS, hint="of the Gaussians; float32: the bound on the error")
         second = gui.add_dropdown("second model", names, initial_value=names[-1], visible=False)
         others = gui.add_dropdown("second colours", COLOURS, initial_value=IMAGE if several else CLASS, visible=False)
         self.wipe = gui.add_slider("wipe at", 0.0, 1.0, 0.01, 0.5, visible=False)
@@ -192,8 +192,11 @@ class Controls:
         ]
 
     def request(self, colours: str) -> FrameRequest:
-        """Return the request for a frame at the present time, with the settings of the controls and with `colours`."""
-        return self._request_at(self.now, colours)
+        """Return the request for a frame at the present time, with the settings of the controls and with `colours`.
+
+        For `float32` the image is requested, whose error it is about.
+        """
+        return self._request_at(self.now, colours if colours in PLAIN else IMAGE)
 
     def request_of(self, view: View) -> FrameRequest:
         """Return the request for a frame at the time of a training view, with the settings of the controls."""

@@ -9,15 +9,20 @@ import torch
 
 from gsbench.effects.picture import cost_colors, effect_set_colors
 from gsbench.measure.images import Pixels, inferno, to_bytes
+from gsbench.models import GaussianModel
 from gsbench.models.query import Query
 from gsbench.models.render import rasterize_slice
+from gsbench.models.twins import doubled, exact_model
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
 from gsbench.schedule import ActiveComponents
+from gsbench.view.rounding import Rounding, check_exactness, rounding
 from gsbench.view.stages import RASTER, SLICE, StageWatch, part_of
 
 DIVIDER = (255, 255, 255)  # RGB of the line between two models
-IMAGE, CLASS, COST = COLOURS = ("image", "class", "cost")  # meanings of the Gaussians' colours
+IMAGE, CLASS, COST = PLAIN = ("image", "class", "cost")  # meanings of the Gaussians' colours
+FLOAT32 = "float32"  # instead of Gaussians the bound on the error of float32, which takes 20 times as long as a frame
+COLOURS = (*PLAIN, FLOAT32)
 EVERY_DEGREE = 3  # the highest SH degree of any model
 
 
@@ -28,7 +33,7 @@ class FrameRequest(NamedTuple):
     center: torch.Tensor | None = None  # [3], viewpoint for which Gaussians are computed; None: the camera's
     agr: bool = True  # whether AGR (neural refinement) is on, if the model has it
     sh_degree: int = EVERY_DEGREE  # highest SH degree of the colours
-    colours: str = IMAGE
+    colours: str = IMAGE  # one of PLAIN
 
 
 class FrameCost(NamedTuple):
@@ -76,7 +81,9 @@ class FrameRenderer:
         background = torch.tensor(run.scene.background).to(run.config.device)
         self._backgrounds = {IMAGE: background, CLASS: torch.ones_like(background), COST: torch.zeros_like(background)}
         self._colors = {CLASS: effect_set_colors(run.model), COST: cost_colors(run.model, most_cost)}
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # of the model
+        self._exact: GaussianModel | None = None  # its copy in float64, made when it is first needed
+        self._exact_lock = threading.Lock()
 
     def render(self, camera: Camera, request: FrameRequest) -> Frame:
         """Render the image of a camera, and return it with its milliseconds.
@@ -91,6 +98,23 @@ class FrameRenderer:
     def image(self, camera: Camera, request: FrameRequest) -> torch.Tensor:
         """Render the image of a camera as floats, [H, W, 3], from which PSNR can be computed."""
         return self._timed_image(camera, request)[0].cpu()
+
+    def rounding(self, camera: Camera, request: FrameRequest) -> Rounding:
+        """Bound the error of float32 in each pixel of the image of a camera; other frames can be rendered meanwhile.
+
+        Raises:
+            InputError: there is no such bound: the model is on a GPU, the CPU kernels are not built, or the model does
+                not compute in float64.
+        """
+        run, center = self.run, request.center
+        check_exactness(run.model)
+        with self._exact_lock:
+            with self._lock, torch.inference_mode():
+                self._exact = self._exact or exact_model(run.model)
+                run.model.active = self._exact.active = self._active(request)
+                single = run.model.slice(Query.at(camera.center if center is None else center, request.time))
+            query = Query.at(doubled(camera).center if center is None else center.double(), request.time)
+            return rounding(self._exact, single, query, camera, self._backgrounds[IMAGE], run.config.raster.antialias)
 
     def _timed_image(self, camera: Camera, request: FrameRequest) -> tuple[torch.Tensor, dict[str, float]]:
         """Render the image of a camera, and return it with the milliseconds of each stage."""

@@ -1,20 +1,29 @@
 """Write the HTML of the viewer's panel: milliseconds by stage, colour legend, and errors against a training view."""
 
 import html
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from gsbench.effects.messages import EFFECT_SETS
 from gsbench.effects.picture import COLOURS
-from gsbench.measure.images import ERROR_SCALE, data_url, inferno
+from gsbench.measure.images import ERROR_SCALE, ROUNDING_SCALE, data_url, inferno
 from gsbench.view.controls import ShownImage
-from gsbench.view.frame import CLASS, COST, FrameCost
+from gsbench.view.frame import CLASS, COST, FLOAT32, FrameCost
 from gsbench.view.nearest import Nearest, ViewComparison
+from gsbench.view.rounding import Rounding
 from gsbench.view.stages import STAGES
 
 STOPS = 9  # of a gradient
+WAITS = "the bound is computed when nothing moves"
+_ROUNDING_ROWS: dict[str, Callable[[Rounding], str]] = {
+    "largest bound": lambda one: f"{one.largest:.2g}",
+    "median bound": lambda one: f"{one.median:.2g}",
+    "undecided pixels": lambda one: f"{100 * one.undecided:.2g} %",
+    "pixels": lambda one: f"{one.image.shape[1]} x {one.image.shape[0]}",
+    "seconds": lambda one: f"{one.seconds:.1f}",
+}
 _STYLE = "width:100%;border-collapse:collapse;table-layout:fixed"
 _NUMBER = "text-align:right;padding:0 0 0 0.5em;vertical-align:bottom"
 _SWATCH = "display:inline-block;width:0.8em;height:0.8em"
@@ -32,12 +41,13 @@ def cost_table(costs: Sequence[FrameCost], width: int, height: int) -> str:
     return _box(_table(rows) + f"<div>at {width} x {height}</div>")
 
 
-def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
-    """Write the legend of the colours if they show the cost of Gaussians or what they depend on; otherwise "".
+def legend(shown: Sequence[ShownImage], most_cost: float, rounding: Mapping[str, Rounding | str]) -> str:
+    """Write the legend of the colours; "" for the Gaussians' own.
 
     Args:
         shown: the images on the screen.
         most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
+        rounding: the bound on the error of float32 by the name of the model, or why it is not shown.
     """
     text = ""
     if by_effect_set := {renderer.name: renderer.counts for renderer, colours in shown if colours == CLASS}:
@@ -51,7 +61,25 @@ def legend(shown: Sequence[ShownImage], most_cost: float) -> str:
     if any(colours == COST for _, colours in shown):
         text += _box(f"What the Gaussians that a pixel shows add to a frame before they are drawn, each"
                      f"{_gradient('0', f'{most_cost:.0f} ns')}")  # fmt: skip
+    if names := list(dict.fromkeys(renderer.name for renderer, colours in shown if colours == FLOAT32)):
+        text += _box(_rounding({name: rounding.get(name, WAITS) for name in names}))
     return text
+
+
+def _rounding(found: Mapping[str, Rounding | str]) -> str:
+    """Write the legend of the bound on the error of float32, with a summary for each model or why there is none."""
+    low, high = (f"{end:g}" for end in ROUNDING_SCALE)
+    text = (f"Bound on the error of float32, in steps of 8 bits, log scale: no channel of the image is farther from "
+            f"the image in float64{_gradient(low, f'{high} or more')}")  # fmt: skip
+    if known := {name: one for name, one in found.items() if isinstance(one, Rounding)}:
+        rows = [_row("", list(known), bold=True)]
+        rows += [_row(label, [cell(one) for one in known.values()]) for label, cell in _ROUNDING_ROWS.items()]
+        text += _table(rows)
+    return text + "".join(
+        f"<div><b>{html.escape(name)}</b>: {html.escape(one)}</div>"
+        for name, one in found.items()
+        if isinstance(one, str)
+    )
 
 
 def comparison(nearest: Nearest, compared: Sequence[ViewComparison]) -> str:

@@ -66,6 +66,13 @@ def test_the_error_is_the_mean_over_channels():
     ).all()
 
 
+def test_errors_of_float32_have_a_log_scale():
+    """Would catch a linear scale, whose errors are all black, other ends than the legend's, and zero as infinity."""
+    values = np.array([[0.0, 1e-7, 1e-6, 1e-3, 1.0, 50.0]])
+    levels = np.array([[0, 0, 0, 0.5, 1, 1]])
+    assert (pictures.rounding_image(values) == pictures.inferno(levels)).all()
+
+
 def test_small_images_are_enlarged_without_smoothing():
     """Would catch interpolated pixels: every pixel of a 100-wide image becomes 3 x 3 equal ones."""
     image = np.random.default_rng(0).random((5, 100, 3))

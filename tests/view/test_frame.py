@@ -180,17 +180,17 @@ def test_resolution_falls_while_the_camera_moves() -> None:
     """Catches a large window that stutters, a frame at rest that stays coarse, and a size of zero."""
     resolution = Resolution()
     for _ in range(3):  # 1 us a pixel and 10 ms a slice: 30,000 pixels
-        width, height = resolution.size(1000, 500, moving=True)
+        width, height = resolution.size(1000, 500, limited=True)
         resolution.took(width * height, 10.0, width * height / 1000)
     assert width * height == pytest.approx(1000 * (MOVING_MS - 10), rel=0.02)
     assert width / height == pytest.approx(2, rel=0.02)
-    assert resolution.size(1000, 500, moving=False) == (1000, 500)
-    width, height = resolution.size(8000, 4000, moving=False)
+    assert resolution.size(1000, 500, limited=False) == (1000, 500)
+    width, height = resolution.size(8000, 4000, limited=False)
     assert width * height == pytest.approx(MOST_PIXELS, rel=0.01)
     resolution.took(100, 500.0, 900.0)
-    width, height = resolution.size(1000, 500, moving=True)
+    width, height = resolution.size(1000, 500, limited=True)
     assert width * height == pytest.approx(LEAST_PIXELS, rel=0.02)
-    assert min(resolution.size(1, 3000, moving=True)) >= 1
+    assert min(resolution.size(1, 3000, limited=True)) >= 1
 
 
 def test_a_browsers_camera_is_ours(one: FrameRenderer) -> None:

@@ -12,9 +12,10 @@ from gsbench.effects.messages import EFFECT_SETS
 from gsbench.effects.picture import COLOURS
 from gsbench.models.effect_sets import NAMES
 from gsbench.scenes import Camera, View
-from gsbench.view.frame import CLASS, COST, IMAGE, FrameCost
+from gsbench.view.frame import CLASS, COST, FLOAT32, IMAGE, FrameCost
 from gsbench.view.nearest import Nearest, ViewComparison
 from gsbench.view.panel import comparison, cost_table, legend
+from gsbench.view.rounding import Rounding
 
 SEVEN = FrameCost("7dgs seed0", {"AGR": 2.0, "conditioning": 1.0, "colours": 0.5, "projection": 0.5, "blending": 4.0})
 THREE = FrameCost("3dgs seed0", {"conditioning": 0.25, "raster": 3.75})
@@ -45,7 +46,7 @@ def shown(colours: str, name: str, *counts: int) -> Any:
 
 def test_the_legend_counts_the_classes_that_there_are() -> None:
     """Catches a count beside the name of another effect set or colour, and effect sets that nothing shown has."""
-    text = legend([shown(CLASS, "7dgs", 1200, 5, 0, 0, 30), shown(CLASS, "4dgs", 0, 700, 0, 0, 0)], 250.0)
+    text = legend([shown(CLASS, "7dgs", 1200, 5, 0, 0, 30), shown(CLASS, "4dgs", 0, 700, 0, 0, 0)], 250.0, {})
     table = rows(text)
     assert list(table) == ["Gaussians", EFFECT_SETS["refined"], EFFECT_SETS["conditioned"], EFFECT_SETS["static"]]
     assert list(table.values()) == [["7dgs", "4dgs"], ["1,200", "0"], ["5", "700"], ["30", "0"]]
@@ -56,11 +57,25 @@ def test_the_legend_counts_the_classes_that_there_are() -> None:
 def test_the_legend_of_costs_has_its_scale() -> None:
     """Catches a scale that is not the one the image was drawn on, and a legend of colours that need none."""
     one = "7dgs", 1, 0, 0, 0, 0
-    both = legend([shown(CLASS, *one), shown(COST, *one)], 251.0)
+    both = legend([shown(CLASS, *one), shown(COST, *one)], 251.0, {})
     assert "251 ns" in both
     assert EFFECT_SETS["refined"] in both
-    assert EFFECT_SETS["refined"] not in legend([shown(IMAGE, *one), shown(COST, *one)], 251.0)
-    assert legend([shown(IMAGE, *one)], 251.0) == ""
+    assert EFFECT_SETS["refined"] not in legend([shown(IMAGE, *one), shown(COST, *one)], 251.0, {})
+    assert legend([shown(IMAGE, *one)], 251.0, {}) == ""
+
+
+def test_the_legend_of_float32_says_what_is_known_of_each_model() -> None:
+    """Catches another model's bound, a summary of a model that is not shown, and a model without a bound or reason."""
+    images = [shown(FLOAT32, name, 1, 0, 0, 0, 0) for name in ("a", "b", "c", "a")]
+    known = Rounding(np.zeros((30, 40, 3), np.uint8), 0.71, 0.00043, 0.0125, 2.04)
+    text = legend(images, 1.0, {"a": known, "b": "no <bound>", "d": "hidden"})
+    assert "1e-06" in text
+    assert rows(text) == {"": ["a"], "largest bound": ["0.71"], "median bound": ["0.00043"],
+                          "undecided pixels": ["1.2 %"], "pixels": ["40 x 30"], "seconds": ["2.0"]}  # fmt: skip
+    assert "<b>b</b>: no &lt;bound&gt;" in text
+    assert "<b>c</b>: the bound is computed when nothing moves" in text
+    assert "hidden" not in text
+    assert legend([shown(IMAGE, "a", 1, 0, 0, 0, 0)], 1.0, {"a": known}) == ""
 
 
 @pytest.mark.parametrize("time", [0.5, None])
@@ -82,7 +97,7 @@ def test_names_of_folders_are_text() -> None:
     view = View(bad, Camera(torch.eye(4), torch.eye(3), 2, 2), None, torch.zeros(2, 2, 3))
     texts = (
         cost_table([FrameCost(bad, {"AGR": 1.0})], 1, 1),
-        legend([shown(CLASS, bad, 1, 0, 0, 0, 0)], 1.0),
+        legend([shown(CLASS, bad, 1, 0, 0, 0, 0)], 1.0, {}),
         comparison(Nearest(view, 0.0, 0.0), [ViewComparison(bad, image, image, image, 1.0)]),
     )
     assert not any("<script" in text for text in texts)

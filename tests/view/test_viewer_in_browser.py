@@ -2,6 +2,7 @@
 
 import re
 import socket
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,9 @@ import pytest
 from chromium import launched
 
 from gsbench.errors import InputError
+from gsbench.kernels.backends import REFERENCE
 from gsbench.run.load import load_run
+from gsbench.view.frame import FrameRenderer
 from gsbench.view.stages import STAGES
 from gsbench.view.viewer import Viewer
 
@@ -212,6 +215,37 @@ def test_gaussians_have_the_colours_of_their_classes_or_costs(visit, viewer):
     assert settle(page) == pictures[0]
     assert not classes.count() + costs.count()
     assert len(set(pictures)) == 3
+
+
+def test_the_bound_on_float32_is_shown_when_nothing_moves(visit, viewer, monkeypatch):
+    """Catches a bound that is not shown, is left of another view, or keeps the viewer waiting; and a silent refusal."""
+    page = visit()
+    start, legend = settle(page), page.get_by_text(re.compile("Bound on the error"))
+    choose(page, "colours", "float32")
+    bound = settle(page)
+    assert page.get_by_text("largest bound").count()
+    turn(page)
+    assert len({start, bound, settle(page)}) == 3
+    released, compute = threading.Event(), FrameRenderer.rounding
+
+    def slowly(renderer, camera, request):
+        released.wait(60)
+        return compute(renderer, camera, request)
+
+    monkeypatch.setattr(FrameRenderer, "rounding", slowly)
+    turn(page)
+    page.wait_for_selector("text=is being computed", timeout=20_000)
+    choose(page, "colours", "image")
+    plain = settle(page)  # although the bound is not ready
+    assert not legend.count()
+    released.set()
+    page.wait_for_timeout(1000)
+    assert settle(page) == plain
+    monkeypatch.undo()
+    monkeypatch.setattr(viewer.renderers[0].run.model, "backend", REFERENCE)
+    choose(page, "colours", "float32")
+    settle(page)
+    assert page.get_by_text("no bound: expected the CPU kernels").count() == 1
 
 
 def nearest(page):
