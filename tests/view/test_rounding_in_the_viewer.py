@@ -1,5 +1,6 @@
 """The viewer's bound on the error of float32: it is that of the stability command, and refused where it has none."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,11 +24,14 @@ needs_kernels = pytest.mark.skipif(not kernels.available(), reason="the kernels 
 def test_the_bound_is_that_of_the_stability_command() -> None:
     """Catches a bound of another view, time or unit, and a summary of other pixels."""
     one = renderer()
-    camera = seen_from(0.5, one)
+    near = seen_from(0.5, one)
+    K = near.K * torch.tensor([0.3, 0.3, 1.0])  # a wide angle: some pixels show nothing
+    camera = replace(near, K=K)
     found = one.rounding(camera, FrameRequest(0.4))
     exact = render_twins(one.run.model, exact_model(one.run.model), camera, 0.4, torch.zeros(3), False).exact
     bound = 255 * exact.bound
     assert (found.image == rounding_image(bound.numpy())).all()
+    assert 0.2 < float((exact.culprit >= 0).double().mean()) < 0.95
     assert found.image.max() > 50
     assert found.largest == pytest.approx(float(bound.max()))
     assert found.median == pytest.approx(float(bound[exact.culprit >= 0].median()))
