@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -250,6 +251,7 @@ def test_a_browser_that_leaves_as_a_frame_begins_ends_its_thread() -> None:
             super().clear()
 
     client.controls, client.changed, client.left, client.rests = Controls(), LeavesThen(), False, False  # type: ignore[assignment]
+    client._bounder, client._bounding = ThreadPoolExecutor(1), None
     client._show, client._compare = lambda _: None, lambda: None  # type: ignore[method-assign]
     thread = threading.Thread(target=client._work, daemon=True)
     thread.start()
