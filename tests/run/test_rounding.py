@@ -45,14 +45,15 @@ def test_a_run_without_the_cpu_kernels_says_why_it_has_none() -> None:
     assert "needs raster.backend=cpu" in why
 
 
-def test_a_model_of_float32_alone_loses_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", [RuntimeError, TypeError])
+def test_a_model_of_float32_alone_loses_no_run(kind: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches an error of a user's model in float64 that ends a trained run."""
     one = trainer("raster.backend=cpu")
     own = type(one.model).slice
 
     def single(self: object, query: Query) -> Gaussians3D:
         if query.center.dtype == torch.float64:
-            raise RuntimeError("expected scalar type Float but found Double")
+            raise kind("expected scalar type Float but found Double")
         return own(self, query)  # type: ignore[arg-type]
 
     monkeypatch.setattr(type(one.model), "slice", single)
