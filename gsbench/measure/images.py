@@ -11,6 +11,7 @@ from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 
 ERROR_SCALE = 0.2  # the error that has the brightest colour, equal for all images, so that they can be compared
+STEPS = 255  # of 8 bits between black and white
 ROUNDING_SCALE = 1e-6, 1.0  # steps of 8 bits, 1/255: the ends of the log scale for errors of float32
 LEAST_WIDTH = 240  # pixels per column; a smaller image is enlarged by an integer factor, without smoothing
 HEADER = 44  # pixels

@@ -43,6 +43,12 @@ class ExactImage(NamedTuple):
         """Whether rounding may decide which Gaussians are blended in a pixel, or their order, [H, W] bool."""
         return self.branches > 0
 
+    @property
+    def median_bound(self) -> float:
+        """The median bound of the pixels that show a Gaussian; 0 if none does."""
+        covered = self.bound[self.culprit >= 0]
+        return float(covered.median()) if len(covered) else 0.0
+
 
 @torch.no_grad()
 def exact_image(

@@ -104,8 +104,13 @@ def _load(records: list[Record]) -> list[str]:
     if not loads:
         return []
     ends = dict.fromkeys(f"{load:.1f}" for load in (min(loads), max(loads)))
-    silent = f"; {len(costs) - len(loads)} of {len(costs)} runs do not say" if len(loads) < len(costs) else ""
+    silent = _silent(len(costs) - len(loads), len(costs))
     return [f"load of the machine during a training, these runs included: {' to '.join(ends)}{silent}"]
+
+
+def _silent(number: int, runs: int) -> str:
+    """Return the end of a footnote that a number of the runs do not support, or "" if all do."""
+    return f"; {number} of {runs} runs do not say" if number else ""
 
 
 def _rounding(records: list[Record]) -> list[str]:
@@ -114,7 +119,7 @@ def _rounding(records: list[Record]) -> list[str]:
     known = [change for change in changes if change is not None]
     if not known:
         return []
-    silent = f"; {len(changes) - len(known)} of {len(changes)} runs do not say" if len(known) < len(changes) else ""
+    silent = _silent(len(changes) - len(known), len(changes))
     return [f"float32 changes PSNR of a view by at most {max(known):.1e} dB (three views of each run{silent})."]
 
 

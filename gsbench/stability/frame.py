@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.raster import Viewport
+from gsbench.measure.images import STEPS
 from gsbench.measure.quality import psnr
 from gsbench.models import GaussianModel
 from gsbench.models.joint import JointModel
@@ -21,7 +22,6 @@ from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, U
 from gsbench.raster.reference import project
 from gsbench.scenes.scene import Camera
 
-STEPS = 255  # of 8 bits between black and white
 WORST = 10  # Gaussians that are listed
 # What makes a Gaussian hard: the ratio of its axes, its opacity, and pixels by which rounding moves its mean.
 FLAT, OPAQUE, MOVED = 1e-3, 0.99, 1e-3
@@ -118,13 +118,12 @@ def measure(
 def compare(shot: Shot, image: Tensor, found: ExactImage) -> ViewExactness:
     """Compare a float32 image [H, W, 3] with the exact one, and both with the photograph if there is one."""
     error = (image.double() - found.image).abs()
-    covered = found.bound[found.culprit >= 0]
     plain = ViewExactness(
         shot.name,
         largest=STEPS * float(error.max()),
         rms=STEPS * float(error.square().mean().sqrt()),
         bound=STEPS * float(found.bound.max()),
-        median_bound=STEPS * float(covered.median()) if len(covered) else 0.0,
+        median_bound=STEPS * found.median_bound,
         undecided=float(found.undecided.double().mean()),
     )
     if shot.truth is None:

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.colors import LogNorm
 
-from gsbench.measure.images import ROUNDING_SCALE, to_bytes
-from gsbench.stability.frame import STEPS, Exactness, ViewExactness
+from gsbench.measure.images import ROUNDING_SCALE, STEPS, to_bytes
+from gsbench.stability.frame import Exactness, ViewExactness
 from gsbench.stability.plots import save_figure
 
 ROUNDING = 1 / math.sqrt(12)  # RMS error of rounding to 8 bits, in steps

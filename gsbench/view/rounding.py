@@ -7,13 +7,11 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError, one_line
-from gsbench.measure.images import Pixels, rounding_image
+from gsbench.measure.images import STEPS, Pixels, rounding_image
 from gsbench.models import GaussianModel, Query
 from gsbench.models.sliced import Gaussians3D
 from gsbench.models.twins import exact_view
 from gsbench.scenes import Camera
-
-STEPS = 255  # of 8 bits between black and white
 
 
 class Rounding(NamedTuple):
@@ -68,11 +66,10 @@ def rounding(
         raise InputError(f"the model does not compute in float64: {one_line(error)}") from None
     found = exact_view(gaussians, single, camera, background, antialias)
     bound = STEPS * found.bound
-    covered = bound[found.culprit >= 0]
     return Rounding(
         rounding_image(bound.numpy()),
         largest=float(bound.max()),
-        median=float(covered.median()) if len(covered) else 0.0,
+        median=STEPS * found.median_bound,
         undecided=float(found.undecided.double().mean()),
         seconds=time.perf_counter() - start,
     )
