@@ -32,7 +32,7 @@ _problems: list[Problem] = []  # problems of the runs that failed; the sweep con
 def entry(composed: DictConfig) -> None:
     """Do one run of a sweep. If the run fails, the error is stored and the sweep continues."""
     if OmegaConf.is_missing(composed, "experiment"):
-        raise InputError(f"no experiment was chosen: add +exp=NAME. Valid: {', '.join(_group('exp'))}.")
+        raise InputError(f"no experiment was chosen: add +exp=NAME. Valid: {', '.join(_group('exp'))}.", docs="runs.md")
     if composed.experiment == "stability":  # the only experiment that trains no model on a scene
         from gsbench.stability.__main__ import main as audit
 
@@ -45,7 +45,7 @@ def entry(composed: DictConfig) -> None:
         raise InputError(f"data.root is not set: add data.root=PATH, the folder that holds the scenes of "
                          f"{composed.data.dataset} ({', '.join(composed.data.scenes)}), each with "
                          f"transforms_{{train,val,test}}.json and the images they name. "
-                         f"Published at: {composed.data.published}")  # fmt: skip
+                         f"Published at: {composed.data.published}", docs="data.md#what-is-read")  # fmt: skip
     problem = do(composed)
     if problem is not None:
         _problems.append(problem)

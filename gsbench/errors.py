@@ -3,9 +3,19 @@
 import difflib
 from collections.abc import Iterable
 
+DOCS = "docs"  # the folder of the docs pages, in a checkout and in an sdist
+
 
 class InputError(ValueError):
-    """The config, the data set or a tensor is wrong. The message is one line, printed without a stack trace."""
+    """The config, the data set or a tensor is wrong. The message is one line, printed without a stack trace.
+
+    Args:
+        message: what was expected, what was found, and what to do.
+        docs: the page of the docs that explains what to do, such as "data.md#fetching"; the message ends with it.
+    """
+
+    def __init__(self, message: str = "", *, docs: str | None = None) -> None:
+        super().__init__(message if docs is None else f"{message} ({DOCS}/{docs})")
 
 
 class TooLargeError(InputError, MemoryError):

@@ -42,7 +42,7 @@ def download(source: Source, folder: Path) -> Path:
     except (requests.exceptions.ConnectTimeout, requests.exceptions.ConnectionError) as error:
         broken = "broke off" if "Read" in repr(error) else "cannot be reached (is this machine online?)"
         raise InputError(f"{source.name}: {urlsplit(url).netloc} {broken}; behind a proxy set HTTPS_PROXY; or "
-                         f"{by_hand(source, path)}") from None  # fmt: skip
+                         f"{by_hand(source, path)}", docs="data.md#fetching") from None  # fmt: skip
     except InputError:
         raise
     # ValueError: an invalid length or URL, perhaps of a redirection, which requests does not always wrap
@@ -62,7 +62,7 @@ def check(path: Path, source: Source, advice: str) -> None:
     found = sha256_of(path)
     if source.sha256 and not found.startswith(source.sha256):
         raise InputError(f"{source.name}: expected {source.file} with SHA-256 {source.sha256}.., got {found[:8]}..: "
-                         f"{advice}")  # fmt: skip
+                         f"{advice}", docs="data.md#fetching")  # fmt: skip
 
 
 def sha256_of(path: Path) -> str:

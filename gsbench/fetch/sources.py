@@ -49,7 +49,7 @@ class Source:
         if self.url is None:
             raise InputError(f"{self.name}: {self.what} has no address that a program can follow: download it in a "
                              f"browser ({self.published}) and unpack it into {self.folder}, or set {MIRROR} to a "
-                             f"server that has {self.file}")  # fmt: skip
+                             f"server that has {self.file}", docs="data.md#fetching")  # fmt: skip
         return self.url
 
 

@@ -29,7 +29,7 @@ def native() -> ModuleType:
     """
     if _native is None:
         raise InputError("the native kernels are not built in this installation: reinstall with a C++20 compiler, "
-                         "or go on with raster.backend=reference")  # fmt: skip
+                         "or go on with raster.backend=reference", docs="install.md#without-a-compiler")  # fmt: skip
     return _native
 
 

@@ -53,10 +53,10 @@ def resolve(name: str, device: str = "cpu") -> Backend:
         return BACKENDS[device] if device in AUTO.devices and _built(device) else REFERENCE
     if name == "cpu" and not kernels.available():
         raise InputError("raster backend 'cpu' is not built in this installation: reinstall with a C++20 compiler, "
-                         "or use raster.backend=reference")  # fmt: skip
+                         "or use raster.backend=reference", docs="install.md#without-a-compiler")  # fmt: skip
     if name == "cuda" and not cuda.available():
-        why = "no CUDA device was found" if cuda.built() else "it is not built here, see docs/gpu.md"
-        raise InputError(f"raster backend 'cuda': {why}; use raster.backend=auto or reference")
+        why = "no CUDA device was found" if cuda.built() else "it is not built here"
+        raise InputError(f"raster backend 'cuda': {why}; use raster.backend=auto or reference", docs="gpu.md#building")
     if name in AUTO.devices and device in AUTO.devices and name != device:
         raise InputError(f"raster backend '{name}' does not render on device '{device}': use device={name}, "
                          "or raster.backend=auto or reference")  # fmt: skip

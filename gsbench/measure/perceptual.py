@@ -148,7 +148,9 @@ def load(backbone: str = "alex", weights: Path | None = None, device: str = "cpu
     path = weights or _trunk(backbone)
     if not path.is_file():
         if weights is not None:
-            raise InputError(f"{path}: expected the weights of LPIPS' {backbone} trunk, found no such file")
+            raise InputError(
+                f"{path}: expected the weights of LPIPS' {backbone} trunk, found no such file", docs="data.md#fetching"
+            )
         raise BackboneMissing(
             f"no trunk weights: {chosen.file} is not in $TORCH_HOME/hub/checkpoints and no file is named"
         )

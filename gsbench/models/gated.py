@@ -142,7 +142,8 @@ def as_gated(model: GaussianModel) -> GatedModel:
     """Return the model if its single Gaussians can be made independent of time or direction; else raise InputError."""
     if not isinstance(model, GatedModel):
         raise InputError(f"effects.gate: expected a model that gates can simplify, {type(model).__name__} is no "
-                         f"GatedModel: make it one (docs/adding_a_model.md), or use effects.gate=off")  # fmt: skip
+                         f"GatedModel: make it one, or use effects.gate=off",
+                         docs="adding_a_model.md")  # fmt: skip
     return model
 
 

@@ -87,7 +87,7 @@ def import_models(module: str | None, named_by: str = "--model-module") -> None:
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = "" if "importlib" in place.filename else f"{Path(place.filename).name}, line {place.lineno}: "
         raise InputError(f"{named_by}: expected a Python module that can be imported: {where}"
-                         f"{type(error).__name__}: {one_line(error)}") from None  # fmt: skip
+                         f"{type(error).__name__}: {one_line(error)}", docs="adding_a_model.md") from None  # fmt: skip
 
 
 def build(name: str, *, module: str | None = None, **options: Any) -> GaussianModel:
@@ -117,7 +117,10 @@ def build(name: str, *, module: str | None = None, **options: Any) -> GaussianMo
     model = find(name, module)
     if inspect.isabstract(model):
         lacks = ", ".join(sorted(model.__abstractmethods__))
-        raise InputError(f"model '{name}': expected all methods that a model needs, {model.__name__} lacks {lacks}")
+        raise InputError(
+            f"model '{name}': expected all methods that a model needs, {model.__name__} lacks {lacks}",
+            docs="adding_a_model.md",
+        )
     # A constructor passes unknown options on to its base, so the options are those of all base classes.
     known: dict[str, inspect.Parameter] = {}
     for cls in (cls for cls in model.__mro__ if issubclass(cls, GaussianModel)):

@@ -27,7 +27,9 @@ def publish(folder: Path, to: Path) -> str:
             faults.append(f"{r.path}: its commit is {r.provenance.git_commit}, which does not reproduce it")
     if faults:
         more = f"; and {len(faults) - 3} more" if len(faults) > 3 else ""
-        raise InputError(f"{folder}: expected finished runs of clean commits, got {'; '.join(faults[:3])}{more}")
+        raise InputError(
+            f"{folder}: expected finished runs of clean commits, got {'; '.join(faults[:3])}{more}", docs="report.md"
+        )
     for path in files.find(folder):
         write_atomically(to / path.relative_to(folder), path.read_bytes())
     published, left_out = tables.load(to)

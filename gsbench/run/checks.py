@@ -220,7 +220,8 @@ def scene_folder(config: Config) -> Path:
     raise InputError(
         f"data.root={data.root}: expected a folder {' or '.join(map(repr, names))} with a scene, such "
         f"as transforms_{{train,val,test}}.json and the images they name, looked for {' and '.join(map(str, folders))}"
-        f"{published}"
+        f"{published}",
+        docs="data.md#what-is-read",
     )
 
 
@@ -260,7 +261,9 @@ def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
     """
     if ("time" in model.observes or config.agr) and not scene.has_time:
         what = "agr=true" if config.agr else config.model.name
-        raise InputError(f"{what}: expected a scene with times, {scene.name} has none: use 3dgs or 6dgs, agr=false")
+        raise InputError(
+            f"{what}: expected a scene with times, {scene.name} has none: use 3dgs or 6dgs, agr=false", docs="models.md"
+        )
     if not scene.extent > 0:
         raise InputError(f"{scene.name}: expected training cameras at different places, all are at one: sizes and "
                          f"rates are relative to the cameras' radius, which is 0")  # fmt: skip

@@ -29,7 +29,8 @@ def check_compare(config: Config) -> None:
         return
     if not is_auto(config):
         raise InputError(f"effects.compare=true: expected model=auto, whose candidates it compares, got "
-                         f"model={config.model.name}: leave effects.compare out, or use model=auto")  # fmt: skip
+                         f"model={config.model.name}: leave effects.compare out, or use model=auto",
+                         docs="effects.md#comparing-models-on-val")  # fmt: skip
     if config.scene.eval_split == "val":
         raise InputError("effects.compare=true: expected results on test, got scene.eval_split=val: results on the "
                          "views by which the model is chosen would be too high; name a model instead")  # fmt: skip
@@ -39,7 +40,8 @@ def check_candidates(config: Config, scene: Scene) -> None:
     """Raise InputError if a scene with times has no val views, or if it cannot train a candidate."""
     if not scene.val:
         raise InputError(f"effects.compare=true: expected views of val to compare models on, {scene.name} has none: "
-                         f"scene.val_every=8 takes every eighth training view")  # fmt: skip
+                         f"scene.val_every=8 takes every eighth training view",
+                         docs="effects.md#comparing-models-on-val")  # fmt: skip
     for name, settings in candidates(config).items():
         try:
             check_scene(build(settings), scene, settings)

@@ -85,7 +85,8 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     path = Path(folder) / checkpoint.FILE_NAME
     if not path.exists():
         raise InputError(f"{folder}: expected the folder of a run with a {checkpoint.FILE_NAME}, found none: "
-                         f"run it again, or name its folder, results/EXPERIMENT/SCENE/MODEL/seedK")  # fmt: skip
+                         f"run it again, or name its folder, results/EXPERIMENT/SCENE/MODEL/seedK",
+                         docs="runs.md#the-folder-of-a-run")  # fmt: skip
     found = checkpoint.read(path, device)
     config = typed_config(found.config, path)
     config.device, config.raster.backend = device, backend
@@ -181,7 +182,7 @@ def typed_config(plain: dict[str, Any], path: Path) -> Config:
     if module is not None and not is_registered(config.model.name):
         raise InputError(f"{path}: expected a model that is known, got '{config.model.name}' of the module "
                          f"{module!a:.80}, which a checkpoint cannot import: do it by --model-module, or `import` it "
-                         f"before load_run")  # fmt: skip
+                         f"before load_run", docs="adding_a_model.md")  # fmt: skip
     return config
 
 

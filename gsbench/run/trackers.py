@@ -137,7 +137,10 @@ def check(name: str | None) -> None:
     if name not in TRACKERS:
         raise InputError(f"log '{name}' is not known. {did_you_mean(name, TRACKERS)}")
     if importlib.util.find_spec(name) is None:
-        raise InputError(f"log={name}: the package {name} is not installed: pip install 'gsbench[{name}]'")
+        raise InputError(
+            f"log={name}: the package {name} is not installed: pip install 'gsbench[{name}]'",
+            docs="runs.md#the-folder-of-a-run",
+        )
 
 
 class Guarded:

@@ -39,7 +39,7 @@ _LAYOUTS = (
     ),
     _Layout(
         "sparse",
-        "images/*.png beside a COLMAP model in sparse/0 (your own capture: docs/data.md)",
+        "images/*.png beside a COLMAP model in sparse/0 (your own capture)",
         "captured",
     ),
 )
@@ -100,7 +100,7 @@ def load(
             return scene
     found = "a folder without it" if root.is_dir() else "no such folder"
     layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
-    raise InputError(f"{root}: {found}: looked for {layouts}")
+    raise InputError(f"{root}: {found}: looked for {layouts}", docs="data.md#what-is-read")
 
 
 def _frames(frames: object, layout: _Layout) -> tuple[int, int]:

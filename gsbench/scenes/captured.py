@@ -81,7 +81,7 @@ def _list_shots(root: Path, posed: colmap.ModelFile, lenses: dict[int, Lens]) ->
     listed = colmap.read_images(posed)
     if len(listed) < HELD_OUT:
         raise InputError(f"{posed.path}: expected at least {HELD_OUT} images, as one in {HELD_OUT} is a test view, "
-                         f"got {len(listed)}")  # fmt: skip
+                         f"got {len(listed)}", docs="data.md#your-own-capture")  # fmt: skip
     table = root / TIMES
     given = read_file(table, str(table), _MAX_TIMES) if os.path.lexists(table) else None
     times = _times_of_names(listed, posed.path) if given is None else _times_of_table(given, table, listed)
@@ -105,9 +105,12 @@ def _times_of_table(data: bytes, path: Path, listed: list[colmap.PosedImage]) ->
     try:
         rows = list(csv.reader(data.decode("utf-8-sig").splitlines(), strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: expected a table name,time: {error}") from None
+        raise InputError(f"{path}: expected a table name,time: {error}", docs="data.md#your-own-capture") from None
     if not rows or [word.strip() for word in rows[0]] != ["name", "time"]:
-        raise InputError(f"{path}: expected the first line name,time, got {','.join(rows[0] if rows else [])[:60]!a}")
+        raise InputError(
+            f"{path}: expected the first line name,time, got {','.join(rows[0] if rows else [])[:60]!a}",
+            docs="data.md#your-own-capture",
+        )
     table: dict[str, float] = {}
     for number, row in enumerate(rows[1:], 2):
         if len(row) != 2 or row[0] in table:
@@ -115,7 +118,10 @@ def _times_of_table(data: bytes, path: Path, listed: list[colmap.PosedImage]) ->
         table[row[0]] = _number(row[1], f"{path}: line {number}")
     missing = [image.name for image in listed if image.name not in table]
     if missing:
-        raise InputError(f"{path}: expected a time of each image of the model, got none of {missing[0][:80]!a}: add it")
+        raise InputError(
+            f"{path}: expected a time of each image of the model, got none of {missing[0][:80]!a}: add it",
+            docs="data.md#your-own-capture",
+        )
     return _scaled([table[image.name] for image in listed])
 
 
@@ -127,7 +133,7 @@ def _times_of_names(listed: list[colmap.PosedImage], source: Path) -> list[float
     for image, found in zip(listed, numbers, strict=True):
         if not found:
             raise InputError(f"{source}: image {image.name[:80]!a}: expected a number in its name, as others have: "
-                             f"rename it, or write {TIMES}")  # fmt: skip
+                             f"rename it, or write {TIMES}", docs="data.md#your-own-capture")  # fmt: skip
     return _scaled([_number(found[0], f"{source}: image {found[0][:40]}") for found in numbers])
 
 
@@ -194,7 +200,7 @@ def _check_size(size: tuple[int, int], expected: tuple[int, int], shot: _Shot) -
                          "use the images that COLMAP saw, and scene.downscale")  # fmt: skip
     if size != expected:
         raise InputError(f"{shot.where}: expected {expected[0]}x{expected[1]} as the first image, got "
-                         f"{size[0]}x{size[1]}: use images of one size")  # fmt: skip
+                         f"{size[0]}x{size[1]}: use images of one size", docs="data.md#your-own-capture")  # fmt: skip
 
 
 def _read_mask(shot: _Shot, path: Path, downscale: int) -> Tensor:  # [H, W] 8 bits

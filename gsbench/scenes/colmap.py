@@ -64,7 +64,9 @@ def read_part(folder: Path, part: str) -> ModelFile:
     for path in (folder / f"{part}.bin", folder / f"{part}.txt"):
         if path.exists():
             return ModelFile(path, read_file(path, str(path), _MAX_FILE))
-    raise InputError(f"{folder}: expected {part}.bin or {part}.txt of COLMAP, found neither")
+    raise InputError(
+        f"{folder}: expected {part}.bin or {part}.txt of COLMAP, found neither", docs="data.md#your-own-capture"
+    )
 
 
 def read_cameras(file: ModelFile) -> dict[int, Lens]:
@@ -142,7 +144,8 @@ def _known(model: str, where: str) -> str:
     """Return the name of a lens model; raise InputError if it is not read."""
     if model not in _PARAMETERS:
         raise InputError(f"{where}: expected a camera {', '.join(_PARAMETERS)}, got {model[:40]!a}: undo its "
-                         "distortion by `colmap image_undistorter`, which writes PINHOLE")  # fmt: skip
+                         "distortion by `colmap image_undistorter`, which writes PINHOLE",
+                         docs="data.md#your-own-capture")  # fmt: skip
     return model
 
 

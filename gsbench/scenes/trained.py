@@ -58,7 +58,8 @@ def read_trained(path: Path) -> TrainedGaussians:
     for name in (name for columns in _COLUMNS.values() for name in columns):
         if name not in names:
             raise InputError(f"{path}: expected trained Gaussians, x y z f_dc_0..2 opacity scale_0..2 rot_0..3 and "
-                             f"f_rest_*, found no '{name}': is it a cloud of points, or compressed?")  # fmt: skip
+                             f"f_rest_*, found no '{name}': is it a cloud of points, or compressed?",
+                             docs="viewing.md#start-from-a-ply")  # fmt: skip
     count = sum(name.startswith("f_rest_") for name in names)
     if count not in _FILE_DEGREES:
         expected = ", ".join(map(str, _FILE_DEGREES))

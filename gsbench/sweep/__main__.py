@@ -47,7 +47,10 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         if not options.experiment.is_dir():
-            raise InputError(f"{options.experiment}: expected the folder of an experiment, such as results/mini")
+            raise InputError(
+                f"{options.experiment}: expected the folder of an experiment, such as results/mini",
+                docs="runs.md#the-folder-of-a-run",
+            )
         if options.command == "retry":
             return _retry(options.experiment, options.launch)
         if options.command == "estimate":

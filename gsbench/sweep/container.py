@@ -80,7 +80,7 @@ def _write(config: DictConfig, runs: Sequence[Sequence[str]]) -> Path:
     image = Path(config.launch.container).absolute()
     if not image.exists():
         raise InputError(f"launch.container: expected an image, a file or folder that all nodes see, got '{image}', "
-                         "which does not exist: docs/install.md says how to build one")  # fmt: skip
+                         "which does not exist: build one", docs="install.md#in-a-container")  # fmt: skip
     binds = sorted(_binds(config, runs))
     for path in binds:
         if "," in path or ":" in path:

@@ -200,4 +200,7 @@ def whole_number(name: str, value: object, most: int) -> int:
 
 
 def _fault(path: Path, got: str) -> InputError:
-    return InputError(f"{path}: expected a checkpoint, got {got}; delete it, or start over with resume=false")
+    return InputError(
+        f"{path}: expected a checkpoint, got {got}; delete it, or start over with resume=false",
+        docs="runs.md#how-a-run-ends",
+    )

@@ -64,7 +64,10 @@ def drawn(seen: Gaussians3D) -> Tensor:
 def check_harmonics(model: GaussianModel, keep_harmonics: bool) -> None:
     """Raise InputError if colours shall stay spherical harmonics, but slices of the model depend on the viewpoint."""
     if keep_harmonics and not has_harmonics(model):
-        raise InputError(f"expected --camera I or --direction X,Y,Z: a slice of {type(model).__name__} depends on it")
+        raise InputError(
+            f"expected --camera I or --direction X,Y,Z: a slice of {type(model).__name__} depends on it",
+            docs="viewing.md#export",
+        )
 
 
 def decompose(factors: Tensor) -> tuple[Tensor, Tensor]:

@@ -32,7 +32,8 @@ def check_exactness(model: GaussianModel) -> None:
                          f"{means.device}: start the viewer with --device cpu")  # fmt: skip
     if not model.backend.serves(means):
         raise InputError("expected the CPU kernels, which have a float64 twin, but they are not built in this "
-                         "installation: reinstall with a C++20 compiler")  # fmt: skip
+                         "installation: reinstall with a C++20 compiler",
+                         docs="install.md#without-a-compiler")  # fmt: skip
 
 
 @torch.inference_mode()
