@@ -1,14 +1,14 @@
 """Place cameras around the Gaussians of a model."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from gsbench.models.base import GaussianModel
-from gsbench.scenes.scene import Camera
+from gsbench.scenes.scene import UP, Camera
 
-UP = (0.0, 0.0, 1.0)  # of Blender's layout: D-NeRF, 7DGS-PBR, the embedded scenes
 ELEVATION = math.radians(25)  # of an orbit above the horizon
 FIELD_OF_VIEW = 0.69  # radians, horizontal; D-NeRF's camera_angle_x
 
@@ -22,12 +22,11 @@ def middle(model: GaussianModel) -> Tensor:
     return means.gather(0, order.gather(0, half.clamp(max=len(means) - 1)))[0]
 
 
-def look_at(eye: Tensor, target: Tensor) -> Tensor:
-    """Return the viewmat [4, 4] of an upright camera at `eye` [3] that looks at `target` [3]."""
+def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
+    """Return the viewmat [4, 4] of an upright camera at `eye` [3] that looks at `target` [3]; `up` [3]: unit vector."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)
-    up = torch.tensor(UP).to(eye)
     if torch.linalg.cross(forward, up).norm() < 1e-3:  # straight up or down
-        up = up.roll(1)
+        up = _level(up)[0]
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat = torch.eye(4).to(eye)
@@ -44,8 +43,21 @@ def intrinsics(width: int, height: int) -> Tensor:
     return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
 
 
+def _level(up: Tensor) -> tuple[Tensor, Tensor]:
+    """Return two unit vectors [3] that form a right-handed basis with `up` [3]; for z they are x and y."""
+    axis = torch.eye(3)[min(range(3), key=up.abs().tolist().__getitem__)]  # the first of equal ones, unlike argmin
+    first = torch.nn.functional.normalize(axis - (axis @ up) * up, dim=0)
+    return first, torch.linalg.cross(up, first)
+
+
 def around(
-    model: GaussianModel, distance: float, width: int, height: int, azimuth: float, elevation: float = ELEVATION
+    model: GaussianModel,
+    distance: float,
+    width: int,
+    height: int,
+    azimuth: float,
+    elevation: float = ELEVATION,
+    up: Sequence[float] = UP,
 ) -> Camera:
     """Return a camera that looks at the middle of a model.
 
@@ -54,10 +66,12 @@ def around(
         distance: the distance of the camera from the middle, world units.
         width: the width of the image, pixels.
         height: the height of the image, pixels.
-        azimuth: the angle about the axis `UP`, radians.
+        azimuth: the angle about `up`, radians.
         elevation: the angle above the horizon, radians.
+        up: a unit vector in world space.
     """
-    flat = math.cos(elevation)
-    towards = torch.tensor([flat * math.sin(azimuth), -flat * math.cos(azimuth), math.sin(elevation)])
+    flat, axis = math.cos(elevation), torch.tensor(up, dtype=torch.float32)
+    basis = torch.stack([*_level(axis), axis])
+    towards = torch.tensor([flat * math.sin(azimuth), -flat * math.cos(azimuth), math.sin(elevation)]) @ basis
     target = middle(model)
-    return Camera(look_at(target + distance * towards, target), intrinsics(width, height), width, height)
+    return Camera(look_at(target + distance * towards, target, axis), intrinsics(width, height), width, height)

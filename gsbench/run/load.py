@@ -1,6 +1,7 @@
 """Load the model of a finished or interrupted run from its folder, and the scene on which it was trained."""
 
-from dataclasses import asdict, dataclass, replace
+import math
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from gsbench.models.registry import is_registered
 from gsbench.run.checks import PACKAGE, check_scene_names, check_values
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Scene
-from gsbench.scenes.scene import Points
+from gsbench.scenes.scene import UP, Points
 from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
 from gsbench.train.seeding import generator
@@ -27,7 +28,7 @@ LARGEST_EXTENT = 1e18  # world units: squares stay finite in single precision
 
 @dataclass(frozen=True)
 class SceneDescription:
-    """The properties of a scene that rendering needs: name, extent, background, whether it has time, image size."""
+    """The properties of a scene that rendering needs: name, extent, background, time, image size, up."""
 
     name: str
     fingerprint: str  # Scene.fingerprint of the data that the model was trained on
@@ -36,13 +37,14 @@ class SceneDescription:
     has_time: bool
     width: int  # of the first training view, pixels
     height: int
+    up: list[float] = field(default_factory=lambda: list(UP))  # Scene.up; older checkpoints have none
 
     @classmethod
     def of(cls, scene: Scene) -> "SceneDescription":
         """Return the description of a loaded scene."""
         camera = scene.train[0].camera
         return cls(scene.name, scene.fingerprint, scene.extent, list(scene.background), scene.has_time,
-                   camera.width, camera.height)  # fmt: skip
+                   camera.width, camera.height, list(scene.up))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ def own_root(root: str, where: Path) -> str:
 
 
 def _check_scene(scene: SceneDescription, path: Path) -> None:
-    """Raise InputError if a scene description has an invalid image size, extent or background."""
+    """Raise InputError if a scene description has an invalid image size, extent, background or up vector."""
     sizes = 0 < scene.width <= MOST_PIXELS and 0 < scene.height <= MOST_PIXELS
     if not sizes or not 0 < scene.extent < LARGEST_EXTENT:
         raise InputError(f"{path}: scene: expected 1 to {MOST_PIXELS} pixels a side and a positive extent, got "
@@ -152,6 +154,8 @@ def _check_scene(scene: SceneDescription, path: Path) -> None:
         raise InputError(
             f"{path}: scene: expected a background of three numbers in [0, 1], got {scene.background!r:.80}"
         )
+    if len(scene.up) != 3 or abs(math.hypot(*scene.up) - 1) > 1e-6:
+        raise InputError(f"{path}: scene: expected a unit vector up, got {scene.up!r:.80}")
 
 
 def plain_description(scene: Scene) -> dict[str, Any]:

@@ -39,7 +39,7 @@ _LAYOUTS = (
     ),
     _Layout(
         "sparse",
-        "images/*.png beside a COLMAP model in sparse/0 (your own capture)",
+        "images (PNG or JPEG) beside a COLMAP model in sparse/0 (your own capture)",
         "captured",
     ),
 )

@@ -228,13 +228,13 @@ def _read_views(
     """
     listed = [(split, frame) for split in splits.values() for frame in split.frames]
     first = listed[0][1]
-    data = images.read_png(first.path, first.where)
+    data = images.read_image(first.path, first.where)
     expected = images.png_size(data, first.where)
     in_8_bits = resize is None and images.stays_in_8_bits(data, expected, len(listed), downscale)
 
     def read(entry: tuple[_Split, _Frame]) -> tuple[View, str]:
         split, frame = entry
-        data = images.read_png(frame.path, frame.where)
+        data = images.read_image(frame.path, frame.where)
         _check_size(images.png_size(data, frame.where), expected, split, frame)
         decoded = images.decode_png(data, frame.where)
         is_kept = in_8_bits and decoded.dtype.name == "uint8"
@@ -267,7 +267,7 @@ def _read_mask(root: Path, frame: _Frame, size: tuple[int, int], downscale: int)
     assert frame.mask is not None
     where = f"{frame.mask} (the mask of {frame.name}; without a folder '{_MASKS}' a scene has no regions)"
     path = files.find_inside(root, frame.mask.relative_to(root).as_posix(), where)
-    return images.decode_regions(images.read_png(path, where), size, downscale, where)
+    return images.decode_regions(images.read_image(path, where), size, downscale, where)
 
 
 def _check_size(size: tuple[int, int], expected: tuple[int, int], split: _Split, frame: _Frame) -> None:

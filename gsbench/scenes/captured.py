@@ -16,11 +16,12 @@ from gsbench.errors import InputError
 from gsbench.reading import read_file
 from gsbench.scenes import colmap, files, images
 from gsbench.scenes.lens import Lens
-from gsbench.scenes.scene import Camera, Scene, View, hold_out, scene_extent
+from gsbench.scenes.scene import Camera, Scene, View, hold_out, scene_extent, up_of
 
 HELD_OUT = 8  # every eighth view in the order of time is a test view
 IMAGES, MASKS, TIMES = "images", "masks", "times.csv"
 _MAX_TIMES = 1 << 26  # bytes of times.csv
+_JPEG = (".jpg", ".jpeg")  # suffixes in lower case
 _LARGEST = 1e30  # the largest time, in any unit
 
 
@@ -40,8 +41,8 @@ class _Shot:
 def load(root: Path, *, downscale: int, background: tuple[float, float, float], resize: str | None = None) -> Scene:
     """Load a scene from images and a COLMAP model; see `gsbench.scenes.load` for the arguments.
 
-    - `images/` has a PNG for each image that the model registers. An image that the model names `x.jpg` is read from
-      `x.png`.
+    - `images/` has a PNG or a JPEG for each image that the model registers. For `x.jpg` of the model, `x.png` is read
+      if there is no `x.jpg`.
     - `sparse/0/`, or `sparse/`, has the model: cameras, images and points3D, as .bin or .txt. Its points are the
       initial points.
     - Times come from `times.csv` with the columns `name,time`, otherwise from the last number in each file name. They
@@ -64,15 +65,17 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
     digests |= digests_of_images
     digests |= {part.path.relative_to(root).as_posix(): files.digest(part.data) for part in (cameras, posed, points)}
     train, test = hold_out(views, HELD_OUT)
+    viewmats = torch.stack([view.camera.viewmat for view in train])
     return Scene(
         name=name,
         train=train,
         val=[],
         test=test,
         background=background,
-        extent=scene_extent(torch.stack([view.camera.viewmat for view in train])),
+        extent=scene_extent(viewmats),
         points=initial,
         fingerprint=files.fingerprint(digests),
+        up=up_of(viewmats),
     )
 
 
@@ -91,13 +94,22 @@ def _list_shots(root: Path, posed: colmap.ModelFile, lenses: dict[int, Lens]) ->
         if image.camera not in lenses:
             raise InputError(f"{where}: expected a camera of the model, got number {image.camera}")
         name = PurePosixPath(image.name).with_suffix(".png") if PurePosixPath(image.name).name else ""
-        path = files.find_inside(root, f"{IMAGES}/{name}", where)
+        path = _find_image(root, image.name, str(name), where)
         mask = files.find_inside(root, f"{MASKS}/{name}", where) if (root / MASKS).is_dir() else None
         viewmat = torch.from_numpy(image.viewmat.astype(np.float32))
-        named_by = f"{path} (named {image.name[:80]!a} in {posed.path.name}; JPEG: convert it to PNG)"
+        named_by = f"{path} (named {image.name[:80]!a} in {posed.path.name})"
         shots.append(_Shot(path, mask, str(name).removesuffix(".png"), named_by, time, viewmat, lenses[image.camera]))
     digests = {} if given is None else {TIMES: files.digest(given)}
     return sorted(shots, key=lambda shot: (shot.time or 0.0, shot.name)), digests
+
+
+def _find_image(root: Path, name: str, as_png: str, where: str) -> Path:
+    """Return the path of an image: that of the JPEG which the model names, if it is there, otherwise that of a PNG."""
+    if PurePosixPath(name).suffix.lower() in _JPEG:
+        path = files.find_inside(root, f"{IMAGES}/{name}", where)
+        if path.is_file():
+            return path
+    return files.find_inside(root, f"{IMAGES}/{as_png}", where)
 
 
 def _times_of_table(data: bytes, path: Path, listed: list[colmap.PosedImage]) -> list[float | None]:
@@ -159,14 +171,14 @@ def _read_views(
 ) -> tuple[list[View], dict[str, str]]:
     """Read and undistort all images by several threads; return their views, and the SHA-256 of each file by name."""
     first = shots[0]
-    data = images.read_png(first.path, first.where)
-    size = images.png_size(data, first.where)
+    data = images.read_image(first.path, first.where)
+    size = images.photo_size(data, first.where)
     in_8_bits = resize is None and images.stays_in_8_bits(data, size, len(shots), downscale)
 
     def read(shot: _Shot) -> tuple[View, str]:
-        data = images.read_png(shot.path, shot.where)
-        _check_size(images.png_size(data, shot.where), size, shot)
-        decoded = images.decode_png(data, shot.where)
+        data = images.read_image(shot.path, shot.where)
+        _check_size(images.photo_size(data, shot.where), size, shot)
+        decoded = images.decode_photo(data, shot.where)
         if decoded.shape[2] == 4 and any(shot.lens.distortion):
             raise InputError(f"{shot.where}: expected an image without alpha, as its camera has distortion: undo it by "
                              "`colmap image_undistorter`")  # fmt: skip
@@ -206,6 +218,6 @@ def _check_size(size: tuple[int, int], expected: tuple[int, int], shot: _Shot) -
 def _read_mask(shot: _Shot, path: Path, downscale: int) -> Tensor:  # [H, W] 8 bits
     """Read and undistort the mask of an image: a PNG with the number of the object in each pixel."""
     where = f"{path} (the mask of {shot.name}; without a folder '{MASKS}' a scene has no regions)"
-    whole = images.decode_regions(images.read_png(path, where), (shot.lens.width, shot.lens.height), 1, where).numpy()
+    whole = images.decode_regions(images.read_image(path, where), (shot.lens.width, shot.lens.height), 1, where).numpy()
     plain = shot.lens.undistort(whole, where, cv2.INTER_NEAREST)
     return torch.from_numpy(plain[downscale // 2 :: downscale, downscale // 2 :: downscale].copy())

@@ -1,5 +1,6 @@
-"""Read PNG images: check the file, decode it with OpenCV, composite it over the background, and reduce its size."""
+"""Read PNG and JPEG images: check the file, decode it, composite it over the background, and reduce its size."""
 
+import io
 import os
 import struct
 import zlib
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, one_line
 from gsbench.process.memory import available, require
 from gsbench.reading import read_file
 
@@ -23,7 +24,7 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 class DamagedError(InputError):
-    """The bytes of a file are not those of a whole PNG."""
+    """The bytes of a file are not those of a whole image."""
 
 
 class Kind(NamedTuple):
@@ -42,6 +43,7 @@ _DECODING = 64  # bytes per pixel while an image is decoded and composited; meas
 _MOST_FLOATS = 1 << 29
 _MAX_FILE = 1 << 30  # bytes; the largest accepted image has 2^29 bytes before compression
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8\xff"
 _MAX_PIXELS = 2**26  # a PNG of a few kilobytes can claim gigabytes of pixels; no data set has more than 8192 x 8192
 
 
@@ -55,12 +57,29 @@ def quiet_opencv() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(before)
 
 
-def read_png(
+def read_image(
     path: Path,
     where: str,  # the path, and the file and field that name it, for the message
 ) -> bytes:
-    """Return the bytes of a PNG file; raise InputError if the file is missing, too large or not a regular file."""
+    """Return the bytes of an image file; raise InputError if the file is missing, too large or not a regular file."""
     return read_file(path, where, _MAX_FILE)
+
+
+def photo_size(
+    data: bytes,
+    where: str,  # the file's path, for the message
+) -> tuple[int, int]:
+    """Return the width and height of a PNG, which is checked as by `png_size`, or of a JPEG, whose header is.
+
+    Raises:
+        InputError: the data is neither, has zero or too many pixels, or colours that are not RGB or RGBA.
+    """
+    if not data.startswith(_JPEG):
+        return png_size(data, where)
+    with _jpeg(data, where) as image:
+        if image.mode != "RGB":
+            raise InputError(f"{where}: expected a JPEG of RGB, got one of {image.mode}: convert it")
+        return _check_size(*image.size, where)
 
 
 def png_size(
@@ -95,7 +114,7 @@ def png_size(
 
 
 def stays_in_8_bits(
-    data: bytes,  # of the first PNG of a scene, which was checked
+    data: bytes,  # of the first image of a scene, which was checked
     size: tuple[int, int],  # width and height of every image
     count: int,
     downscale: int,
@@ -104,7 +123,8 @@ def stays_in_8_bits(
 
     This is so for a large scene of 8-bit images that are not reduced.
     """
-    return downscale == 1 and data[_DEPTH_AT] == 8 and 12 * count * size[0] * size[1] > _MOST_FLOATS
+    is_8_bits = data.startswith(_JPEG) or data[_DEPTH_AT] == 8
+    return downscale == 1 and is_8_bits and 12 * count * size[0] * size[1] > _MOST_FLOATS
 
 
 def count_readers(
@@ -126,6 +146,22 @@ def count_readers(
     free = available()
     threads = os.cpu_count() or 1
     return threads if free is None else max(1, min(threads, (free - all_kept) // decoding))
+
+
+def decode_photo(
+    data: bytes,
+    where: str,  # the file's path, for the message
+) -> Pixels:  # [H, W, 3|4] RGB or RGBA, as stored: straight alpha
+    """Decode a PNG as `decode_png` does, or a JPEG to RGB; its EXIF orientation is ignored, as COLMAP ignores it.
+
+    Raises:
+        InputError: the data is neither, is damaged or truncated, has no pixels, or is neither RGB nor RGBA.
+    """
+    if not data.startswith(_JPEG):
+        return decode_png(data, where)
+    photo_size(data, where)
+    with _jpeg(data, where) as image:  # Pillow, because OpenCV fills the missing rows of a truncated JPEG with grey
+        return np.array(image)
 
 
 def decode_png(
@@ -227,6 +263,18 @@ def _composite_8_bits(
     return composited
 
 
+@contextmanager
+def _jpeg(data: bytes, where: str) -> Iterator[Image.Image]:
+    """Open a JPEG within a `with` block; what Pillow raises there is raised as InputError."""
+    try:
+        with Image.open(io.BytesIO(data), formats=("JPEG",)) as image:
+            yield image
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # Pillow raises many types of exceptions for damaged files
+        raise DamagedError(f"{where}: damaged JPEG ({one_line(error)[:80]}): copy it again") from None
+
+
 def _decode(data: bytes, where: str) -> NDArray[Any]:
     """Decode a checked PNG with OpenCV; raise InputError if OpenCV fails."""
     try:
@@ -243,12 +291,18 @@ def _decode(data: bytes, where: str) -> NDArray[Any]:
 def _check_header(header: bytes, where: str, kind: Kind) -> tuple[int, int]:
     """Check the header chunk IHDR of a PNG and return width and height (PNG specification, section 11.2.2)."""
     width, height, depth, color, compression, filtering, interlacing = struct.unpack(">IIBBBBB", header)
-    if width == 0 or height == 0:
-        raise InputError(f"{where}: expected an image with pixels, its size is {width}x{height}: render it again")
-    if width * height > _MAX_PIXELS:
-        raise InputError(f"{where}: expected at most {_MAX_PIXELS} pixels, its size is {width}x{height}: resize it")
+    _check_size(width, height, where)
     if depth not in kind.depths.get(color, ()):
         raise InputError(f"{where}: expected {kind.words}, got PNG's colour type {color} of {depth} bits")
     if compression or filtering or interlacing > 1:
         raise DamagedError(f"{where}: damaged PNG, its compression, filter or interlacing is unknown: copy it again")
+    return width, height
+
+
+def _check_size(width: int, height: int, where: str) -> tuple[int, int]:
+    """Return the size of an image; raise InputError if it has no or too many pixels."""
+    if width == 0 or height == 0:
+        raise InputError(f"{where}: expected an image with pixels, its size is {width}x{height}: render it again")
+    if width * height > _MAX_PIXELS:
+        raise InputError(f"{where}: expected at most {_MAX_PIXELS} pixels, its size is {width}x{height}: resize it")
     return width, height

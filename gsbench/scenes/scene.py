@@ -7,6 +7,9 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 
+UP = (0.0, 0.0, 1.0)  # in Blender's layout: D-NeRF, 7DGS-PBR, the embedded scenes
+_LEAN = 0.01  # weight of the mean up vector against cameras without roll: decides where these leave a choice
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -92,6 +95,7 @@ class Scene:
     points: Points | None  # None: the data set has no points
     fingerprint: str  # SHA-256 of the files, by which record.json identifies the data
     repaired: tuple[str, ...] = ()  # names of damaged images that were replaced by the frame before
+    up: tuple[float, float, float] = UP  # unit vector; orbits and the viewer turn about it, training does not read it
 
     @property
     def has_time(self) -> bool:
@@ -149,3 +153,22 @@ def scene_extent(
     rotations, translations = viewmats[:, :3, :3].double(), viewmats[:, :3, 3].double()
     centers = -torch.einsum("cji,cj->ci", rotations, translations)
     return 1.1 * float((centers - centers.mean(dim=0)).norm(dim=1).max())
+
+
+def up_of(
+    viewmats: Tensor,  # [C, 4, 4] the training cameras
+) -> tuple[float, float, float]:
+    """Estimate which way is up from the cameras, for data whose world axes are arbitrary, as COLMAP's are.
+
+    The mean of the cameras' up vectors leans towards the scene if the cameras look down and stand on one side of it.
+    Cameras without roll have level x axes r_i, so the result is the unit vector u along (mean r_i r_i^T + w I)^-1 m,
+    where m is the mean up vector and w is small: level to all r_i, and in the plane that they leave free along m.
+    """
+    rotations = viewmats[:, :3, :3].double()
+    right, mean_up = rotations[:, 0], -rotations[:, 1].mean(0)
+    spread = right.T @ right / len(right) + _LEAN * torch.eye(3, dtype=torch.float64)
+    if float(mean_up.norm()) < _LEAN:  # the cameras stand every way
+        return UP
+    up = torch.linalg.solve(spread, mean_up)
+    x, y, z = (up / up.norm()).tolist()
+    return x, y, z

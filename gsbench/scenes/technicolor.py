@@ -14,7 +14,7 @@ from gsbench.errors import InputError
 from gsbench.reading import read_file
 from gsbench.scenes import colmap, files, images
 from gsbench.scenes.points import read_ply
-from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent
+from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent, up_of
 
 CAMERAS = "cameras_parameters.txt"
 COLUMNS = ("f", "cu", "cv", "ar", "sk", "qw", "qx", "qy", "qz", "tx", "ty", "tz")  # intrinsics, rotation, translation
@@ -78,16 +78,18 @@ def load(
     digests[CAMERAS] = files.digest(text)
     train = [view for image, view in zip(listed, views, strict=True) if image.camera != TEST_CAMERA]
     test = [view for image, view in zip(listed, views, strict=True) if image.camera == TEST_CAMERA]
+    viewmats = torch.stack([view.camera.viewmat for view in train])
     return Scene(
         name=root.name,
         train=train,
         val=[],
         test=test,
         background=background,
-        extent=scene_extent(torch.stack([view.camera.viewmat for view in train])),
+        extent=scene_extent(viewmats),
         points=_points(root),
         fingerprint=files.fingerprint(digests),
         repaired=tuple(image.path.stem for image in replaced),
+        up=up_of(viewmats),
     )
 
 
@@ -199,16 +201,16 @@ def _read_views(
     """
     first, last = listed[0].frame, listed[-1].frame
     where = str(listed[0].path)
-    size = images.png_size(images.read_png(listed[0].path, where), where)
+    size = images.png_size(images.read_image(listed[0].path, where), where)
     cameras = [_camera(row, size[0] // downscale, size[1] // downscale, downscale) for row in rows]
 
     def read(image: _Image) -> tuple[View, str]:
         where = str(image.path)
-        data = images.read_png(image.path, where)
+        data = images.read_image(image.path, where)
         if image in replaced:
             _check_damaged(data, image)
             before = replaced[image].path
-            decoded = _decode(images.read_png(before, str(before)), before, size)
+            decoded = _decode(images.read_image(before, str(before)), before, size)
         else:
             decoded = _decode_or_advise(data, image, size)
         is_kept = downscale == 1 and decoded.dtype.name == "uint8"

@@ -26,11 +26,11 @@ def around(run: LoadedRun, azimuth: float, elevation: float) -> Camera:
 
     Args:
         run: the run of the model.
-        azimuth: the angle about the axis `UP`, radians.
+        azimuth: the angle about the up direction of the scene, radians.
         elevation: the angle above the horizon, radians.
     """
     size = run.scene.width, run.scene.height
-    return cameras.around(run.model, run.scene.extent, *size, azimuth, elevation)
+    return cameras.around(run.model, run.scene.extent, *size, azimuth, elevation, run.scene.up)
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:

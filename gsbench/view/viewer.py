@@ -65,11 +65,12 @@ class Viewer:
     def _stand(self, run: LoadedRun) -> None:
         """Place the first camera of every browser at the start of an orbit around the model."""
         camera = paths.around(run, 0.0, cameras.ELEVATION)
-        self.server.scene.set_up_direction(cameras.UP)
+        up = np.array(run.scene.up)
+        self.server.scene.set_up_direction(up)
         start = self.server.initial_camera
         start.position = camera.center.double().numpy()
         start.look_at = cameras.middle(run.model).double().numpy()
-        start.up = np.array(cameras.UP)
+        start.up = up
         start.fov = 2 * float(np.arctan(camera.height / 2 / float(camera.K[1, 1])))
 
     def _in_turn(self, callback: Callable[[viser.ClientHandle], None]) -> Callable[[viser.ClientHandle], Any]:

@@ -256,6 +256,7 @@ def test_a_config_and_a_scene_of_the_wrong_type_are_refused(folder: Path, tmp_pa
     found = checkpoint.read(folder / checkpoint.FILE_NAME)
     for config, scene in (({}, found.scene), (found.config, {}), ({**found.config, "seed": "x"}, found.scene),
                           ({**found.config, "train": 3}, found.scene), (found.config, {**found.scene, "extent": "x"}),
+                          (found.config, {**found.scene, "up": [0.0, 0.0, 0.0]}),
                           ({**found.config, "model": {"name": "nosuch"}}, found.scene)):  # fmt: skip
         checkpoint.save(tmp_path / checkpoint.FILE_NAME, Checkpoint("t", "d", found.state, config, scene))
         with pytest.raises(InputError):

@@ -6,19 +6,23 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from capture import COLOR, Capture, circle, write_image
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from tiny_run import main_here
 
 from gsbench import scenes
 from gsbench.errors import InputError
 from gsbench.measure import record
-from gsbench.scenes import colmap
+from gsbench.run.load import SceneDescription
+from gsbench.scenes import colmap, images
 from gsbench.scenes.sample import folder
+from gsbench.scenes.scene import up_of
 
 WIDTH, HEIGHT, COUNT = 16, 12, 9
 NAMES = [f"frame_{i:03d}.png" for i in range(COUNT)]
@@ -166,6 +170,135 @@ def test_times_of_names(own: Path) -> None:
     scene = scenes.load(own)
     assert [view.time for view in scene.train] == [i / 8 for i in (0, 1, 2, 3, 4, 5, 6, 8)]
     assert [view.name for view in scene.test] == ["cam9/take2_90"]
+
+
+JPEG = ["jpg", "jpeg", "JPG", "JPEG"]
+
+
+def write_jpegs(own: Path) -> list[str]:
+    """Write the images of a capture as JPEGs of every suffix, beside PNGs of another picture; return their names."""
+    names = [f"frame_{i:03d}.{JPEG[i % len(JPEG)]}" for i in range(COUNT)]
+    across, down = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    for i, name in enumerate(names):
+        write_image(own / "images" / name, np.stack([10 * across, 20 * down, 0 * down + 20 * i], -1).astype(np.uint8))
+    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, circle(COUNT)).write(own, "txt")
+    return names
+
+
+def test_jpegs_are_read(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a suffix that is not known, blue in place of red, the PNG of that name, and a scene kept in 8 bits."""
+    write_jpegs(own)
+    for most in (images._MOST_FLOATS, 0):  # as floats, and in 8 bits
+        monkeypatch.setattr(images, "_MOST_FLOATS", most)
+        scene = scenes.load(own)
+        assert len(scene.train) + len(scene.test) == COUNT
+        for view in (*scene.train, *scene.test):
+            red, green, blue = (view.image * 255).unbind(-1)
+            error = [
+                (red - 10 * torch.arange(WIDTH)).abs(),
+                (green - 20 * torch.arange(HEIGHT)[:, None]).abs(),
+                (blue - 20 * int(view.name[-3:])).abs(),
+            ]
+            assert torch.stack(error).mean() < 6  # JPEG halves the resolution of colours; measured: 3.3
+        assert [view.name for view in scene.test] == ["frame_007"]
+    scene = scenes.load(own, downscale=2)
+    assert scene.train[0].image.shape == (HEIGHT // 2, WIDTH // 2, 3)
+
+
+def grey(own: Path, name: str) -> None:
+    write_image(own / "images" / name, np.zeros((HEIGHT, WIDTH), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("break_it", "said"),
+    [
+        (
+            lambda own, name: os.truncate(path := own / "images" / name, path.stat().st_size - 40),
+            "damaged JPEG.*truncated",
+        ),
+        (lambda own, name: os.truncate(own / "images" / name, 20), "frame_001.jpeg.*damaged JPEG"),
+        (lambda own, name: (own / "images" / name).write_bytes(b"GIF89a"), "frame_001.jpeg.*expected a PNG"),
+        (grey, "expected a JPEG of RGB, got one of L"),
+        (
+            lambda own, name: write_image(own / "images" / name, np.zeros((9, 9, 3), np.uint8)),
+            "expected 16x12 as its camera in COLMAP, got 9x9",
+        ),
+        (
+            lambda own, name: [(own / "images" / name).unlink(), (own / "images" / name).symlink_to("/etc/passwd")],
+            "expected a path inside",
+        ),
+    ],
+)
+def test_a_jpeg_that_is_not_whole_is_refused(own: Path, break_it: Callable[[Path, str], object], said: str) -> None:
+    """Catches missing rows that are read as grey, and a stack trace of the decoder."""
+    names = write_jpegs(own)
+    break_it(own, names[1])
+    with pytest.raises(InputError, match=said) as caught:
+        scenes.load(own)
+    assert "\n" not in str(caught.value)
+
+
+@given(at=st.integers(0, 10_000), value=st.binary(min_size=1, max_size=8))
+def test_changed_bytes_of_a_jpeg_are_an_input_error_or_an_image(at: int, value: bytes) -> None:
+    """Catches any other exception of the decoder, and an image of another shape than its header says."""
+    data = bytearray(cv2.imencode(".jpg", np.arange(WIDTH * HEIGHT * 3, dtype=np.uint8).reshape(HEIGHT, WIDTH, 3))[1])
+    start = 3 + at % (len(data) - 3)
+    data[start : start + len(value)] = value[: len(data) - start]
+    try:
+        size = images.photo_size(bytes(data), "x.jpg")
+        assert images.decode_photo(bytes(data), "x.jpg").shape == (size[1], size[0], 3)
+    except InputError:
+        return
+
+
+def arc(degrees: float, pitch: float, roll: float = 0.0, count: int = 24) -> np.ndarray:  # [count, 4, 4]
+    """Cameras on an arc around the z axis that look down by `pitch` degrees; `roll`: their deviation, in degrees."""
+    yaw, rolls = np.linspace(0, degrees, count), roll * np.random.default_rng(0).standard_normal(count)
+    level = Rotation.from_euler("x", -90, degrees=True)  # x right, z down to x right, z forward along y
+    stand = Rotation.from_euler("zxz", np.stack([-yaw, 0 * yaw, 0 * yaw], 1), degrees=True)
+    look = Rotation.from_euler("zx", np.stack([rolls, pitch + 0 * yaw], 1), degrees=True)
+    viewmats = np.tile(np.eye(4), (count, 1, 1))
+    viewmats[:, :3, :3] = (look * level.inv() * stand).as_matrix()
+    viewmats[:, 2, 3] = 4
+    return viewmats
+
+
+def lean(up: tuple[float, float, float], true: np.ndarray) -> float:
+    """The angle between two unit vectors, in degrees."""
+    return float(np.degrees(np.arccos(np.clip(np.dot(up, true), -1, 1))))
+
+
+def test_up_turns_with_the_world(tmp_path: Path, blender: scenes.Scene) -> None:
+    """Catches z taken for up in a world whose axes are arbitrary, and down for up."""
+    views = write_embedded(tmp_path / "own", blender, "bin")
+    K, plain = views[0].camera.K, torch.stack([view.camera.viewmat for view in views]).double().numpy()
+    assert lean(scenes.load(tmp_path / "own").up, np.array([0, 0, 1])) < 1
+    for seed in range(3):
+        turn = Rotation.random(random_state=seed).as_matrix()
+        turned = plain.copy()
+        turned[:, :3, :3] = plain[:, :3, :3] @ turn.T
+        names, size = [f"shot {i}.png" for i in range(len(views))], (160, 160)
+        lens = tuple(float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        Capture("PINHOLE", *size, lens, names, turned).write(tmp_path / "own", "bin")
+        scene = scenes.load(tmp_path / "own")
+        assert lean(scene.up, turn @ [0, 0, 1]) < 1
+        assert SceneDescription.of(scene).up == list(scene.up)  # which a checkpoint keeps
+
+
+@pytest.mark.parametrize(
+    ("degrees", "pitch", "roll", "most"),
+    [(360, 30, 0, 0.1), (120, 30, 0, 1), (60, 40, 0, 6), (120, 30, 2, 2), (360, 30, 5, 4), (0, 0, 0, 0.1)],
+)
+def test_up_is_level_to_the_cameras(degrees: float, pitch: float, roll: float, most: float) -> None:
+    """Catches the mean of up vectors, which leans by 25 degrees on an arc of 120 from which cameras look down."""
+    assert lean(up_of(torch.from_numpy(arc(degrees, pitch, roll))), np.array([0, 0, 1])) < most
+
+
+def test_cameras_that_stand_every_way_have_no_up() -> None:
+    """Catches a division by the length of a zero vector."""
+    viewmats = arc(360, 0)
+    viewmats[::2, :2] *= -1
+    assert up_of(torch.from_numpy(viewmats)) == (0, 0, 1)
 
 
 def test_names_without_numbers_have_no_times(own: Path) -> None:

@@ -1,6 +1,7 @@
 """The command `python -m gsbench.export`: what it writes, and everything that can be asked wrong."""
 
 import json
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -130,14 +131,19 @@ def test_another_size_shows_the_same(folder: Path) -> None:
     assert (plain - blocks).abs().mean() < 0.02
 
 
-def test_an_orbit_looks_at_the_model(folder: Path) -> None:
-    """Catches cameras that look away, stand on their heads or are left-handed."""
+@pytest.mark.parametrize("up", [cameras.UP, (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.6, 0.0, -0.8)])
+def test_an_orbit_looks_at_the_model(folder: Path, up: tuple[float, float, float]) -> None:
+    """Catches cameras that look away, stand on their heads, are left-handed or turn about another axis."""
     run = load_run(folder)
+    run = replace(run, scene=replace(run.scene, up=list(up)))
+    for camera in paths.orbit(run, 5):
+        height = (camera.center - cameras.middle(run.model)) @ torch.tensor(up)
+        assert float(height) == pytest.approx(run.scene.extent * math.sin(cameras.ELEVATION), rel=1e-4)
     for camera in (*paths.orbit(run, 5), *paths.spiral(run, 5), paths.around(run, 0.0, 1.5707963)):
         rotation = camera.viewmat[:3, :3]
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
         assert torch.linalg.det(rotation) > 0
-        assert rotation[1] @ torch.tensor(cameras.UP) < 1e-3  # y points down
+        assert rotation[1] @ torch.tensor(up) < 1e-3  # y points down
         center = camera.viewmat[:3, :3] @ cameras.middle(run.model) + camera.viewmat[:3, 3]
         torch.testing.assert_close(center, torch.tensor([0, 0, run.scene.extent]), atol=1e-3, rtol=1e-3)
 
