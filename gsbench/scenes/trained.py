@@ -5,6 +5,8 @@ logit, and the rotation is a quaternion wxyz. The columns `f_rest_*` are the SH 
 of the red channel, then green, then blue.
 """
 
+import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.headers import ALPHA_MAX
 from gsbench.process.memory import require
 from gsbench.scenes.ply import read_vertices
 
@@ -28,6 +31,7 @@ _COLUMNS = {
 }
 PLY_ROW = 4 * (17 + 3 * ((MAX_DEGREE + 1) ** 2 - 1))  # bytes of a Gaussian in a file of `ply_of`
 _LARGEST = 1e30  # largest accepted number; its square in double and its sums in single precision are finite
+_LARGEST_LOGIT = math.log(ALPHA_MAX / (1 - ALPHA_MAX))
 _VALUE = 40  # bytes that a number of a Gaussian needs while it is read: in the file, in double and in single precision
 
 
@@ -50,8 +54,11 @@ class TrainedGaussians:
 def read_trained(path: Path) -> TrainedGaussians:
     """Read trained 3D Gaussians from an ascii or binary PLY file of 3DGS with SH degree 0 to 4.
 
+    An opacity of exactly 0 or 1, which converters of compressed files write as an infinite logit, becomes 0.001 or
+    0.999, the largest alpha that is blended; a line on stderr says how many.
+
     Raises:
-        InputError: the file is not such a PLY, lacks a column, or has a value that is not finite.
+        InputError: the file is not such a PLY, lacks a column, or has another value that is not finite.
     """
     vertices = read_vertices(path)
     names = vertices.dtype.names or ()
@@ -68,6 +75,7 @@ def read_trained(path: Path) -> TrainedGaussians:
     if missing := [name for name in rest if name not in names]:
         raise InputError(f"{path}: f_rest_*: expected the numbers 0 to {count - 1}, found no '{missing[0]}'")
     require(_VALUE * len(vertices) * (14 + count), f"{path}: {len(vertices)} Gaussians", "use a smaller file")
+    vertices = _with_finite_logits(vertices, path)
     read = {name: _table(vertices, columns, path) for name, columns in _COLUMNS.items()}
     if not (read["quats"].square().sum(1) > 0).all():
         raise InputError(f"{path}: rot_0..3: expected quaternions, some are zero")
@@ -100,11 +108,23 @@ def ply_of(trained: TrainedGaussians) -> bytes:
     return "\n".join(header).encode() + torch.cat(parts, 1).numpy().astype("<f4").tobytes()
 
 
+def _with_finite_logits(vertices: NDArray[np.void], path: Path) -> NDArray[np.void]:
+    """Return vertices with the logits of opacities 0.001 and 0.999 in place of infinite ones; say how many those were."""
+    infinite = np.isinf(vertices["opacity"])
+    if infinite.any():
+        vertices = vertices.copy()  # of a file, which is read only
+        vertices["opacity"][infinite] = np.copysign(_LARGEST_LOGIT, vertices["opacity"][infinite])
+        print(f"{path}: {int(infinite.sum())} of {len(vertices)} opacities are exactly 0 or 1, taken for "
+              f"{1 - ALPHA_MAX:.3f} or {ALPHA_MAX:.3f}", file=sys.stderr)  # fmt: skip
+    return vertices
+
+
 def _table(vertices: NDArray[np.void], names: tuple[str, ...], path: Path) -> Tensor:
     """Return some properties of PLY vertices as [N, len(names)] float32; raise InputError if a value is not finite."""
     table = np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
-    if not (np.abs(table) <= _LARGEST).all():
-        wrong = int((~(np.abs(table) <= _LARGEST)).any(axis=1).sum())
-        raise InputError(f"{path}: {names[0]}..{names[-1]}: expected finite numbers, {wrong} Gaussians have others: "
-                         f"remove them")  # fmt: skip
+    bad = ~(np.abs(table) <= _LARGEST)
+    if bad.any():
+        named = ", ".join(name for name, column in zip(names, bad.T, strict=True) if column.any())
+        raise InputError(f"{path}: {named:.80}: expected finite numbers, {int(bad.any(axis=1).sum())} of {len(bad)} "
+                         f"Gaussians have others: remove them")  # fmt: skip
     return torch.from_numpy(table.astype(np.float32))

@@ -9,6 +9,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from gsbench.errors import InputError
+from gsbench.kernels.headers import ALPHA_MAX
 from gsbench.scenes.trained import TrainedGaussians, ply_of, read_trained
 
 N = 5
@@ -81,6 +82,19 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert PlyData.read(io.BytesIO(ply_of(trained)))["vertex"].count == N
 
 
+@pytest.mark.parametrize("text", [True, False])
+def test_an_opacity_of_exactly_0_or_1_is_read(text: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a PLY that was compressed and converted back, refused for its infinite logits, and a change unsaid."""
+    rows = np.ones(N, [(name, "f4") for name in columns(0)])
+    rows["opacity"] = [np.inf, 3, -np.inf, np.inf, 20]
+    PlyData([PlyElement.describe(rows, "vertex")], text=text).write(str(tmp_path / "a.ply"))
+    opacities = torch.sigmoid(read_trained(tmp_path / "a.ply").logits.double())
+    expected = torch.sigmoid(torch.tensor([0, 3, 0, 0, 20], dtype=torch.float64))
+    expected[[0, 2, 3]] = torch.tensor([ALPHA_MAX, 1 - ALPHA_MAX, ALPHA_MAX], dtype=torch.float64)
+    torch.testing.assert_close(opacities, expected, rtol=0, atol=1e-7)
+    assert "a.ply: 3 of 5 opacities are exactly 0 or 1" in capsys.readouterr().err
+
+
 def spoilt(name: str, value: float) -> np.ndarray:
     """A file's rows with one value that is not to be used."""
     rows = np.ones(N, [(name, "f4") for name in columns(0)])
@@ -96,9 +110,9 @@ def spoilt(name: str, value: float) -> np.ndarray:
         (np.ones(N, [(name, "f4") for name in "xyz"]), "cloud of points"),
         (np.ones(N, [(name, "f4") for name in columns(1)[:-1] if name != "f_rest_3"]), "f_rest"),
         (np.ones(N, [(name.replace("rest_3", "rest_33"), "f4") for name in columns(1)]), "'f_rest_3'"),
-        (spoilt("x", np.nan), "finite"),
-        (spoilt("scale_1", -np.inf), "1 Gaussians"),
-        (spoilt("opacity", np.inf), "opacity"),
+        (spoilt("x", np.nan), r"a\.ply: x: expected finite numbers, 1 of 5 Gaussians"),
+        (spoilt("scale_1", -np.inf), "scale_1: expected finite numbers, 1 of 5"),
+        (spoilt("opacity", np.nan), "opacity: expected finite numbers, 1 of 5"),
         (np.zeros(N, [(name, "f4") for name in columns(0)]), "quaternions"),
     ],
 )

@@ -10,7 +10,7 @@ from plyfile import PlyData
 
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query
-from gsbench.models.cameras import intrinsics, look_at
+from gsbench.models.cameras import UP, intrinsics, look_at
 from gsbench.models.render import render
 from gsbench.raster import rasterize
 from gsbench.scenes import Camera
@@ -26,7 +26,9 @@ COLUMNS = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_
 
 def camera(x: float, y: float, z: float) -> Camera:
     """A camera there that looks at the origin."""
-    return Camera(look_at(torch.tensor([x, y, z]), torch.zeros(3)), intrinsics(SIZE, SIZE), SIZE, SIZE)
+    return Camera(
+        look_at(torch.tensor([x, y, z]), torch.zeros(3), torch.tensor(UP)), intrinsics(SIZE, SIZE), SIZE, SIZE
+    )
 
 
 def trained(variant: str) -> GaussianModel:

@@ -22,7 +22,12 @@ EXTENT = 4.0
 def camera(x: float, *, towards: float = 0.0) -> Camera:
     """At x on a line, looking along y and as far aside."""
     eye = torch.tensor([x, -5.0, 0.0])
-    return Camera(cameras.look_at(eye, eye + torch.tensor([towards, 1.0, 0.0])), cameras.intrinsics(8, 8), 8, 8)
+    return Camera(
+        cameras.look_at(eye, eye + torch.tensor([towards, 1.0, 0.0]), torch.tensor(cameras.UP)),
+        cameras.intrinsics(8, 8),
+        8,
+        8,
+    )
 
 
 def scene(*seen: tuple[Camera, float | None]) -> Scene:
