@@ -109,7 +109,7 @@ def ply_of(trained: TrainedGaussians) -> bytes:
 
 
 def _with_finite_logits(vertices: NDArray[np.void], path: Path) -> NDArray[np.void]:
-    """Return vertices with the logits of opacities 0.001 and 0.999 in place of infinite ones; say how many those were."""
+    """Return vertices with logits of the opacities 0.001 and 0.999 in place of infinite ones; say how many."""
     infinite = np.isinf(vertices["opacity"])
     if infinite.any():
         vertices = vertices.copy()  # of a file, which is read only
