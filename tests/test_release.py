@@ -28,12 +28,16 @@ def commands(jobs: dict[str, Any]) -> str:
 
 
 def test_the_version_is_one() -> None:
-    """Catches a release whose citation or metadata name another version, and a second place for it."""
+    """Catches a release whose citation, metadata or pages name another version, and a second place for it."""
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert str(citation["version"]) == gsbench.__version__
     assert "version" not in PYPROJECT["project"]
     (source,) = (one["input"] for one in PYPROJECT["tool"]["dynamic-metadata"] if one["field"] == "version")
     assert f'__version__ = "{gsbench.__version__}"' in (ROOT / source).read_text()
+    for page in ("CONTRIBUTING.md", "docs/install.md"):
+        named = re.findall(r"(?:gsbench[- ]|\bv)(\d+\.\d+\.\d+)", (ROOT / page).read_text())
+        assert named, page
+        assert {*named} == {gsbench.__version__}, page
 
 
 def test_the_changelog_has_the_version_and_its_day() -> None:

@@ -9,7 +9,7 @@ import torch
 from tiny_run import overrides, run_here, write_moving_square
 
 from gsbench.errors import InputError
-from gsbench.measure import perceptual
+from gsbench.measure import perceptual, provenance
 from gsbench.measure import record as files
 from gsbench.measure.record import Record
 from gsbench.train import checkpoint
@@ -96,6 +96,17 @@ def test_a_place_is_no_setting(again, data: Path, tmp_path: Path) -> None:
     record, said = again(f"data.root={tmp_path / 'moved'}", "train.checkpoint_minutes=9", change=no_checkpoint)
     assert record == again.first
     assert "finished before, kept" in said
+
+
+def test_a_release_trains_nothing_again(again, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a version in the name of a run, in its hash or in its checkpoint, which would cost every training."""
+    monkeypatch.setattr(provenance, "__version__", "9.9.9")
+    record, said = again()
+    assert record == again.first
+    assert "finished before, kept" in said
+    record, _ = again("protocol.quantise=true")  # measured from the checkpoint: `again` refuses a step
+    assert record.status == "ok"
+    assert record.provenance.versions["gsbench"] == "9.9.9"
 
 
 def test_what_is_measured_otherwise_is_named(again) -> None:
