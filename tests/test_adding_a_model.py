@@ -107,8 +107,8 @@ def test_a_model_that_cannot_be_gated_is_refused_before_step_0(gated: Path) -> N
     for label in ("blinks", "blinks_agr"):
         assert found[label].status == "failed"
         assert found[label].reason == (
-            "effects.gate: expected a model that gates can simplify, Balls is no GatedModel: make it one "
-            "(docs/adding_a_model.md), or use effects.gate=off"
+            "effects.gate: expected a model that gates can simplify, Balls is no GatedModel: make it one, "
+            "or use effects.gate=off (docs/adding_a_model.md)"
         )
         assert found[label].provenance.data_hash == "not loaded"  # a run that began to train has the hash
 
