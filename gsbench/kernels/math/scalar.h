@@ -3,6 +3,8 @@
 
 #include <cmath>
 
+#include "thresholds.h"
+
 #ifdef __CUDACC__
 #define GSB_HD __host__ __device__
 #else
@@ -47,7 +49,7 @@ GSB_HD inline T exp(T x) {
 
 template <class T>
 GSB_HD inline T sigmoid(T x) {
-    return T(1.0f) / (T(1.0f) + exp(T(0.0f) - x));
+    return T(1.0f) / (T(1.0f) + exp(min(T(0.0f) - x, T(EXPONENT_MAX))));  // exp of a vector ends there
 }
 
 template <class T>
