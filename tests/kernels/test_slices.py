@@ -144,6 +144,14 @@ def static(dtype: torch.dtype) -> dict[str, Tensor]:
 
 
 @pytest.mark.usefixtures("instruction_set")
+def test_opacities_of_the_largest_logits() -> None:
+    """Catches exp2 beyond the exponents of float32: without AVX-512, the opacity of a logit of -100 was 1."""
+    logits = torch.tensor([-1e30, -200.0, -150.0, -128.0, -100.0, -90.0, -88.0, -80.0, 0.0, 80.0, 100.0, 200.0, 1e30])
+    _, found = slice_static(torch.zeros(len(logits), 3), torch.eye(4)[:1].expand(len(logits), 4).contiguous(), logits)
+    torch.testing.assert_close(found, torch.sigmoid(logits), rtol=1e-5, atol=1e-30)
+
+
+@pytest.mark.usefixtures("instruction_set")
 def test_static_slice() -> None:
     """Catches a wrong sign of a rotation's entry, a size that does not stop, or a derivative, at a vector's end too."""
     raw, single = static(torch.float64), static(torch.float32)

@@ -47,9 +47,10 @@ GSB_HD inline T exp(T x) {
     return exp2(x * LOG2_E);
 }
 
+// -x is bounded, because exp2 of a SIMD vector without AVX-512 is right for x < 129 alone: beyond, its exponent wraps.
 template <class T>
 GSB_HD inline T sigmoid(T x) {
-    return T(1.0f) / (T(1.0f) + exp(min(T(0.0f) - x, T(EXPONENT_MAX))));  // exp of a vector ends there
+    return T(1.0f) / (T(1.0f) + exp(min(T(0.0f) - x, T(EXPONENT_MAX))));
 }
 
 template <class T>
