@@ -99,7 +99,9 @@ def shape_in(sizes: dict[str, int], declared: str, unknown: int | None = None) -
 def values(key: str, shape: list[int], dtype: torch.dtype, count: int) -> Tensor:
     """The numbers of an input: its own, or any."""
     if key in VALUES:
-        own = VALUES[key][tuple(slice(size) for size in shape)].clone()
+        own = VALUES[key]
+        for dim, size in enumerate(shape):  # repeated where more are asked for
+            own = own.index_select(dim, torch.arange(size) % own.shape[dim])
         return own if count or dtype is torch.float32 else own.zero_()  # no number of a Gaussian where there are none
     return torch.rand(shape, generator=torch.Generator().manual_seed(len(key))).to(dtype)
 
@@ -133,6 +135,23 @@ def test_shapes_and_gradients(operation: Operation) -> None:
         assert gradient.shape == at.tensors[name].shape
         assert gradient.isfinite().all(), name
         assert gradient.any(), f"{name}: no gradient; where that is due to its numbers, give it others in VALUES"
+
+
+@OPERATIONS
+def test_v3_and_v4_have_the_same_bits(operation: Operation) -> None:
+    """Catches a product that only one build fuses with a sum, another order of a sum, an approximate instruction."""
+    levels = kernels.native().instruction_sets()
+    if "v4" not in levels or "v3" not in levels:
+        pytest.skip("needs a processor with AVX-512, and the kernels of v3 and v4: make test LEVELS=all")
+    many = 3 * 16 + 5  # some whole vectors, and a rest
+    at, found = call(operation, N if "ids" in operation.inputs else many), {}  # `ids` are of N Gaussians
+    for level in ("v3", "v4"):
+        kernels.use_instruction_set(level)
+        found[level] = run(operation, at)
+    kernels.use_instruction_set(levels[-1])
+    (outputs, gradients), (other_outputs, other_gradients) = found.values()
+    assert all(torch.equal(x, y) for x, y in zip(outputs, other_outputs, strict=True))
+    assert [name for name, x in gradients.items() if not torch.equal(x, other_gradients[name])] == []
 
 
 @OPERATIONS

@@ -106,7 +106,7 @@ GSB_HD inline void backward_splat(const RecordOf<Profile>& s, const float* c, in
         const Falloff<Vec, Profile> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s);
         const Mask blended = (f.alpha >= Vec(ALPHA_MIN)) & (position < Vec::load(blocks.stop(b)));
         const Vec alpha = select(blended, f.alpha, zero);
-        const Vec before = Vec::load(T) * reciprocal(Vec(1.0f) - alpha);
+        const Vec before = Vec::load(T) / (Vec(1.0f) - alpha);
         const Vec weight = alpha * before;
         before.store(T);
         Vec g(0.0f);  // of the splat's own colour

@@ -270,7 +270,7 @@ GSB_HD inline void backward_rows(const ColorArgs& a, const Pieces& pieces, const
     const Shades s(a, rows);
     Vec g_Y[LANES], g_time[LANES];  // of a Gaussian in each vector
     // The added values are rounded first, so that the result does not depend on which views share a sum.
-    const auto add = [](Vec x, float* p, int n) { store_first(load_some(p, n) + rounded(x), p, n); };
+    const auto add = [](Vec x, float* p, int n) { store_first(load_some(p, n) + x, p, n); };
     for (int i = 0; i < rows.count; ++i) {
         const Vec color = load_some(colors + rows.threes[i], 3);
         Vec g = load_some(g_colors + rows.threes[i], 3);

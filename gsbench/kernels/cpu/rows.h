@@ -44,16 +44,15 @@ GSB_HD inline void scatter_row(const Vec (&x)[W], float* rows, int64_t i, int n)
     keep_rows(copy, W, rows, i, n);
 }
 
-// Adds instead of storing. The added values are rounded first, so that the result does not depend on which views share
-// a sum.
+// Adds instead of storing.
 template <int W>
 GSB_HD inline void add_row(const Vec (&x)[W], float* rows, int64_t i, int n) {
     Vec sum[W];
     gather_row(rows, i, n, sum);
-    GSB_UNROLL for (int k = 0; k < W; ++k) sum[k] += rounded(x[k]);
+    GSB_UNROLL for (int k = 0; k < W; ++k) sum[k] += x[k];
     scatter_row(sum, rows, i, n);
 }
-GSB_HD inline void add_first(Vec x, float* p, int n) { store_first(load_first(p, n) + rounded(x), p, n); }
+GSB_HD inline void add_first(Vec x, float* p, int n) { store_first(load_first(p, n) + x, p, n); }
 
 template <int H, int W>
 GSB_HD inline void gather_matrix(const float* rows, int64_t i, int n, Vec (&out)[H][W]) {
@@ -79,7 +78,7 @@ template <int W>
 GSB_HD inline void add_columns(const Vec (&x)[W], float* rows, int width, int first, int64_t i, int n) {
     Vec sum[W];
     gather_columns(rows, width, first, i, n, sum);
-    GSB_UNROLL for (int k = 0; k < W; ++k) scatter(sum[k] + rounded(x[k]), rows + i * width + first + k, width, n);
+    GSB_UNROLL for (int k = 0; k < W; ++k) scatter(sum[k] + x[k], rows + i * width + first + k, width, n);
 }
 
 // Returns whether rows i to i + n - 1 of `width` floats are all zero; if a given gradient is zero, the result is zero

@@ -10,15 +10,16 @@ inline namespace GSB_ISA {
 
 constexpr int LANES = 16;
 constexpr uint32_t ALL_LANES = 0xffff;
+constexpr float EXP2_LEAST = -126.0f;  // 2^x of a smaller x is 2^-126, the smallest float with all its digits
 
 // The polynomial with the smallest relative error (1.5e-7 in float) for 2^r with 0 <= r < 1, exact at 0.
 template <class T>
 GSB_HD inline T exp2_fraction(T r) {
-    T y = r * 0.00186712993f + 0.00901703065f;
-    y = y * r + 0.0557999129f;
-    y = y * r + 0.24016445f;
-    y = y * r + 0.693151312f;
-    return y * r + 1.0f;
+    T y = times_plus(r, T(0.00186712993f), T(0.00901703065f));
+    y = times_plus(y, r, T(0.0557999129f));
+    y = times_plus(y, r, T(0.24016445f));
+    y = times_plus(y, r, T(0.693151312f));
+    return times_plus(y, r, T(1.0f));
 }
 
 }  // namespace GSB_ISA
@@ -33,9 +34,27 @@ GSB_HD inline T exp2_fraction(T r) {
 namespace gsb {
 inline namespace GSB_ISA {
 
+// A product that is not rounded yet: a sum with it is rounded once (a fused multiply-add), if the CPU has that. So the
+// source says what is fused and not the compiler, whose choice depends on the instruction set, and all instruction sets
+// with a fused multiply-add compute the same bits. Of two products the first is fused.
+struct Product {
+    Vec a, b;
+
+    GSB_HD operator Vec() const { return times(a, b); }
+};
+GSB_HD inline Product operator*(Vec a, Vec b) { return {a, b}; }
+GSB_HD inline Vec operator+(Product x, Vec y) { return times_plus(x.a, x.b, y); }
+GSB_HD inline Vec operator+(Vec x, Product y) { return times_plus(y.a, y.b, x); }
+GSB_HD inline Vec operator+(Product x, Product y) { return x + Vec(y); }
+GSB_HD inline Vec operator-(Product x, Vec y) { return times_minus(x.a, x.b, y); }
+GSB_HD inline Vec operator-(Vec x, Product y) { return minus_times(x, y.a, y.b); }
+GSB_HD inline Vec operator-(Product x, Product y) { return x - Vec(y); }
+
 GSB_HD inline Vec operator-(Vec a) { return Vec(0.0f) - a; }
 GSB_HD inline Vec& operator+=(Vec& a, Vec b) { return a = a + b; }
+GSB_HD inline Vec& operator+=(Vec& a, Product b) { return a = a + b; }
 GSB_HD inline Vec& operator-=(Vec& a, Vec b) { return a = a - b; }
+GSB_HD inline Vec& operator-=(Vec& a, Product b) { return a = a - b; }
 GSB_HD inline Mask operator>(Vec a, Vec b) { return b < a; }
 GSB_HD inline Mask operator>=(Vec a, Vec b) { return b <= a; }
 

@@ -25,8 +25,11 @@ struct Vec {
 
 GSB_HD inline Vec operator+(Vec a, Vec b) { return _mm512_add_ps(a.v, b.v); }
 GSB_HD inline Vec operator-(Vec a, Vec b) { return _mm512_sub_ps(a.v, b.v); }
-GSB_HD inline Vec operator*(Vec a, Vec b) { return _mm512_mul_ps(a.v, b.v); }
 GSB_HD inline Vec operator/(Vec a, Vec b) { return _mm512_div_ps(a.v, b.v); }
+GSB_HD inline Vec times(Vec a, Vec b) { return _mm512_mul_ps(a.v, b.v); }
+GSB_HD inline Vec times_plus(Vec a, Vec b, Vec c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }    // a b + c
+GSB_HD inline Vec times_minus(Vec a, Vec b, Vec c) { return _mm512_fmsub_ps(a.v, b.v, c.v); }   // a b - c
+GSB_HD inline Vec minus_times(Vec c, Vec a, Vec b) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }  // c - a b
 GSB_HD inline Mask operator<(Vec a, Vec b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
 GSB_HD inline Mask operator<=(Vec a, Vec b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LE_OQ)}; }
 GSB_HD inline Mask operator==(Vec a, Vec b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_EQ_OQ)}; }
@@ -46,20 +49,19 @@ GSB_HD inline Vec min(Vec a, Vec b) { return _mm512_min_ps(a.v, b.v); }
 GSB_HD inline Vec max(Vec a, Vec b) { return _mm512_max_ps(a.v, b.v); }
 GSB_HD inline Vec sqrt(Vec a) { return _mm512_sqrt_ps(a.v); }
 
-GSB_HD inline Vec reciprocal(Vec x) {  // 14 bits, and one step of Newton's
-    const Vec y = _mm512_rcp14_ps(x.v);
-    return y * (Vec(2.0f) - x * y);
-}
-
 GSB_HD inline Vec exp2(Vec x) {
-    const Vec r = _mm512_reduce_ps(x.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);  // x - floor(x)
-    return _mm512_scalef_ps(exp2_fraction(r).v, x.v);                                // times 2^floor(x)
+    const __m512 bounded = _mm512_max_ps(x.v, _mm512_set1_ps(EXP2_LEAST));
+    const __m512 whole = _mm512_roundscale_ps(bounded, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);
+    // A subtraction rounds to nearest, as with AVX2. `vreduceps`, which does both in one, rounds down.
+    return _mm512_scalef_ps(exp2_fraction(Vec(_mm512_sub_ps(bounded, whole))).v, whole);
 }
 
 // x = mantissa * 2^exponent, mantissa in [0.75, 1.5)
 GSB_HD inline void split(Vec x, Vec& mantissa, Vec& exponent) {
-    mantissa = _mm512_getmant_ps(x.v, _MM_MANT_NORM_p75_1p5, _MM_MANT_SIGN_zero);
-    exponent = _mm512_getexp_ps((x / mantissa).v);
+    const __m512i raw = _mm512_castps_si512(x.v), three_quarters = _mm512_set1_epi32(0x3f400000);
+    const __m512i whole = _mm512_srai_epi32(_mm512_sub_epi32(raw, three_quarters), 23);
+    mantissa = _mm512_castsi512_ps(_mm512_sub_epi32(raw, _mm512_slli_epi32(whole, 23)));
+    exponent = _mm512_cvtepi32_ps(whole);
 }
 
 // Loads p[by] .. p[by + 15] with |by| < 16 by aligned loads from an aligned p, because a load that crosses cache lines
@@ -141,12 +143,6 @@ GSB_HD inline void scatter_rows(Vec x, float* p, const int32_t* offsets, int n) 
     alignas(64) float lane[LANES];
     x.store(lane);
     for (int i = 0; i < n; ++i) p[offsets[i]] = lane[i];
-}
-
-// Returns x, rounded: the compiler cannot fuse a product with the sum that follows.
-GSB_HD inline Vec rounded(Vec x) {
-    __asm__("" : "+v"(x.v));
-    return x;
 }
 
 // Returns the vector whose lane i is lane from[i] of x; `from` is aligned.
@@ -269,14 +265,14 @@ GSB_HD inline int append_bits(uint32_t bits, uint32_t base, uint32_t* out) {
     return __builtin_popcount(bits);
 }
 
-// Writes the lane sums of four vectors to out[0..3].
+// Writes the lane sums of four vectors to out[0..3], in the same order as with AVX2: lane i + 8 to lane i, then neighbours.
 GSB_HD inline void sum4(Vec a, Vec b, Vec c, Vec d, float* out) {
     const __m512 ab = _mm512_add_ps(_mm512_shuffle_f32x4(a.v, b.v, 0x44), _mm512_shuffle_f32x4(a.v, b.v, 0xee));
     const __m512 cd = _mm512_add_ps(_mm512_shuffle_f32x4(c.v, d.v, 0x44), _mm512_shuffle_f32x4(c.v, d.v, 0xee));
-    __m512 x = _mm512_add_ps(_mm512_shuffle_f32x4(ab, cd, 0x88), _mm512_shuffle_f32x4(ab, cd, 0xdd));
-    x = _mm512_add_ps(x, _mm512_permute_ps(x, 0x4e));
-    x = _mm512_add_ps(x, _mm512_permute_ps(x, 0xb1));  // each quarter holds one sum, four times
-    const __m512i pick = _mm512_setr_epi32(0, 4, 8, 12, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0);
+    __m512 x = _mm512_add_ps(_mm512_shuffle_ps(ab, cd, 0x88), _mm512_shuffle_ps(ab, cd, 0xdd));
+    x = _mm512_add_ps(x, _mm512_permute_ps(x, 0xb1));
+    x = _mm512_add_ps(x, _mm512_shuffle_f32x4(x, x, 0xb1));  // the sums of a and c, then those of b and d
+    const __m512i pick = _mm512_setr_epi32(0, 8, 2, 10, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0);
     _mm_storeu_ps(out, _mm512_castps512_ps128(_mm512_permutexvar_ps(pick, x)));
 }
 

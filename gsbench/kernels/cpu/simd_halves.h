@@ -5,6 +5,8 @@
 
 #if defined(__x86_64__)
 #include <immintrin.h>
+#elif defined(__aarch64__)
+#include <arm_neon.h>
 #endif
 
 namespace gsb {
@@ -67,8 +69,21 @@ struct Register {
 
     GSB_HD friend Register operator+(Register a, Register b) { return a.v + b.v; }
     GSB_HD friend Register operator-(Register a, Register b) { return a.v - b.v; }
-    GSB_HD friend Register operator*(Register a, Register b) { return a.v * b.v; }
     GSB_HD friend Register operator/(Register a, Register b) { return a.v / b.v; }
+    GSB_HD friend Register times(Register a, Register b) { return a.v * b.v; }
+#if defined(__AVX2__)
+    GSB_HD friend Register times_plus(Register a, Register b, Register c) { return Floats(_mm256_fmadd_ps(a.v, b.v, c.v)); }
+    GSB_HD friend Register times_minus(Register a, Register b, Register c) { return Floats(_mm256_fmsub_ps(a.v, b.v, c.v)); }
+    GSB_HD friend Register minus_times(Register c, Register a, Register b) { return Floats(_mm256_fnmadd_ps(a.v, b.v, c.v)); }
+#elif defined(__aarch64__)
+    GSB_HD friend Register times_plus(Register a, Register b, Register c) { return Floats(vfmaq_f32(c.v, a.v, b.v)); }
+    GSB_HD friend Register times_minus(Register a, Register b, Register c) { return Floats(vfmaq_f32(-c.v, a.v, b.v)); }
+    GSB_HD friend Register minus_times(Register c, Register a, Register b) { return Floats(vfmsq_f32(c.v, a.v, b.v)); }
+#else  // no fused multiply-add: the product is rounded, then the sum
+    GSB_HD friend Register times_plus(Register a, Register b, Register c) { return a.v * b.v + c.v; }
+    GSB_HD friend Register times_minus(Register a, Register b, Register c) { return a.v * b.v - c.v; }
+    GSB_HD friend Register minus_times(Register c, Register a, Register b) { return c.v - a.v * b.v; }
+#endif
     GSB_HD friend Mask operator<(Register a, Register b) { return {a.v < b.v}; }
     GSB_HD friend Mask operator<=(Register a, Register b) { return {a.v <= b.v}; }
     GSB_HD friend Mask operator==(Register a, Register b) { return {a.v == b.v}; }
@@ -86,13 +101,13 @@ struct Register {
 #endif
     }
     GSB_HD friend Register exp2(Register x) {
-        const Floats bounded = x.v > -126.0f ? x.v : Floats{} - 126.0f;
+        const Floats bounded = x.v > EXP2_LEAST ? x.v : Floats{} + EXP2_LEAST;
         Ints whole = __builtin_convertvector(bounded, Ints);  // towards zero: one too many below it
         Floats r = bounded - __builtin_convertvector(whole, Floats);
         const Ints below = r < 0.0f;  // -1 where so
         whole += below;
         r -= __builtin_convertvector(below, Floats);
-        return exp2_fraction(r) * reinterpret_cast<Floats>((whole + 127) << 23);
+        return exp2_fraction(Register(r)).v * reinterpret_cast<Floats>((whole + 127) << 23);
     }
     GSB_HD friend void split(Register x, Register& mantissa, Register& exponent) {
         const Ints raw = reinterpret_cast<Ints>(x.v), whole = (raw - 0x3f400000) >> 23;  // 0x3f400000 is 0.75
@@ -136,8 +151,17 @@ struct Pair {
 
     GSB_HD friend Pair operator+(Pair a, Pair b) { return {a.lo + b.lo, a.hi + b.hi}; }
     GSB_HD friend Pair operator-(Pair a, Pair b) { return {a.lo - b.lo, a.hi - b.hi}; }
-    GSB_HD friend Pair operator*(Pair a, Pair b) { return {a.lo * b.lo, a.hi * b.hi}; }
     GSB_HD friend Pair operator/(Pair a, Pair b) { return {a.lo / b.lo, a.hi / b.hi}; }
+    GSB_HD friend Pair times(Pair a, Pair b) { return {times(a.lo, b.lo), times(a.hi, b.hi)}; }
+    GSB_HD friend Pair times_plus(Pair a, Pair b, Pair c) {  // a b + c
+        return {times_plus(a.lo, b.lo, c.lo), times_plus(a.hi, b.hi, c.hi)};
+    }
+    GSB_HD friend Pair times_minus(Pair a, Pair b, Pair c) {  // a b - c
+        return {times_minus(a.lo, b.lo, c.lo), times_minus(a.hi, b.hi, c.hi)};
+    }
+    GSB_HD friend Pair minus_times(Pair c, Pair a, Pair b) {  // c - a b
+        return {minus_times(c.lo, a.lo, b.lo), minus_times(c.hi, a.hi, b.hi)};
+    }
     GSB_HD friend Mask operator<(Pair a, Pair b) { return {a.lo < b.lo, a.hi < b.hi}; }
     GSB_HD friend Mask operator<=(Pair a, Pair b) { return {a.lo <= b.lo, a.hi <= b.hi}; }
     GSB_HD friend Mask operator==(Pair a, Pair b) { return {a.lo == b.lo, a.hi == b.hi}; }
@@ -166,21 +190,6 @@ static_assert(Vec::size == LANES);
 GSB_HD inline Vec negative_where(Mask m, Vec x) { return select(m, min(x, Vec(0.0f) - x), x); }
 GSB_HD inline void store_where(Mask m, Vec x, float* p) { select(m, x, Vec::load(p)).store(p); }
 GSB_HD inline bool any(Mask m) { return bits(m) != 0; }
-GSB_HD inline Vec reciprocal(Vec x) { return Vec(1.0f) / x; }
-
-// Returns x, rounded: the compiler cannot fuse a product with the sum that follows.
-GSB_HD inline Register rounded(Register x) {
-#if defined(__x86_64__)
-    __asm__("" : "+x"(x.v));
-#else
-    __asm__("" : "+w"(x.v));
-#endif
-    return x;
-}
-template <class Half>
-GSB_HD inline Pair<Half> rounded(Pair<Half> x) {
-    return {rounded(x.lo), rounded(x.hi)};
-}
 
 // Writes the lane sums of four vectors to out[0..3].
 GSB_HD inline Floats fold(Register x) { return x.v; }

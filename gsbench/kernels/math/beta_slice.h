@@ -70,7 +70,7 @@ GSB_HD inline T log_fading(T y) {
     T series = T(1.0f / 45.0f) - x2 * (17.0f / 2520.0f);
     series = T(1.0f / 12.0f) - x2 * series;
     series = T(0.5f) - x2 * series;
-    return select(x < T(0.25f), T(0.0f) - (x + x2 * series), max(T(LN_2) - softplus(x * 2.0f), T(BETA_LOG_MIN)));
+    return select(x < T(0.25f), T(0.0f) - (x + x2 * series), max(T(LN_2) - softplus(T(x * 2.0f)), T(BETA_LOG_MIN)));
 }
 
 // Returns the gradient of y from that of `log_fading`, which returned `log`.
@@ -99,7 +99,7 @@ struct BetaFading {
         const T g_sum = g * factor;
         GSB_UNROLL for (int i = 0; i < K; ++i) {
             g_exponents[i] = g_sum * logs[i];
-            g_white[i] = log_fading_vjp(white[i], logs[i], g_sum * exponents[i]);
+            g_white[i] = log_fading_vjp(white[i], logs[i], T(g_sum * exponents[i]));
         }
     }
 };

@@ -38,7 +38,7 @@ struct Falloff<T, Beta> {
         rest = max(difference, T(RIM_MIN));
         // The second term is what rounding took from the difference: large exponents need it.
         log2_rest = log2(rest) + ((one - difference) - r2) * LOG2_E;
-        free = select(r2 < one, T(s.opacity) * exp2(log2_rest * T(s.shape)), T(0.0f));
+        free = select(r2 < one, T(s.opacity) * exp2(T(log2_rest * T(s.shape))), T(0.0f));
         alpha = min(free, T(ALPHA_MAX));
     }
 };
@@ -54,7 +54,7 @@ struct FalloffMoments {
         T slope = g;
         if constexpr (Profile::HAS_SHAPE) {
             of[SHAPE] += g * f.log2_rest;
-            slope = g * reciprocal(f.rest);
+            slope = g / f.rest;
         }
         const T gu = slope * f.u, gw = slope * f.w;
         of[U] += gu;
@@ -94,7 +94,7 @@ template <class T>
 GSB_HD inline T least_power(T x0, T x1, T y0, T y1, T p, T q, T r, T foot_x, T foot_y) {
     const T zero(0.0f);
     const T near_x = clamp(zero, x0, x1), near_y = clamp(zero, y0, y1);
-    const T along_y = clamp(foot_y * near_x, y0, y1), along_x = clamp(foot_x * near_y, x0, x1);
+    const T along_y = clamp(T(foot_y * near_x), y0, y1), along_x = clamp(T(foot_x * near_y), x0, x1);
     const T w1 = p * near_x, u1 = q * near_x + r * along_y;
     const T w2 = p * along_x, u2 = q * along_x + r * near_y;
     return min(w1 * w1 + u1 * u1, w2 * w2 + u2 * u2);

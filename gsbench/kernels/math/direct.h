@@ -39,7 +39,7 @@ struct DirectGaussian {
           time(sigmoid(raw.time)), shares{sigmoid(raw.shares[0]), sigmoid(raw.shares[1])}, motion(moved(view)) {
         T squares(0.0f);
         GSB_UNROLL for (int k = 0; k < 4; ++k) squares = squares + motion.white[k] * motion.white[k];
-        opacity_factor = exp(squares * -DIRECT_FADING);
+        opacity_factor = exp(T(squares * -DIRECT_FADING));
     }
 
     GSB_HD Seen observe() const {

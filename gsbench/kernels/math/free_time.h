@@ -28,7 +28,7 @@ struct FreeTimeGaussian {
         delta = T(view.time) - raw.time;
         duration = size_of(raw.duration);
         white = delta / duration;
-        opacity_factor = exp(white * white * -0.5f);
+        opacity_factor = exp(T(white * white * -0.5f));
     }
 
     GSB_HD Seen observe() const {
@@ -44,7 +44,7 @@ struct FreeTimeGaussian {
     GSB_HD void vjp(const Seen& g, Parameters& out) const {
         const T g_exponent = g.opacity * still.opacity * opacity_factor;  // of -white^2 / 2
         out.time = g_exponent * white / duration;
-        out.duration = size_vjp(raw.duration, T(1.0f), g_exponent * white * white);
+        out.duration = size_vjp(raw.duration, T(1.0f), T(g_exponent * white * white));
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
             out.mean[i] = g.mean[i];
             out.velocity[i] = g.mean[i] * delta;

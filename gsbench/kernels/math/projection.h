@@ -85,9 +85,9 @@ struct Projection {
         const auto in_range = (depth > T(camera.near)) & (depth < T(camera.far));
         z = select(in_range, depth, one);  // what is not drawn passes through harmlessly
         inv_z = one / z;
-        tan_x = clamp(x * inv_z, T(camera.tangent_min(camera.cx, camera.fx, camera.width)),
+        tan_x = clamp(T(x * inv_z), T(camera.tangent_min(camera.cx, camera.fx, camera.width)),
                       T(camera.tangent_max(camera.cx, camera.fx, camera.width)));
-        tan_y = clamp(y * inv_z, T(camera.tangent_min(camera.cy, camera.fy, camera.height)),
+        tan_y = clamp(T(y * inv_z), T(camera.tangent_min(camera.cy, camera.fy, camera.height)),
                       T(camera.tangent_max(camera.cy, camera.fy, camera.height)));
         j1 = (R[0] - R[2] * tan_x) * (inv_z * camera.fx);
         j2 = (R[1] - R[2] * tan_y) * (inv_z * camera.fy);
@@ -122,8 +122,8 @@ struct Projection {
         s.depth = depth;
         // alpha >= 1/255 only inside the ellipse r^2 <= reach; this is the bounding box of the ellipse.
         const T reach = Profile::reach(s.opacity, shape);
-        s.half_x = sqrt(reach * xx) * size + BOUNDS_MARGIN;
-        s.half_y = sqrt(reach * yy) * size + BOUNDS_MARGIN;
+        s.half_x = sqrt(T(reach * xx)) * size + BOUNDS_MARGIN;
+        s.half_y = sqrt(T(reach * yy)) * size + BOUNDS_MARGIN;
         const auto drawn = solid & (s.opacity >= T(ALPHA_MIN)) & (s.x + s.half_x > zero) & (s.y + s.half_y > zero) &
                            (s.x - s.half_x < T(camera.width)) & (s.y - s.half_y < T(camera.height));
         s.half_x = select(drawn, s.half_x, zero);

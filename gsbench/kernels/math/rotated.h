@@ -77,7 +77,7 @@ struct RotatedGaussian {
         reflections.reduce(rows, t);
         const T delta[1] = {T(observed) - raw.time};
         whiten(t, delta, white);
-        opacity_factor = exp(white[0] * white[0] * (-0.5f * lambda_t));
+        opacity_factor = exp(T(white[0] * white[0] * (-0.5f * lambda_t)));
         // A Gaussian that is culled keeps its mean, so that huge numbers do not reach a gradient.
         const auto seen = opacity_factor > T(TIME_OPACITY_FACTOR_MIN);
         opacity_factor = select(seen, opacity_factor, zero);

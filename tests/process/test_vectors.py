@@ -1,0 +1,48 @@
+"""torch computes with vectors of AVX2 where the processor has AVX-512, and as the environment says where it says."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tiny_run import ROOT
+
+from gsbench.process import vectors
+
+ASK = "import torch; print(torch.backends.cpu.get_cpu_capability())"
+
+
+def capability(imports: str, **variables: str) -> str:
+    """The vectors that torch uses in a new process."""
+    environment = {name: value for name, value in os.environ.items() if name != vectors.VARIABLE} | variables
+    command = [sys.executable, "-c", f"{imports}; {ASK}"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True)
+    return done.stdout.strip()
+
+
+@pytest.mark.skipif(not vectors._has_avx512(), reason="needs a processor with AVX-512")
+@pytest.mark.parametrize("imports", ["import gsbench", "import torch; import gsbench"])
+def test_torch_uses_avx2_where_there_is_avx512(imports: str) -> None:
+    """Catches a setting that comes after torch has read it."""
+    assert capability("import torch") == "AVX512"
+    assert capability(imports) == "AVX2"
+    assert capability(imports, ATEN_CPU_CAPABILITY="avx512") == "AVX512"
+
+
+@pytest.mark.parametrize(
+    ("flags", "wanted"),
+    [("fpu avx2 avx512f avx512bw", "avx2"), ("fpu avx2 fma", None), ("", None)],
+)
+def test_nothing_is_set_without_avx512(
+    flags: str, wanted: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Catches AVX2 asked of a processor that may not have it, where torch would end by a signal."""
+    info = tmp_path / "cpuinfo"
+    if flags:
+        info.write_text(f"processor\t: 0\nflags\t\t: {flags}\n")
+    monkeypatch.setattr(vectors, "CPUINFO", info)
+    monkeypatch.delenv(vectors.VARIABLE, raising=False)
+    vectors.use_vectors_of_avx2()
+    assert os.environ.get(vectors.VARIABLE) == wanted
+    monkeypatch.delenv(vectors.VARIABLE, raising=False)
