@@ -31,7 +31,12 @@ CASES = {
 }
 PAPERS = "best_on_test=true"  # trex by the paper's protocol
 SMALLER = "downscale=4,iterations=7000"  # trex at 200 x 200 pixels
-LIMITED = "recipe=quick,iterations=6500,densify.max_gaussians=110000"
+# `+recipe=quick` and what a row changes of it, by the setting of its runs.
+QUICK = {
+    "recipe=quick": "",
+    "recipe=quick,iterations=6500,densify.max_gaussians=110000": ", 6,500 iterations, at most 110,000 Gaussians",
+    "recipe=quick,iterations=12000,densify.max_gaussians=110000": ", 12,000 iterations, at most 110,000 Gaussians",
+}
 
 
 @dataclass(frozen=True)

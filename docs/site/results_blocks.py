@@ -6,10 +6,10 @@ from statistics import fmean
 
 from published import (
     CASES,
-    LIMITED,
     MODELS,
     NAMES,
     PAPERS,
+    QUICK,
     SMALLER,
     SUCCESSORS,
     change,
@@ -216,10 +216,10 @@ def _whole(runs: list[Record]) -> list[str]:
 
 
 def quick(published: Path) -> str:
-    """Return the tables of trex with `+recipe=quick`, and with fewer steps and a limit of Gaussians."""
+    """Return the tables of trex with `+recipe=quick`, and with other lengths and a limit of Gaussians."""
     found = experiment(published, "dnerf")
     rows = []
-    for variant, words in (("recipe=quick", ""), (LIMITED, ", 6,500 iterations, at most 110,000 Gaussians")):
+    for variant, words in QUICK.items():
         for model in (m for m in ("7dgs", "4dgs", "7dgs_noagr") if found.has(m, variant)):
             runs = found.runs(model, variant)
             _, _, val, _, ssim, lpips, _, _, many = _whole(runs)
