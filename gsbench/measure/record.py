@@ -176,6 +176,14 @@ class OnDemand:
 
 
 @dataclass(frozen=True)
+class Stop:
+    """The end of a training with `train.patience`, which keeps the iteration with the best PSNR on val."""
+
+    iteration: int  # the last finished one
+    kept: int  # the one whose Gaussians were measured
+
+
+@dataclass(frozen=True)
 class Provenance:
     """The conditions under which a run was measured: commit, versions, machine, settings and date."""
 
@@ -228,6 +236,7 @@ class Record:
     overrides: list[str] = field(default_factory=list)  # `python -m gsbench` with these arguments repeats the run
     regions: dict[str, Region] = field(default_factory=dict)  # by "moving" and "object", if there are such pixels
     on_demand: OnDemand | None = None  # None: no effect was removed from the model or its Gaussians
+    stop: Stop | None = None  # None: the last iteration was measured, without `train.patience`
 
     @property
     def path(self) -> Path:

@@ -73,7 +73,7 @@ def _stated(records: list[Record], spread: str) -> list[str]:
     notes += _load(records)
     if any(_commit(r).endswith("-dirty") for r in records):
         notes.append(f"{WARNING}: files differed from their commit (-dirty): it does not reproduce these numbers.")
-    notes += [*_rounding(records), _seeds(records, spread), *DEFINITIONS]
+    notes += [*_rounding(records), *_stops(records), _seeds(records, spread), *DEFINITIONS]
     return sorted(notes, key=lambda note: not note.startswith(WARNING))
 
 
@@ -121,6 +121,21 @@ def _rounding(records: list[Record]) -> list[str]:
         return []
     silent = _silent(len(changes) - len(known), len(changes))
     return [f"float32 changes PSNR of a view by at most {max(known):.1e} dB (three views of each run{silent})."]
+
+
+def _stops(records: list[Record]) -> list[str]:
+    """List a footnote on runs that were measured at an earlier iteration (`train.patience`); empty if there is none."""
+    early = [r.stop for r in records if r.stop is not None and r.stop.kept < r.stop.iteration]
+    if not early:
+        return []
+    kept, ends = ([getattr(stop, name) for stop in early] for name in ("kept", "iteration"))
+    return [f"{len(early)} of {len(records)} runs were measured at the iteration with the best PSNR on val, "
+            f"{_span(kept)}, and ended at iteration {_span(ends)} (train.patience)."]  # fmt: skip
+
+
+def _span(numbers: list[int]) -> str:
+    low, high = min(numbers), max(numbers)
+    return f"{low:,}" if low == high else f"{low:,} to {high:,}"
 
 
 def _commit(record: Record) -> str:

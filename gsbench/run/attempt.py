@@ -97,7 +97,7 @@ class Attempt:
         return replace(
             record, protocol=record.protocol | found.frames, on_demand=on_demand, metrics=found.metrics,
             missing=found.missing, per_view=found.per_view, regions=found.regions,
-            cost=found.cost, curve=trainer.curve.points,
+            cost=found.cost, curve=trainer.curve.points, stop=trainer.early_stop.stop,
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:

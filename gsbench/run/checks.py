@@ -58,6 +58,7 @@ RANGES = {  # the ranges of settings, both ends included
     "train.penalties.strain.weight": (0, math.inf),
     "train.densify.max_gaussians": (LEAST_GAUSSIANS, ENDLESS),
     "train.curve_points": (1, MAX_POINTS),
+    "train.patience": (0.01, 1),
     "train.checkpoint_minutes": (0, ENDLESS),
     "model.min_opacity": (0, 0.25),  # a reset lowers opacities to twice as much
     "data.initial_points": (4, ENDLESS),
@@ -256,8 +257,8 @@ def check_gates(model: GaussianModel, config: Config) -> None:
 def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
     """Raise InputError if the scene cannot train the model.
 
-    Reasons are a model with time for a scene without time, cameras that are all at one place, and images that are too
-    small.
+    Reasons are a model with time for a scene without time, cameras that are all at one place, images that are too
+    small, and `train.patience` without views of val to watch.
     """
     if ("time" in model.observes or config.agr) and not scene.has_time:
         what = "agr=true" if config.agr else config.model.name
@@ -272,6 +273,22 @@ def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
     if side // factor < WINDOW:
         key = f"train.coarse, after the factor {factor}" if factor > 1 else f"scene.downscale={config.scene.downscale}"
         raise InputError(f"{key}: expected images of at least {WINDOW} pixels, the loss's window, got {side // factor}")
+    _check_patience(scene, config)
+
+
+def _check_patience(scene: Scene, config: Config) -> None:
+    """Raise InputError if `train.patience` has no val to watch, or watches the views on which results are measured."""
+    if config.train.patience is None:
+        return
+    if not scene.val:
+        raise InputError(f"train.patience: expected views of val to watch, {scene.name} has none: "
+                         f"scene.val_every=8 takes every eighth training view")  # fmt: skip
+    if config.scene.eval_split == "val":
+        raise InputError("train.patience: expected results on test, got scene.eval_split=val: results on the views by "
+                         "which the iteration is chosen would be too high; leave train.patience out")  # fmt: skip
+    if config.effects.compare:
+        raise InputError("train.patience: expected effects.compare=false, as a candidate of model=auto must not end "
+                         "before they are compared: leave one of the two out")  # fmt: skip
 
 
 def evaluated_views(scene: Scene, split: str) -> list[View]:

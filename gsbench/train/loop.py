@@ -34,6 +34,7 @@ from gsbench.train.renderer import Renderer
 from gsbench.train.rows import Rows
 from gsbench.train.seeding import batch, generator
 from gsbench.train.step import Step, fitting_threads
+from gsbench.train.stopping import NOTHING_KEPT, EarlyStop
 from gsbench.train.thinning import blend_weights, heaviest
 
 
@@ -93,6 +94,7 @@ class Trainer:
             self.optimizer.skip = self.finite_check.skip
         self.curve = Curve()
         self.best = Best()
+        self.early_stop = EarlyStop(self.schedule, train.patience)
         self.comparison: ModelComparison | None = None  # by which model=auto chose this model
         self.step = 0
         self._is_full = False  # whether the largest allowed number of Gaussians was reached
@@ -100,7 +102,7 @@ class Trainer:
     def run(
         self, save: Callable[[dict[str, Any]], None], label: str, goes_on: Callable[[], bool] = lambda: True
     ) -> None:
-        """Train until the last step, or until `goes_on()` returns False.
+        """Train until the last step, until PSNR on val no longer rises, or until `goes_on()` returns False.
 
         Args:
             save: a function that gets the state every `checkpoint_minutes` and once at the end.
@@ -135,6 +137,8 @@ class Trainer:
                 # The bar shows the seconds of the last measurement: the clock itself waits for a GPU when it is read.
                 loss = f"loss {self.finite_check.loss:.4f}"
                 bar.set_postfix_str(f"{self.curve.progress}, {loss}, {len(self.model)} Gaussians", refresh=False)
+                if self.step == train.iterations or self.early_stop.is_over(self.step):
+                    self._keep_best()
                 if not goes_on():
                     break
                 if time.monotonic() - saved >= 60 * train.checkpoint_minutes and self.step < train.iterations:
@@ -143,6 +147,17 @@ class Trainer:
         if self.step == train.iterations and self.config.effects.gate != "off":
             self.gate_at_end()
         save(self.state_dict())
+
+    def _keep_best(self) -> None:
+        """End the training with the Gaussians of the iteration that had the best PSNR on val (`train.patience`)."""
+        kept = self.early_stop.take(self.step)
+        if kept is not None:
+            self.load_state_dict(self.state_dict() | kept)
+            stop = self.early_stop.stop
+            assert stop is not None
+            tqdm.write(f"step {stop.iteration}: PSNR on val is highest at step {stop.kept}: the training ends with the "
+                       f"Gaussians of that step", file=sys.stderr)  # fmt: skip
+        self.step = self.config.train.iterations
 
     def gate_at_end(self, by_halves: bool = False) -> None:
         """Make Gaussians independent of time, direction or AGR (a network) after the training.
@@ -224,6 +239,7 @@ class Trainer:
         self.model.set_active(self.schedule.active(self.step))
         val = self.psnr(self.scene.val) if self.scene.val else math.nan
         self.curve.add(self.step + 1, sum(self.stages.seconds.values()), val)
+        self.early_stop.see(self.step + 1, val, self._state_of_gaussians)
         leak = self.config.protocol.best_on_test
         if not leak and not val > self.best.val:
             return
@@ -250,6 +266,18 @@ class Trainer:
         self.finite_check.look()
         return {
             "step": self.step,
+            **self._state_of_gaussians(),
+            "stages": self.stages.state_dict(),
+            "effort": self.effort.state_dict(),
+            "curve": self.curve.state_dict(),
+            "best": vars(self.best).copy(),
+            "early_stop": self.early_stop.state_dict(),
+            "comparison": asdict(self.comparison) if self.comparison else None,
+        }
+
+    def _state_of_gaussians(self) -> dict[str, Any]:
+        """Return the part of the state that belongs to the Gaussians, and not to the measurements of the training."""
+        return {
             "model": self.model.pack(),
             "optimizer": self.optimizer.state_dict(),
             "density": self.density.state_dict(),
@@ -257,11 +285,6 @@ class Trainer:
             "gating": self.gating.state_dict(),
             "average": self.average.state_dict(),
             "penalties": self.penalties.state_dict(),
-            "stages": self.stages.state_dict(),
-            "effort": self.effort.state_dict(),
-            "curve": self.curve.state_dict(),
-            "best": vars(self.best).copy(),
-            "comparison": asdict(self.comparison) if self.comparison else None,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -283,6 +306,7 @@ class Trainer:
             self.effort.load_state_dict(state.get("effort"))
             self.curve.load_state_dict(state["curve"])
             self.best = Best(**state["best"])
+            self.early_stop.load_state_dict(state.get("early_stop", NOTHING_KEPT))
             self.comparison = comparison_of(state)
         except (InputError, MemoryError):
             raise

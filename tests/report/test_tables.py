@@ -266,6 +266,18 @@ def test_the_change_by_float32_is_told_as_far_as_it_is_known():
     assert "float32" not in page(make())
 
 
+def test_runs_measured_before_their_last_iteration_are_told():
+    """Catches a number of an earlier iteration that stands as that of the last one."""
+    ran = [
+        make(seed=0, stop=files.Stop(4000, 4000)),
+        make(seed=1, stop=files.Stop(3000, 2200)),
+        make(seed=2, stop=files.Stop(2800, 2000)),
+    ]
+    said = "- 2 of 3 runs were measured at the iteration with the best PSNR on val, 2,000 to 2,200, and ended at iteration"
+    assert f"{said} 2,800 to 3,000 (train.patience).\n" in page(*ran)
+    assert "patience" not in page(*ran[:1], make(seed=3))
+
+
 def test_columns_that_leak_or_are_rare_say_so():
     """Would catch the best-on-test column without its warning, or an LPIPS-VGG that was measured and is not shown."""
     metrics = {**make().metrics, "lpips_vgg": 0.25, "psnr_best_on_test": 26.5}

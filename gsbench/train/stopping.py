@@ -1,0 +1,92 @@
+"""Keep the iteration with the best PSNR on val, and stop a training whose PSNR on val no longer rises."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from gsbench.errors import InputError
+from gsbench.measure.record import Stop
+from gsbench.measure.schema import parse
+from gsbench.schedule import Schedule
+
+NOTHING_KEPT: dict[str, Any] = {"best": None, "kept": None, "stop": None}  # of a checkpoint without `train.patience`
+
+
+class EarlyStop:
+    """Early stopping: hold the state of a training at its best PSNR on val; do nothing if `train.patience` is None.
+
+    The training stops if the last `train.patience` of all iterations, counted from the end of densification at the
+    earliest, had no better PSNR on val. Iterations before the final SH degree or before AGR are not kept, because the
+    state would be shown with parts that it was not trained with.
+    """
+
+    def __init__(self, schedule: Schedule, patience: float | None) -> None:
+        """Start without a kept state.
+
+        Args:
+            schedule: the schedule of the training.
+            patience: the share of all iterations after which a training without a better PSNR stops; None for never.
+        """
+        self.schedule = schedule
+        self.wait = None if patience is None else max(1, round(patience * schedule.config.iterations))
+        self.stop: Stop | None = None  # of a training that ended by this class
+        self._best: tuple[int, float] | None = None  # iteration and PSNR on val, dB
+        self._kept: dict[str, Any] | None = None  # the state at that iteration; None if it is the last one
+
+    def see(self, iteration: int, psnr: float, state: Callable[[], dict[str, Any]]) -> None:
+        """Look at a measurement on val, and keep the state of the training if it is the best so far.
+
+        Args:
+            iteration: the number of finished iterations.
+            psnr: PSNR on val, dB; NaN if there is no val.
+            state: a function that returns the state of the training.
+        """
+        last = self.schedule.config.iterations
+        now, end = self.schedule.active(iteration - 1), self.schedule.active(last - 1)
+        if self.wait is None or (now.sh_degree, now.refine) != (end.sh_degree, end.refine):
+            return
+        if self._best is None or psnr > self._best[1]:
+            self._best = iteration, psnr
+            self._kept = None if iteration == last else _copied(state())
+
+    def is_over(self, iteration: int) -> bool:
+        """Return whether the training stops after so many finished iterations."""
+        if self.wait is None or self._best is None:
+            return False
+        return iteration - max(self._best[0], self.schedule.densify_stop) >= self.wait
+
+    def take(self, iteration: int) -> dict[str, Any] | None:
+        """Return the state with the best PSNR on val after the end of a training; None if the last one has it.
+
+        Args:
+            iteration: the number of finished iterations.
+        """
+        if self.wait is None or self._best is None:
+            return None
+        self.stop, kept, self._kept = Stop(iteration, self._best[0]), self._kept, None
+        return kept
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the kept state and its PSNR for a checkpoint."""
+        stop = None if self.stop is None else vars(self.stop).copy()
+        return {"best": self._best, "kept": self._kept, "stop": stop}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the kept state from a checkpoint; raise InputError if it is not one."""
+        best, self._kept = state["best"], state["kept"]
+        if best is not None and not (len(best) == 2 and isinstance(best[0], int) and isinstance(best[1], float)):
+            raise InputError(f"checkpoint: expected the best iteration and its PSNR, got {best!r:.80}")
+        if not isinstance(self._kept, dict | None):
+            raise InputError(f"checkpoint: expected the state at the best PSNR on val, got {self._kept!r:.80}")
+        self._best = None if best is None else (best[0], best[1])
+        self.stop = None if state["stop"] is None else parse(Stop, state["stop"], "checkpoint: stop")
+
+
+def _copied(state: Any) -> Any:
+    """Return a copy of nested dicts, lists and tensors, which the training then cannot change."""
+    if isinstance(state, torch.Tensor):
+        return state.clone()
+    if isinstance(state, dict):
+        return {key: _copied(value) for key, value in state.items()}
+    return [_copied(value) for value in state] if isinstance(state, list) else state

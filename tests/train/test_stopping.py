@@ -1,0 +1,105 @@
+"""`train.patience`: the iteration with the best PSNR on val is kept, and a training that no longer gains stops."""
+
+import copy
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from test_resume import assert_same_bits
+from test_wiring import trainer
+
+from gsbench.errors import InputError
+from gsbench.run.checks import check_scene
+from gsbench.stability.training_cases import compose, moving_square
+from gsbench.train.loop import Trainer
+
+PATIENT = ("train.curve_points=20", "train.patience=0.2", "train.densify.every=5", "train.densify.reset_every=1000000",
+           "train.average_from=100", "effects.gate=end", "train.sh_every=1", "train.refine_from=1")  # fmt: skip
+
+
+def with_val(psnr: dict[int, float], *more: str) -> Trainer:
+    """A trainer of 100 iterations whose PSNR on val, by iteration, is given: it rises where nothing is given."""
+    fitted = trainer("7dgs", *PATIENT, *more)
+    real = fitted.psnr
+    fitted.psnr = lambda views: (  # type: ignore[method-assign]
+        psnr.get(fitted.step + 1, fitted.step / 100) if views is fitted.scene.val else real(views)
+    )
+    return fitted
+
+
+def parameters_at(iteration: int) -> list[torch.Tensor]:
+    """The parameters after so many iterations of a training without patience."""
+    fitted = trainer("7dgs", *PATIENT, "train.patience=null", "effects.gate=off")
+    fitted.run(lambda _: None, "square", lambda: fitted.step < iteration)
+    assert fitted.step == iteration
+    return [p.detach().clone() for p in fitted.model.parameters()]
+
+
+@pytest.mark.parametrize("best", [40, 75])  # during densification, and after it
+def test_a_training_stops_after_its_best_and_keeps_it(best: int) -> None:
+    """Catches a training that goes on, one that keeps its last state, and a state that the next steps have changed."""
+    fitted = with_val({best: 50.0}, "effects.gate=off")
+    saved: list[dict[str, Any]] = []
+    fitted.run(saved.append, "square")
+    stop = fitted.early_stop.stop
+    assert stop is not None
+    assert (stop.kept, stop.iteration) == (best, max(best, fitted.schedule.densify_stop) + 20)
+    assert fitted.curve.points[-1].iteration == stop.iteration
+    assert fitted.step == 100  # so that the run is finished for all who ask
+    kept = [p.detach() for p in fitted.model.parameters()]
+    assert_same_bits([p.data for p in kept], [p.data for p in parameters_at(best)])
+    assert saved[-1]["early_stop"]["kept"] is None  # nothing is left to go back to
+
+
+def test_a_training_that_gains_to_the_end_is_that_without_patience() -> None:
+    """Catches a training that patience changes where it has nothing to do, such as one without its average."""
+    fitted = with_val({}, "effects.gate=off")
+    fitted.run(lambda _: None, "square")
+    assert fitted.early_stop.stop is not None
+    assert (fitted.early_stop.stop.kept, fitted.early_stop.stop.iteration) == (100, 100)
+    assert_same_bits([p.data for p in fitted.model.parameters()], [p.data for p in parameters_at(100)])
+
+
+def test_effects_are_removed_from_the_gaussians_that_are_kept() -> None:
+    """Catches gates at the end whose rows are those of the last iteration: more Gaussians than the kept one has."""
+    fitted = with_val({40: 50.0})
+    fitted.run(lambda _: None, "square")
+    assert 0 < len(fitted.model) <= len(parameters_at(40)[0])
+    assert fitted.gating.gates
+
+
+def test_a_killed_run_keeps_the_same_iteration() -> None:
+    """Catches a checkpoint that has lost the best iteration, or how long ago it was."""
+    whole, killed, resumed = (with_val({60: 50.0}, "effects.gate=off") for _ in range(3))
+    ends: list[dict[str, Any]] = []
+    for fitted, goes_on in ((whole, lambda: True), (killed, lambda: killed.step < 67)):
+        fitted.run(lambda state: ends.append(copy.deepcopy(state)), "square", goes_on)
+    resumed.load_state_dict(ends[-1])
+    resumed.run(lambda _: None, "square")
+    assert resumed.early_stop.stop == whole.early_stop.stop
+    assert_same_bits([p.data for p in resumed.model.parameters()], [p.data for p in whole.model.parameters()])
+
+
+@pytest.mark.parametrize("changed", [{"best": 3}, {"best": ("a", 1.0)}, {"kept": 3}, {"stop": {"iteration": "x"}}, {}])
+def test_a_damaged_checkpoint_is_refused(changed: dict[str, Any]) -> None:
+    """Catches a stack trace from what a checkpoint says was kept."""
+    fitted = with_val({})
+    state = fitted.state_dict()
+    state["early_stop"] = state["early_stop"] | changed if changed else {}
+    with pytest.raises(InputError, match=r"^checkpoint: "):
+        fitted.load_state_dict(state)
+
+
+def test_what_patience_needs_is_asked_at_the_door() -> None:
+    """Catches a run that watches nothing, or that is measured on what it was chosen by."""
+    fitted, config = trainer("7dgs"), compose("7dgs", 100, "train.patience=0.2")
+    check_scene(fitted.model, fitted.scene, config)
+    with pytest.raises(InputError, match=r"^train\.patience: expected views of val"):
+        check_scene(fitted.model, replace(moving_square(), val=[]), config)
+    config.scene.eval_split = "val"
+    with pytest.raises(InputError, match=r"^train\.patience: expected results on test"):
+        check_scene(fitted.model, fitted.scene, config)
+    config.scene.eval_split, config.effects.compare = "test", True
+    with pytest.raises(InputError, match=r"^train\.patience: expected effects\.compare=false"):
+        check_scene(fitted.model, fitted.scene, config)
