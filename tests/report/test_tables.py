@@ -273,7 +273,9 @@ def test_runs_measured_before_their_last_iteration_are_told():
         make(seed=1, stop=files.Stop(3000, 2200)),
         make(seed=2, stop=files.Stop(2800, 2000)),
     ]
-    said = "- 2 of 3 runs were measured at the iteration with the best PSNR on val, 2,000 to 2,200, and ended at iteration"
+    said = (
+        "- 2 of 3 runs were measured at the iteration with the best PSNR on val, 2,000 to 2,200, and ended at iteration"
+    )
     assert f"{said} 2,800 to 3,000 (train.patience).\n" in page(*ran)
     assert "patience" not in page(*ran[:1], make(seed=3))
 
