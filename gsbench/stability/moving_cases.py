@@ -206,3 +206,11 @@ def camera_on_a_moving_mean(g: Generator, severity: float, model: str) -> Observ
     observed.raw["directions"] = 0.5 * torch.randn(COUNT, 3, generator=g)
     set_view(observed, -1.0)
     return observed
+
+
+@case("slicing", *MODELS)
+def moving_opacities_at_their_ends(g: Generator, severity: float, model: str) -> Observed:
+    """Use opacity logits of -200 to 200: exp overflows at 89."""
+    observed = ordinary(g, model)
+    observed.raw["opacities"] = severity * torch.tensor([-200.0, -89.0, 20.0, 200.0])
+    return observed
