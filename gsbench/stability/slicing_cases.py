@@ -269,7 +269,7 @@ def vanishing_quaternion(g: Generator, severity: float, model: str) -> Observed:
 
 @case("slicing", *ALL)
 def opacities_at_their_ends(g: Generator, severity: float, model: str) -> Observed:
-    """Use opacity logits of -200 to 200, as pruning to zero or a PLY with an opacity of 1 makes: exp overflows at 89."""
+    """Use opacity logits of -200 to 200, as a PLY with opacities of 0 and 1 has: exp overflows at 89."""
     observed = ordinary(g, model)
     observed.raw["opacities"] = severity * torch.tensor([-200.0, -89.0, 20.0, 200.0])
     return observed
