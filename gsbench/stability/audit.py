@@ -3,8 +3,10 @@
 import sys
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
+from multiprocessing import get_context
 from typing import TypeVar
 
 import torch
@@ -62,7 +64,9 @@ def present() -> list[str]:
 
 
 def run(million: int = MILLION, *, long: bool = False, short: bool = False) -> Audit:
-    """Run the stability audit with a progress bar on stderr.
+    """Run the stability audit with a progress bar on stderr, on one thread.
+
+    The trainings whose drift is measured take half of the time; they run in another process meanwhile.
 
     Args:
         million: the number of random Gaussians with ill-conditioned factors to slice, by default a million.
@@ -70,13 +74,16 @@ def run(million: int = MILLION, *, long: bool = False, short: bool = False) -> A
             (otherwise only with the default order).
         short: test only default settings, with fewer Gaussians and training steps, one seed and no timings.
     """
-    began = time.perf_counter()
+    began, threads = time.perf_counter(), torch.get_num_threads()
+    torch.set_num_threads(1)
     audit = Audit(present())
-    listed = _short_steps(audit) if short else _steps(audit, million, long)
-    with tqdm(listed, desc="stability", file=sys.stderr) as steps:
-        for name, step in steps:
-            steps.set_postfix_str(name)
-            step()
+    with ProcessPoolExecutor(1, get_context("spawn")) as other:  # a process is started by its first task
+        listed = _short_steps(audit) if short else _steps(audit, million, long, other)
+        with tqdm(listed, desc="stability", file=sys.stderr) as steps:
+            for name, step in steps:
+                steps.set_postfix_str(name)
+                step()
+    torch.set_num_threads(threads)
     audit.seconds = time.perf_counter() - began
     return audit
 
@@ -112,8 +119,25 @@ def _extend(cells: list[Cell], judge: Callable[[Case], Iterable[Cell]], case: Ca
     cells.extend(judge(case))
 
 
-def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Step]]:
-    """Return the names and functions of all tests and timings in a full audit."""
+def _drifts(backend: str, long: bool) -> list[Cell]:
+    """Measure how far trainings in float32 drift from float64, on one thread."""
+    torch.set_num_threads(1)
+    found: list[Cell] = []
+    for case in of_area("drift"):
+        some, count = (case, LONG_DRIFT_STEPS) if long else (only(case, *DRIFTING), DRIFT_STEPS)
+        found += trainings.drift(some, backend, steps=count)
+    return found
+
+
+def _steps(audit: Audit, million: int, long: bool, other: ProcessPoolExecutor) -> list[tuple[str, Step]]:
+    """Return the names and functions of all tests and timings in a full audit.
+
+    Args:
+        audit: gets the results.
+        million: the number of random Gaussians.
+        long: whether trainings are long.
+        other: the process in which the drift of trainings is measured; timings begin when it is done.
+    """
     steps: list[tuple[str, Step]] = []
 
     def add(name: str, found: list[T], more: Callable[[], Iterable[T]]) -> None:
@@ -127,15 +151,14 @@ def _steps(audit: Audit, million: int, long: bool) -> list[tuple[str, Step]]:
     for case in of_area("training"):
         more = {"steps": LONG_STEPS} if long and case.name == "learning_rates_times_30" else {}
         add(case.name, audit.cells, partial(trainings.judge, case, fastest, **more))
-    for case in of_area("drift"):
-        some, count = (case, LONG_DRIFT_STEPS) if long else (only(case, *DRIFTING), DRIFT_STEPS)
-        add(case.name, audit.cells, partial(trainings.drift, some, fastest, steps=count))
+    drifts = other.submit(_drifts, fastest, long)
     for order in FACTOR_ORDERS:
         count = million if long or order == DEFAULT_ORDER else min(million, NOT_DEFAULT)
         steps.append((f"hard slices, {order}", partial(hard_slices, audit, order, count)))
     for model in moving_population.MODELS:
         steps.append((f"hard slices, {model}", partial(moving_slices, audit, model, min(million, MOVING))))
     add("error by condition number", audit.conditions, curves.by_condition)
+    add("drift of float32", audit.cells, drifts.result)
     add("error by time", audit.accuracy, partial(curves.accuracy_for_time, audit.backends))
     add("cost of safety", audit.safety, partial(curves.safety, audit.backends))
     return steps

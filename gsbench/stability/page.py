@@ -55,8 +55,9 @@ def conditions(audit: Audit) -> list[str]:
         f"{', '.join(f'{k} {v}' for k, v in versions().items())}; backends here: {', '.join(audit.backends)}; "
         f"{audit.seconds:.0f} s.",
         "",
-        "A cell reads: error of the result / error of its gradient / share not finite or indefinite / milliseconds, "
-        "forward and backward. It is the worst Gaussian of a case, and the 99.9th percentile of the hard slices. "
+        "A cell reads: error of the result / error of its gradient / share not finite or indefinite / milliseconds of "
+        "one thread, forward and backward. It is the worst Gaussian of a case, and the 99.9th percentile of the hard "
+        "slices. "
         f"{MARK.strip()} marks a cell over its bound; a default is the scheme `square_root`. `cholesky` has a kernel "
         "for 6D and 7D on the CPU, to be compared with; `schur` runs in torch.",
         f"The hard slices' float64 reference differs from mpmath by at most: {checks}.",
