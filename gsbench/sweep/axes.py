@@ -1,4 +1,7 @@
-"""Expand a command line before Hydra reads it: scene=all becomes a sweep with one run for each scene."""
+"""Expand a command line before Hydra reads it: scene=all becomes a sweep with one run for each scene.
+
+A command that names a launcher is a sweep too: without `--multirun`, Hydra ignores launchers, and trains here.
+"""
 
 import itertools
 import re
@@ -37,8 +40,10 @@ def expand(words: Sequence[str]) -> list[str]:
         if not before.startswith("-"):  # else it is the value of an option, such as a folder
             _check_group(*word.lstrip("+").partition("=")[::2])
     keys = {word.partition("=")[0].lstrip("+"): word.partition("=")[2] for word in words if "=" in word}
+    informs = any(word in INFORM for word in words)
+    multirun = multirun or (keys.get("launch", "local") != "local" and not informs)
     wants_all = keys.get("scene", "all") == "all" and "exp" in keys and keys["exp"] != "stability"
-    if wants_all and not any(word in INFORM for word in words):
+    if wants_all and not informs:
         if "," in keys["exp"]:
             raise InputError(f"scene=all: expected one experiment, got exp={keys['exp']}: name the scenes, scene=A,B")
         scenes = scenes_of([word for word in words if word.partition("=")[0].lstrip("+") in SCENES_DEPEND_ON])

@@ -30,11 +30,14 @@ def schema() -> None:
         (["--config-dir", "/tmp", "model=7dgs"], ["--config-dir", "/tmp", "model=7dgs"]),
         (["model=7dgs", "--config-dir", "."], ["model=7dgs", "--config-dir", "."]),
         (["+exp=stability"], ["+exp=stability"]),
+        (["+exp=mini", "scene=dust", "+launch=slurm"], ["--multirun", "+exp=mini", "scene=dust", "+launch=slurm"]),
+        (["+exp=mini", "scene=suzanne", "+launch=local"], ["+exp=mini", "scene=suzanne", "+launch=local"]),
+        (["+exp=mini", "+launch=slurm", "--cfg", "job"], ["+exp=mini", "+launch=slurm", "--cfg", "job"]),
     ],
 )  # fmt: skip
 def test_scenes_are_an_axis(words: list[str], expanded: list[str]) -> None:
     """Catches scenes that a cluster does one after the other in one job, and a flag that Hydra does not see,
-    and a folder of configs that is taken for a choice."""
+    a folder of configs that is taken for a choice, and a run for Slurm that trains on the login node instead."""
     assert expand(words) == expanded
 
 
