@@ -25,6 +25,14 @@ def test_it_is_committed_without_outputs(name: str) -> None:
     assert not ran, "clear the outputs: jupyter nbconvert --clear-output --inplace examples/*.ipynb"
 
 
+def test_git_ignores_what_they_write() -> None:
+    """Catches a notebook that leaves scenes and results as untracked files in a checkout."""
+    ignored = (ROOT / ".gitignore").read_text().splitlines()
+    for name, written in {"first_look": "first_look", "own_capture": "captures", "own_model": "own_model"}.items():
+        assert f"{written}/" in "".join(sources(name, "code")) or f'"{written}"' in "".join(sources(name, "code"))
+        assert f"examples/{written}/" in ignored
+
+
 def test_their_model_is_the_one_of_the_page() -> None:
     """Catches a notebook and a page that explain two different models by one name."""
     page = {Path(path).name: text.strip() for path, text in blocks().items()}
