@@ -94,7 +94,7 @@ def _told(error: Exception) -> str | None:
         return explain(error)
     if isinstance(error, OSError):  # an error of Hydra's files; errors of a run are stored in its record.json
         return one_line(error)
-    return one_line(error) if raised_by_library(error) else None
+    return explain(error) if raised_by_library(error) else None
 
 
 _in_two_lines = warnings.formatwarning

@@ -98,7 +98,7 @@ def load(
             reader = importlib.import_module(f"gsbench.scenes.{layout.reader}")
             scene: Scene = reader.load(root, downscale=downscale, background=background, resize=resize, **more)
             return scene
-    found = "a folder without it" if root.is_dir() else "no such folder"
+    found = "a folder without a scene" if root.is_dir() else "no such folder"
     layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
     raise InputError(f"{root}: {found}: looked for {layouts}", docs="data.md#what-is-read")
 

@@ -1,4 +1,4 @@
-"""Explain in one line why Hydra or OmegaConf rejects a command line or a config."""
+"""Explain in one line why Hydra, OmegaConf or a launcher rejects a command line or a config."""
 
 import traceback
 
@@ -10,10 +10,11 @@ from gsbench.errors import did_you_mean
 from gsbench.measure.renamed import present_key
 
 LIBRARIES = ("hydra", "omegaconf", "antlr4", "joblib", "submitit")
+NO_SLURM = 'Could not detect "srun"'  # how submitit says so
 
 
 def explain(error: Exception) -> str:
-    """Explain an error of Hydra or OmegaConf in one line that contains the wrong key and the most similar valid key."""
+    """Explain an error of Hydra, OmegaConf or a launcher in one line, with the wrong key and the most similar one."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         if group == "hydra/launcher":
@@ -28,6 +29,9 @@ def explain(error: Exception) -> str:
         if keys and cause.key not in keys:
             return f"config key '{cause.full_key}' is not known. {did_you_mean(str(cause.key), keys)}"
         return f"config key '{cause.full_key}': {str(cause).splitlines()[0]}"
+    if str(error).startswith(NO_SLURM):
+        return ("+launch=slurm: expected a machine of a Slurm cluster, srun is not on PATH: use its login node, or "
+                "+launch=parallel (docs/runs.md#slurm-from-a-login-node-to-the-table)")  # fmt: skip
     return " ".join(str(error).split())
 
 

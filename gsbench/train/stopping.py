@@ -74,11 +74,11 @@ class EarlyStop:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the kept state from a checkpoint; raise InputError if it is not one."""
+        if not isinstance(state, dict) or not isinstance(state["kept"], dict | None):
+            raise InputError("checkpoint: expected the state at the best PSNR on val")
         best, self._kept = state["best"], state["kept"]
         if best is not None and not (len(best) == 2 and isinstance(best[0], int) and isinstance(best[1], float)):
             raise InputError(f"checkpoint: expected the best iteration and its PSNR, got {best!r:.80}")
-        if not isinstance(self._kept, dict | None):
-            raise InputError(f"checkpoint: expected the state at the best PSNR on val, got {self._kept!r:.80}")
         self._best = None if best is None else (best[0], best[1])
         self.stop = None if state["stop"] is None else parse(Stop, state["stop"], "checkpoint: stop")
 

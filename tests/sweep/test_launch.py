@@ -15,7 +15,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from tiny_run import gsbench, overrides, write_moving_square
+from tiny_run import gsbench, main_here, overrides, write_moving_square
 
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
@@ -193,3 +193,15 @@ def test_several_processes_give_the_bits_of_one(square: Path, tmp_path: Path) ->
         assert all(torch.equal(one[name], two[name]) for name in one)
         metrics = [json.loads(file.with_name("record.json").read_text())["metrics"] for file in (path, other)]
         assert metrics[0] == metrics[1]
+
+
+def test_without_slurm_the_error_says_where_to_go(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches an error of submitit that only asks whether this is a cluster."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    words = ["-m", "+exp=mini", "scene=suzanne", "model=3dgs", "+launch=slurm", f"results={tmp_path / 'results'}"]
+    assert main_here(*words) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("gsbench: error: +launch=slurm: expected a machine of a Slurm cluster, srun is not on PATH")
+    assert said.endswith("(docs/runs.md#slurm-from-a-login-node-to-the-table)")
