@@ -18,7 +18,7 @@ LEVELS ?= native
 # What builds images.
 DOCKER ?= docker
 
-.PHONY: help table1 frontier tables test test-all stability stability-long bench gpu-check slurm-check sanitize lint format docs scenes setup locks wheel image clean
+.PHONY: help table1 frontier tables test test-all notebooks stability stability-long bench gpu-check slurm-check sanitize lint format docs scenes setup locks wheel image clean
 .DEFAULT_GOAL := help
 
 help:  ## what there is to make
@@ -88,6 +88,9 @@ test: lint  ## lint, types and all tests but the slow ones
 
 test-all: $(VENV)/levels-all lint $(VENV)/installed-docs  ## the slow tests too, in every instruction set
 	$(BIN)/python -m pytest -m 'slow or not slow'
+
+notebooks: $(VENV)/installed-docs  ## run the notebooks of examples/ from a fresh folder
+	$(BIN)/python -m pytest -n 0 -m slow tests/test_examples.py
 
 stability: $(VENV)/levels-all  ## hard cases against an oracle; results/stability/, fails where a default breaks its bound
 	$(BIN)/python -m gsbench.stability
