@@ -142,6 +142,15 @@ def broken(site: Path) -> list[str]:
     return bad
 
 
+def test_code_that_a_page_shows_is_where_the_page_looks() -> None:
+    """Catches a class that moved to another file, without building the site."""
+    block = r"\{literalinclude\} \.\./(\S+)\n(?::\S+:.*\n)*?:pyobject: (\S+)"
+    shown = [found for page in (ROOT / "docs").glob("*.md") for found in re.findall(block, page.read_text())]
+    assert shown
+    for file, name in shown:
+        assert re.search(rf"^(class|def) {name}\b", (ROOT / file).read_text(), re.MULTILINE), (file, name)
+
+
 @pytest.mark.slow
 def test_the_site_builds_offline_without_a_broken_link(tmp_path: Path) -> None:
     """Catches a warning of Sphinx, a link to a page, a heading or a file that is gone, and what needs a network."""
