@@ -269,13 +269,11 @@ GSB_HD inline void backward_rows(const ColorArgs& a, const Pieces& pieces, const
     const Vec zero(0.0f);
     const Shades s(a, rows);
     Vec g_Y[LANES], g_time[LANES];  // of a Gaussian in each vector
-    // The added values are rounded first, so that the result does not depend on which views share a sum.
-    const auto add = [](Vec x, float* p, int n) { store_first(load_some(p, n) + x, p, n); };
     for (int i = 0; i < rows.count; ++i) {
         const Vec color = load_some(colors + rows.threes[i], 3);
         Vec g = load_some(g_colors + rows.threes[i], 3);
         g = select(Vec(1.0f) / color > zero, g, zero);  // 1 / -0 is -inf
-        add(g * SH_0, out.sh0 + rows.threes[i], 3);
+        add_first(g * SH_0, out.sh0 + rows.threes[i], 3);
         g = permute(g, CHANNELS);
         const float* row = a.shN + rows.all[i];
         float* g_row = out.shN + rows.all[i];
@@ -284,7 +282,7 @@ GSB_HD inline void backward_rows(const ColorArgs& a, const Pieces& pieces, const
         g_Y[i] = g_time[i] = zero;
         for (int k = 0; k < pieces.count; ++k) {
             const Piece& p = pieces.piece[k];
-            add(s.weight(i, p) * g, g_row + p.at, p.floats);
+            add_first(s.weight(i, p) * g, g_row + p.at, p.floats);
             const Vec product = load_some(row + p.at, p.floats) * g;
             const Vec along = select(p.bases, sum_threes(product, p.bases_at), zero);
             g_Y[i] += p.wave ? along * Vec(s.cosines[p.wave][i]) : along;

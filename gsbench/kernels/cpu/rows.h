@@ -44,7 +44,7 @@ GSB_HD inline void scatter_row(const Vec (&x)[W], float* rows, int64_t i, int n)
     keep_rows(copy, W, rows, i, n);
 }
 
-// Adds instead of storing.
+// Adds instead of storing. A Vec is rounded, unlike a Product, so the result does not depend on which views share a sum.
 template <int W>
 GSB_HD inline void add_row(const Vec (&x)[W], float* rows, int64_t i, int n) {
     Vec sum[W];
@@ -52,7 +52,7 @@ GSB_HD inline void add_row(const Vec (&x)[W], float* rows, int64_t i, int n) {
     GSB_UNROLL for (int k = 0; k < W; ++k) sum[k] += x[k];
     scatter_row(sum, rows, i, n);
 }
-GSB_HD inline void add_first(Vec x, float* p, int n) { store_first(load_first(p, n) + x, p, n); }
+GSB_HD inline void add_first(Vec x, float* p, int n) { store_first(load_some(p, n) + x, p, n); }
 
 template <int H, int W>
 GSB_HD inline void gather_matrix(const float* rows, int64_t i, int n, Vec (&out)[H][W]) {
