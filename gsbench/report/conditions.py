@@ -1,7 +1,7 @@
 """State the conditions under which the results of a table were measured, and warn if they differ between runs."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from gsbench.errors import printable
@@ -103,9 +103,8 @@ def _load(records: list[Record]) -> list[str]:
     loads = [cost.load for cost in costs if cost.load is not None]
     if not loads:
         return []
-    ends = dict.fromkeys(f"{load:.1f}" for load in (min(loads), max(loads)))
     silent = _silent(len(costs) - len(loads), len(costs))
-    return [f"load of the machine during a training, these runs included: {' to '.join(ends)}{silent}"]
+    return [f"load of the machine during a training, these runs included: {_span(loads, '.1f')}{silent}"]
 
 
 def _silent(number: int, runs: int) -> str:
@@ -128,14 +127,14 @@ def _stops(records: list[Record]) -> list[str]:
     early = [r.stop for r in records if r.stop is not None and r.stop.kept < r.stop.iteration]
     if not early:
         return []
-    kept, ends = ([getattr(stop, name) for stop in early] for name in ("kept", "iteration"))
+    kept, ends = [stop.kept for stop in early], [stop.iteration for stop in early]
     return [f"{len(early)} of {len(records)} runs were measured at the iteration with the best PSNR on val, "
-            f"{_span(kept)}, and ended at iteration {_span(ends)} (train.patience)."]  # fmt: skip
+            f"{_span(kept, ',')}, and ended at iteration {_span(ends, ',')} (train.patience)."]  # fmt: skip
 
 
-def _span(numbers: list[int]) -> str:
-    low, high = min(numbers), max(numbers)
-    return f"{low:,}" if low == high else f"{low:,} to {high:,}"
+def _span(numbers: Sequence[float], form: str) -> str:
+    """Return the least and the largest number, or one of them if they look alike."""
+    return " to ".join(dict.fromkeys(format(number, form) for number in (min(numbers), max(numbers))))
 
 
 def _commit(record: Record) -> str:

@@ -11,6 +11,7 @@ import torch
 
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel
+from gsbench.raster.exact import U
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Camera, Points, Scene, View
 from gsbench.stability.cases import Case, Cell, device_of
@@ -55,7 +56,8 @@ def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS, **more: Any) -
         differences, notes, bad, ms, bound = [], [], 0.0, 0.0, case.bound
         for seed in seeds:
             training: Training = case(model=name, run_seed=seed, **more)
-            exact = fit(replace(training, scene=double(training.scene)), "reference")
+            doubled = replace(training, scene=double(training.scene))
+            exact = fit(doubled, "reference")
             start = time.perf_counter()
             single = fit(training, backend)
             ms += 1e3 * (time.perf_counter() - start)
@@ -65,7 +67,7 @@ def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS, **more: Any) -
             notes.append(f"seed {seed}: {found:.4f} dB and {len(single.model)} Gaussians, in float64 {true:.4f} and "
                          f"{len(exact.model)}")  # fmt: skip
             if abs(found - true) > case.bound.forward:
-                shaken = [fit(replace(training, scene=double(training.scene)), "reference", one) for one in SHAKEN]
+                shaken = [fit(doubled, "reference", one) for one in SHAKEN]
                 others = [one.psnr(one.scene.test) for one in shaken]
                 bound = replace(bound, forward=max(bound.forward, *(abs(other - true) for other in others)))
                 notes.append(f"from start values changed by one rounding, float64 has "
@@ -112,7 +114,7 @@ def _shake(model: GaussianModel, seed: int) -> None:
     g = torch.Generator().manual_seed(seed)
     for parameter in model.parameters():
         change = 2 * torch.rand(parameter.shape, generator=g, dtype=parameter.dtype) - 1
-        parameter.mul_(1 + 2.0**-24 * change.to(parameter.device))
+        parameter.mul_(1 + U * change.to(parameter.device))
 
 
 def psnr(trainer: Trainer) -> float:

@@ -19,21 +19,8 @@ MAGIC = b"gsbench checkpoint 4\n"  # then the SHA-256 of the rest in hex and a l
 FILE_NAME = "checkpoint.pt"
 DIGEST = 64  # hex digits
 # Keys of a training's state whose values are bit-equal in all trainings with one seed, interrupted or not.
-REPRODUCED = frozenset(
-    {
-        "step",
-        "model",
-        "optimizer",
-        "density",
-        "minimum_scale",
-        "gating",
-        "average",
-        "penalties",
-        "best",
-        "early_stop",
-        "comparison",
-    }
-)
+REPRODUCED = frozenset({"step", "model", "optimizer", "density", "minimum_scale", "gating", "average", "penalties",
+                        "best", "early_stop", "comparison"})  # fmt: skip
 # Keys of measured times, at any depth of the state. They differ between two trainings with one seed.
 TIMES = frozenset({"stages", "effort", "curve", "seconds", "frame_ms_before", "frame_ms", "frame_ms_without"})
 

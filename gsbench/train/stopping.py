@@ -1,9 +1,8 @@
 """Keep the iteration with the best PSNR on val, and stop a training whose PSNR on val no longer rises."""
 
+import copy
 from collections.abc import Callable
 from typing import Any
-
-import torch
 
 from gsbench.errors import InputError
 from gsbench.measure.record import Stop
@@ -48,7 +47,7 @@ class EarlyStop:
             return
         if self._best is None or psnr > self._best[1]:
             self._best = iteration, psnr
-            self._kept = None if iteration == last else _copied(state())
+            self._kept = None if iteration == last else copy.deepcopy(state())
 
     def is_over(self, iteration: int) -> bool:
         """Return whether the training stops after so many finished iterations."""
@@ -81,12 +80,3 @@ class EarlyStop:
             raise InputError(f"checkpoint: expected the best iteration and its PSNR, got {best!r:.80}")
         self._best = None if best is None else (best[0], best[1])
         self.stop = None if state["stop"] is None else parse(Stop, state["stop"], "checkpoint: stop")
-
-
-def _copied(state: Any) -> Any:
-    """Return a copy of nested dicts, lists and tensors, which the training then cannot change."""
-    if isinstance(state, torch.Tensor):
-        return state.clone()
-    if isinstance(state, dict):
-        return {key: _copied(value) for key, value in state.items()}
-    return [_copied(value) for value in state] if isinstance(state, list) else state

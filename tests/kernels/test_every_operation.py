@@ -145,10 +145,12 @@ def test_v3_and_v4_have_the_same_bits(operation: Operation) -> None:
         pytest.skip("needs a processor with AVX-512, and the kernels of v3 and v4: make test LEVELS=all")
     many = 3 * 16 + 5  # some whole vectors, and a rest
     at, found = call(operation, N if "ids" in operation.inputs else many), {}  # `ids` are of N Gaussians
-    for level in ("v3", "v4"):
-        kernels.use_instruction_set(level)
-        found[level] = run(operation, at)
-    kernels.use_instruction_set(levels[-1])
+    try:
+        for level in ("v3", "v4"):
+            kernels.use_instruction_set(level)
+            found[level] = run(operation, at)
+    finally:
+        kernels.use_instruction_set(levels[-1])
     (outputs, gradients), (other_outputs, other_gradients) = found.values()
     assert all(torch.equal(x, y) for x, y in zip(outputs, other_outputs, strict=True))
     assert [name for name, x in gradients.items() if not torch.equal(x, other_gradients[name])] == []
