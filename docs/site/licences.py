@@ -102,7 +102,10 @@ def tables() -> str:
         if name in NOT_INSTALLED:
             version, licence = "", NOT_INSTALLED[name]
         else:
-            found = metadata.distribution(name)
+            try:
+                found = metadata.distribution(name)
+            except metadata.PackageNotFoundError:
+                sys.exit(f"licences: expected {name} to be installed, it is not: run make docs first")
             version, licence = found.version.partition("+")[0], licence_of(found)
         licence = f"**{licence}**" if "GPL" in licence else licence
         rows.append(f"| {name} | {version} | {group} | {'; '.join(filter(None, (licence, NOTES.get(name))))} |")
