@@ -3,17 +3,17 @@
 import re
 from importlib import resources
 
-_LINE = re.compile(r"^constexpr (int|float) (\w+) = ([\d.e-]+)f?(?: / ([\d.]+)f)?;", re.MULTILINE)
+_LINE = re.compile(r"^constexpr (int|float|double) (\w+) = ([\d.e-]+)f?(?: / ([\d.]+)f)?;", re.MULTILINE)
 
 
-def _constants(header: str, kind: str) -> dict[str, float]:
-    """Return the constants of type `kind` ("int" or "float") in a C++ header of this package, by name."""
+def _constants(header: str, *kinds: str) -> dict[str, float]:
+    """Return the constants of these types in a C++ header of this package, by name."""
     text = resources.files("gsbench.kernels").joinpath(header).read_text()
     return {name: float(value) / float(divisor or 1)
-            for type_, name, value, divisor in _LINE.findall(text) if type_ == kind}  # fmt: skip
+            for type_, name, value, divisor in _LINE.findall(text) if type_ in kinds}  # fmt: skip
 
 
-_thresholds = _constants("math/thresholds.h", "float")
+_thresholds = _constants("math/thresholds.h", "float", "double")
 LOG_SIZE_MAX = _thresholds["LOG_SIZE_MAX"]
 EXPONENT_MAX = _thresholds["EXPONENT_MAX"]
 TIME_OPACITY_FACTOR_MIN = _thresholds["TIME_OPACITY_FACTOR_MIN"]

@@ -111,9 +111,7 @@ def exact_image(
             "background": background.double(), "means2d": boxes.means2d, "half_sizes": boxes.half_sizes,
             "offsets": bins.offsets, "ids": bins.ids}  # fmt: skip
     kept |= {f"out.{name}": x for name, x in out._asdict().items()}
-    drawn = boxes.half_sizes[0, :, 0] > 0
-    numbers = {"N": N, "D": D, "beta": shapes is not None, "width": width, "height": height,
-               "depth_error": float((table[:, 10] * drawn).max()) if N else 0.0}  # fmt: skip
+    numbers = {"N": N, "D": D, "beta": shapes is not None, "width": width, "height": height}
     library.call("exact_image", {name: x.data_ptr() for name, x in kept.items()} | numbers, viewmat)
     return out
 

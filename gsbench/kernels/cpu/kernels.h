@@ -35,7 +35,6 @@ struct ExactArgs {
     int64_t N;
     int D;
     bool beta;
-    double depth_error;    // the largest of all Gaussians that float64 or float32 draws
     const double* exact;   // [N, 8]: x, y, p, q, r of math/projection.h, opacity (0: culled), exponent, depth
     // [N, 11]: x, y, p, q, r, opacity and exponent in float32; half sizes (0: culled); whether float32 surely draws it;
     // the error of the depth
@@ -46,7 +45,7 @@ struct ExactArgs {
     int width, height;
     int threads;
 };
-GSB_FIELDS(ExactArgs, INPUTS, N, D, beta, depth_error, exact, single, colors, color_errors, background, means2d, half_sizes, offsets,
+GSB_FIELDS(ExactArgs, INPUTS, N, D, beta, exact, single, colors, color_errors, background, means2d, half_sizes, offsets,
            ids, width, height, threads)
 
 struct ExactPicture {

@@ -77,7 +77,7 @@ GSB_HD inline Vec log2(Vec x) {
     y = y * s2 + (1.0f / 5.0f);
     y = y * s2 + (1.0f / 3.0f);
     y = y * s2 + 1.0f;
-    return e + s * y * (2.0f * LOG2_E);
+    return e + s * y * Vec(2 * LOG2_E);
 }
 
 // The moves of colours, whose rows have three channels for each basis; simd_moves_avx2.h has faster ones.

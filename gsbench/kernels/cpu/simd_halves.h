@@ -3,6 +3,8 @@
 
 #include <cstdint>
 
+#include "simd_pair.h"
+
 #if defined(__x86_64__)
 #include <immintrin.h>
 #elif defined(__aarch64__)
@@ -21,6 +23,7 @@ typedef float Floats __attribute__((vector_size(WIDTH * 4)));
 typedef int32_t Ints __attribute__((vector_size(WIDTH * 4)));
 
 struct RegisterMask {
+    static constexpr int size = WIDTH;
     Ints m;
 
     GSB_HD friend RegisterMask operator&(RegisterMask a, RegisterMask b) { return {a.m & b.m}; }
@@ -40,6 +43,7 @@ struct RegisterMask {
 };
 
 struct Register {
+    using Number = float;
     using Mask = RegisterMask;
     static constexpr int size = WIDTH;
     Floats v;
@@ -113,68 +117,6 @@ struct Register {
         const Ints raw = reinterpret_cast<Ints>(x.v), whole = (raw - 0x3f400000) >> 23;  // 0x3f400000 is 0.75
         mantissa.v = reinterpret_cast<Floats>(raw - (whole << 23));
         exponent.v = __builtin_convertvector(whole, Floats);
-    }
-};
-
-template <class Half>
-struct PairMask {
-    Half lo, hi;
-
-    GSB_HD friend PairMask operator&(PairMask a, PairMask b) { return {a.lo & b.lo, a.hi & b.hi}; }
-    GSB_HD friend PairMask operator|(PairMask a, PairMask b) { return {a.lo | b.lo, a.hi | b.hi}; }
-    GSB_HD friend PairMask operator!(PairMask a) { return {!a.lo, !a.hi}; }
-    GSB_HD friend uint32_t bits(PairMask a) { return bits(a.lo) | bits(a.hi) << (sizeof(Half) / sizeof(int32_t)); }
-};
-
-template <class Half>
-struct Pair {
-    using Mask = PairMask<typename Half::Mask>;
-    static constexpr int size = 2 * Half::size;
-    Half lo, hi;
-
-    Pair() = default;
-    GSB_HD Pair(Half lo, Half hi) : lo(lo), hi(hi) {}
-    GSB_HD Pair(float s) : lo(s), hi(s) {}
-
-    GSB_HD static Pair load(const float* p) { return {Half::load(p), Half::load(p + Half::size)}; }
-    GSB_HD void store(float* p) const {
-        lo.store(p);
-        hi.store(p + Half::size);
-    }
-    GSB_HD static Pair gather(const float* p, int stride) {
-        return {Half::gather(p, stride), Half::gather(p + Half::size * stride, stride)};
-    }
-    GSB_HD void scatter(float* p, int stride) const {
-        lo.scatter(p, stride);
-        hi.scatter(p + Half::size * stride, stride);
-    }
-
-    GSB_HD friend Pair operator+(Pair a, Pair b) { return {a.lo + b.lo, a.hi + b.hi}; }
-    GSB_HD friend Pair operator-(Pair a, Pair b) { return {a.lo - b.lo, a.hi - b.hi}; }
-    GSB_HD friend Pair operator/(Pair a, Pair b) { return {a.lo / b.lo, a.hi / b.hi}; }
-    GSB_HD friend Pair times(Pair a, Pair b) { return {times(a.lo, b.lo), times(a.hi, b.hi)}; }
-    GSB_HD friend Pair times_plus(Pair a, Pair b, Pair c) {  // a b + c
-        return {times_plus(a.lo, b.lo, c.lo), times_plus(a.hi, b.hi, c.hi)};
-    }
-    GSB_HD friend Pair times_minus(Pair a, Pair b, Pair c) {  // a b - c
-        return {times_minus(a.lo, b.lo, c.lo), times_minus(a.hi, b.hi, c.hi)};
-    }
-    GSB_HD friend Pair minus_times(Pair c, Pair a, Pair b) {  // c - a b
-        return {minus_times(c.lo, a.lo, b.lo), minus_times(c.hi, a.hi, b.hi)};
-    }
-    GSB_HD friend Mask operator<(Pair a, Pair b) { return {a.lo < b.lo, a.hi < b.hi}; }
-    GSB_HD friend Mask operator<=(Pair a, Pair b) { return {a.lo <= b.lo, a.hi <= b.hi}; }
-    GSB_HD friend Mask operator==(Pair a, Pair b) { return {a.lo == b.lo, a.hi == b.hi}; }
-    GSB_HD friend Pair select(Mask m, Pair yes, Pair no) {
-        return {select(m.lo, yes.lo, no.lo), select(m.hi, yes.hi, no.hi)};
-    }
-    GSB_HD friend Pair min(Pair a, Pair b) { return {min(a.lo, b.lo), min(a.hi, b.hi)}; }
-    GSB_HD friend Pair max(Pair a, Pair b) { return {max(a.lo, b.lo), max(a.hi, b.hi)}; }
-    GSB_HD friend Pair sqrt(Pair a) { return {sqrt(a.lo), sqrt(a.hi)}; }
-    GSB_HD friend Pair exp2(Pair x) { return {exp2(x.lo), exp2(x.hi)}; }
-    GSB_HD friend void split(Pair x, Pair& mantissa, Pair& exponent) {
-        split(x.lo, mantissa.lo, exponent.lo);
-        split(x.hi, mantissa.hi, exponent.hi);
     }
 };
 

@@ -34,10 +34,10 @@ struct Falloff<T, Beta> {
         const T one(1.0f);
         w = T(s.p) * dx;
         u = T(s.q) * dx + T(s.r) * dy;
-        const T r2 = min((w * w + u * u) * (1.0f / HALF_LOG2_E), one), difference = one - r2;
+        const T r2 = min((w * w + u * u) * T(1 / HALF_LOG2_E), one), difference = one - r2;
         rest = max(difference, T(RIM_MIN));
         // The second term is what rounding took from the difference: large exponents need it.
-        log2_rest = log2(rest) + ((one - difference) - r2) * LOG2_E;
+        log2_rest = log2(rest) + ((one - difference) - r2) * T(LOG2_E);
         free = select(r2 < one, T(s.opacity) * exp2(T(log2_rest * T(s.shape))), T(0.0f));
         alpha = min(free, T(ALPHA_MAX));
     }
@@ -73,10 +73,10 @@ GSB_HD inline void splat_gradient(const FalloffMoments<float, Profile>& moments,
                                   float (&g)[Profile::MOMENTS]) {
     using M = FalloffMoments<float, Profile>;
     const auto& m = moments.of;
-    float scale = 2.0f * LN_2;
+    float scale = 2.0f * static_cast<float>(LN_2);
     if constexpr (Profile::HAS_SHAPE) {
         scale *= 2.0f * s.shape;
-        g[6] = LN_2 * m[M::SHAPE];
+        g[6] = static_cast<float>(LN_2) * m[M::SHAPE];
     }
     g[0] = scale * (s.p * m[M::W] + s.q * m[M::U]);
     g[1] = scale * (s.r * m[M::U]);

@@ -9,7 +9,7 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-constexpr float HALF_LOG2_E = 0.721347520f;  // exp(-x/2) = 2^(-HALF_LOG2_E x)
+constexpr double HALF_LOG2_E = 0.7213475204444817;  // exp(-x/2) = 2^(-HALF_LOG2_E x)
 
 struct Gaussian {
     static constexpr bool HAS_SHAPE = false;
@@ -18,7 +18,7 @@ struct Gaussian {
     // Returns the largest r^2 at which alpha >= ALPHA_MIN.
     template <class T>
     GSB_HD static T reach(T opacity, T) {
-        return log2(max(opacity * 255.0f, T(1.0f))) * (1.0f / HALF_LOG2_E);
+        return log2(max(opacity * 255.0f, T(1.0f))) * T(1 / HALF_LOG2_E);
     }
 };
 
@@ -30,7 +30,7 @@ struct Beta {
     GSB_HD static T reach(T opacity, T shape) {
         const T one(1.0f);
         // (1 - r^2)^b = e^(-b x), so that alpha = ALPHA_MIN at r^2 = 1 - e^-x; of a small x, by its series.
-        const T x = min(log2(max(opacity * 255.0f, one)) * LN_2 / shape, T(EXPONENT_MAX));
+        const T x = min(log2(max(opacity * 255.0f, one)) * T(LN_2) / shape, T(EXPONENT_MAX));
         const T series = x * (one - x * (T(0.5f) - x * (1.0f / 6.0f)));
         return select(x < T(0.03f), series, one - exp(T(0.0f) - x));
     }

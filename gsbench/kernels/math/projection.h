@@ -16,7 +16,7 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-constexpr float SQRT_HALF_LOG2_E = 0.849321800f;  // scales the root, as HALF_LOG2_E scales the power
+constexpr double SQRT_HALF_LOG2_E = 0.8493218002880191;  // scales the root, as HALF_LOG2_E scales the power
 constexpr float BOUNDS_MARGIN = 0.01f;            // pixels, so that rounding cuts off no pixel
 
 // A pinhole camera and the settings of the projection.
@@ -115,8 +115,8 @@ struct Projection {
         Splat<T> s;
         s.x = x * inv_z * camera.fx + camera.cx;
         s.y = y * inv_z * camera.fy + camera.cy;
-        s.p = unit * SQRT_HALF_LOG2_E / sqrt(xx);
-        s.r = sqrt(xx / det) * (unit * SQRT_HALF_LOG2_E);
+        s.p = unit * T(SQRT_HALF_LOG2_E) / sqrt(xx);
+        s.r = sqrt(xx / det) * (unit * T(SQRT_HALF_LOG2_E));
         s.q = zero - xy / xx * s.r;
         s.opacity = opacity * compensation;
         s.depth = depth;

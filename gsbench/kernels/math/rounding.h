@@ -1,11 +1,9 @@
-// What float32 can make of the alpha of a projected Gaussian at a pixel: an interval that contains the result of
+// What float32 can make of the alpha of a projected Gaussian at pixels: intervals that contain the result of
 // math/blending.h for any rounding of its operations (running error analysis: Higham, Accuracy and Stability of
-// Numerical Algorithms, section 3.3), computed in float64.
+// Numerical Algorithms, section 3.3). T is a SIMD vector of doubles.
 #pragma once
 
-#include <cmath>
-
-#include "profiles.h"
+#include "blending.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
@@ -20,71 +18,77 @@ struct ExactSplat {
     double x, y, p, q, r, opacity, shape;
 };
 
+template <class T>
 struct Interval {
-    double low, high;
+    T low, high;
 };
 
-// The offset of a pixel from the mean, and its power w^2 + u^2.
+// Pixels in the coordinates u, w of math/blending.h, where u = u_x + u_y; their power is w^2 + u^2.
+template <class T>
 struct ExactOffset {
-    double dx, dy, w, u, power;
+    T w, u_x, u_y, u, power;
 
-    ExactOffset(const ExactSplat& s, double x, double y) : dx(x - s.x), dy(y - s.y) {
-        w = s.p * dx;
-        u = s.q * dx + s.r * dy;
+    GSB_HD ExactOffset(const ExactSplat& s, T x, T y) {
+        const T dx = x - s.x;
+        w = dx * s.p;
+        u_x = dx * s.q;
+        u_y = (y - s.y) * s.r;
+        u = u_x + u_y;
         power = w * w + u * u;
     }
 };
 
-// Returns the largest error of the power in float32, at any point that is at most `beside` pixels away along x and y.
-inline double power_error(const ExactSplat& s, const ExactOffset& o, double beside = 0) {
-    const double dx = std::abs(o.dx) + beside, dy = std::abs(o.dy) + beside;
-    const double error_w = 2.01 * U * std::abs(s.p) * dx;
-    const double error_u = 3.01 * U * (std::abs(s.q) * dx + std::abs(s.r) * dy);
-    return 2 * (std::abs(o.w) * error_w + std::abs(o.u) * error_u) + error_w * error_w + error_u * error_u +
-           2.01 * U * o.power;
+// Returns the largest error of the power in float32. That of w is at most 2.01 U |w|, that of u 3.01 U (|u_x| + |u_y|).
+template <class T>
+GSB_HD inline T power_error(const ExactOffset<T>& o) {
+    const T terms = abs(o.u_x) + abs(o.u_y);
+    const T of_w = o.w * o.w * (4.02 * U + 4.05 * U * U);
+    const T of_u = terms * (abs(o.u) * (6.02 * U) + terms * (9.07 * U * U));
+    return of_w + of_u + o.power * (2.01 * U);
 }
 
-// The falloff in float64 and its interval in float32, by profile. Both are before alpha is held below ALPHA_MAX.
+// The interval of the falloff in float32, by profile, before alpha is held below ALPHA_MAX. `exact` is the falloff in
+// float64, and `power` its power.
 template <class Profile>
-struct ExactFalloff {
-    static double value(const ExactSplat& s, const ExactOffset& o) { return s.opacity * std::exp2(-o.power); }
-
-    static Interval single(const ExactSplat& s, const ExactOffset& o) {
-        const double error = power_error(s, o), value = s.opacity * std::exp2(-o.power);
-        const double grows = error < 1e-3 ? 1 + 0.7 * error : std::exp2(error);
-        const double rounds = EXP2_ERROR + 2.01 * U;
-        return {value / grows * (1 - rounds), value * grows * (1 + rounds)};
+struct SingleFalloff {
+    // Where the powers of float64 and float32 hardly differ, the falloff of float64 gives that of float32: the series
+    // of 2^x has a relative error of 1e-10 for |x| <= 0.01. Then 2^x <= 1 + 0.7 x; and 2^-x >= 1 - 0.7 x for all x.
+    template <class T>
+    GSB_HD static Interval<T> at(const ExactSplat& s, const ExactOffset<T>& o, T power, T exact, double opacity_ratio) {
+        constexpr double rounds = EXP2_ERROR + 2.01 * U + 1e-10;
+        const T error = power_error(o), more = power - o.power;
+        T value = exact * opacity_ratio * (((more * 0.0555 + 0.24022650696) * more + LN_2) * more + 1.0);
+        T grows = error * 0.7;
+        if (!(opacity_ratio > 0) || any(max(abs(more), error) > T(0.01))) {
+            value = exp2(-o.power) * s.opacity;
+            grows = max(grows, exp2(error) - 1.0);
+        }
+        return {value * max(T(1.0) - grows, T(0.0)) * (1 - rounds), value * (grows + 1.0) * (1 + rounds)};
     }
 };
 
 template <>
-struct ExactFalloff<Beta> {
-    static constexpr double EXACT_SCALE = 1.38629436111989061883;  // 1 / (log2(e) / 2): r^2 of a power
-    static constexpr double SINGLE_SCALE = 1.0f / HALF_LOG2_E, RIM = 1e-6;
+struct SingleFalloff<Beta> {
+    static constexpr double SCALE = static_cast<float>(1 / HALF_LOG2_E);
 
-    static double value(const ExactSplat& s, const ExactOffset& o) {
-        const double r2 = o.power * EXACT_SCALE;
-        if (r2 >= 1) return 0;
-        return s.opacity * std::exp(s.shape * (r2 < 0.5 ? std::log1p(-r2) : std::log(std::fmax(1 - r2, RIM))));
-    }
-
-    static Interval single(const ExactSplat& s, const ExactOffset& o) {
-        const double r2 = o.power * SINGLE_SCALE, error = power_error(s, o) * SINGLE_SCALE + 2.01 * U * r2;
-        return {at(s, r2 + error, -1), at(s, r2 - error, 1)};
+    template <class T>
+    GSB_HD static Interval<T> at(const ExactSplat& s, const ExactOffset<T>& o, T, T, double) {
+        const T r2 = o.power * SCALE, error = power_error(o) * SCALE + r2 * (2.01 * U);
+        return {end(s, r2 + error, -1.0), end(s, r2 - error, 1.0)};
     }
 
 private:
     // Returns the falloff at r^2, with all errors that follow in the direction of `sign`.
-    static double at(const ExactSplat& s, double r2, double sign) {
-        if (r2 >= 1) return 0;
-        r2 = std::fmax(r2, 0);
-        const double rest = std::fmax(1 - r2, RIM * (1 + sign * U));
-        const double logarithm = rest < 0.5 ? std::log2(rest) : std::log1p(-r2) * 1.4426950408889634;
+    template <class T>
+    GSB_HD static T end(const ExactSplat& s, T r2, double sign) {
+        const T inside = clamp(r2, T(0.0), T(1.0)), difference = T(1.0) - inside;
+        const T rest = max(difference, T(RIM_MIN * (1 + sign * U)));
+        const T logarithm = log2(rest) + ((T(1.0) - difference) - inside) * LOG2_E;
         // The logarithm of the rounded rest, and what is added for its rounding.
-        const double error = (LOG2_ERROR + U) * std::abs(logarithm) + 2 * U * r2;
-        const double exponent = s.shape * (logarithm + sign * error);
-        return s.opacity * std::exp2(exponent + sign * 1.01 * U * std::abs(exponent)) *
-               (1 + sign * (EXP2_ERROR + 2.01 * U));
+        const T error = abs(logarithm) * (LOG2_ERROR + U) + inside * (2 * U);
+        const T exponent = (logarithm + error * sign) * s.shape;
+        const T value = exp2(exponent + abs(exponent) * (1.01 * U * sign)) * s.opacity;
+        return select(r2 < T(1.0), value * (1 + sign * (EXP2_ERROR + 2.01 * U)), T(0.0));
     }
 };
 

@@ -38,12 +38,12 @@ GSB_HD inline float exp2(float x) { return ::exp2f(x); }
 GSB_HD inline float log2(float x) { return ::log2f(x); }
 GSB_HD inline float round(float x) { return ::rintf(x); }
 
-constexpr float LOG2_E = 1.44269504f;
-constexpr float LN_2 = 0.693147181f;
+constexpr double LOG2_E = 1.4426950408889634;
+constexpr double LN_2 = 0.6931471805599453;
 
 template <class T>
 GSB_HD inline T exp(T x) {
-    return exp2(T(x * LOG2_E));
+    return exp2(T(x * T(LOG2_E)));
 }
 
 // -x is bounded, because exp2 of a SIMD vector without AVX-512 is right for x < 129 alone: beyond, its exponent wraps.

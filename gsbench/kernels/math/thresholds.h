@@ -19,7 +19,7 @@ constexpr float ALPHA_MAX = 0.999f;
 constexpr float TRANSMITTANCE_MIN = 1e-4f;
 // 1 - r^2 of a Beta profile is held above this in alpha and in its gradient, which for exponents below 1 is infinite at
 // the rim r = 1.
-constexpr float RIM_MIN = 1e-6f;
+constexpr double RIM_MIN = 1e-6;
 // lambda_o of dGS, the coefficient in the exponent of its opacity factor.
 constexpr float DIRECT_FADING = 0.35f;
 // The least ln(1 - tanh) in an opacity factor of UBS and dBS: ln 1.2e-7, as in the authors' code.
