@@ -94,6 +94,18 @@ struct DoubleRegister {
     GSB_HD friend DoubleRegister min(DoubleRegister a, DoubleRegister b) { return a.v < b.v ? a.v : b.v; }
     GSB_HD friend DoubleRegister max(DoubleRegister a, DoubleRegister b) { return a.v > b.v ? a.v : b.v; }
 #endif
+    GSB_HD friend DoubleRegister sqrt(DoubleRegister a) {
+#if defined(__AVX512F__)
+        return DoubleLanes(_mm512_sqrt_pd(a.v));
+#elif defined(__AVX2__)
+        return DoubleLanes(_mm256_sqrt_pd(a.v));
+#elif defined(__x86_64__)
+        return DoubleLanes(_mm_sqrt_pd(a.v));
+#else
+        for (int i = 0; i < DOUBLE_WIDTH; ++i) a.v[i] = ::sqrt(a.v[i]);
+        return a;
+#endif
+    }
     GSB_HD friend DoubleRegister abs(DoubleRegister a) {
         return reinterpret_cast<DoubleLanes>(reinterpret_cast<LongLanes>(a.v) & INT64_MAX);
     }
@@ -133,6 +145,13 @@ constexpr uint32_t ALL_DOUBLES = (1u << DOUBLES) - 1;
 template <class Half>
 GSB_HD inline Pair<Half> abs(Pair<Half> a) {
     return {abs(a.lo), abs(a.hi)};
+}
+
+// Loads p[lane * stride] to the first n lanes, and zero to the others.
+GSB_HD inline Doubles gather(const double* p, int stride, int n) {
+    alignas(64) double lane[DOUBLES] = {};
+    for (int i = 0; i < n; ++i) lane[i] = p[i * stride];
+    return Doubles::load(lane);
 }
 
 GSB_HD inline Doubles operator*(Doubles a, Doubles b) { return times(a, b); }

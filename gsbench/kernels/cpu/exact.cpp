@@ -14,22 +14,14 @@ namespace gsb {
 inline namespace GSB_ISA {
 namespace {
 
-constexpr int EXACT_COLUMNS = 8, SINGLE_COLUMNS = 11;  // of the arguments
 constexpr int BLOCK_SIDE = 4;  // pixels along a side of the blocks of blend.cpp
 constexpr int ACROSS = TILE / STRIP_WIDTH, STRIPS = ACROSS * TILE / STRIP_HEIGHT;  // of a tile
 static_assert(STRIPS == 32 && DOUBLES % ACROSS == 0);
 
-// Returns the largest power at which alpha is at least 1/255, a little enlarged; -1 if there is none.
-template <class Profile>
-double reach_of(const ExactSplat& s) {
-    const double above = s.opacity * 255;
-    if (above < 1 - 1e-5) return -1;
-    const double most_seen = std::log(most(above, 1));
-    const double r2 = Profile::HAS_SHAPE ? -std::expm1(-most_seen / s.shape) : 2 * most_seen;
-    return r2 * HALF_LOG2_E * (1 + 1e-5) + 1e-5;
+template <class Number>
+ExactSplat splat_of(const Number (&x)[7]) {
+    return {x[0], x[1], x[2], x[3], x[4], x[5], x[6]};
 }
-
-ExactSplat splat_of(const double* row) { return {row[0], row[1], row[2], row[3], row[4], row[5], row[6]}; }
 
 // The strips of a tile, and which of them a Gaussian may reach.
 struct Strips {
@@ -80,36 +72,36 @@ double sure_power(const ExactSplat& s, double half_x, double half_y, const Strip
     return power - 8 * error * (root + error);
 }
 
-Listed listed_of(const ExactArgs& a, int64_t id, const Strips& strips, uint32_t& reached) {
-    const double *exact = a.exact + id * EXACT_COLUMNS, *single = a.single + id * SINGLE_COLUMNS;
-    const double depth = exact[7], error = single[10];
+// Returns a Gaussian in the list of a tile, and bits of the strips that it may reach in float64 or in float32.
+Listed listed_of(const ExactRecord& record, int32_t id, const Strips& strips, uint32_t& reached) {
     Listed g{};
-    g.id = static_cast<int32_t>(id);
-    g.near = depth - error;
-    g.far = depth + error;
+    g.id = id;
+    g.near = record.depth - record.depth_error;
+    g.far = record.depth + record.depth_error;
     g.sure = -1;
     reached = 0;
-    if (exact[5] > 0) {
-        g.exact = splat_of(exact);
-        const double reach = std::sqrt(a.beta ? reach_of<Beta>(g.exact) : reach_of<Gaussian>(g.exact)) * (1 + U);
-        reached |= strips.reached(g.exact, reach);
+    if (record.half_x > 0) {
+        g.exact = splat_of(record.exact);
+        reached |= strips.reached(g.exact, record.half_x * g.exact.p);
     }
-    if (single[7] > 0) {
-        g.single = splat_of(single);
-        reached |= strips.reached(g.single, single[7] * g.single.p * (1 + 4 * U) + 2 * strips.root_error(g.single, 0));
-        if (single[9] > 0) g.sure = sure_power(g.single, single[7], single[8], strips);
-        if (exact[5] > 0) g.opacity_ratio = g.single.opacity / g.exact.opacity;
+    if (record.single_half_x > 0) {
+        const double half_x = record.single_half_x;
+        g.single = splat_of(record.single);
+        reached |= strips.reached(g.single, half_x * g.single.p * (1 + 4 * U) + 2 * strips.root_error(g.single, 0));
+        if (record.sure) g.sure = sure_power(g.single, half_x, record.single_half_y, strips);
+        if (record.half_x > 0) g.opacity_ratio = g.single.opacity / g.exact.opacity;
     }
     return g;
 }
 
-// Fetches what is read of a Gaussian. It is inlined, because GCC removes a call without effects.
-GSB_HD inline void fetch(const ExactArgs& a, int64_t id) {
-    __builtin_prefetch(a.exact + id * EXACT_COLUMNS);
-    __builtin_prefetch(a.single + id * SINGLE_COLUMNS);
-    __builtin_prefetch(a.single + id * SINGLE_COLUMNS + SINGLE_COLUMNS - 1);
-    __builtin_prefetch(a.colors + id * a.D);
-    __builtin_prefetch(a.color_errors + id * a.D);
+// Copies a tile's list, sorted by the exact depth. It was sorted by the depth in float32, so that few are moved.
+void sort_exactly(const ExactArgs& a, const int32_t* from, int64_t count, int32_t* ids) {
+    for (int64_t i = 0; i < count; ++i) {
+        __builtin_prefetch(a.records + from[i + AHEAD < count ? i + AHEAD : i]);
+        int64_t at = i;
+        for (; at > 0 && a.records[ids[at - 1]].depth > a.records[from[i]].depth; --at) ids[at] = ids[at - 1];
+        ids[at] = from[i];
+    }
 }
 
 // The memory of a thread, with room for the longest list of a tile.
@@ -117,6 +109,7 @@ struct TileMemory {
     const int64_t longest;
     Buffer<Listed> listed;
     Buffer<Paint> paints;    // [longest, D]
+    Buffer<int32_t> ids;
     Buffer<int32_t> places;  // [STRIPS, longest]: of the tile's Gaussians those that may reach a strip
     Buffer<Entry> entries;
     Buffer<Entry*> members;
@@ -124,7 +117,7 @@ struct TileMemory {
 
     TileMemory(int64_t longest, int D)
         : longest(longest), listed(static_cast<size_t>(longest)), paints(static_cast<size_t>(longest * D)),
-          places(static_cast<size_t>(longest * STRIPS)),
+          ids(static_cast<size_t>(longest)), places(static_cast<size_t>(longest * STRIPS)),
           entries(static_cast<size_t>(longest)), members(static_cast<size_t>(longest)),
           nearest(static_cast<size_t>(longest)), channels(static_cast<size_t>(5 * D * DOUBLES)) {}
 
@@ -140,18 +133,25 @@ void exact_tile(const ExactArgs& a, TileMemory& memory, int64_t tile, const Exac
     const int across = tiles_along(a.width);
     const Strips strips(static_cast<int>(tile % across) * TILE, static_cast<int>(tile / across) * TILE);
     const int64_t count = a.offsets[tile + 1] - a.offsets[tile];
-    const int32_t* ids = a.ids + a.offsets[tile];
+    int32_t* ids = memory.ids.data();
     int64_t counts[STRIPS] = {};
     Listed* listed = memory.listed.data();
     Paint* paints = memory.paints.data();
     int32_t* places = memory.places.data();
     double nearest = INFINITY;
+    sort_exactly(a, a.ids + a.offsets[tile], count, ids);
     for (int64_t i = 0; i < count; ++i) {
-        fetch(a, ids[i + AHEAD < count ? i + AHEAD : i]);
+        const int64_t next = ids[i + AHEAD < count ? i + AHEAD : i];
+        __builtin_prefetch(&a.records[next].depth_error);  // in the other cache line
+        __builtin_prefetch(a.colors + next * a.D);
+        __builtin_prefetch(a.single_colors + next * a.D);
         uint32_t reached;
-        listed[i] = listed_of(a, ids[i], strips, reached);
+        listed[i] = listed_of(a.records[ids[i]], ids[i], strips, reached);
         const int64_t color = static_cast<int64_t>(ids[i]) * a.D;
-        for (int k = 0; k < a.D; ++k) paints[i * a.D + k] = Paint(a.colors[color + k], a.color_errors[color + k]);
+        for (int k = 0; k < a.D; ++k) {
+            const double exact = a.colors[color + k];
+            paints[i * a.D + k] = Paint(exact, magnitude(a.single_colors[color + k] - exact));
+        }
         for (; reached; reached &= reached - 1) {
             const int strip = __builtin_ctz(reached);
             places[strip * memory.longest + counts[strip]++] = static_cast<int32_t>(i);

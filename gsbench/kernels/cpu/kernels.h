@@ -30,23 +30,50 @@ struct TileLists {
 };
 GSB_FIELDS(TileLists, OUTPUTS, offsets, ids)
 
-// Projected Gaussians in float64 and the results of the kernels in float32, to render the exact image of one camera.
+// Gaussians in float64, the same in float32 as one camera projects them (Splats of arguments.h), and the camera.
+struct ExactProjectArgs {
+    int64_t N;
+    const double *means, *factors, *opacities, *shapes;  // [N, 3] [N, 3, 3] [N] [N] (null: Gaussians)
+    const float *means2d, *roots, *depths, *half_sizes, *single_shapes;  // of one camera; single_shapes: [N] or null
+    const float *viewmats, *Ks;  // [4, 4] [3, 3]
+    int width, height;
+    double near, far, eps2d;
+    bool antialias;
+    int threads;
+};
+GSB_FIELDS(ExactProjectArgs, INPUTS, N, means, factors, opacities, shapes, means2d, roots, depths, half_sizes,
+           single_shapes, viewmats, Ks, width, height, near, far, eps2d, antialias, threads)
+
+// A Gaussian that is projected in float64 and in float32, in two cache lines.
+struct alignas(64) ExactRecord {
+    double exact[7], depth;  // x, y, p, q, r of math/projection.h, opacity, exponent
+    double half_x;           // 0: culled
+    double depth_error;      // of float32
+    float single[7], single_half_x, single_half_y;  // as in float64
+    bool sure;                                      // whether float32 surely draws it
+};
+static_assert(sizeof(ExactRecord) == 128);
+
+struct ExactSplats {
+    ExactRecord* records;                  // [N]
+    float *means2d, *half_sizes, *depths;  // [N, 2] [N, 2] [N]: boxes that contain those of float64 and float32
+};
+GSB_FIELDS(ExactSplats, OUTPUTS, records, means2d, half_sizes, depths)
+
+// The Gaussians of `exact_splats` with their colours, to render the exact image.
 struct ExactArgs {
     int64_t N;
     int D;
     bool beta;
-    const double* exact;   // [N, 8]: x, y, p, q, r of math/projection.h, opacity (0: culled), exponent, depth
-    // [N, 11]: x, y, p, q, r, opacity and exponent in float32; half sizes (0: culled); whether float32 surely draws it;
-    // the error of the depth
-    const double* single;
-    const double *colors, *color_errors, *background;  // [N, D] [N, D] [D]
-    const float *means2d, *half_sizes;                 // [N, 2]: boxes that contain those of float64 and float32
-    const int32_t *offsets, *ids;                      // each tile's list, by exact depth
+    const ExactRecord* records;    // [N]
+    const double* colors;          // [N, D]
+    const float *single_colors, *background;  // [N, D] [D]
+    const int32_t *offsets, *ids;  // each tile's list, by depths in float64 that are rounded to float32
     int width, height;
     int threads;
 };
-GSB_FIELDS(ExactArgs, INPUTS, N, D, beta, exact, single, colors, color_errors, background, means2d, half_sizes, offsets,
-           ids, width, height, threads)
+GSB_FIELDS(ExactArgs, INPUTS, N, D, beta, records, colors, single_colors, background, offsets, ids, width, height,
+           threads)
 
 struct ExactPicture {
     double *image, *bound;  // [H, W, D] [H, W]: the largest error of a channel of the image in float32
@@ -78,6 +105,7 @@ GSB_FIELDS(AdamAllState, OUTPUTS, parameters, means, squares)
     GSB_KERNELS(kernel)                            \
     kernel(count_tiles, BinArgs, TileOffsets)      \
     kernel(fill_tiles, BinArgs, TileLists)         \
+    kernel(exact_splats, ExactProjectArgs, ExactSplats)\
     kernel(exact_image, ExactArgs, ExactPicture)   \
     kernel(adam_all, AdamAllArgs, AdamAllState)
 

@@ -1,7 +1,6 @@
 // Projects Gaussians to the image planes of all cameras, sixteen at a time; math/projection.h has the formulas.
-#include "../math/projection.h"
-
 #include "buffer.h"
+#include "camera.h"
 #include "isa.h"
 #include "rows.h"
 
@@ -10,26 +9,6 @@ inline namespace GSB_ISA {
 namespace {
 
 constexpr int64_t CHUNK = 512;  // Gaussians a task; camera gradients are summed by chunks, whatever the thread count
-
-Camera camera_of(const ProjectArgs& a, int64_t c) {
-    const float *view = a.viewmats + c * 16, *K = a.Ks + c * 9;
-    Camera camera;
-    for (int i = 0; i < 3; ++i) {
-        for (int j = 0; j < 3; ++j) camera.rotation[i][j] = view[i * 4 + j];
-        camera.translation[i] = view[i * 4 + 3];
-    }
-    camera.fx = K[0];
-    camera.cx = K[2];
-    camera.fy = K[4];
-    camera.cy = K[5];
-    camera.width = static_cast<float>(a.width);
-    camera.height = static_cast<float>(a.height);
-    camera.near = a.near;
-    camera.far = a.far;
-    camera.eps2d = a.eps2d;
-    camera.antialias = a.antialias;
-    return camera;
-}
 
 Projection<Vec> load(const ProjectArgs& a, const Camera& camera, int64_t i, int n) {
     Vec mean[3], f[3][3];
@@ -86,7 +65,7 @@ Splat<Vec> splat_of(Projection<Vec>& projection, const ProjectArgs& a, int64_t i
 template <class Profile>
 void project_as(const ProjectArgs& a, const Splats& out) {
     for (int64_t c = 0; c < a.C; ++c) {
-        const Camera camera = camera_of(a, c);
+        const Camera camera = camera_of<float>(a, c);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
         for (int64_t i = 0; i < a.N; i += LANES) {
             const int n = lanes_from(i, a.N);
@@ -108,7 +87,7 @@ void project_backward_as(const ProjectArgs& a, const SplatGrads& grads, const Pr
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
         const int64_t begin = chunk * CHUNK, end = begin + CHUNK < a.N ? begin + CHUNK : a.N;
         for (int64_t c = 0; c < a.C; ++c) {
-            const Camera camera = camera_of(a, c);
+            const Camera camera = camera_of<float>(a, c);
             Vec3<Vec> g_view[4] = {};
             for (auto& row : g_view) row = {Vec(0.0f), Vec(0.0f), Vec(0.0f)};
             for (int64_t i = begin; i < end; i += LANES) {

@@ -19,21 +19,27 @@ inline namespace GSB_ISA {
 constexpr double SQRT_HALF_LOG2_E = 0.8493218002880191;  // scales the root, as HALF_LOG2_E scales the power
 constexpr float BOUNDS_MARGIN = 0.01f;            // pixels, so that rounding cuts off no pixel
 
-// A pinhole camera and the settings of the projection.
-struct Camera {
-    float rotation[3][3], translation[3];  // world to camera
-    float fx, fy, cx, cy;                  // pixels
-    float width, height;
-    float near, far, eps2d;
+// A pinhole camera and the settings of the projection, in float32 or float64.
+template <class Number>
+struct CameraOf {
+    static constexpr Number LEAST_ALPHA = Number(1) / Number(255);
+
+    Number rotation[3][3], translation[3];  // world to camera
+    Number fx, fy, cx, cy;                  // pixels
+    Number width, height;
+    Number near, far, eps2d;
     bool antialias;
 
     // The Jacobian is evaluated at most 15 % of the image size outside of the image (3DGS), because it diverges far
     // away.
-    GSB_HD float tangent_min(float center, float focal, float size) const { return (-center - 0.15f * size) / focal; }
-    GSB_HD float tangent_max(float center, float focal, float size) const {
-        return (size - center + 0.15f * size) / focal;
+    GSB_HD Number tangent_min(Number center, Number focal, Number size) const {
+        return (-center - Number(0.15) * size) / focal;
+    }
+    GSB_HD Number tangent_max(Number center, Number focal, Number size) const {
+        return (size - center + Number(0.15) * size) / focal;
     }
 };
+using Camera = CameraOf<float>;
 
 template <class T>
 struct Splat {
@@ -53,9 +59,9 @@ struct GaussianGrad {
 };
 
 // The projection of one Gaussian by one camera: `splat` computes it, and `vjp` computes the gradients.
-template <class T>
+template <class T, class Number = float>
 struct Projection {
-    const Camera& camera;
+    const CameraOf<Number>& camera;
     Vec3<T> mean;       // world
     Vec3<T> factor[3];  // F by rows
     T opacity;
@@ -68,7 +74,7 @@ struct Projection {
     T size, unit, eps;  // pixels; 1 / size; eps2d over size^2
     T area2, xx, xy, yy, det, compensation;
 
-    GSB_HD Projection(const Camera& camera, const Vec3<T>& mean, const Vec3<T> (&F)[3], T opacity)
+    GSB_HD Projection(const CameraOf<Number>& camera, const Vec3<T>& mean, const Vec3<T> (&F)[3], T opacity)
         : camera(camera), mean(mean), factor{F[0], F[1], F[2]}, opacity(opacity) {
         for (int i = 0; i < 3; ++i) {
             R[i] = {T(camera.rotation[i][0]), T(camera.rotation[i][1]), T(camera.rotation[i][2])};
@@ -124,7 +130,7 @@ struct Projection {
         const T reach = Profile::reach(s.opacity, shape);
         s.half_x = sqrt(T(reach * xx)) * size + BOUNDS_MARGIN;
         s.half_y = sqrt(T(reach * yy)) * size + BOUNDS_MARGIN;
-        const auto drawn = solid & (s.opacity >= T(ALPHA_MIN)) & (s.x + s.half_x > zero) & (s.y + s.half_y > zero) &
+        const auto drawn = solid & (s.opacity >= T(camera.LEAST_ALPHA)) & (s.x + s.half_x > zero) & (s.y + s.half_y > zero) &
                            (s.x - s.half_x < T(camera.width)) & (s.y - s.half_y < T(camera.height));
         s.half_x = select(drawn, s.half_x, zero);
         s.half_y = select(drawn, s.half_y, zero);
