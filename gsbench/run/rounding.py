@@ -7,7 +7,7 @@ from gsbench.measure.quality import evenly, psnr
 from gsbench.models.twins import exact_model, render_twins
 from gsbench.train.loop import Trainer
 
-VIEWS = 3  # evenly spaced; a view takes about twenty times as long as a frame
+VIEWS = 3  # evenly spaced; a view takes ten to twenty times as long as a frame
 
 
 def psnr_float32(trainer: Trainer) -> tuple[float | None, str]:

@@ -70,6 +70,25 @@ def test_no_error_is_above_its_bound(instruction_set: str) -> None:
         kernels.use_instruction_set(best)
 
 
+def test_every_instruction_set_and_number_of_threads_has_the_same_bits() -> None:
+    """Catches a fused product, an exponential of a library, and a sum whose order depends on threads."""
+    sets, threads = kernels.native().instruction_sets(), torch.get_num_threads()
+    true: dict[int, Tensor] = {}
+    bounds: dict[tuple[int, bool], Tensor] = {}
+    try:
+        for name, count in [*((name, 1) for name in sets), (sets[-1], 3)]:
+            kernels.use_instruction_set(name)
+            torch.set_num_threads(count)
+            for seed in range(20):
+                found = images(hard_scenes.scene(seed), NOISES[seed % len(NOISES)], seed)[1]
+                assert torch.equal(found.image, true.setdefault(seed, found.image)), (name, count, seed)
+                # Without fused multiply-add, float32 projects to other numbers.
+                assert torch.equal(found.bound, bounds.setdefault((seed, name == "v2"), found.bound)), (name, count)
+    finally:
+        kernels.use_instruction_set(sets[-1])
+        torch.set_num_threads(threads)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_no_error_of_2000_scenes_is_above_its_bound() -> None:

@@ -47,15 +47,17 @@ struct Strips {
         return 3.01 * U * (most(magnitude(s.p), magnitude(s.q)) * dx + magnitude(s.r) * dy);
     }
 
-    // Returns bits of the strips with a pixel where the root of the power is at most `root`.
+    // Returns bits of the strips with a pixel where the root of the power is at most `root`, and a little more, because
+    // alpha may round up to 1/255 there.
     uint32_t reached(const ExactSplat& s, double root) const {
+        const double most_power = root * root * (1 + 1e-5) + 1e-5;
         const double foot_y = -s.q / s.r, foot_x = -s.q * s.r / (s.p * s.p + s.q * s.q);
         uint32_t found = 0;
         for (int i = 0; i < STRIPS / DOUBLES; ++i) {
             const Doubles x = x0[i] - s.x, y = y0[i] - s.y;
             const Doubles x1 = x + (STRIP_WIDTH - 1.0), y1 = y + (STRIP_HEIGHT - 1.0);
             const Doubles power = least_power<Doubles>(x, x1, y, y1, s.p, s.q, s.r, foot_x, foot_y);
-            found |= bits(power <= root * root) << i * DOUBLES;
+            found |= bits(power <= most_power) << i * DOUBLES;
         }
         return found;
     }

@@ -130,8 +130,9 @@ struct Projection {
         const T reach = Profile::reach(s.opacity, shape);
         s.half_x = sqrt(T(reach * xx)) * size + BOUNDS_MARGIN;
         s.half_y = sqrt(T(reach * yy)) * size + BOUNDS_MARGIN;
-        const auto drawn = solid & (s.opacity >= T(camera.LEAST_ALPHA)) & (s.x + s.half_x > zero) & (s.y + s.half_y > zero) &
-                           (s.x - s.half_x < T(camera.width)) & (s.y - s.half_y < T(camera.height));
+        const auto drawn = solid & (s.opacity >= T(camera.LEAST_ALPHA)) & (s.x + s.half_x > zero) &
+                           (s.y + s.half_y > zero) & (s.x - s.half_x < T(camera.width)) &
+                           (s.y - s.half_y < T(camera.height));
         s.half_x = select(drawn, s.half_x, zero);
         s.half_y = select(drawn, s.half_y, zero);
         return s;
