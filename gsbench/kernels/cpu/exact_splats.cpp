@@ -1,5 +1,7 @@
 // Projects Gaussians in float64, eight at a time, and joins each with its projection in float32; math/projection.h has
 // the formulas.
+#include "../math/rounding.h"
+
 #include "camera.h"
 #include "doubles.h"
 #include "isa.h"
@@ -10,7 +12,6 @@ namespace {
 
 constexpr double BEYOND = 32;    // pixels outside of the image where boxes end
 constexpr double MARGIN = 0.05;  // pixels: more than the rounding of boxes
-constexpr double U = 0x1p-24;    // the unit roundoff of float32
 
 // The part of an axis of the image, which is `size` pixels long, that boxes cover.
 struct Span {
