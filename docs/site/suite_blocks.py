@@ -8,7 +8,7 @@ from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 
-from published import MODELS, NAMES, Experiment, best, experiments, number, signed, table
+from published import MODELS, NAMES, Experiment, best, experiment, experiments, number, signed, table
 from scipy import stats
 
 from gsbench.measure.record import Record, model_folder
@@ -26,6 +26,7 @@ EFFECTS = {
     "`model=auto` instead of 7DGS": ("auto", "7dgs"),
 }
 Choice = Callable[[dict[str, Record]], Record]
+TESTED = "eval_split=test"  # of runs with +exp=tuning, which otherwise measures on val
 COMPARED = "auto,compare=true"  # model=auto that compares its candidates on val
 
 
@@ -67,6 +68,17 @@ def kinds(published: Path) -> str:
         "zero; not corrected for the number of cells), and on how many scenes PSNR rises."
     )
     return f"{table(['change', *columns], rows)}\n\n{said}"
+
+
+def held_out(published: Path) -> str:
+    """Return the table of PSNR on scenes that no choice was made on."""
+    found = experiment(published, "held_out")
+    models = [model for model in MODELS if found.has(model, TESTED)]
+    rows = []
+    for scene in found.group.scenes:
+        psnr = [float(found.group.sample(found.configuration(m, TESTED), scene, "psnr").mean()) for m in models]
+        rows.append([scene, *best(psnr, [f"{x:.2f}" for x in psnr])])
+    return table(["scene", *models], rows)
 
 
 @dataclass(frozen=True)
@@ -219,4 +231,5 @@ def _early(effect: str) -> Callable[[Experiment, str], float]:
     return mean
 
 
-BLOCKS = {"suite_scenes": scenes, "suite_kinds": kinds, "suite_choices": choices, "suite_forecasts": forecasts}
+BLOCKS = {"suite_scenes": scenes, "suite_kinds": kinds, "suite_choices": choices, "suite_forecasts": forecasts,
+          "held_out": held_out}  # fmt: skip
