@@ -1,6 +1,7 @@
 """Write the blocks of docs/results.md: tables and sentences that follow from the published records."""
 
 import math
+from collections import defaultdict
 from pathlib import Path
 from statistics import fmean
 
@@ -188,11 +189,11 @@ def trex400(published: Path) -> str:
     """Return the table of trex by the paper's own protocol, beside the paper's rows."""
     found = experiment(published, "dnerf")
     rows: list[list[str]] = []
-    trained_by: dict[str, list[str]] = {}  # rows by commit
+    commits: dict[str, list[str]] = defaultdict(list)  # the models and recipes that each one trained
     for model in ("7dgs", "7dgs_noagr", "4dgs"):
         runs = found.runs(model, PAPERS)
         rows.append([model, *_whole(runs)])
-        trained_by.setdefault(runs[0].provenance.git_commit[:7], []).append(model)
+        commits[runs[0].provenance.git_commit[:7]].append(model)
         own = paper_row("D-NeRF", "trex", model)
         minutes = number(math.nan if own.train_min is None else own.train_min, 1)
         rows.append(["paper", "–", f"{own.psnr:.2f}", "–", "–", number(own.ssim, 3), number(own.lpips, 3), minutes,
@@ -201,14 +202,14 @@ def trex400(published: Path) -> str:
         variant = f"recipe={name},{PAPERS}"
         runs = found.runs("7dgs_noagr", variant)
         rows.append([f"7dgs_noagr with {words}, `+recipe={name}`", *_whole(runs)])
-        trained_by.setdefault(runs[0].provenance.git_commit[:7], []).append(f"`+recipe={name}`")
+        commits[runs[0].provenance.git_commit[:7]].append(f"`+recipe={name}`")
     head = ["trex, 400 x 400", "PSNR, last iteration", "best on test (leaks)", "val", "training views", "SSIM",
             "LPIPS-Alex", "CPU min; paper: GPU min", "FPS", "Gaussians"]  # fmt: skip
     ours = found.of("7dgs", PAPERS).mean - found.of("7dgs_noagr", PAPERS).mean
     theirs = paper_row("D-NeRF", "trex", "7dgs").psnr - paper_row("D-NeRF", "trex", "7dgs_noagr").psnr
     said = f"On trex AGR changes PSNR by {signed(ours)} dB here, by {signed(theirs)} in the paper."
-    commits = listing([f"{commit} ({', '.join(rows)})" for commit, rows in trained_by.items()])
-    said += f" The rows were trained at {count(len(trained_by), 'commit')}: {commits}. Newer code is faster."
+    named = listing([f"{commit} ({', '.join(trained)})" for commit, trained in commits.items()])
+    said += f" CPU minutes are of the code that trained a row, at {count(len(commits), 'commit')}: {named}."
     return f"{table(head, rows)}\n\n{said}"
 
 

@@ -1,7 +1,7 @@
 """Write the blocks of docs/results.md about the suite: each scene, effects by kind of scene, what foretells them."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
@@ -12,7 +12,7 @@ from published import MODELS, NAMES, Experiment, best, experiment, experiments, 
 from scipy import stats
 
 from gsbench.measure.record import Record, model_folder
-from gsbench.report.configurations import QUANTITIES
+from gsbench.report.configurations import QUANTITIES, Values
 from gsbench.report.intervals import estimate
 from gsbench.report.page.messages import count
 
@@ -35,10 +35,9 @@ def scenes(published: Path) -> str:
     rows, seeds = [], set()
     for found in experiments(published / "suite"):
         for scene in found.group.scenes:
-            psnr = {model: found.group.sample(found.configuration(model), scene, "psnr") for model in MODELS}
-            means = {model: float(values.mean()) for model, values in psnr.items() if len(values)}
-            seeds |= {len(values) for values in psnr.values() if len(values)}
-            shown = dict(zip(means, best([*means.values()], [f"{x:.2f}" for x in means.values()]), strict=True))
+            psnr = _psnr(found, scene, MODELS)
+            seeds |= {len(values) for values in psnr.values()}
+            shown = _means(psnr)
             rows.append([scene, found.group.dataset, *(shown.get(model, "–") for model in MODELS)])
     said = (
         f"Each number is the mean of {min(seeds)} seeds; bold: the highest of a row; –: the model does not train there."
@@ -74,11 +73,20 @@ def held_out(published: Path) -> str:
     """Return the table of PSNR on scenes that no choice was made on."""
     found = experiment(published, "held_out")
     models = [model for model in MODELS if found.has(model, TESTED)]
-    rows = []
-    for scene in found.group.scenes:
-        psnr = [float(found.group.sample(found.configuration(m, TESTED), scene, "psnr").mean()) for m in models]
-        rows.append([scene, *best(psnr, [f"{x:.2f}" for x in psnr])])
+    rows = [[scene, *_means(_psnr(found, scene, models, TESTED)).values()] for scene in found.group.scenes]
     return table(["scene", *models], rows)
+
+
+def _psnr(found: Experiment, scene: str, models: Sequence[str], variant: str = "") -> dict[str, Values]:
+    """Return PSNR of the runs of each model that trains on a scene, dB."""
+    psnr = {model: found.group.sample(found.configuration(model, variant), scene, "psnr") for model in models}
+    return {model: values for model, values in psnr.items() if len(values)}
+
+
+def _means(psnr: dict[str, Values]) -> dict[str, str]:
+    """Format the mean PSNR of each model over its runs, with the highest one bold."""
+    means = [float(values.mean()) for values in psnr.values()]
+    return dict(zip(psnr, best(means, [f"{mean:.2f}" for mean in means]), strict=True))
 
 
 @dataclass(frozen=True)

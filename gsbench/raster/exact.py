@@ -105,7 +105,7 @@ def exact_image(
     kept = {"records": records, "colors": colors.contiguous(), "single_colors": single_colors.contiguous(),
             "background": background.contiguous(), "offsets": bins.offsets, "ids": bins.ids}  # fmt: skip
     kept |= {f"out.{name}": x for name, x in out._asdict().items()}
-    numbers = {"N": N, "D": D, "beta": shapes is not None, "width": width, "height": height}
+    numbers = {"D": D, "beta": shapes is not None, "width": width, "height": height}
     library.call("exact_image", {name: x.data_ptr() for name, x in kept.items()} | numbers, viewmat)
     return out
 

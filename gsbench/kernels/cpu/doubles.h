@@ -140,7 +140,6 @@ using Doubles = Pair<Pair<DoubleRegister>>;
 #endif
 using DoubleMask = Doubles::Mask;
 constexpr int DOUBLES = Doubles::size;
-constexpr uint32_t ALL_DOUBLES = (1u << DOUBLES) - 1;
 
 template <class Half>
 GSB_HD inline Pair<Half> abs(Pair<Half> a) {

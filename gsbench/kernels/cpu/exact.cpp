@@ -5,16 +5,15 @@
 //   T ((alpha' - alpha_k) (c_k - B_(k+1)) + alpha' (c' - c_k)) + rounding of the sum + (rounding of T) B_(k+1)
 // when float32 blends alpha' and c'. The sum of the largest changes bounds the error of the pixel. alpha' lies in an
 // interval (math/rounding.h). It is zero too if the Gaussian may be skipped or culled.
-#include "bins.h"
 #include "buffer.h"
 #include "exact_strip.h"
 #include "isa.h"
+#include "tile.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
 namespace {
 
-constexpr int BLOCK_SIDE = 4;  // pixels along a side of the blocks of blend.cpp
 constexpr int ACROSS = TILE / STRIP_WIDTH, STRIPS = ACROSS * TILE / STRIP_HEIGHT;  // of a tile
 static_assert(STRIPS == 32 && DOUBLES % ACROSS == 0);
 
@@ -69,7 +68,7 @@ double sure_power(const ExactSplat& s, double half_x, double half_y, const Strip
     const double x = half_x - 2 * U * magnitude(s.x), y = half_y - 2 * U * magnitude(s.y);
     if (x <= 0 || y <= 0) return -1;
     const double root_x = x * s.p, root_y = y * s.p * s.r / std::sqrt(s.p * s.p + s.q * s.q);
-    const double error = strips.root_error(s, BLOCK_SIDE);
+    const double error = strips.root_error(s, BLOCK);
     const double root = least(root_x, root_y) * (1 - 8 * U), power = root * root;
     return power - 8 * error * (root + error);
 }

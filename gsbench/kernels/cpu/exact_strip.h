@@ -17,7 +17,7 @@ alignas(64) constexpr double STRIP_COLUMN[DOUBLES] = {0, 1, 2, 3, 0, 1, 2, 3};  
 alignas(64) constexpr double STRIP_ROW[DOUBLES] = {0, 0, 0, 0, 1, 1, 1, 1};
 
 constexpr int PAIRWISE = 16;  // largest group of tied depths whose pairs are looked at
-constexpr double LEAST_ALPHA = 1.0 / 255, MOST_ALPHA = 0.999, LEAST_LEFT = 1e-4;  // in float64
+constexpr double MOST_ALPHA = 0.999, LEAST_LEFT = 1e-4;  // in float64
 constexpr double NOISE = 1e-15;  // of the float64 arithmetic itself, relative
 
 inline double magnitude(double x) { return x < 0 ? -x : x; }
@@ -110,7 +110,7 @@ private:
         const Doubles alpha = min(exact.free, MOST_ALPHA), power = exact.w * exact.w + exact.u * exact.u;
         const Interval<Doubles> free = SingleFalloff<Profile>::at(g.single, offset, power, exact.free, g.opacity_ratio);
         const Doubles high = min(free.high, most_seen), low = min(free.low, most_seen);
-        const DoubleMask blends = alpha >= LEAST_ALPHA, may = high >= least_seen;
+        const DoubleMask blends = alpha >= CameraOf<double>::LEAST_ALPHA, may = high >= least_seen;
         const DoubleMask must = (low >= least_seen) & (offset.power <= g.sure);
         return {select(blends, alpha, zero), select(must, low, zero), select(may, high, zero),
                 (blends & !must) | (may & !blends) | (may & !must)};

@@ -62,7 +62,6 @@ GSB_FIELDS(ExactSplats, OUTPUTS, records, means2d, half_sizes, depths)
 
 // The Gaussians of `exact_splats` with their colours, to render the exact image.
 struct ExactArgs {
-    int64_t N;
     int D;
     bool beta;
     const ExactRecord* records;    // [N]
@@ -72,7 +71,7 @@ struct ExactArgs {
     int width, height;
     int threads;
 };
-GSB_FIELDS(ExactArgs, INPUTS, N, D, beta, records, colors, single_colors, background, offsets, ids, width, height,
+GSB_FIELDS(ExactArgs, INPUTS, D, beta, records, colors, single_colors, background, offsets, ids, width, height,
            threads)
 
 struct ExactPicture {

@@ -22,7 +22,7 @@ constexpr float BOUNDS_MARGIN = 0.01f;            // pixels, so that rounding cu
 // A pinhole camera and the settings of the projection, in float32 or float64.
 template <class Number>
 struct CameraOf {
-    static constexpr Number LEAST_ALPHA = Number(1) / Number(255);
+    static constexpr Number LEAST_ALPHA = Number(1) / Number(255);  // ALPHA_MIN of float32
 
     Number rotation[3][3], translation[3];  // world to camera
     Number fx, fy, cx, cy;                  // pixels
@@ -40,6 +40,7 @@ struct CameraOf {
     }
 };
 using Camera = CameraOf<float>;
+static_assert(Camera::LEAST_ALPHA == ALPHA_MIN);
 
 template <class T>
 struct Splat {
