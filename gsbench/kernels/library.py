@@ -1,6 +1,7 @@
 """Call compiled kernels on the CPU or on a GPU, with arguments given by name."""
 
 import functools
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -10,6 +11,7 @@ from torch import Tensor
 from gsbench import kernels
 from gsbench.errors import InputError
 from gsbench.kernels import cuda
+from gsbench.kernels.recording import current as recording_now
 
 # The prefix of a kernel argument's name, by the role of its C++ structure (kernels/arguments.h).
 _PREFIX = {"INPUTS": "", "OUTPUTS": "out.", "GIVEN": "given.", "GRADS": "grad."}
@@ -32,7 +34,11 @@ class Library:
             InputError: the kernel does not support these sizes or options.
         """
         slots["threads"] = torch.get_num_threads()
-        self._run(name, *[slots[field] for field in self._fields[name]])
+        run = partial(self._run, name, *[slots[field] for field in self._fields[name]])
+        run()
+        recording = recording_now()
+        if recording is not None:
+            recording.add(run)
 
     def _run(self, name: str, *values: Any) -> None:
         try:

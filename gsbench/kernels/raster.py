@@ -8,14 +8,17 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels import recording
 from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.headers import TILE
 from gsbench.kernels.library import Library, allocate, library_of
 from gsbench.kernels.operation import Operation, address, in_rows
+from gsbench.kernels.recording import read
 from gsbench.process.memory import require
 
 TILE_PIXELS = TILE * TILE
 MAX_PAIRS = (1 << 31) - 1  # splats and tile intersections (pairs of tile and splat) are numbered by int32
+ROOM = 2.0  # the memory for tile intersections of a recording, as a multiple of what its first image needs
 GEOMETRY = 6  # numbers per splat: x, y, p, q, r, opacity; of a Beta profile its exponent too
 LOWER = "use a smaller image, fewer cameras at once or fewer Gaussians"  # where memory does not suffice
 
@@ -172,7 +175,7 @@ def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, 
     """
     library = library_of(splats.depths.device.type)
     if not library.needs_scratch:
-        return _bin_on_cpu(library, splats, viewport), int(flags.item())
+        return _bin_on_cpu(library, splats, viewport), read(flags, lambda value: value == 0)
     order, ends = _sort_on_gpu(library, splats, viewport, flags)
     *total, flagged = ends[-2:].tolist()
     pairs = _countable(total[0] if total else 0)
@@ -213,11 +216,12 @@ def _bin_on_cpu(library: Library, splats: Splats, viewport: Viewport) -> Bins:
     offsets = like.new_empty(len(like) * count_tiles(viewport.width, viewport.height) + 1, dtype=torch.int32)
     total = like.new_empty(1, dtype=torch.int64)
     library.call("count_tiles", slots | {"out.offsets": address(offsets), "out.pairs": address(total)}, like)
-    pairs = _countable(int(total.item()))
-    require(4 * pairs, f"the lists of {pairs} pairs of a tile and a Gaussian", LOWER)
-    ids = like.new_empty(pairs, dtype=torch.int32)
+    pairs = _countable(read(total, lambda value: value <= room))
+    room = pairs if recording.current() is None else int(ROOM * pairs)
+    require(4 * room, f"the lists of {pairs} pairs of a tile and a Gaussian", LOWER)
+    ids = like.new_empty(room, dtype=torch.int32)
     library.call("fill_tiles", slots | {"out.offsets": address(offsets), "out.ids": address(ids)}, like)
-    return Bins(offsets, ids)
+    return Bins(offsets, ids[:pairs])
 
 
 PAIRS = "lists of each tile's Gaussians"

@@ -191,12 +191,10 @@ class Trainer:
         if step < schedule.densify_stop:
             with stages("density"):
                 for view, one in zip(views, seen, strict=True):
-                    self.density.accumulate(
-                        one.info.drawn, one.g_means2d, view.camera.width, view.camera.height, len(views)
-                    )
+                    self.density.accumulate(one.drawn, one.g_means2d, view.camera.width, view.camera.height, len(views))
         self.finite_check.see(step, torch.stack([one.loss for one in seen]).sum(), self.optimizer.groups)
         with stages("optimizer"):
-            drawn = torch.cat([one.info.drawn for one in seen]).any(0) if self.optimizer.is_sparse else None
+            drawn = torch.cat([one.drawn for one in seen]).any(0) if self.optimizer.is_sparse else None
             self.optimizer.step(step, drawn, slowed=self.gating.slows_agr(step))
             self.minimum_scale.hold()
         with stages("density"):

@@ -91,6 +91,7 @@ class Optimizer:
             slowed: the factor by which the learning rate of AGR, the neural refinement, is multiplied.
         """
         rates = self.rates_at(step, slowed)
+        is_native = self._is_native()
         by_kernel: list[tuple[nn.Parameter, float]] = []
         rest_has_gradients = False
         for name, parameters in self.groups.items():
@@ -98,7 +99,7 @@ class Optimizer:
                 assert drawn is not None
                 self._step_rows(parameters[0], rates[name], drawn)
             for parameter in parameters:
-                if parameter.grad is not None and self._is_native(parameter):
+                if parameter.grad is not None and is_native:
                     by_kernel.append((parameter, rates[name]))
                 elif parameter.grad is not None:
                     rest_has_gradients = True
@@ -117,9 +118,10 @@ class Optimizer:
         return {name: rate_at(rate, step, self.train, self.extent) * (slowed if name == "refinement" else 1.0)
                 for name, rate in self.rates.items()}  # fmt: skip
 
-    def _is_native(self, parameter: Tensor) -> bool:
-        """Return whether the CPU kernel, not torch, updates a parameter."""
-        return parameter.device.type == "cpu" and self.model.backend.serves(parameter) and self.skip is None
+    def _is_native(self) -> bool:
+        """Return whether the CPU kernel, not torch, updates the parameters; all have one device and type."""
+        means = self.model.splats["means"]
+        return means.device.type == "cpu" and self.model.backend.serves(means) and self.skip is None
 
     def _state_of(self, parameter: Tensor) -> dict[str, Tensor]:
         """Return Adam's step count and moments of a parameter; create them with zeros if they do not exist."""

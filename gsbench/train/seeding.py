@@ -1,5 +1,7 @@
 """Make the random generators of a training from the seed of its run, and draw the order of the views."""
 
+import functools
+
 import torch
 
 
@@ -18,8 +20,14 @@ def batch(step: int, views: int, batch_size: int, seed: int) -> list[int]:
     chosen = []
     for position in range(step * batch_size, (step + 1) * batch_size):
         epoch, place = divmod(position, views)
-        chosen.append(int(torch.randperm(views, generator=generator(seed, epoch))[place]))
+        chosen.append(_order(views, seed, epoch)[place])
     return chosen
+
+
+@functools.lru_cache(maxsize=2)  # a batch may end one epoch and begin the next
+def _order(views: int, seed: int, epoch: int) -> list[int]:
+    """Return the order of the training views in an epoch."""
+    return torch.randperm(views, generator=generator(seed, epoch)).tolist()
 
 
 def generator(seed: int, *purpose: int) -> torch.Generator:

@@ -4,7 +4,7 @@ The gradients of the views are added in a fixed order, so the result has the sam
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -17,11 +17,11 @@ from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
 from gsbench.process.workers import side_by_side
-from gsbench.raster import RasterInfo
 from gsbench.scenes import View
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.losses import photometric
 from gsbench.train.penalties.base import Penalty
+from gsbench.train.repetition import Observed, Repetition, Stages
 
 Sums = dict[int, Tensor]  # gradients by the id of the tensor with respect to which they are taken
 
@@ -31,12 +31,21 @@ Sums = dict[int, Tensor]  # gradients by the id of the tensor with respect to wh
 WORTH_A_THREAD = 4_000
 PIXELS_OF_A_GAUSSIAN = 12
 
+# A step with more work than this many Gaussians, in all views of its batch, is not recorded to be repeated. A recording
+# keeps about 900 bytes of memory for each, and Python code is a small share of such a step.
+MOST_RECORDED = 500_000
+
+
+def work_of(gaussians: int, pixels: int) -> float:
+    """Return the work on a view, as the number of Gaussians that without pixels are as much work."""
+    return gaussians + pixels / PIXELS_OF_A_GAUSSIAN
+
 
 @contextmanager
 def fitting_threads(gaussians: int, pixels: int) -> Iterator[None]:
     """Run the training step in a `with` block on one thread if it has few Gaussians and pixels; results are equal."""
     threads = torch.get_num_threads()
-    if gaussians + pixels / PIXELS_OF_A_GAUSSIAN < WORTH_A_THREAD:
+    if work_of(gaussians, pixels) < WORTH_A_THREAD:
         torch.set_num_threads(1)
     try:
         yield
@@ -81,8 +90,8 @@ def _parts(views: int) -> list[int]:
 
 def _in_order(parts: Sequence[Sums]) -> Sums:
     """Add dictionaries of gradients, in order, to the first one; a dictionary that views share is added only once."""
-    total = parts[0]
-    done = {id(total)}
+    total = dict(parts[0])
+    done = {id(parts[0])}
     for part in parts[1:]:
         if id(part) not in done:
             done.add(id(part))
@@ -92,11 +101,12 @@ def _in_order(parts: Sequence[Sums]) -> Sums:
 
 
 class Seen(NamedTuple):
-    """Hold the results of one view of a training step: loss, visible Gaussians, and gradients of the 2D means."""
+    """Hold the results of one view of a training step. The next step may overwrite the tensors."""
 
-    loss: Tensor  # []
-    info: RasterInfo
+    loss: Tensor  # [] the view's part of the batch's loss
+    drawn: Tensor  # [1, N] bool: which Gaussians were not culled
     g_means2d: Tensor  # [1, N, 2] gradient of the batch's loss by the 2D means, per pixel
+    sums: Sums  # gradients of the batch's loss by the parameters, of this view and of those that share the dictionary
 
 
 class Step:
@@ -122,6 +132,7 @@ class Step:
         self.antialias = antialias
         self.stages = stages
         self.penalties: Sequence[tuple[float, Penalty]] = ()
+        self._repetition: Repetition[Seen] = Repetition()
 
     def __call__(self, views: Sequence[View], penalties: Sequence[tuple[float, Penalty]] = ()) -> list[Seen]:
         """Render `views` and store the gradient of the loss in the model's parameters.
@@ -145,36 +156,57 @@ class Step:
         workers = min(len(views), self.model.backend.workers(self.model.splats["means"]))
         bounds = [len(views) * worker // workers for worker in range(workers + 1)]
         sums = deal(len(views), bounds)
-        if workers == 1:
-            seen = [self._see(i, view, sources, sums[i], len(views), self.stages) for i, view in enumerate(views)]
-        else:
-            seen = self._by_workers(views, sources, sums, bounds)
+        seed = self.background.new_full((), 1 / len(views))
+        seen = self._repetition(
+            self._signature(views, sources, workers),
+            views,
+            lambda i, observed, stages: self._see(i, observed, sources, sums[i], seed, stages),
+            lambda work: self._of_all(work, bounds),
+        )
         with self.stages("backward"):
-            total = add_up(sums)
+            total = add_up([one.sums for one in seen])
             for parameter in sources:
                 parameter.grad = total.get(id(parameter))
         return seen
 
-    def _by_workers(
-        self, views: Sequence[View], sources: list[nn.Parameter], sums: list[Sums], bounds: list[int]
-    ) -> list[Seen]:
-        """Compute the gradients of the views by several threads; thread i renders views bounds[i] to bounds[i + 1]."""
-        started = time.perf_counter()
+    def _signature(self, views: Sequence[View], sources: list[nn.Parameter], workers: int) -> Hashable:
+        """Return all that the calls of a step depend on, except values of tensors; None if they must not be repeated.
+
+        A model may have attributes that this class does not know, so all its numbers and strings are included.
+        """
+        model, sets = self.model, self.model.effect_sets
+        by_cpu_kernels = self.background.is_cpu and model.backend.serves(self.background)
+        work = sum([work_of(len(model), view.camera.width * view.camera.height) for view in views])
+        if self.penalties or not by_cpu_kernels or work > MOST_RECORDED:
+            return None
+        tensors = [*self.parameters, *([] if sets is None else [sets.orders, sets.intervals])]
+        places = tuple([None if x is None else (x.data_ptr(), x.shape) for x in tensors])
+        counts = None if sets is None else (sets.refined, sets.conditioned)
+        own = tuple([x for x in vars(model).values() if isinstance(x, int | float | str)])
+        return places, counts, own, model.active, tuple(map(id, sources)), workers, torch.get_num_threads()
+
+    def _of_all(self, work: Callable[[int, Stages], Seen], bounds: Sequence[int]) -> list[Seen]:
+        """Call `work` for all views of a batch; thread i does so for the views bounds[i] to bounds[i + 1]."""
         workers = len(bounds) - 1
+        if workers == 1:
+            return [work(i, self.stages) for i in range(bounds[1])]
+        started = time.perf_counter()
         clocks = [StageClock() for _ in range(workers)]
 
         def run(worker: int) -> list[Seen]:
-            return [self._see(i, views[i], sources, sums[i], len(views), clocks[worker])
-                    for i in range(bounds[worker], bounds[worker + 1])]  # fmt: skip
+            return [work(i, clocks[worker]) for i in range(bounds[worker], bounds[worker + 1])]
 
         seen = [one for part in side_by_side(run, range(workers), workers) for one in part]
         self.stages.share([clock.seconds for clock in clocks], time.perf_counter() - started)
         return seen
 
     def _see(
-        self, index: int, view: View, sources: list[nn.Parameter], sums: Sums, views: int, stages: StageClock
+        self, index: int, view: Observed, sources: list[nn.Parameter], sums: Sums, seed: Tensor, stages: Stages
     ) -> Seen:
-        """Render view number `index` of a batch and add the gradients of its loss to `sums`."""
+        """Render view number `index` of a batch and add the gradients of its loss to `sums`.
+
+        `seed` is the gradient of the batch's loss by the loss of one view.
+        """
         with Tape() as tape:
             with stages("slice"):
                 query = Query.of(view.camera, view.time)
@@ -194,8 +226,8 @@ class Step:
                     loss = loss + weight * penalty(query, index)
         with stages("backward"):
             means2d = output.info.means2d
-            tape.backward(loss, torch.full_like(loss, 1 / views), [*sources, means2d], sums)
+            tape.backward(loss, seed, [*sources, means2d], sums)
             g_means2d = sums.pop(id(means2d), None)
-        if g_means2d is None:
-            g_means2d = torch.zeros_like(means2d)
-        return Seen(loss.detach() / views, output.info, g_means2d)
+            if g_means2d is None:
+                g_means2d = torch.zeros_like(means2d)
+            return Seen(loss.detach() * seed, output.info.drawn, g_means2d, sums)

@@ -18,7 +18,6 @@ from gsbench.measure.speed import StageClock
 from gsbench.models import Query
 from gsbench.models.render import rasterize_slice
 from gsbench.models.sliced import tensors_of
-from gsbench.raster import RasterInfo
 from gsbench.run.checks import check_values
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene, View
@@ -131,11 +130,6 @@ def test_a_point_of_the_curve_is_measured_before_a_reset() -> None:
     assert opacities.max().sigmoid() <= 2.001 * fitted.config.model.min_opacity
 
 
-def info_of(drawn: torch.Tensor) -> RasterInfo:
-    """What the rasterizer says where Gaussians [1, N] are drawn or not."""
-    return RasterInfo(drawn[..., None].float().expand(-1, -1, 2), torch.zeros(1, 1, 2), torch.zeros(1, 1), 0)
-
-
 def test_what_any_view_of_the_batch_saw_is_moved() -> None:
     """Catches sparse_adam that moves what the last view saw alone, or the first."""
     fitted = trainer("3dgs", "train.batch_size=3", "optim=sparse_adam")
@@ -143,7 +137,7 @@ def test_what_any_view_of_the_batch_saw_is_moved() -> None:
     drawn = torch.zeros(3, 1, N, dtype=torch.bool)
     for view in range(3):
         drawn[view, 0, view] = True  # each view sees the Gaussian of its number
-    seen = [Seen(torch.ones(()), info_of(one), torch.zeros(1, N, 2)) for one in drawn]
+    seen = [Seen(torch.ones(()), one, torch.zeros(1, N, 2), {}) for one in drawn]
     fitted.gradients = lambda *_: seen  # type: ignore[assignment]
     moved = []
     fitted.optimizer.step = lambda _, drawn, **__: moved.append(drawn)  # type: ignore[method-assign]

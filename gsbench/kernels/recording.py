@@ -1,0 +1,134 @@
+"""Record the kernel calls and torch operations of a function on the CPU, and repeat them in the same memory.
+
+A training step of a small model is a few dozen kernel calls, which take some microseconds each. The Python code around
+them, which checks, allocates and differentiates, takes longer, and does the same for every view. A repetition runs only
+the recorded calls, with the present values of their tensors. On a GPU, a CUDA graph does the same.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from functools import partial
+from types import TracebackType
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+_in_charge = threading.local()  # each thread has its own
+_ONE_AT_A_TIME = threading.RLock()  # torch has global variables that say whether a thread records
+
+_VARYING = {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape, torch.Tag.nondeterministic_seeded}
+_aten = torch.ops.aten
+_ALLOCATE = {_aten.empty.memory_format, _aten.empty_strided.default, _aten.empty_like.default, _aten.new_empty.default}
+_ALLOCATE_ZEROS = {_aten.zeros.default, _aten.zeros_like.default, _aten.new_zeros.default}
+
+
+class OutdatedError(Exception):
+    """A recording cannot be repeated for the present values of its tensors."""
+
+
+def current() -> Recording | None:
+    """Return the recording that is active in this thread, or None."""
+    return getattr(_in_charge, "recording", None)
+
+
+def read(number: Tensor, holds: Callable[[int], bool]) -> int:
+    """Return the value of an integer tensor of one element.
+
+    An active recording reads the tensor again in every repetition, which fails unless `holds(value)` is true.
+    """
+    recording = current()
+    return int(number.item()) if recording is None else recording.read(number, holds)
+
+
+class Recording(TorchDispatchMode):
+    """Records what is called in `with Recording() as recording: ...`; `recording.repeat()` calls it again.
+
+    All tensors that are made in the block stay in memory. A repetition writes new values to them.
+    """
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Return False: nothing here is compiled, and torch would import its compiler, which takes a second."""
+        return False
+
+    def __init__(self) -> None:
+        """Create a recording without calls."""
+        super().__init__()
+        self._calls: list[Callable[[], Any]] = []
+        self._kept: list[Any] = []  # so that no two results of the block share memory by chance
+        self._reads = False
+        self.is_repeatable = True  # false if an operation of the block gives other results each time
+
+    def __enter__(self) -> Self:
+        _ONE_AT_A_TIME.acquire()
+        self._outer = current()
+        _in_charge.recording = self
+        super().__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        super().__exit__(kind, error, at)
+        _in_charge.recording = self._outer
+        _ONE_AT_A_TIME.release()
+
+    def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run a torch operation and record it."""
+        kwargs = kwargs or {}
+        result = operation(*args, **kwargs)
+        self._kept.append(result)
+        if not self._reads and _varies(operation, args):
+            self.is_repeatable = False
+        elif operation._schema.is_mutable:
+            self._calls.append(partial(operation, *args, **kwargs))
+        elif operation in _ALLOCATE_ZEROS:
+            self._calls.append(result.zero_)
+        elif not operation.is_view and operation not in _ALLOCATE and not self._reads:
+            self._calls.append(partial(_redo, result, partial(operation, *args, **kwargs)))
+        return result
+
+    def add(self, call: Callable[[], Any]) -> None:
+        """Record a call, such as that of a kernel, that is no torch operation and writes to the same memory again."""
+        self._calls.append(call)
+
+    def read(self, number: Tensor, holds: Callable[[int], bool]) -> int:
+        """Read a tensor, as the function `read` describes."""
+        self._reads = True
+        value = int(number.item())
+        self._reads = False
+        self._calls.append(partial(_check, number, holds))
+        return value
+
+    def repeat(self) -> None:
+        """Call everything that was recorded again, in the same order; to be called without gradients.
+
+        Raises:
+            OutdatedError: a number that the block read has a value for which other calls are needed.
+        """
+        for call in self._calls:
+            call()
+
+
+def _varies(operation: Any, args: Any) -> bool:
+    """Return whether an operation gives a number, a random result, or a result of another shape for other values."""
+    if operation is _aten.index.Tensor:  # x[i] has a fixed shape, unless an index is a mask
+        return any(index is not None and index.dtype in (torch.bool, torch.uint8) for index in args[1])
+    return not _VARYING.isdisjoint(operation.tags)
+
+
+def _redo(result: Any, operation: Callable[[], Any]) -> None:
+    """Write the result of an operation over its earlier result, a tensor or several tensors."""
+    new = operation()
+    if isinstance(result, Tensor):
+        result.copy_(new)
+        return
+    for x, y in zip(result, new, strict=True):
+        x.copy_(y)
+
+
+def _check(number: Tensor, holds: Callable[[int], bool]) -> None:
+    if not holds(int(number.item())):
+        raise OutdatedError

@@ -1,0 +1,124 @@
+"""A recording repeats kernels and torch operations in the same memory, with the bits of the code that it recorded."""
+
+import subprocess
+import sys
+import threading
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import is_in_torch_dispatch_mode
+
+from gsbench.kernels.recording import OutdatedError, Recording, current, read
+from gsbench.kernels.slices import slice_static
+from gsbench.kernels.tape import Tape
+
+
+def numbers(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def repeated(recording: Recording) -> None:
+    with torch.no_grad():
+        recording.repeat()
+
+
+def test_a_repetition_has_the_results_of_the_present_values() -> None:
+    """Catches an operation that is left out: in place, of several results, into zeros, or through a view."""
+
+    def work(x: Tensor) -> list[Tensor]:
+        summed = torch.zeros_like(x)
+        summed += x.exp()
+        summed[1:] *= 2
+        halves = torch.linalg.qr(x.view(4, 2)[:2])
+        return [summed, *halves, x.new_full((2,), 3.0) + x[[1, 3]], torch.cat([x, summed]).sum()]
+
+    given = numbers(8)
+    with Recording() as recording:
+        found = work(given)
+    assert recording.is_repeatable
+    for seed in (1, 2):
+        given.copy_(numbers(8, seed=seed))
+        repeated(recording)
+        assert all(torch.equal(x, y) for x, y in zip(found, work(given), strict=True))
+
+
+def test_kernels_and_gradients_are_repeated() -> None:
+    """Catches a kernel that is not recorded, a backward pass of the tape, and autograd's where torch is in between."""
+    scales, quats, opacities = numbers(50, 3), numbers(50, 4), numbers(50)
+    given = [scales, quats, opacities]
+
+    def work(sums: dict[int, Tensor]) -> list[Tensor]:
+        sources = [x.requires_grad_() for x in given]
+        with Tape() as tape:
+            factors, dimmed = slice_static(scales * 0.5, quats, opacities)
+            loss = (factors.square().sum((1, 2)) * dimmed).sum()
+        tape.backward(loss, torch.ones(()), sources, sums)
+        return [loss.detach(), *[sums[id(x)] for x in sources]]
+
+    with Recording() as recording:
+        found = work({})
+    assert recording.is_repeatable
+    with torch.no_grad():
+        for i, x in enumerate(given):
+            x.copy_(numbers(*x.shape, seed=5 + i))
+    repeated(recording)
+    assert all(torch.equal(x, y) for x, y in zip(found, work({}), strict=True))
+    assert all(x.any() for x in found)
+
+
+def test_a_number_that_was_read_is_read_again() -> None:
+    """Catches a repetition with a number that no longer holds, and a reading outside of a recording."""
+    count = torch.tensor([3])
+    assert read(count, lambda _: False) == 3
+    with Recording() as recording:
+        assert read(count, lambda value: value < 5) == 3
+    assert recording.is_repeatable
+    count.fill_(4)
+    repeated(recording)
+    count.fill_(5)
+    with pytest.raises(OutdatedError):
+        repeated(recording)
+
+
+@pytest.mark.parametrize("work", [Tensor.item, Tensor.nonzero, torch.rand_like, lambda x: x[x > 0]])
+def test_what_cannot_be_repeated_says_so(work: object) -> None:
+    """Catches a number that Python code read, a shape that depends on values, and a draw without its generator."""
+    x = torch.ones(())
+    with Recording() as recording:
+        work(x)  # type: ignore[operator]
+    assert not recording.is_repeatable
+
+
+def test_threads_record_one_after_the_other() -> None:
+    """Catches a recording with another thread's calls, and torch's note of a recording that stays after its end."""
+    made: list[list[tuple[Recording, Tensor]]] = [[], []]
+    given = [torch.ones(3), torch.ones(3)]
+
+    def work(thread: int) -> None:
+        for _ in range(50):
+            with Recording() as recording:
+                made[thread].append((recording, given[thread] * 2))
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert current() is None
+    assert not is_in_torch_dispatch_mode()
+    given[0].fill_(2.0)
+    for recording, _ in [*made[0], *made[1]]:
+        repeated(recording)
+    assert all((result == 4).all() for _, result in made[0])
+    assert all((result == 2).all() for _, result in made[1])
+
+
+def test_recording_does_not_import_torch_s_compiler() -> None:
+    """Catches a second that every training would lose, because torch imports its compiler for a dispatch mode."""
+    code = (
+        "import sys, torch; from gsbench.kernels.recording import Recording\n"
+        "with Recording(): torch.ones(2) * 2\n"
+        "sys.exit('torch._dynamo' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

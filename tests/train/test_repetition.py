@@ -1,0 +1,104 @@
+"""A training whose steps are repeated has the bits of one whose steps are not."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from test_resume import assert_same_bits
+from test_wiring import trainer
+
+from gsbench.kernels.recording import Recording
+from gsbench.stability.training_cases import moving_square
+from gsbench.train.checkpoint import without_times
+from gsbench.train.finite_check import DivergedError
+from gsbench.train.loop import Trainer
+from gsbench.train.step import Step
+
+MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "7dgs_nodir", "dbs", "dgs", "freetime", "ndgs", "ubs")
+
+
+@pytest.fixture
+def repeats(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Counts repetitions of recordings."""
+    counted, repeat = [0], Recording.repeat
+
+    def count(self: Recording) -> None:
+        counted[0] += 1
+        repeat(self)
+
+    monkeypatch.setattr(Recording, "repeat", count)
+    return counted
+
+
+def trained(fitted: Trainer) -> object:
+    fitted.run(lambda _: None, "a training")
+    return without_times(fitted.state_dict())
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize("threads_used", [1, 2])
+@pytest.mark.parametrize(("model", "overrides"), [*((name, ()) for name in MODELS), ("7dgs", ("effects.gate=both",))])
+def test_a_training_has_the_same_bits(
+    model: str, overrides: tuple[str, ...], threads_used: int, repeats: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches work of a step that depends on something that neither the signature has nor a repetition reads again."""
+    torch.set_num_threads(threads_used)
+    given = trained(trainer(model, *overrides))
+    assert repeats[0] > 4 * 50
+    monkeypatch.setattr(Step, "_signature", lambda *_: None)
+    repeats[0] = 0
+    assert_same_bits(given, trained(trainer(model, *overrides)))
+    assert repeats[0] == 0
+
+
+def test_a_view_with_more_intersections_is_not_repeated(repeats: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches lists of tiles that write beyond their memory, which was made for the view that was recorded."""
+    square = moving_square()
+    near = square.train[1]
+    viewmat = near.camera.viewmat.clone()
+    viewmat[2, 3] *= 0.2
+    train = [square.train[0]] * 3 + [replace(near, camera=replace(near.camera, viewmat=viewmat))]
+    scene = replace(square, train=train, val=square.train[:3], test=square.train[3:5])
+    found = []
+    for signature in (Step._signature, lambda *_: None):
+        monkeypatch.setattr(Step, "_signature", signature)
+        fitted, losses = trainer("3dgs", "train.batch_size=1", scene=scene), []
+        for fitted.step in range(24):
+            fitted._descend()
+            losses.append(fitted.finite_check.loss)
+        found.append(losses)
+    assert found[0] == found[1]
+    assert 0 < repeats[0] < 4 * 22
+
+
+def test_a_value_that_is_not_finite_is_found_in_a_repetition(repeats: list[int]) -> None:
+    """Catches a training that goes on with NaN, because the rasterizer's check was not repeated."""
+    fitted = trainer("7dgs")
+    for fitted.step in range(4):
+        fitted._descend()
+    assert repeats[0] > 0
+    with torch.no_grad():
+        fitted.model.splats["means"][0, 0] = math.nan
+    fitted.step = 4
+    with pytest.raises(DivergedError, match="step 4"):
+        fitted._descend()
+
+
+def test_an_attribute_of_a_model_may_change(repeats: list[int]) -> None:
+    """Catches a model of another author whose option, which a schedule of its own changes, is read only once."""
+    fitted = trainer("3dgs")
+    shade, light, own = fitted.model.shade, [], vars(fitted.model)
+
+    def brighter(*arguments: Any) -> torch.Tensor:
+        light.append(own["light"])
+        return shade(*arguments) * light[-1]
+
+    own |= {"light": 1.0, "shade": brighter}
+    for fitted.step in range(5):
+        fitted._descend()
+    assert repeats[0] > 0
+    own["light"] = 0.5
+    fitted._descend()
+    assert light[-1] == 0.5
