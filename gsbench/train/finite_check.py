@@ -5,6 +5,9 @@ import math
 import torch
 from torch import Tensor, nn
 
+from gsbench.kernels.backends import CPU
+from gsbench.kernels.finite import are_finite
+
 LOOK_EVERY = 50  # steps between two reads of the result on a GPU, since a read synchronises; on a CPU it is 1
 
 
@@ -40,13 +43,10 @@ class FiniteCheck:
             DivergedError: a check failed, in this step or since the result was last read.
         """
         gradients = {name: [p.grad for p in group if p.grad is not None] for name, group in groups.items()}
-        if self.every == 1:
-            # A finite sum contains no NaN. A sum of large numbers may overflow; then each gradient is checked.
-            total = sum([g.sum() for given in gradients.values() for g in given], loss)
-            if math.isfinite(float(total)):
-                self.loss = float(loss)
-                self._state[3] = loss
-                return
+        if self.every == 1 and _are_finite([loss, *[g for given in gradients.values() for g in given]]):
+            self.loss = float(loss)
+            self._state[3] = loss
+            return
         self._names = list(gradients)
         bad = torch.stack([*(~_all_finite(given, loss) for given in gradients.values()), ~loss.isfinite()]).float()
         now = torch.stack([bad.amax(), loss.new_full((), step), bad.argmax().float(), loss])
@@ -67,6 +67,13 @@ class FiniteCheck:
             raise DivergedError(f"step {step:.0f}: the gradient of '{self._names[int(which)]}' is not finite "
                                 f"(loss {self.loss})")  # fmt: skip
         raise DivergedError(f"step {step:.0f}: the loss is {self.loss}")
+
+
+def _are_finite(values: list[Tensor]) -> bool:
+    """Return whether all values are finite; if torch's sum of them overflows, also False."""
+    if all(CPU.serves(x) for x in values):
+        return are_finite(values)
+    return math.isfinite(float(sum(x.sum() for x in values)))
 
 
 def _all_finite(gradients: list[Tensor], like: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import nn
 
+from gsbench.kernels.finite import are_finite
 from gsbench.train.finite_check import DivergedError, FiniteCheck
 
 
@@ -57,3 +58,14 @@ def test_a_bad_step_found_later_changes_nothing_meanwhile() -> None:
     assert torch.equal(before[5], before[6])  # .. step 6 was not ..
     assert torch.equal(before[6], before[7])  # .. nor was step 7
     assert fitted.isfinite().all()
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize(("array", "place"), [(0, 0), (39, 4), (17, 299_999)])
+def test_one_bad_number_among_many_arrays_is_found(array: int, place: int) -> None:
+    """Catches a kernel call that leaves out the last arrays, the last numbers, or what another thread found."""
+    torch.set_num_threads(2)
+    arrays = [torch.full((300_000,) if i == 17 else (5,), 3e38) for i in range(40)]
+    assert are_finite([*arrays, torch.zeros(0)])
+    arrays[array][place] = math.nan
+    assert not are_finite(arrays)

@@ -98,6 +98,15 @@ struct AdamAllState {
 };
 GSB_FIELDS(AdamAllState, OUTPUTS, parameters, means, squares)
 
+// Whether several arrays are finite; on a GPU torch checks them.
+struct FiniteArgs {
+    int count;
+    int64_t numbers[MAX_ADAM];
+    const float* arrays[MAX_ADAM];  // of [numbers]
+    int threads;
+};
+GSB_FIELDS(FiniteArgs, INPUTS, count, numbers, arrays, threads)
+
 }  // namespace gsb
 
 #define GSB_CPU_KERNELS(kernel)                    \
@@ -106,7 +115,8 @@ GSB_FIELDS(AdamAllState, OUTPUTS, parameters, means, squares)
     kernel(fill_tiles, BinArgs, TileLists)         \
     kernel(exact_splats, ExactProjectArgs, ExactSplats)\
     kernel(exact_image, ExactArgs, ExactPicture)   \
-    kernel(adam_all, AdamAllArgs, AdamAllState)
+    kernel(adam_all, AdamAllArgs, AdamAllState)    \
+    kernel(flag_arrays, FiniteArgs, ValueFlags)
 
 namespace gsb {
 

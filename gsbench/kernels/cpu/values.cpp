@@ -1,4 +1,5 @@
-// Checks in one pass whether the rasterizer's inputs are finite and in range; math/values.h has the ranges.
+// Checks in one pass whether the rasterizer's inputs are finite and in range, or whether gradients are finite;
+// math/values.h has the ranges.
 #include "../math/values.h"
 
 #include "isa.h"
@@ -38,6 +39,12 @@ bool good(const Range& r, int threads) {
 void flag_values(const ValueArgs& a, const ValueFlags& out) {
     for (const Range& range : ranges_of(a).range) {
         if (!good(range, a.threads)) *out.flags |= int64_t{1} << range.bit;
+    }
+}
+
+void flag_arrays(const FiniteArgs& a, const ValueFlags& out) {
+    for (int i = 0; i < a.count; ++i) {
+        if (!good(finite(a.arrays[i], a.numbers[i], i), a.threads)) *out.flags |= int64_t{1} << i;
     }
 }
 

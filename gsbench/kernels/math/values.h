@@ -21,10 +21,11 @@ struct Ranges {
     Range range[RANGES];
 };
 
+inline Range finite(const float* values, int64_t count, int bit) {
+    return {values, count, 1, -FLT_MAX, FLT_MAX, bit};
+}
+
 inline Ranges ranges_of(const ValueArgs& a) {
-    const auto finite = [](const float* values, int64_t count, int bit) {
-        return Range{values, count, 1, -FLT_MAX, FLT_MAX, bit};
-    };
     const auto of_Ks = [&](int entry, float low, float high) { return Range{a.Ks + entry, a.C, 9, low, high, 5}; };
     return {{finite(a.means, a.N * 3, 0), finite(a.factors, a.N * 9, 1), {a.opacities, a.N, 1, 0.0f, 1.0f, 2},
              finite(a.colors, a.all_colors, 3), finite(a.viewmats, a.C * 16, 4), finite(a.Ks, a.C * 9, 5),
