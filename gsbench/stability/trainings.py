@@ -52,10 +52,11 @@ def judge(case: Case, backend: str, **more: Any) -> Iterator[Cell]:
 def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS, **more: Any) -> Iterator[Cell]:
     """Yield, for each model, the difference in test PSNR of float32 and float64 training that is nearest to its bound.
 
-    There is one difference for each seed. The float64 training uses the torch implementation. Some trainings amplify every rounding, for example if it decides
-    which Gaussians are split. So where the difference exceeds the bound, both are trained again from start values that
-    are changed by one rounding of float32, and the difference is that of the means. Its bound is then the largest
-    difference of the means that chance explains (Student's t, 1 % for all seeds of a model together).
+    There is one difference for each seed. The float64 training uses the torch implementation. Some trainings amplify
+    every rounding, for example if it decides which Gaussians are split. So where the difference exceeds the bound, both
+    are trained again from start values that are changed by one rounding of float32, and the difference is that of the
+    means. Its bound is then the largest difference of the means that chance explains (Student's t, 1 % for all seeds of
+    a model together).
     """
     for name in case.subjects:
         found, notes, bad, ms = [(0.0, case.bound.forward)], [], 0.0, 0.0
