@@ -10,8 +10,7 @@ from torch import Tensor
 
 from gsbench import kernels
 from gsbench.errors import InputError
-from gsbench.kernels import cuda
-from gsbench.kernels.recording import current as recording_now
+from gsbench.kernels import cuda, recording
 
 # The prefix of a kernel argument's name, by the role of its C++ structure (kernels/arguments.h).
 _PREFIX = {"INPUTS": "", "OUTPUTS": "out.", "GIVEN": "given.", "GRADS": "grad."}
@@ -36,9 +35,9 @@ class Library:
         slots["threads"] = torch.get_num_threads()
         run = partial(self._run, name, *[slots[field] for field in self._fields[name]])
         run()
-        recording = recording_now()
-        if recording is not None:
-            recording.add(run)
+        active = recording.current()
+        if active is not None:
+            active.add(run)
 
     def _run(self, name: str, *values: Any) -> None:
         try:

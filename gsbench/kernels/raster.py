@@ -13,7 +13,6 @@ from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.headers import TILE
 from gsbench.kernels.library import Library, allocate, library_of
 from gsbench.kernels.operation import Operation, address, in_rows
-from gsbench.kernels.recording import read
 from gsbench.process.memory import require
 
 TILE_PIXELS = TILE * TILE
@@ -175,7 +174,7 @@ def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, 
     """
     library = library_of(splats.depths.device.type)
     if not library.needs_scratch:
-        return _bin_on_cpu(library, splats, viewport), read(flags, lambda value: value == 0)
+        return _bin_on_cpu(library, splats, viewport), recording.read(flags, lambda value: value == 0)
     order, ends = _sort_on_gpu(library, splats, viewport, flags)
     *total, flagged = ends[-2:].tolist()
     pairs = _countable(total[0] if total else 0)
@@ -216,7 +215,7 @@ def _bin_on_cpu(library: Library, splats: Splats, viewport: Viewport) -> Bins:
     offsets = like.new_empty(len(like) * count_tiles(viewport.width, viewport.height) + 1, dtype=torch.int32)
     total = like.new_empty(1, dtype=torch.int64)
     library.call("count_tiles", slots | {"out.offsets": address(offsets), "out.pairs": address(total)}, like)
-    pairs = _countable(read(total, lambda value: value <= room))
+    pairs = _countable(recording.read(total, lambda value: value <= room))  # the memory of a recording stays as it is
     room = pairs if recording.current() is None else int(ROOM * pairs)
     require(4 * room, f"the lists of {pairs} pairs of a tile and a Gaussian", LOWER)
     ids = like.new_empty(room, dtype=torch.int32)

@@ -89,7 +89,10 @@ def _parts(views: int) -> list[int]:
 
 
 def _in_order(parts: Sequence[Sums]) -> Sums:
-    """Add dictionaries of gradients, in order, to the first one; a dictionary that views share is added only once."""
+    """Return the sum of dictionaries of gradients, added in order to the tensors of the first one.
+
+    A dictionary that views share is added only once.
+    """
     total = dict(parts[0])
     done = {id(parts[0])}
     for part in parts[1:]:
