@@ -60,7 +60,6 @@ class Recording(TorchDispatchMode):
         super().__init__()
         self._calls: list[Callable[[], Any]] = []
         self._kept: list[Any] = []  # so that no two results of the block share memory by chance
-        self._reads = False
         self.is_repeatable = True  # false if an operation of the block gives other results each time
 
     def __enter__(self) -> Self:
@@ -80,13 +79,13 @@ class Recording(TorchDispatchMode):
         kwargs = kwargs or {}
         result = operation(*args, **kwargs)
         self._kept.append(result)
-        if not self._reads and _varies(operation, args):
+        if _varies(operation, args):
             self.is_repeatable = False
         elif operation._schema.is_mutable:
             self._calls.append(partial(operation, *args, **kwargs))
         elif operation in _ALLOCATE_ZEROS:
             self._calls.append(result.zero_)
-        elif not operation.is_view and operation not in _ALLOCATE and not self._reads:
+        elif not operation.is_view and operation not in _ALLOCATE:
             self._calls.append(partial(_redo, result, partial(operation, *args, **kwargs)))
         return result
 
@@ -96,11 +95,8 @@ class Recording(TorchDispatchMode):
 
     def read(self, number: Tensor, holds: Callable[[int], bool]) -> int:
         """Read a tensor, as the function `read` describes."""
-        self._reads = True
-        value = int(number.item())
-        self._reads = False
         self._calls.append(partial(_check, number, holds))
-        return value
+        return int(number.numpy().item())  # torch's own `item` would be recorded as what cannot be repeated
 
     def repeat(self) -> None:
         """Call everything that was recorded again, in the same order; to be called without gradients.

@@ -71,9 +71,7 @@ class GraphedFrames:
         if size not in self._recordings:
             self._recordings[size] = self._record(camera, time)
         recording = self._recordings[size]
-        recording.camera.viewmat.copy_(camera.viewmat)
-        recording.camera.K.copy_(camera.K)
-        recording.camera.center.copy_(camera.center)
+        recording.camera.overwrite(camera)
         if recording.time is not None and time is not None:
             recording.time.fill_(time)
         recording.play()
@@ -87,7 +85,7 @@ class GraphedFrames:
         seen = self.model.slice(Query.of(camera, time))
         drawn = rasterize_slice(seen, camera, self.background, self.model.backend, self.antialias)
         room = 1 + int(MARGIN * drawn.info.pairs)
-        own = Camera(camera.viewmat.clone(), camera.K.clone(), camera.width, camera.height)
+        own = camera.clone()
         own_time = None if time is None else own.K.new_full((), time)
         view = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, self.antialias)
 

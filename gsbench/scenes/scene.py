@@ -25,6 +25,16 @@ class Camera:
         """Compute the position, which every rendering needs, once."""
         object.__setattr__(self, "center", -self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
+    def clone(self) -> "Camera":
+        """Return the same camera in memory of its own, which `overwrite` may change."""
+        return Camera(self.viewmat.clone(), self.K.clone(), self.width, self.height)
+
+    def overwrite(self, other: "Camera") -> None:
+        """Write the values of another camera, with images of the same size, to the memory of this one."""
+        self.viewmat.copy_(other.viewmat)
+        self.K.copy_(other.K)
+        self.center.copy_(other.center)
+
     def to(self, device: str) -> "Camera":
         """Return a copy of the camera whose tensors are on `device`."""
         return Camera(self.viewmat.to(device), self.K.to(device), self.width, self.height)

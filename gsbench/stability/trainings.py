@@ -10,11 +10,11 @@ from statistics import fmean, variance
 from typing import Any
 
 import torch
-from scipy import special
 
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel
 from gsbench.raster.exact import U
+from gsbench.report.intervals import Spread
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Camera, Points, Scene, View
 from gsbench.stability.cases import Case, Cell, device_of
@@ -86,8 +86,8 @@ def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS, **more: Any) -
 
 def _by_chance(a: Sequence[float], b: Sequence[float], p: float) -> float:
     """Return the difference of the means of two samples that chance exceeds with probability p (Student's t)."""
-    error = math.sqrt(variance(a) / len(a) + variance(b) / len(b))
-    return error * float(special.stdtrit(len(a) + len(b) - 2, 1 - p / 2))
+    spread = Spread(variance(a) / len(a) + variance(b) / len(b), len(a) + len(b) - 2)
+    return spread.half_width(1 - p)
 
 
 def _on_test(trainer: Trainer) -> float:

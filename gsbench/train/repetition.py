@@ -35,15 +35,13 @@ class Observed(NamedTuple):
 
     def copy(self) -> Observed:
         """Return a copy in memory of its own, which `overwrite` changes."""
-        camera = Camera(self.camera.viewmat.clone(), self.camera.K.clone(), self.camera.width, self.camera.height)
+        camera = self.camera.clone()
         time = None if self.time is None else camera.K.new_tensor(self.time)
         return Observed(camera, time, self.target.clone())
 
     def overwrite(self, other: Observed) -> None:
         """Take the values of another view of the same size."""
-        self.camera.viewmat.copy_(other.camera.viewmat)
-        self.camera.K.copy_(other.camera.K)
-        self.camera.center.copy_(other.camera.center)
+        self.camera.overwrite(other.camera)
         self.target.copy_(other.target)
         if isinstance(self.time, Tensor) and other.time is not None:
             self.time.fill_(other.time)
@@ -118,17 +116,16 @@ class Repetition(Generic[Result]):
         """
         observed = [Observed.of(view) for view in views]
         signature = None if signature is None else (signature, *[one.signature for one in observed])
-        before, self._signature = self._signature, signature
-        if signature is None or signature != before:
-            self._recorded, self._is_repeatable = {}, True
-            return of_all(lambda index, stages: see(index, observed[index], stages))
+        is_new = signature is None or signature != self._signature
+        if is_new:
+            self._signature, self._recorded, self._is_repeatable = signature, {}, True
         if self._recorded:
             recorded = self._recorded
             try:
                 return of_all(lambda index, stages: recorded[index].repeat(observed[index], stages))
             except OutdatedError:
                 self._recorded = {}
-        if not self._is_repeatable:
+        if is_new or not self._is_repeatable:
             return of_all(lambda index, stages: see(index, observed[index], stages))
         made: dict[int, _Recorded[Result]] = {}
 
