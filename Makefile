@@ -129,7 +129,7 @@ docs: $(VENV)/installed-docs  ## build the site from docs/ into build/site
 scenes:  ## render the embedded scenes anew into build/scenes, with Blender (Python 3.11, 1 GB); half an hour
 	$(PYTHON) -m venv build/blender
 	build/blender/bin/pip install --quiet --disable-pip-version-check --no-deps --require-hashes --requirement locks/blender.txt
-	for scene in suzanne moving-matte rig; do \
+	for scene in moving-matte pendulum suzanne; do \
 		build/blender/bin/python gsbench/scenes/generate.py $$scene build/scenes/$$scene || exit; \
 	done
 

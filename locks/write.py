@@ -13,7 +13,7 @@ from pathlib import Path
 FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parent
 BUILD = "cmake\nninja\nscikit-build-core\nnanobind\nsetuptools\n"  # gsbench's, and of the one package without a wheel
-BLENDER = "bpy==4.5.12 ; python_version < '3.12'\n"  # it needs numpy 1.26, so it has a .venv of its own
+BLENDER = "bpy==4.5.12 ; python_version < '3.12'\npillow==13.0.0\n"  # it needs numpy 1.26, so it has a .venv of its own
 CUDA = ("torch", "triton", "nvidia-", "cuda-")  # how the names begin that a torch for the CPU has or replaces
 UV = ["-m", "uv", "pip", "compile", "--quiet", "--universal", "--generate-hashes", "--python-version", "3.11"]
 PLAIN = ["--no-header", "--no-annotate", "--no-emit-index-url"]

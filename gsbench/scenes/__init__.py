@@ -72,13 +72,13 @@ def load(
         InputError: the layout is unknown, or the data has an error; the message names the file and field.
 
     Example:
-        `suzanne` is one of the two scenes that come with gsbench.
+        `suzanne` is one of the three scenes that come with gsbench.
 
         >>> from gsbench import load_scene
         >>> from gsbench.scenes import sample
         >>> scene = load_scene(sample.folder() / "suzanne", downscale=2)
         >>> len(scene.train), len(scene.val), len(scene.test)
-        (86, 6, 10)
+        (120, 15, 15)
         >>> view = scene.test[0]
         >>> view.image.shape, view.camera.width, scene.has_time
         (torch.Size([80, 80, 3]), 80, True)

@@ -28,7 +28,9 @@ def project(view: scenes.View, point: list[float]) -> tuple[float, float, float]
     return float(u), float(v), float(depth)
 
 
-@pytest.mark.parametrize(("name", "counts"), [("moving-matte", (60, 10, 20)), ("suzanne", (86, 6, 10))])
+@pytest.mark.parametrize(
+    ("name", "counts"), [("moving-matte", (120, 15, 15)), ("pendulum", (132, 10, 20)), ("suzanne", (120, 15, 15))]
+)
 def test_embedded_scenes_are_complete(name: str, counts: tuple[int, int, int]) -> None:
     """Catches package data that lacks a file, a wrong split, and an image out of its contract."""
     scene = scenes.load(folder() / name)
