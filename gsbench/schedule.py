@@ -21,10 +21,6 @@ STEPS_BETWEEN_RESETS = 300
 # as many Gaussians and a lower PSNR on val (docs/tuning.md).
 MOST_ROUNDS = 36
 
-# The largest model of the 7DGS paper has 1.41 million Gaussians, the largest here 0.55 million. A Gaussian of 7DGS has
-# 84 numbers, with gradient and moments four times as many: 2.7 GB for 2 million Gaussians.
-MOST_GAUSSIANS = 2_000_000
-
 # The step, in a run of 30,000, after which Gaussians with small blend weights are removed, if densification is over.
 THIN = 15_600
 # The step, in a run of 30,000, after which Gaussians are made independent of time, direction or AGR, if densification
@@ -104,14 +100,13 @@ class Schedule:
         coarse = self.config.coarse or []
         return next((factor for factor, until in coarse if step < self.scaled(until)), 1)
 
-    def most_gaussians(self, step: int) -> int:
+    def most_gaussians(self, step: int, limit: int) -> int:
         """Return how many Gaussians a model may have after the round of densification at a step.
 
-        At full resolution this is `train.densify.max_gaussians`. At resolution 1 / s it is divided by
-        s^(2 - step / densify_stop), because a smaller image shows less detail (DashGaussian, section 4.2).
+        At full resolution this is `limit`. At resolution 1 / s it is divided by s^(2 - step / densify_stop), because
+        a smaller image shows less detail (DashGaussian, section 4.2).
         """
-        most = self.config.densify.max_gaussians or MOST_GAUSSIANS
-        return math.ceil(most / self.resolution(step) ** (2 - step / self.densify_stop))
+        return math.ceil(limit / self.resolution(step) ** (2 - step / self.densify_stop))
 
     def within(self, step: int, start: int, stop: int | None) -> bool:
         """Return whether a step of this run lies between `start` and `stop`.

@@ -61,12 +61,12 @@ def test_agr_never_acts_where_it_is_off() -> None:
 
 def test_growth_follows_the_resolution() -> None:
     """Catches a limit that a quarter of the width fills with Gaussians, and one that full resolution does not have."""
-    config = TrainConfig(coarse=[[4, 3_000], [2, 14_900]], densify=DensifyConfig(max_gaussians=48_000))
+    config = TrainConfig(coarse=[[4, 3_000], [2, 14_900]], densify=DensifyConfig())
     s = Schedule(config, sh_degree=3, agr=True)
-    assert s.most_gaussians(0) == 3_000  # 48,000 / 4^2
-    assert s.most_gaussians(7_500) == 16_971  # 48,000 / 2^1.5
-    assert s.most_gaussians(14_999) == 48_000
-    assert schedule(30_000).most_gaussians(0) == 2_000_000
+    assert s.most_gaussians(0, 48_000) == 3_000  # 48,000 / 4^2
+    assert s.most_gaussians(7_500, 48_000) == 16_971  # 48,000 / 2^1.5
+    assert s.most_gaussians(14_999, 48_000) == 48_000
+    assert schedule(30_000).most_gaussians(0, 48_000) == 48_000
 
 
 @pytest.mark.parametrize(("iterations", "points"), [(1_000, 10), (7, 3), (5, 20), (100, 1)])
