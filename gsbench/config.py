@@ -93,7 +93,7 @@ class DensifyConfig:
     clone_below: float = 0.01  # clone if the largest scale is below this share of the extent, else split
     prune_above: float = 0.1  # prune if the largest scale is above this share of the extent, after an opacity reset
     thin_to: float | None = None  # share of Gaussians that stay after `stop`, by blend weight; None: all
-    max_gaussians: int | None = None  # most Gaussians at full resolution; None: one for 40 training pixels
+    max_gaussians: int | None = None  # most Gaussians at full resolution; None: one for 64 training pixels
     noise: float = 5e5  # of mcmc: factor of the noise on means; 0: none
 
 

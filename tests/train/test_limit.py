@@ -1,4 +1,4 @@
-"""The largest number of Gaussians of a training: one for so many training pixels, or what the settings say."""
+"""The largest number of Gaussians of a training: one for 64 training pixels, or what the settings say."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -21,9 +21,9 @@ def views(number: int, side: int) -> list[Any]:
 @pytest.mark.parametrize(
     ("number", "side", "initial", "most"),
     [
-        (120, 80, 3_000, 19_200),
-        (120, 80, 10_000, 20_000),
-        (100, 800, 100_000, 1_600_000),
+        (120, 80, 1_000, 12_000),
+        (120, 80, 10_000, 40_000),
+        (100, 800, 100_000, 1_000_000),
         (800, 2_000, 400_000, 2_000_000),
     ],
 )
@@ -43,11 +43,11 @@ def test_a_training_keeps_to_it_and_says_so_once(capsys: pytest.CaptureFixture[s
     model.initialise(points, square.extent, generator(config.seed))
     fitted = Trainer(model, square, square.test, config)
     pixels = sum(view.camera.width * view.camera.height for view in square.train)
-    assert fitted.most == max(pixels // 40, 40)
+    assert fitted.most == max(pixels // 64, 80)
     fitted.run(lambda _: None, "limit")
     assert len(model) <= fitted.most
     said = capsys.readouterr().err
     assert (
-        said.count(f"{fitted.most} Gaussians are the most (one for 40 training pixels; train.densify.max_gaussians)")
+        said.count(f"{fitted.most} Gaussians are the most (one for 64 training pixels; train.densify.max_gaussians)")
         == 1
     )
