@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -25,7 +25,6 @@ CASES = {
     "500": "iterations=500",
     "1,000": "",
     "1,000, threshold 4e-4": "densify.grad_threshold=0.0004",
-    "1,000, threshold 1e-4": "densify.grad_threshold=0.0001",
     "2,000": "iterations=2000",
     "4,000": "iterations=4000",
 }
@@ -176,6 +175,11 @@ def best(values: list[float], texts: list[str]) -> list[str]:
     """Mark the highest value bold, as it is shown."""
     highest = max(text for text, value in zip(texts, values, strict=True) if value == max(values))
     return [f"**{text}**" if text == highest else text for text in texts]
+
+
+def by_scene(of: Estimate, form: Callable[[float], str] = number) -> list[str]:
+    """Format what an estimate is the mean of: a number for each scene."""
+    return [form(mean) for mean in of.each]
 
 
 def plus_minus(of: Estimate) -> str:

@@ -13,6 +13,7 @@ from published import (
     QUICK,
     SMALLER,
     SUCCESSORS,
+    by_scene,
     change,
     cost,
     costs,
@@ -60,7 +61,7 @@ def table1(published: Path) -> str:
         runs = found.runs(model)
         metrics = [number(metric(runs, key), digits) for key, digits in (("psnr", 2), ("ssim", 3), ("lpips_alex", 3))]
         seconds, fps, many = (cost(runs, key) for key in ("train_s", "fps", "num_gaussians"))
-        rows.append([model, *metrics, f"{seconds:.1f}", f"{fps:,.0f}", f"{many:,.0f}"])
+        rows.append([model, *by_scene(found.of(model)), *metrics, f"{seconds:.1f}", f"{fps:,.0f}", f"{many:,.0f}"])
     kept, faster = (cost(found.runs("auto"), key) / cost(found.runs("7dgs"), key) for key in ("num_gaussians", "fps"))
     tested = found.tested("auto", "7dgs")
     said = (
@@ -69,7 +70,7 @@ def table1(published: Path) -> str:
         f"{'' if tested.told else 'not '}significant. Successors have "
         f"{listing([f'{psnr:.2f} dB (`{m}`)' for psnr, m in successors(found)])}."
     )
-    head = ["model", "PSNR", "SSIM", "LPIPS-Alex", "training, s", "FPS", "Gaussians"]
+    head = ["model", *found.group.scenes, "PSNR", "SSIM", "LPIPS-Alex", "training, s", "FPS", "Gaussians"]
     return f"Measured on {machine(found)}.\n\n{table(head, rows)}\n\n{said}"
 
 
@@ -86,8 +87,8 @@ def lengths(published: Path) -> str:
         if choice is None:
             answers.append([limit, "none", "", ""])
             continue
-        psnr, name = choice.point.psnr, choice.point.configuration.name
-        answers.append([limit, f"`{name}`", plus_minus(psnr), f"{len(choice.ahead)} of {choice.others}"])
+        psnr, name = choice.point.psnr.mean, choice.point.configuration.name
+        answers.append([limit, f"`{name}`", number(psnr), f"{len(choice.ahead)} of {choice.others}"])
     longer = overfitted(found)
     said = "The model with the best PSNR on val within a budget, its PSNR on test, and how many others it beats there:"
     parts = [table(["iterations", *MODELS], rows, left=0)]
@@ -114,8 +115,8 @@ def effects(published: Path) -> str:
         told = change(gain, told=price.told["psnr"])
         numbers = [signed(price.costs[unit].mean, digits) for unit, digits in (("seconds", 1), ("ms", 2), ("mb", 2))]
         title = name.replace(" alone", "").replace(", with", " given")
-        rows.append([title, told, f"± {gain.half_over_scenes:.1f}", f"{gain.gaining} of {gain.scenes}", *numbers])
-    head = ["effect", "PSNR, dB", "over scenes", "scenes that gain", "training, s", "frame, ms", "model, MB"]
+        rows.append([title, told, *by_scene(gain, signed), *numbers])
+    head = ["effect", "PSNR, dB", *found.group.scenes, "training, s", "frame, ms", "model, MB"]
     text = table(head, rows, left=2)
     direction = priced["direction, with time"]
     if direction.told["psnr"] and direction.costs["psnr"].mean < 0:
@@ -134,13 +135,14 @@ def effects(published: Path) -> str:
 def ablation(published: Path) -> str:
     """Return the table of what each part of 7DGS is worth."""
     found = experiment(published, "ablation")
-    full = found.of("7dgs", "ablation=none").mean
-    rows = [row(["changed", "`+ablation=`", "PSNR, dB"]), row(["---"] * 3), row(["nothing", "`none`", f"{full:.2f}"])]
+    full = found.of("7dgs", "ablation=none")
+    rows = [["nothing", "`none`", number(full.mean), *by_scene(full)]]
     by_variant = {c.variant: c for c in found.group.configurations}
     for name, words in ABLATIONS.items():
         tested = found.family.of([(1.0, by_variant[f"ablation={name}"]), (-1.0, by_variant["ablation=none"])])
-        rows.append(row([words, f"`{name}`", change(tested.difference, told=tested.told)]))
-    return "\n".join(rows)
+        of = tested.difference
+        rows.append([words, f"`{name}`", change(of, told=tested.told), *by_scene(of, signed)])
+    return table(["changed", "`+ablation=`", "PSNR, dB", *found.group.scenes], rows, left=3)
 
 
 def recipe(published: Path) -> str:

@@ -8,7 +8,7 @@ from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 
-from published import MODELS, NAMES, Experiment, best, experiment, experiments, number, signed, table
+from published import MODELS, NAMES, Experiment, best, experiments, number, signed, table
 from scipy import stats
 
 from gsbench.measure.record import Record, model_folder
@@ -26,7 +26,6 @@ EFFECTS = {
     "`model=auto` instead of 7DGS": ("auto", "7dgs"),
 }
 Choice = Callable[[dict[str, Record]], Record]
-TESTED = "eval_split=test"  # of runs with +exp=tuning, which otherwise measures on val
 COMPARED = "auto,compare=true"  # model=auto that compares its candidates on val
 
 
@@ -67,14 +66,6 @@ def kinds(published: Path) -> str:
         "zero; not corrected for the number of cells), and on how many scenes PSNR rises."
     )
     return f"{table(['change', *columns], rows)}\n\n{said}"
-
-
-def held_out(published: Path) -> str:
-    """Return the table of PSNR on scenes that no choice was made on."""
-    found = experiment(published, "held_out")
-    models = [model for model in MODELS if found.has(model, TESTED)]
-    rows = [[scene, *_means(_psnr(found, scene, models, TESTED)).values()] for scene in found.group.scenes]
-    return table(["scene", *models], rows)
 
 
 def _psnr(found: Experiment, scene: str, models: Sequence[str], variant: str = "") -> dict[str, Values]:
@@ -239,5 +230,4 @@ def _early(effect: str) -> Callable[[Experiment, str], float]:
     return mean
 
 
-BLOCKS = {"suite_scenes": scenes, "suite_kinds": kinds, "suite_choices": choices, "suite_forecasts": forecasts,
-          "held_out": held_out}  # fmt: skip
+BLOCKS = {"suite_scenes": scenes, "suite_kinds": kinds, "suite_choices": choices, "suite_forecasts": forecasts}
