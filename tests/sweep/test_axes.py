@@ -6,7 +6,7 @@ from gsbench.config import register_schema
 from gsbench.errors import InputError
 from gsbench.sweep.axes import expand
 
-MINI = "scene=moving-matte,suzanne"
+MINI = "scene=moving-matte,pendulum,suzanne"
 
 
 @pytest.fixture(scope="module", autouse=True)
