@@ -58,7 +58,7 @@ def test_without_a_compiler_it_installs_and_says_that_it_is_slow(sdist: Path, tm
         names = archive.namelist()
         archive.extractall(tmp_path / "site")
     assert not [name for name in names if name.endswith((".so", ".cpp", ".cu"))]
-    assert wheel.stat().st_size < 5 * MB
+    assert wheel.stat().st_size < 15 * MB
     # Without `site`, as an editable install would come before the wheel.
     path = os.pathsep.join([str(tmp_path / "site"), *[entry for entry in sys.path if entry.endswith("-packages")]])
     smoke = [sys.executable, "-S", str(ROOT / "tests/smoke.py"), "reference"]
