@@ -1,9 +1,11 @@
 """The views of the embedded scenes: enough of them, good poses, and held-out views between training views."""
 
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from gsbench.scenes import generate
 from gsbench.scenes.generate import RECIPES, Shot
@@ -52,3 +54,15 @@ def test_a_rig_repeats_its_places_and_an_orbit_does_not() -> None:
         train = [shot for shot in RECIPES[name].shots() if shot.split == "train"]
         assert len({shot.pose.tobytes() for shot in train}) == places
         assert len({shot.time for shot in train}) == times
+
+
+def test_a_picture_is_packed_without_a_change_that_shows(tmp_path: Path) -> None:
+    """Catches a packed picture that lost colours or alpha, and hidden colours that would only take room."""
+    before = np.random.default_rng(0).integers(1, 256, (8, 9, 4), dtype=np.uint8)
+    before[:, :4, 3] = 0
+    Image.fromarray(before).save(tmp_path / "a.png")
+    generate._pack(tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as image:
+        after = np.array(image)
+    np.testing.assert_array_equal(after[:, 4:], before[:, 4:])
+    assert (after[:, :4] == 0).all()
