@@ -115,7 +115,8 @@ def forecasts(published: Path) -> str:
             [one.name, one.effect, f"{signed(rank)} ({signed(low)} to {signed(high)})", count(len(known), "scene")]
         )
     text = table(["known early", "change in PSNR by", "rank correlation", "over"], rows, left=2)
-    return f"{text}\n\nThe intervals of {unsure} of {len(rows)} contain zero."
+    said = "No prediction is shown to work." if unsure == len(rows) else ""
+    return f"{text}\n\n{unsure} of {len(rows)} intervals contain zero. {said}".rstrip()
 
 
 def choices(published: Path) -> str:
