@@ -62,8 +62,8 @@ def kinds(published: Path) -> str:
             cells.append(f"{mean} ± {number(of.half_over_scenes)}, {of.gaining} of {of.scenes}")
         rows.append([name, *cells])
     said = (
-        "A cell has the mean change of PSNR in dB, half the width of its 95 % interval over scenes (bold: without "
-        "zero; not corrected for the number of cells), and on how many scenes PSNR rises."
+        "A cell has the mean change of PSNR in dB, half the width of its 95 % interval over scenes, and on how many "
+        "scenes PSNR rises. Bold: the interval excludes zero (no correction for many cells)."
     )
     return f"{table(['change', *columns], rows)}\n\n{said}"
 
