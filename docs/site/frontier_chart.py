@@ -18,7 +18,7 @@ PICTURE = ROOT / "docs" / "images" / "frontier.png"
 LENGTHS = ("250", "500", "1,000", "2,000", "4,000")  # iterations
 NAMES = {"auto": "7DGS on demand (auto)", "7dgs": "7DGS", "7dgs_nodir": "7DGS without direction", "4dgs": "4DGS",
          "7dgs_noagr": "7DGS without AGR", "6dgs": "6DGS", "3dgs": "3DGS"}  # fmt: skip
-APART = 0.32  # dB between two labels
+APART = 0.42  # dB between two labels
 TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200)  # seconds
 
 Point = tuple[float, float, float]  # seconds, dB, half of the 95 % interval
