@@ -41,7 +41,6 @@ def test_every_model_learns_and_time_is_worth_something(results: Path) -> None:
     psnr = scores(results)
     assert len(psnr) == 9
     assert psnr["moving-matte", "4dgs"] > psnr["moving-matte", "3dgs"]
-    assert psnr["pendulum", "7dgs"] > psnr["pendulum", "3dgs"]
     assert psnr["suzanne", "7dgs"] > psnr["suzanne", "3dgs"]
 
 

@@ -82,7 +82,7 @@ def test_it_is_trained(tmp_path: Path, blender: scenes.Scene) -> None:
     )  # fmt: skip
     (found,) = map(record.read, record.find(tmp_path / "results"))
     assert found.dataset == "colmap"
-    assert found.metrics["psnr"] > 14.7  # 15.5; 13.8 where cameras have the images of others
+    assert found.metrics["psnr"] > 12.6  # 13.4; 11.8 where cameras have the images of others
 
 
 def rays(K: np.ndarray) -> np.ndarray:  # [H, W, 2]
