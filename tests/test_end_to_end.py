@@ -8,7 +8,7 @@ from tiny_run import gsbench
 from gsbench.measure import record
 from gsbench.report import layout, tables
 
-SHORT = ("train.iterations=150", "train.densify.every=25", "train.curve_points=1", "data.initial_points=500",
+SHORT = ("train.iterations=250", "train.densify.every=25", "train.curve_points=1", "data.initial_points=500",
          "protocol.renders=30", "protocol.pictures=0")  # fmt: skip
 
 
@@ -40,8 +40,8 @@ def test_every_model_learns_and_time_is_worth_something(results: Path) -> None:
     """Catches a model that does not learn, or a time dimension that does nothing where things move."""
     psnr = scores(results)
     assert len(psnr) == 9
-    assert psnr["moving-matte", "4dgs"] > psnr["moving-matte", "3dgs"]
-    assert psnr["suzanne", "7dgs"] > psnr["suzanne", "3dgs"]
+    assert psnr["moving-matte", "4dgs"] > psnr["moving-matte", "3dgs"] + 1
+    assert psnr["suzanne", "7dgs"] > psnr["suzanne", "3dgs"] + 1
 
 
 def test_the_table_has_every_run_and_the_papers_row(results: Path) -> None:
