@@ -68,7 +68,7 @@ table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR, and mode
 	exit $$status
 
 # Models come last, so that they take turns: minutes in which the machine is slow are every model's.
-frontier: setup  ## train seven models at five lengths and two capacities, and AGR on all, three seeds, two at a time; 45 minutes
+frontier: setup  ## train seven models at five lengths and two capacities, and AGR on all, three seeds, two at a time; 54 minutes
 	@status=0; for axis in train.iterations=250,500,1000,2000,4000 train.densify.grad_threshold=4e-4; do \
 		$(BIN)/python -m gsbench --multirun +exp=frontier +launch=parallel launch.at_once=2 \
 			results=$(RESULTS) seed=0,1,2 $$axis model=$(MODELS),7dgs_nodir $(ARGS) || status=$$?; \
