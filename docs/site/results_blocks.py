@@ -80,16 +80,12 @@ def lengths(published: Path) -> str:
     rows = [costs(found, case, MODELS, "{psnr}, {seconds}") for case in CASES]
     newer = [m for m in SUCCESSORS if found.has(m, CASES["2,000"])]
     points = frontier.points(found.group, found.group.basis)
-    answers, ahead = [], 0
-    for unit, budget in frontier.BUDGETS:
-        choice = frontier.choose(points, unit, budget, found.family)
+    chosen = [frontier.choose(points, unit, budget, found.family) for unit, budget in frontier.BUDGETS]
+    answers = []
+    for (unit, budget), choice in zip(frontier.BUDGETS, chosen, strict=True):
         limit = f"{budget:g} s of training" if unit == "seconds" else f"{1000 / budget:.0f} frames a second"
-        if choice is None:
-            answers.append([limit, "none", "–"])
-            continue
-        ahead += len(choice.ahead)
-        psnr, name = choice.point.psnr.mean, choice.point.configuration.name
-        answers.append([limit, f"`{name}`", number(psnr)])
+        best = [f"`{choice.point.configuration.name}`", number(choice.point.psnr.mean)] if choice else ["none", "–"]
+        answers.append([limit, *best])
     longer = overfitted(found)
     said = "The model with the best PSNR on val within a budget, and its PSNR on test:"
     parts = [table(["iterations", *MODELS], rows, left=0)]
@@ -97,9 +93,9 @@ def lengths(published: Path) -> str:
         own = [costs(found, case, newer, "{psnr}, {seconds}") for case in CASES if found.has(newer[0], CASES[case])]
         parts += ["The successors of 7DGS:", table(["iterations", *newer], own, left=0)]
     parts += [said, table(["budget", "best", "PSNR"], answers, left=2)]
-    if not ahead:
+    if not any(choice.ahead for choice in chosen if choice):
         parts.append(
-            f"None of them is significantly better than another model within its budget: the intervals are over "
+            "None of them is significantly better than another model within its budget: the intervals are over "
             f"{count(len(found.group.scenes), 'scene')}."
         )
     if longer:

@@ -115,8 +115,10 @@ def forecasts(published: Path) -> str:
             [one.name, one.effect, f"{signed(rank)} ({signed(low)} to {signed(high)})", count(len(known), "scene")]
         )
     text = table(["known early", "change in PSNR by", "rank correlation", "over"], rows, left=2)
-    said = "No prediction is shown to work." if unsure == len(rows) else ""
-    return f"{text}\n\n{unsure} of {len(rows)} intervals contain zero. {said}".rstrip()
+    said = f"{unsure} of {len(rows)} intervals contain zero."
+    if unsure == len(rows):
+        said += " No prediction is shown to work."
+    return f"{text}\n\n{said}"
 
 
 def choices(published: Path) -> str:

@@ -22,7 +22,7 @@ from gsbench.scenes import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.train.averaging import NO_AVERAGE, Average
 from gsbench.train.checkpoint import whole_number
-from gsbench.train.densify import PIXELS_PER_GAUSSIAN, densification, most_gaussians
+from gsbench.train.densify import PIXELS_PER_GAUSSIAN, densification, gaussian_limit
 from gsbench.train.densify.minimum_scale import MinimumScale
 from gsbench.train.densify.scores import ErrorScore
 from gsbench.train.finite_check import DivergedError, FiniteCheck
@@ -79,7 +79,7 @@ class Trainer:
         self.rows = Rows(model, self.optimizer)
         score = ErrorScore(model, scene.train, self.renderer, train.ssim_weight)
         self.density = densification(self.rows, train.densify, config.model.min_opacity, len(scene.train), score)
-        self.most = most_gaussians(train.densify, scene.train, len(model))
+        self.limit = gaussian_limit(train.densify, scene.train, len(model))
         self.minimum_scale = MinimumScale(model, [view.camera for view in scene.train])
         self.rows.add(self.minimum_scale)
         self.average = Average(model, self.schedule.average_start)
@@ -203,7 +203,7 @@ class Trainer:
                 rate = self.optimizer.rates_at(step)["means"]
                 self.density.add_noise(rate, generator(self.config.seed, step, 1))  # 1: not the numbers of `densify`
             if schedule.densifies(step):
-                most = schedule.most_gaussians(step, self.most)
+                most = schedule.most_gaussians(step, self.limit)
                 refused = self.density.densify(generator(self.config.seed, step), schedule.has_reset(step), most)
                 if factor == 1:
                     self._tell_full(refused, most)
@@ -230,8 +230,8 @@ class Trainer:
         """Print once that the largest number of Gaussians is reached; `refused` Gaussians were not added."""
         if refused and not self._is_full:
             self._is_full = True
-            limit = self.config.train.densify.max_gaussians
-            by = f"one for {PIXELS_PER_GAUSSIAN} training pixels; " if limit is None else ""
+            chosen = self.config.train.densify.max_gaussians is not None
+            by = "" if chosen else f"one for {PIXELS_PER_GAUSSIAN} training pixels; "
             tqdm.write(f"step {self.step + 1}: {most} Gaussians are the most ({by}train.densify.max_gaussians): "
                        f"{refused} of smaller gradients are not cloned or split", file=sys.stderr)  # fmt: skip
 

@@ -5,13 +5,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from test_wiring import trainer
 
 from gsbench.config import DensifyConfig
-from gsbench.run.setup import build
-from gsbench.stability.training_cases import compose, moving_square
-from gsbench.train.densify import most_gaussians
-from gsbench.train.loop import Trainer
-from gsbench.train.seeding import generator
+from gsbench.stability.training_cases import moving_square
+from gsbench.train.densify import gaussian_limit
 
 
 def views(number: int, side: int) -> list[Any]:
@@ -29,25 +27,23 @@ def views(number: int, side: int) -> list[Any]:
 )
 def test_the_limit_follows_from_the_training_pixels(number: int, side: int, initial: int, most: int) -> None:
     """Catches a limit of the views' number or of one view, one that many initial points exceed, and one without end."""
-    assert most_gaussians(DensifyConfig(), views(number, side), initial) == most
-    assert most_gaussians(DensifyConfig(max_gaussians=500), views(number, side), initial) == 500
+    assert gaussian_limit(DensifyConfig(), views(number, side), initial) == most
+    assert gaussian_limit(DensifyConfig(max_gaussians=500), views(number, side), initial) == 500
 
 
 def test_a_training_keeps_to_it_and_says_so_once(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a limit that no round of densification gets, and a training that is silent about what it left out."""
-    config = compose("3dgs", 100, "train.densify.grad_threshold=0", "train.densify.every=5", "effects.gate=off")
     square = moving_square()
     assert square.points is not None
     points = replace(square.points, means=square.points.means[:20], colors=square.points.colors[:20])
-    model = build(config)
-    model.initialise(points, square.extent, generator(config.seed))
-    fitted = Trainer(model, square, square.test, config)
+    words = ("train.densify.grad_threshold=0", "train.densify.every=5", "effects.gate=off")
+    fitted = trainer("3dgs", *words, scene=replace(square, points=points))
     pixels = sum(view.camera.width * view.camera.height for view in square.train)
-    assert fitted.most == max(pixels // 64, 80)
+    assert fitted.limit == max(pixels // 64, 80)
     fitted.run(lambda _: None, "limit")
-    assert len(model) <= fitted.most
+    assert len(fitted.model) <= fitted.limit
     said = capsys.readouterr().err
     assert (
-        said.count(f"{fitted.most} Gaussians are the most (one for 64 training pixels; train.densify.max_gaussians)")
+        said.count(f"{fitted.limit} Gaussians are the most (one for 64 training pixels; train.densify.max_gaussians)")
         == 1
     )

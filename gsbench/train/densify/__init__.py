@@ -32,7 +32,7 @@ def check_kind(kind: str) -> None:
         raise InputError(f"train.densify.kind '{kind}' is not known. {did_you_mean(kind, KINDS)}")
 
 
-def most_gaussians(config: DensifyConfig, views: Sequence[View], initial: int) -> int:
+def gaussian_limit(config: DensifyConfig, views: Sequence[View], initial: int) -> int:
     """Return the largest number of Gaussians that a training may have at full resolution.
 
     Args:
