@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.process.heap import keep_freed_memory
 from gsbench.process.threads import sleep_when_idle
-from gsbench.process.vectors import use_vectors_of_avx2
+from gsbench.process.vectors import compute_the_same_bits
 from gsbench.version import __version__ as __version__
 
 keep_freed_memory()  # these three calls must come before the import of torch or the kernels
 sleep_when_idle()
-use_vectors_of_avx2()
+compute_the_same_bits()
 
 __all__ = ["Query", "build", "load_run", "load_scene", "lpips", "psnr", "rasterize", "slice_gaussians", "ssim"]
 

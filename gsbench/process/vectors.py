@@ -1,23 +1,26 @@
-"""Make torch compute with vectors of AVX2 on a processor with AVX-512, so that results do not depend on the processor.
+"""Make torch and its MKL compute the same bits on every x86-64 processor with AVX2.
 
-torch has other approximations and other orders of sums for AVX-512. The CPU kernels of gsbench need no such setting:
-they compute the same bits with both (kernels/cpu/simd.h).
+By default they choose approximations and orders of sums by the processor. The CPU kernels of gsbench need no such
+setting (kernels/cpu/simd.h).
 """
 
 import os
 from pathlib import Path
 
-VARIABLE = "ATEN_CPU_CAPABILITY"  # torch reads it at its first operation
+TORCH = "ATEN_CPU_CAPABILITY"  # torch reads it at its first operation
+MKL = "MKL_CBWR"  # MKL too; COMPATIBLE is its only code for which Intel promises the same bits on processors of AMD
 CPUINFO = Path("/proc/cpuinfo")
 
 
-def use_vectors_of_avx2() -> None:
-    """Make torch use AVX2 if the processor has AVX-512, unless the environment chooses; call before torch computes.
+def compute_the_same_bits() -> None:
+    """Make torch use AVX2 if the processor has AVX-512, and MKL its compatible code, unless the environment chooses.
 
-    Without AVX2, torch would end the process by a signal. Every processor with AVX-512 has AVX2.
+    Call it before torch computes. Without AVX2, torch would end the process by a signal. Every processor with AVX-512
+    has AVX2.
     """
-    if VARIABLE not in os.environ and _has_avx512():
-        os.environ[VARIABLE] = "avx2"
+    os.environ.setdefault(MKL, "COMPATIBLE")
+    if _has_avx512():
+        os.environ.setdefault(TORCH, "avx2")
 
 
 def _has_avx512() -> bool:

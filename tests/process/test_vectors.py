@@ -1,4 +1,4 @@
-"""torch computes with vectors of AVX2 where the processor has AVX-512, and as the environment says where it says."""
+"""torch and MKL compute the same bits on every processor, unless the environment says otherwise."""
 
 import os
 import subprocess
@@ -6,16 +6,20 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from tiny_run import ROOT
 
 from gsbench.process import vectors
 
 ASK = "import torch; print(torch.backends.cpu.get_cpu_capability())"
+PRODUCT = "import torch; torch.ones(64, 64) @ torch.ones(64, 64)"
 
 
 def capability(imports: str, **variables: str) -> str:
     """The vectors that torch uses in a new process."""
-    environment = {name: value for name, value in os.environ.items() if name != vectors.VARIABLE} | variables
+    environment = {
+        name: value for name, value in os.environ.items() if name not in (vectors.TORCH, vectors.MKL)
+    } | variables
     command = [sys.executable, "-c", f"{imports}; {ASK}"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True)
     return done.stdout.strip()
@@ -30,6 +34,17 @@ def test_torch_uses_avx2_where_there_is_avx512(imports: str) -> None:
     assert capability(imports, ATEN_CPU_CAPABILITY="avx512") == "AVX512"
 
 
+@pytest.mark.skipif("mkl" not in torch.__config__.show().lower(), reason="needs a torch with MKL")
+@pytest.mark.parametrize("imports", ["import gsbench", "import torch; import gsbench"])
+def test_mkl_uses_its_compatible_code(imports: str) -> None:
+    """Catches a variable that MKL does not know, or one that is set too late."""
+    plain = {name: value for name, value in os.environ.items() if name not in (vectors.TORCH, vectors.MKL)}
+    for wanted, first in (("CNR:OFF", "import torch"), ("CNR:COMPATIBLE", imports)):
+        done = subprocess.run([sys.executable, "-c", f"{first}; {PRODUCT}"], capture_output=True, text=True, cwd=ROOT,
+                              env=plain | {"MKL_VERBOSE": "1"}, check=True)  # fmt: skip
+        assert wanted in done.stdout
+
+
 @pytest.mark.parametrize(
     ("flags", "wanted"),
     [("fpu avx2 avx512f avx512bw", "avx2"), ("fpu avx2 fma", None), ("", None)],
@@ -42,7 +57,9 @@ def test_nothing_is_set_without_avx512(
     if flags:
         info.write_text(f"processor\t: 0\nflags\t\t: {flags}\n")
     monkeypatch.setattr(vectors, "CPUINFO", info)
-    monkeypatch.delenv(vectors.VARIABLE, raising=False)
-    vectors.use_vectors_of_avx2()
-    assert os.environ.get(vectors.VARIABLE) == wanted
-    monkeypatch.delenv(vectors.VARIABLE, raising=False)
+    for variable in (vectors.TORCH, vectors.MKL):
+        monkeypatch.setenv(variable, "of before")  # so that the end of the test undoes what it sets
+        monkeypatch.delenv(variable)
+    vectors.compute_the_same_bits()
+    assert os.environ.get(vectors.TORCH) == wanted
+    assert os.environ[vectors.MKL] == "COMPATIBLE"
