@@ -150,6 +150,13 @@ class GaussianModel(nn.Module, ABC):
         """Raise the spatial sizes of each Gaussian to at least `least` [N], world units; by default do nothing."""
         return
 
+    def hold_lifetimes(self, least: float) -> None:
+        """Raise the lifetime of each Gaussian to at least `least` (1 = the length of the scene); see `lifetimes`.
+
+        By default do nothing.
+        """
+        return
+
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
         """Return covariance parameters of the model for which the spatial covariance is that of trained 3D Gaussians.
 

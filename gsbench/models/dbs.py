@@ -116,6 +116,12 @@ class DirectBetaModel(BetaModel, MovingGaussians3D):
         b = exponents(self.splats["betas"].detach()[:, -1])
         return self.splats["times"].detach()[:, 0], 1 / (reach(b) * L_tt)
 
+    def hold_lifetimes(self, least: float) -> None:
+        """Lower the entry L_tt of each precision such that the lifetime is at least `least`."""
+        if "time" in self.observes:
+            b = exponents(self.splats["betas"].detach()[:, -1])
+            self.splats["precision"].data[:, -1].clamp_(max=-(reach(b) * least).log())
+
 
 @register("dbs_static")
 class StaticDirectBetaModel(DirectBetaModel):

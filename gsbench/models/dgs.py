@@ -137,6 +137,10 @@ class DirectModel(MovingGaussians3D):
         L_tt = sizes(self.splats["precision"].detach()[:, 6])
         return torch.sigmoid(self.splats["times"].detach()[:, 0]), 1 / (math.sqrt(2 * DIRECT_FADING) * L_tt)
 
+    def hold_lifetimes(self, least: float) -> None:
+        """Lower the entry L_tt of each precision such that the lifetime is at least `least`."""
+        self.splats["precision"].data[:, 6].clamp_(max=-math.log(math.sqrt(2 * DIRECT_FADING) * least))
+
 
 def coupling_matrix(coupling: Tensor, scales: Tensor) -> Tensor:
     """Compute V_pq = s Theta / |Theta| from Theta [N, 3 C] and scales [N, 3] with the mean s, [N, 3, C]."""

@@ -86,3 +86,7 @@ class FreeTimeModel(MovingGaussians3D):
     def lifetimes(self) -> tuple[Tensor, Tensor]:
         """Return the mean times mu_t [N] and the standard deviations s [N] in time."""
         return self.splats["times"].detach()[:, 0], sizes(self.splats["durations"].detach()[:, 0])
+
+    def hold_lifetimes(self, least: float) -> None:
+        """Raise the standard deviation in time of each Gaussian to at least `least`."""
+        self.splats["durations"].data.clamp_(min=math.log(least))

@@ -229,6 +229,11 @@ class Gaussians4DModel(JointModel):
         """Raise the three spatial scales of each Gaussian to at least `least` [N]."""
         self.splats["scales"].data[:, :3].clamp_(min=least.log()[:, None])
 
+    def hold_lifetimes(self, least: float) -> None:
+        """Raise the fourth scale of each Gaussian to `least`, in the model's unit of time; rotations do not change."""
+        least_scale = math.log(least) + 0.5 * self.log_lambda["time"].detach() + self.clock.log()
+        self.splats["scales"].data[:, 3].clamp_(min=least_scale)
+
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
         """Multiply the three spatial scales by factors. This is exact if the 4D rotation turns only space."""

@@ -14,6 +14,7 @@ from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
 from gsbench.models.beta import (
     BetaModel,
+    exponents,
     opacity_factor,
     positive,
     profiles,
@@ -23,7 +24,7 @@ from gsbench.models.beta import (
 )
 from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
-from gsbench.models.sliced import Conditioned, Geometry
+from gsbench.models.sliced import Conditioned, Geometry, reach
 from gsbench.models.slicing import Reduced, cholesky3, gain_of, reduce, triangularise, whiten
 from gsbench.scenes.scene import Points
 
@@ -121,6 +122,15 @@ class UniversalBetaModel(BetaModel):
             query.time,
         )
         return Geometry(*geometry)
+
+    def hold_lifetimes(self, least: float) -> None:
+        """Raise the size of time such that the Gaussian exp(-b y_t^2) of each opacity factor is at least `least` long.
+
+        This Gaussian bounds the opacity factor (1 - tanh(y_t^2))^b.
+        """
+        if "time" in self.observes:
+            b = exponents(self.splats["betas"].detach()[:, -1])
+            self.splats["scales"].data[:, -1].clamp_(min=softplus_inverse(reach(b) * least))
 
     def factors(self, raw: Raw) -> Tensor:
         """Compute the factors of the conditional covariances, [N, 3, 3], by the formula of the class."""

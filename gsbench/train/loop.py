@@ -22,7 +22,8 @@ from gsbench.scenes import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.train.averaging import NO_AVERAGE, Average
 from gsbench.train.checkpoint import whole_number
-from gsbench.train.densify import PIXELS_PER_GAUSSIAN, densification, gaussian_limit
+from gsbench.train.densify import densification, gaussian_limit
+from gsbench.train.densify.minimum_lifetime import MinimumLifetime
 from gsbench.train.densify.minimum_scale import MinimumScale
 from gsbench.train.densify.scores import ErrorScore
 from gsbench.train.finite_check import DivergedError, FiniteCheck
@@ -82,6 +83,7 @@ class Trainer:
         self.limit = gaussian_limit(train.densify, scene.train, len(model))
         self.minimum_scale = MinimumScale(model, [view.camera for view in scene.train])
         self.rows.add(self.minimum_scale)
+        self.minimum_lifetime = MinimumLifetime(model, scene.train)
         self.average = Average(model, self.schedule.average_start)
         self.rows.add(self.average)
         self.penalties = Penalties(self.rows, train.penalties, self.schedule, config.seed, scene.train)
@@ -198,6 +200,7 @@ class Trainer:
             drawn = torch.cat([one.drawn for one in seen]).any(0) if self.optimizer.is_sparse else None
             self.optimizer.step(step, drawn, slowed=self.gating.slows_agr(step))
             self.minimum_scale.hold()
+            self.minimum_lifetime.hold()
         with stages("density"):
             if self.density.adds_noise:
                 rate = self.optimizer.rates_at(step)["means"]
@@ -230,9 +233,8 @@ class Trainer:
         """Print once that the largest number of Gaussians is reached; `refused` Gaussians were not added."""
         if refused and not self._is_full:
             self._is_full = True
-            chosen = self.config.train.densify.max_gaussians is not None
-            by = "" if chosen else f"one for {PIXELS_PER_GAUSSIAN} training pixels; "
-            tqdm.write(f"step {self.step + 1}: {most} Gaussians are the most ({by}train.densify.max_gaussians): "
+            which = "default of " if self.config.train.densify.max_gaussians is None else ""
+            tqdm.write(f"step {self.step + 1}: {most} Gaussians are the most ({which}train.densify.max_gaussians): "
                        f"{refused} of smaller gradients are not cloned or split", file=sys.stderr)  # fmt: skip
 
     def _measure(self) -> None:

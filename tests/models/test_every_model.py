@@ -214,3 +214,36 @@ def test_before_it_has_gaussians(name: str) -> None:
     assert len(model) == 0
     with pytest.raises(InputError, match="points: expected more than 3"):
         started(model, 0)
+
+
+TIMED = [name for name in NAMES if "time" in registry.find(name).observes]
+# The raw parameter and the column that hold the size in time, and a number that makes this size tiny.
+IN_TIME = {"4dgs": ("scales", 3, -20.0), "dbs": ("precision", -1, 20.0), "dgs": ("precision", -1, 20.0),
+           "freetime": ("durations", 0, -20.0), "ubs": ("scales", -1, -20.0)}  # fmt: skip
+LEAST = 0.04
+
+
+@pytest.mark.parametrize("name", TIMED)
+def test_a_model_holds_it(name: str) -> None:
+    """Catches a model that forgets lambda, its unit of time or the exponents, or that lengthens what is long enough."""
+    model = started(build(name, **needed(name)))
+    raw = {key: value.data for key, value in model.splats.items()}
+    bounded = getattr(model, "bounded_times", False) or name == "dgs"
+    raw["times"].fill_(0.0 if bounded else 0.5)  # the sigmoid of 0 is 0.5
+    parameter, column, tiny = IN_TIME.get(name) or ("log_diagonal", model.rows["t"][0], -20.0)  # type: ignore[index]
+    raw[parameter][::2, column] = tiny
+    before = {key: value.clone() for key, value in raw.items()}
+
+    def shares() -> torch.Tensor:
+        """The opacities LEAST after the mean time, divided by those at the mean time."""
+        now, later = (model.slice(Query.at(CAMERA.float(), 0.5 + dt)).opacities for dt in (0.0, LEAST))
+        return (later / now)[now > 1e-3]
+
+    assert (shares() < 0.01).any()
+    with torch.no_grad():
+        model.hold_lifetimes(LEAST)
+    assert 0.5 < shares().min() < 0.65  # exp(-1/2) is 0.61, Beta profiles fall faster
+    for key, value in raw.items():
+        changed = value != before[key]
+        assert key == parameter or not changed.any()
+        assert not changed[1::2].any()

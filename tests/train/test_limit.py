@@ -43,7 +43,4 @@ def test_a_training_keeps_to_it_and_says_so_once(capsys: pytest.CaptureFixture[s
     fitted.run(lambda _: None, "limit")
     assert len(fitted.model) <= fitted.limit
     said = capsys.readouterr().err
-    assert (
-        said.count(f"{fitted.limit} Gaussians are the most (one for 64 training pixels; train.densify.max_gaussians)")
-        == 1
-    )
+    assert said.count(f"{fitted.limit} Gaussians are the most (default of train.densify.max_gaussians)") == 1
