@@ -86,7 +86,7 @@ def test_the_short_audit_names_what_fails(
 def test_drift_is_that_of_the_worst_seed(spread: float, holds: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a drift on training views, of one seed, or averaged over seeds until it is small.
 
-    It is excused if changes by one rounding move both kinds of trainings as far, and only then.
+    It is excused if small changes of the start values move both kinds of trainings as far, and only then.
     """
     gaps, shaken = {0: 0.001, 1: -0.5, 2: 0.002}, []
 
@@ -170,11 +170,11 @@ def test_missing_numbers_are_not_good_ones() -> None:
     assert audit.curves.percentile(errors) == math.inf
 
 
-def test_a_shaken_start_is_one_rounding_away() -> None:
-    """Catches start values that stay, that move by more than float32 rounds, or that two seeds move alike."""
+def test_a_shaken_start_is_16_roundings_away() -> None:
+    """Catches start values that stay, that move by more than rounding changes a slice, or that two seeds move alike."""
     made = [torch.nn.ParameterList([torch.linspace(-3, 3, 50).double()]) for _ in range(3)]
     for model, seed in zip(made[1:], (1, 2), strict=True):
         trainings._shake(model, seed)  # type: ignore[arg-type]
     start, one, two = (next(iter(model)).detach() for model in made)
-    assert 0 < ((one - start) / start).abs().max() <= 2.0**-24
+    assert 2.0**-24 < ((one - start) / start).abs().max() <= 2.0**-20
     assert not torch.equal(one, two)
