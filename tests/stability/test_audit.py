@@ -44,7 +44,7 @@ def test_the_whole_audit_passes(tmp_path: Path, capsys: pytest.CaptureFixture[st
     """Catches a default over its bound in what the short audit leaves out: other models, seeds, long trainings."""
     assert command.main(["--out", str(tmp_path)]) == 0, capsys.readouterr().out
     drifts = [line for line in (tmp_path / "table.md").read_text().splitlines() if "single_against_double" in line]
-    assert [line.count("in float64") for line in drifts] == [3, 3, 3]
+    assert [line.count("Gaussians, in float64") for line in drifts] == [3, 3, 3]
 
 
 @pytest.mark.parametrize("order", ["paper", "conditioned_first"])
