@@ -57,9 +57,8 @@ $(VENV)/installed-docs: $(VENV)/levels-$(LEVELS)
 	$(LOCKED)/docs.txt
 	touch $@
 
-# Two runs at once, each with half of the cores: small runs leave a second thread idle for part of a step. 96 s became
-# 67 on two cores, with the same bits. Exit status 1 of the report: numbers that differ from the published ones, which it
-# says, and which are a result.
+# Two runs at once, each with half of the cores: small runs leave a second thread idle for part of a step. Exit status 1 of
+# the report: numbers that differ from the published ones, which it says, and which are a result.
 table1: setup  ## train 3DGS, 4DGS, 6DGS and 7DGS with and without AGR, and model=auto, on the embedded scenes; print the table, compare it
 	@status=0; \
 	$(BIN)/python -m gsbench --multirun +exp=mini +launch=parallel launch.at_once=2 results=$(RESULTS) model=$(MODELS) $(ARGS) \
