@@ -78,7 +78,7 @@ def test_own_capture_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     """Catches a capture that its own cells write wrong, times that are lost, and a training that does not learn."""
     text, figures = run("own_capture", tmp_path, monkeypatch)
     assert figures == 2
-    assert "76 training views, 10 test views, 3000 points" in text
+    assert "105 training views, 15 test views, 3000 points" in text
     assert psnr(text, "4dgs") > psnr(text, "3dgs") > 15
 
 
