@@ -151,10 +151,7 @@ class GaussianModel(nn.Module, ABC):
         return
 
     def hold_lifetimes(self, least: float) -> None:
-        """Raise the lifetime of each Gaussian to at least `least` (1 = the length of the scene); see `lifetimes`.
-
-        By default do nothing.
-        """
+        """Raise the lifetime s (see `lifetimes`) of each Gaussian to at least `least`; by default do nothing."""
         return
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:

@@ -118,9 +118,8 @@ class DirectBetaModel(BetaModel, MovingGaussians3D):
 
     def hold_lifetimes(self, least: float) -> None:
         """Lower the entry L_tt of each precision such that the lifetime is at least `least`."""
-        if "time" in self.observes:
-            b = exponents(self.splats["betas"].detach()[:, -1])
-            self.splats["precision"].data[:, -1].clamp_(max=-(reach(b) * least).log())
+        b = exponents(self.splats["betas"].detach()[:, -1])
+        self.splats["precision"].data[:, -1].clamp_(max=-(reach(b) * least).log())
 
 
 @register("dbs_static")

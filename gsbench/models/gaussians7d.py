@@ -71,5 +71,5 @@ class Gaussians7DModel(TimedModel, DirectionalModel):
         return times, deviations / math.sqrt(2) if self.joint_gate else deviations
 
     def hold_lifetimes(self, least: float) -> None:
-        """Raise the lifetime of each Gaussian to at least `least`; see `TriangularModel.hold_lifetimes`."""
+        """Raise the lifetime of each Gaussian to at least `least`; see `TimedModel.hold_lifetimes`."""
         super().hold_lifetimes(least * math.sqrt(2) if self.joint_gate else least)

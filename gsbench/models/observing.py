@@ -1,5 +1,6 @@
 """Define the base classes of triangular models that depend on time, on direction, or on both."""
 
+import math
 from typing import Any
 
 from torch import Tensor
@@ -30,6 +31,11 @@ class TimedModel(TriangularModel):
         found = super().lifetimes()
         assert found is not None
         return self.mean_times(dict(self.splats.items()))[:, 0], found[1]
+
+    def hold_lifetimes(self, least: float) -> None:
+        """Raise the diagonal entry of time in each Cholesky factor, a lower bound of sqrt(S_t), to at least `least`."""
+        least_entry = math.log(least) + 0.5 * self.log_lambda["time"].detach()
+        self.splats["log_diagonal"].data[:, self.rows["t"][0]].clamp_(min=least_entry)
 
 
 class DirectionalModel(TriangularModel):

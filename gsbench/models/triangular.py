@@ -178,12 +178,6 @@ class TriangularModel(JointModel):
         space = self.rows["p"]
         self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=least.log()[:, None])
 
-    def hold_lifetimes(self, least: float) -> None:
-        """Raise the diagonal entry of time in each Cholesky factor, a lower bound of sqrt(S_t), to at least `least`."""
-        if "time" in self.observes:
-            least_entry = math.log(least) + 0.5 * self.log_lambda["time"].detach()
-            self.splats["log_diagonal"].data[:, self.rows["t"][0]].clamp_(min=least_entry)
-
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Split Gaussians in time if they move and are long in time, else in space.
 

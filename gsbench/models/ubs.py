@@ -128,9 +128,8 @@ class UniversalBetaModel(BetaModel):
 
         This Gaussian bounds the opacity factor (1 - tanh(y_t^2))^b.
         """
-        if "time" in self.observes:
-            b = exponents(self.splats["betas"].detach()[:, -1])
-            self.splats["scales"].data[:, -1].clamp_(min=softplus_inverse(reach(b) * least))
+        b = exponents(self.splats["betas"].detach()[:, -1])
+        self.splats["scales"].data[:, -1].clamp_(min=softplus_inverse(reach(b) * least))
 
     def factors(self, raw: Raw) -> Tensor:
         """Compute the factors of the conditional covariances, [N, 3, 3], by the formula of the class."""

@@ -26,8 +26,8 @@ from gsbench.train.seeding import generator
 
 SEEDS = (0, 1, 2)  # of the trainings whose drift is measured
 SHAKEN = (1, 2, 3)  # seeds of the changes of start values
-# Start values are changed by at most this part: as much as rounding changes a slice of hard cases in float32. Smaller
-# changes do not decide which pixels have an alpha above 1/255, but float32 does.
+# Start values are changed by at most this part, about the error of a slice of hard cases in float32. A change by one
+# rounding (U) is smaller than what float32 changes in a step, so it cannot show what such changes do by chance.
 SHAKE = 16 * U
 CHANCE = 0.01  # the probability that a model without a drift is said to have one
 

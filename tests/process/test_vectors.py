@@ -15,14 +15,17 @@ ASK = "import torch; print(torch.backends.cpu.get_cpu_capability())"
 PRODUCT = "import torch; torch.ones(64, 64) @ torch.ones(64, 64)"
 
 
+def said(code: str, **variables: str) -> str:
+    """What a new process prints, whose environment chooses no arithmetic but by `variables`."""
+    plain = {name: value for name, value in os.environ.items() if name not in (vectors.TORCH, vectors.MKL)}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=plain | variables, check=True)
+    return done.stdout
+
+
 def capability(imports: str, **variables: str) -> str:
     """The vectors that torch uses in a new process."""
-    environment = {
-        name: value for name, value in os.environ.items() if name not in (vectors.TORCH, vectors.MKL)
-    } | variables
-    command = [sys.executable, "-c", f"{imports}; {ASK}"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True)
-    return done.stdout.strip()
+    return said(f"{imports}; {ASK}", **variables).strip()
 
 
 @pytest.mark.skipif(not vectors._has_avx512(), reason="needs a processor with AVX-512")
@@ -38,11 +41,8 @@ def test_torch_uses_avx2_where_there_is_avx512(imports: str) -> None:
 @pytest.mark.parametrize("imports", ["import gsbench", "import torch; import gsbench"])
 def test_mkl_uses_its_compatible_code(imports: str) -> None:
     """Catches a variable that MKL does not know, or one that is set too late."""
-    plain = {name: value for name, value in os.environ.items() if name not in (vectors.TORCH, vectors.MKL)}
     for wanted, first in (("CNR:OFF", "import torch"), ("CNR:COMPATIBLE", imports)):
-        done = subprocess.run([sys.executable, "-c", f"{first}; {PRODUCT}"], capture_output=True, text=True, cwd=ROOT,
-                              env=plain | {"MKL_VERBOSE": "1"}, check=True)  # fmt: skip
-        assert wanted in done.stdout
+        assert wanted in said(f"{first}; {PRODUCT}", MKL_VERBOSE="1")
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,10 @@ def views(*times: float | None) -> list[Any]:
     ],
 )
 def test_it_is_half_the_gap_between_the_times_of_training(times: tuple[Any, ...], least: float | None) -> None:
-    """Catches the gap between views of the same time, the mean or longest gap, and a static scene that has one."""
-    assert MinimumLifetime(build("3dgs"), views(*times)).least == (least and pytest.approx(least))
+    """Catches the gap between views of the same time, the mean or longest gap, and a static scene or model with one."""
+    assert MinimumLifetime(build("4dgs"), views(*times)).least == (least and pytest.approx(least))
+    for name in ("3dgs", "dbs_static", "ubs_static"):
+        assert MinimumLifetime(build(name), views(*times)).least is None
 
 
 def test_every_step_of_a_training_holds_it() -> None:

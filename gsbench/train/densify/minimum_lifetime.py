@@ -14,10 +14,11 @@ class MinimumLifetime:
     """Keep each Gaussian's standard deviation in time above LEAST_GAPS of the median gap between training times."""
 
     def __init__(self, model: GaussianModel, views: list[View]) -> None:
-        """Compute the minimum lifetime of a training; there is none if the views have fewer than two times."""
+        """Compute the minimum lifetime; there is none if the model has no time, or the views fewer than two times."""
         self.model = model
         times = torch.tensor(sorted({view.time for view in views if view.time is not None}), dtype=torch.float64)
-        self.least = LEAST_GAPS * float(times.diff().median()) if len(times) > 1 else None
+        has_gaps = "time" in model.observes and len(times) > 1
+        self.least = LEAST_GAPS * float(times.diff().median()) if has_gaps else None
 
     @torch.no_grad()
     def hold(self) -> None:
