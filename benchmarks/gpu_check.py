@@ -1,10 +1,11 @@
 """Everything that needs a GPU, in one command of under eight minutes: python benchmarks/gpu_check.py --out FOLDER.
 
 Builds for the GPU at hand, offline, as a user would (pip install --no-build-isolation --no-deps); runs the tests of the
-backend on it, a short training, compute-sanitizer, and the benchmarks beside gsplat. A part that fails or runs out of
-its time does not stop the next ones; the exit code is 1 if any did. The folder gets gpu_check.{log,json,md} and
-gpu.{json,md}. Needs the interpreter's own torch for CUDA, nvcc, cmake, ninja, nanobind, scikit-build-core, pytest,
-hypothesis; what else is missing (hydra, gsplat) is said and left out. Uses the standard library only.
+backend and compute-sanitizer on it, all at once, then a short training, then the benchmarks beside gsplat, alone. A
+part that fails or runs out of its time does not stop the next ones; the exit code is 1 if any did. The folder gets
+gpu_check.{log,json,md} and gpu.{json,md}. Needs the interpreter's own torch for CUDA, nvcc, cmake, ninja, nanobind,
+scikit-build-core, pytest, hypothesis; what else is missing (hydra, gsplat) is said and left out. Uses the standard
+library only.
 """
 
 import argparse
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TextIO
 
@@ -28,7 +30,20 @@ LIMIT = 470  # seconds for all parts
 PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath), "/usr/local/cuda/bin"])
 PROBE = "import torch; print('%d%d' % torch.cuda.get_device_capability(), torch.cuda.get_device_name(), sep='|')"
 IMPORTED = "from gsbench.kernels import cuda; assert cuda.available(); print(cuda.cuda().__file__)"
-SANITIZER = ["compute-sanitizer", "--report-api-errors", "no", "--error-exitcode", "3"]
+# What the caller's own PYTHONPATH has (gsplat, hydra) stays importable.
+SOURCES = os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]).rstrip(os.pathsep)
+TESTS = ["tests/kernels/test_cuda.py", "tests/kernels/test_cuda_graph.py", "tests/kernels/test_cuda_models.py",
+         "tests/kernels/test_every_operation.py", "tests/raster/test_door.py"]  # fmt: skip
+# torch's caching allocator would hide a buffer that is run over from memcheck.
+SANITIZER = [
+    "env",
+    "PYTORCH_NO_CUDA_MEMORY_CACHING=1",
+    "compute-sanitizer",
+    "--report-api-errors",
+    "no",
+    "--error-exitcode",
+    "3",
+]
 
 
 class Check:
@@ -42,23 +57,35 @@ class Check:
 
     def run(self, name: str, command: list[str], seconds: float, **environment: str) -> bool:
         """Run one part from the repository's root; returns whether it ended well, within its time."""
+        return self.run_at_once({name: command}, seconds, **environment)
+
+    def run_at_once(self, commands: dict[str, list[str]], seconds: float, **environment: str) -> bool:
+        """Run parts that are not timed at once; returns whether all ended well, within the time that each has."""
+        seconds = min(seconds, self.end - time.monotonic())
+        if seconds <= 0:
+            for name in commands:
+                self.note(name, "failed: no time was left for it")
+            return False
+        with ThreadPoolExecutor(len(commands)) as pool:
+            return all(list(pool.map(lambda part: self._part(*part, seconds, environment), commands.items())))
+
+    def _part(self, name: str, command: list[str], seconds: float, environment: dict[str, str]) -> bool:
         self.say(f"== {name}: {' '.join(command)}")
         began = time.monotonic()
-        seconds = min(seconds, self.end - began)
-        if seconds <= 0:
-            return self.note(name, "failed: no time was left for it")
-        env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PATH": PATH, **environment}
-        try:
-            process = subprocess.Popen(command, cwd=ROOT, env=env, stdout=self.log, stderr=self.log,
-                                       start_new_session=True)  # fmt: skip
-            code = process.wait(seconds)
-            outcome = f"failed: exit code {code}" if code else "ok"
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)  # compilers and debuggers have children of their own
-            process.wait()
-            outcome = f"failed: not done after {seconds:.0f} s"
-        except OSError as error:
-            outcome = f"failed: {error.strerror}: {error.filename}"
+        env = {**os.environ, "PYTHONPATH": SOURCES, "PYTHONUNBUFFERED": "1", "PATH": PATH, **environment}
+        with tempfile.TemporaryFile("w+") as said:
+            try:
+                process = subprocess.Popen(command, cwd=ROOT, env=env, stdout=said, stderr=said, start_new_session=True)
+                code = process.wait(seconds)
+                outcome = f"failed: exit code {code}" if code else "ok"
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)  # compilers and debuggers have children of their own
+                process.wait()
+                outcome = f"failed: not done after {seconds:.0f} s"
+            except OSError as error:
+                outcome = f"failed: {error.strerror}: {error.filename}"
+            said.seek(0)
+            self.log.write(f"== {name} said:\n{said.read()}")
         return self.note(name, outcome, time.monotonic() - began)
 
     def note(self, name: str, outcome: str, seconds: float = 0.0) -> bool:
@@ -105,7 +132,12 @@ def everything(check: Check, capability: str) -> None:
     python = sys.executable
     if not build(check, capability):
         return
-    check.run("tests", [python, "-m", "pytest", "-p", "no:cacheprovider", "tests/kernels", "tests/raster"], 150)
+    tests = [python, "-m", "pytest", "-p", "no:cacheprovider", *TESTS]
+    if importlib.util.find_spec("xdist") is not None:
+        tests += ["-n", str(min(8, os.cpu_count() or 1))]
+    sanitized = {f"compute-sanitizer {tool}": [*SANITIZER, "--tool", tool, python, "-m", "benchmarks.gpu_small"]
+                 for tool in ("memcheck", "racecheck")}  # fmt: skip
+    check.run_at_once({"tests": tests} | sanitized, 150)
     if importlib.util.find_spec("hydra") is None:
         check.note("training", "left out: hydra is not installed")
     else:
@@ -115,10 +147,6 @@ def everything(check: Check, capability: str) -> None:
     if importlib.util.find_spec("gsplat") is None:
         check.note("gsplat", "left out: gsplat is not installed, so its columns stay empty")
     check.run("benchmarks", [python, "-m", "benchmarks.gpu", "--out", str(check.out)], 240)
-    # torch's caching allocator would hide a buffer that is run over from memcheck.
-    for tool in ("memcheck", "racecheck"):
-        check.run(f"compute-sanitizer {tool}", [*SANITIZER, "--tool", tool, python, "-m", "benchmarks.gpu_small"], 120,
-                  PYTORCH_NO_CUDA_MEMORY_CACHING="1")  # fmt: skip
 
 
 def build(check: Check, capability: str) -> bool:

@@ -96,5 +96,6 @@ def rasterize(
     if backend != "auto" and chosen in (CPU, CUDA):
         raise InputError(f"raster backend '{chosen.name}': expected float32 tensors on device '{chosen.name}', got "
                          f"{means.dtype} on {means.device}; backend 'reference' takes any")  # fmt: skip
+    reference.check_room(means, viewmats)
     check_values(*inputs, shapes)
     return reference.draw(*inputs, viewport, shapes)

@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, RIM_MIN, TRANSMITTANCE_MIN
-from gsbench.kernels.raster import Viewport
+from gsbench.kernels.raster import LOWER, Viewport
+from gsbench.process.memory import require
 from gsbench.raster.output import RasterInfo, RasterOutput
 
 TILE = 8  # pixels; in small tiles fewer pixels are evaluated for Gaussians that do not reach them
+NUMBERS = 300  # numbers in memory for each Gaussian and camera, measured without gradients
 CHUNK = 1 << 21  # (Gaussian, pixel) pairs that are blended at once, which limits memory and fits caches
 
 
@@ -26,6 +28,13 @@ class CameraSplats(NamedTuple):
     depths: Tensor  # [N]
     half_sizes: Tensor  # [N, 2] pixels: alpha < ALPHA_MIN outside of means2d +- half_sizes; 0: culled
     shapes: Tensor | None = None  # [N] exponents of Beta profiles; None: Gaussians
+
+
+def check_room(means: Tensor, viewmats: Tensor) -> None:
+    """Raise InputError if the CPU memory does not suffice for the Gaussians, means [N, 3], of all cameras [C, 4, 4]."""
+    if means.device.type == "cpu":
+        C, N = len(viewmats), len(means)
+        require(means.element_size() * C * N * NUMBERS, f"images of {C} cameras with {N} Gaussians", LOWER)
 
 
 def draw(

@@ -10,6 +10,7 @@
 #include <cstdint>
 #include <cstring>
 #include <functional>
+#include <stdexcept>
 
 #include "../../gsbench/kernels/cuda/kernels.h"
 
@@ -111,6 +112,7 @@ namespace gsb::cuda {
 
 template <class... Parameters, class... Arguments>
 void launch(void (*kernel)(Parameters...), dim3 grid, dim3 block, Stream, Arguments... arguments) {
+    if (grid.x * grid.y * grid.z == 0) throw std::runtime_error("CUDA: invalid argument");  // as a GPU says
     shim::run(grid, block, [&] { kernel(static_cast<Parameters>(arguments)...); });
 }
 

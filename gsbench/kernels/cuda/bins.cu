@@ -111,8 +111,10 @@ void count_tiles(const BinArgs& a, const TileCounts& out, Stream stream) {
 void fill_tiles(const BinArgs& a, const TileOrder& by_depth, const TileLists& out, Stream stream) {
     const int64_t count = a.C * tiles_along(a.width) * tiles_along(a.height), pairs = by_depth.pairs;
     if (pairs > 0) {
-        launch(a.shapes ? fill_kernel<Beta> : fill_kernel<Gaussian>, blocks_for(a.N * a.C * WARP), THREADS, stream, a,
-               by_depth, count, out.tiles, out.splats);
+        if (a.N * a.C > 0) {
+            launch(a.shapes ? fill_kernel<Beta> : fill_kernel<Gaussian>, blocks_for(a.N * a.C * WARP), THREADS, stream,
+                   a, by_depth, count, out.tiles, out.splats);
+        }
         sort_pairs(out.scratch, out.scratch_bytes, out.tiles, out.sorted_tiles, out.splats, out.ids, pairs,
                    bit_width(count), stream);
     }
