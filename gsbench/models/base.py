@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from gsbench.errors import InputError
 from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.colors import show_colors
-from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.appearance import sh_colors
 from gsbench.models.color_order import ColorOrder
@@ -323,24 +322,6 @@ class GaussianModel(nn.Module, ABC):
         return groups
 
     # ---- density control: keep, copy and split rows
-
-    @torch.no_grad()
-    def visible_intervals(self) -> Tensor | None:
-        """Return the first and the last time at which each Gaussian can be visible, [N, 2]; None without time.
-
-        A Gaussian with opacity o, mean time mu_t and lifetime s is visible at time t if o exp(-((t - mu_t) / s)^2 / 2)
-        is at least 1/255. Times are in [0, 1]; (inf, inf) marks a Gaussian that is never visible. The intervals only
-        serve to sort the Gaussians: they ignore AGR, the neural refinement.
-        """
-        lifetimes = self.lifetimes()
-        if lifetimes is None:
-            return None
-        times, deviations = lifetimes
-        opacities = torch.sigmoid(self.splats["opacities"])
-        reach = (2 * (opacities / ALPHA_MIN).log().clamp(min=0)).sqrt() * deviations
-        interval = torch.stack([times - reach, times + reach], 1)
-        never = (reach == 0) | (interval[:, 1] < 0) | (interval[:, 0] > 1)
-        return torch.where(never[:, None], math.inf, interval.clamp(0, 1))
 
     @torch.no_grad()
     def select(self, rows: Tensor) -> None:

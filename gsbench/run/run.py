@@ -13,6 +13,7 @@ from gsbench.effects import messages
 from gsbench.errors import InputError, one_line, printable
 from gsbench.measure import record as records
 from gsbench.measure.atomic import remove_leftovers
+from gsbench.measure.curve import Curve
 from gsbench.measure.record import Record
 from gsbench.process.memory import is_out_of_memory
 from gsbench.run import claim, trackers
@@ -25,6 +26,7 @@ from gsbench.train.diagnosis import explain
 from gsbench.train.finite_check import DivergedError
 
 TRACEBACK = "traceback.txt"
+FALL = 0.1  # dB of PSNR on val that a training may lose unmentioned; seeds differ by as much (docs/tuning.md)
 SPARE = 1 << 25  # bytes reserved, so that a run which ends without memory can still write its record
 
 
@@ -161,11 +163,24 @@ def write(record: Record, folder: Path) -> None:
 
 
 def summary(record: Record) -> str:
-    """Return a record in one line: PSNR, size and speed, or the reason for a failure."""
+    """Return a record in one line: PSNR, size and speed, or the reason for a failure; and whether PSNR on val fell."""
     if record.metrics is None or record.cost is None:
         return f"{record.status}: {record.reason}"
     psnr = record.metrics["psnr"]
     return (
         f"PSNR {'-' if psnr is None else format(psnr, '.2f')} dB, {record.cost.num_gaussians} Gaussians, "
-        f"trained in {record.cost.train_s:.0f} s, {record.cost.fps:.0f} FPS"
+        f"trained in {record.cost.train_s:.0f} s, {record.cost.fps:.0f} FPS{too_long(record)}"
     )
+
+
+def too_long(record: Record) -> str:
+    """Return a sentence if PSNR on val was more than FALL dB higher before the end of the training, otherwise ""."""
+    curve = Curve(record.curve)
+    best, last = curve.best, curve.last
+    if record.stop is not None or best is None or last is None or best.psnr_val is None or last.psnr_val is None:
+        return ""
+    fall = best.psnr_val - last.psnr_val
+    if fall <= FALL:
+        return ""
+    return (f". PSNR on val was {fall:.2f} dB higher at iteration {best.iteration}: a shorter training may be better "
+            f"(train.iterations)")  # fmt: skip

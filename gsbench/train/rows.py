@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsbench.models import GaussianModel
+from gsbench.models.visible_times import visible_intervals
 
 START_BINS = 16  # number of intervals of the time range, by which rows are sorted
 
@@ -72,7 +73,7 @@ class Rows:
         groups of 16 that are processed from 96 % to 42 %. If some Gaussians were made independent of time, direction or
         AGR (a network), this function does nothing, because Gaussians are then sorted by what they depend on.
         """
-        intervals = None if self.model.effect_sets is not None else self.model.visible_intervals()
+        intervals = None if self.model.effect_sets is not None else visible_intervals(self.model)
         if intervals is not None:
             first, last = intervals.unbind(1)
             self.select(((first * START_BINS).floor() + last / 2).argsort(stable=True))

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import GaussianModel, Query, build
+from gsbench.models.visible_times import visible_intervals
 from gsbench.scenes.scene import Points
 
 N = 24
@@ -69,7 +70,7 @@ def lively(variant: str, count: int = N, seed: int = 0, **options: Any) -> Gauss
 
 def assert_culled_outside_its_intervals(model: GaussianModel, times: Tensor, exact: bool) -> None:
     """A Gaussian has too low an opacity outside its visible interval and, if `exact`, only there."""
-    intervals = model.visible_intervals()
+    intervals = visible_intervals(model)
     assert intervals is not None
     first, last = intervals.unbind(1)
     hidden = 0

@@ -15,6 +15,7 @@ from gsbench.models.gated import GatedModel
 from gsbench.models.query import unit
 from gsbench.models.slicing import slice_gaussians
 from gsbench.models.ubs import joint_factor
+from gsbench.models.visible_times import visible_intervals
 
 DIRECTION = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
 QUERY = Query(-DIRECTION, torch.tensor(0.7, dtype=torch.float64))  # seen from there, the origin lies in DIRECTION
@@ -158,7 +159,7 @@ def test_outside_its_interval_a_gaussian_of_dbs_is_culled() -> None:
     with torch.no_grad():
         model.splats["betas"].clamp_(min=-1.5)  # weaker ones end at the floor, where they may stay visible
     assert_culled_outside_its_intervals(model, torch.linspace(0, 1, 21, dtype=torch.float64), exact=False)
-    assert started(build("ubs"), 5).visible_intervals() is None  # its rows are not sorted
+    assert visible_intervals(started(build("ubs"), 5)) is None  # its rows are not sorted
 
 
 @pytest.mark.parametrize("name", NAMES)
