@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
+
 from gsbench.measure.record import Record
 from gsbench.report import compare, tables
 from gsbench.report.comparisons import comparisons
@@ -30,6 +32,7 @@ CASES = {
 }
 FALL = 0.1  # dB of PSNR; seeds differ by as much (docs/tuning.md)
 PAPERS = "best_on_test=true"  # trex by the paper's protocol
+ON_GPU = f"device=cuda,{PAPERS}"  # the same on a GPU
 SMALLER = "downscale=4,iterations=7000"  # trex at 200 x 200 pixels
 # `+recipe=quick` and what a row changes of it, by the setting of its runs.
 QUICK = {
@@ -127,6 +130,12 @@ def metric(runs: list[Record], name: str) -> float:
     """Average a metric over runs; NaN if one lacks it."""
     values = [value for run in runs if run.metrics and (value := run.metrics.get(name)) is not None]
     return fmean(values) if values and len(values) == len(runs) else math.nan
+
+
+def best_on_test(runs: list[Record]) -> Estimate:
+    """Estimate the PSNR at the best iteration on test; the interval is over seeds."""
+    values = [value for run in runs if run.metrics and (value := run.metrics.get("psnr_best_on_test")) is not None]
+    return estimate([np.array(values)[:, None]], generalise=False) if values else Estimate(math.nan, 0, 0, "")
 
 
 def cost(runs: list[Record], name: str) -> float:
