@@ -305,14 +305,8 @@ class _Eager(torch.autograd.Function):
         operation, wanted = ctx.operation, ctx.needs_input_grad[2:]
         slots = operation.prepare(tensors, ctx.numbers, outputs)
         gradients = operation.backward(tensors, slots, outputs, given, wanted)
-        return (
-            None,
-            None,
-            *[
-                (torch.zeros_like(x) if g is None else g) if asked else None
-                for x, g, asked in zip(tensors, gradients, wanted, strict=True)
-            ],
-        )
+        found = [torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)]
+        return None, None, *[g if asked else None for g, asked in zip(found, wanted, strict=True)]
 
 
 # Output gradients that may be null, which these kernels treat as zero.
