@@ -12,6 +12,7 @@ import argparse
 import importlib.util
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -32,18 +33,12 @@ PROBE = "import torch; print('%d%d' % torch.cuda.get_device_capability(), torch.
 IMPORTED = "from gsbench.kernels import cuda; assert cuda.available(); print(cuda.cuda().__file__)"
 # What the caller's own PYTHONPATH has (gsplat, hydra) stays importable.
 SOURCES = os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]).rstrip(os.pathsep)
-TESTS = ["tests/kernels/test_cuda.py", "tests/kernels/test_cuda_graph.py", "tests/kernels/test_cuda_models.py",
-         "tests/kernels/test_every_operation.py", "tests/raster/test_door.py"]  # fmt: skip
+# The tests that use a GPU if there is one.
+TESTS = [str(path) for folder in ("kernels", "raster") for path in sorted((ROOT / "tests" / folder).glob("test_*.py"))
+         if re.search('cuda_device|"cuda"', path.read_text())]  # fmt: skip
 # torch's caching allocator would hide a buffer that is run over from memcheck.
-SANITIZER = [
-    "env",
-    "PYTORCH_NO_CUDA_MEMORY_CACHING=1",
-    "compute-sanitizer",
-    "--report-api-errors",
-    "no",
-    "--error-exitcode",
-    "3",
-]
+SANITIZER = ["env", "PYTORCH_NO_CUDA_MEMORY_CACHING=1",
+             "compute-sanitizer", "--report-api-errors", "no", "--error-exitcode", "3"]  # fmt: skip
 
 
 class Check:

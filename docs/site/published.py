@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-import numpy as np
-
+from gsbench.measure.curve import FALL
 from gsbench.measure.record import Record
 from gsbench.report import compare, tables
 from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import Configuration, Group, Values, groups
 from gsbench.report.family import Family, Tested, Weights
-from gsbench.report.intervals import Estimate, estimate
+from gsbench.report.intervals import Estimate, estimate, over_seeds
 from gsbench.report.page import messages
 
 MODELS = ("3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto")
@@ -30,7 +29,6 @@ CASES = {
     "2,000": "iterations=2000",
     "4,000": "iterations=4000",
 }
-FALL = 0.1  # dB of PSNR; seeds differ by as much (docs/tuning.md)
 PAPERS = "best_on_test=true"  # trex by the paper's protocol
 ON_GPU = f"device=cuda,{PAPERS}"  # the same on a GPU
 SMALLER = "downscale=4,iterations=7000"  # trex at 200 x 200 pixels
@@ -135,7 +133,7 @@ def metric(runs: list[Record], name: str) -> float:
 def best_on_test(runs: list[Record]) -> Estimate:
     """Estimate the PSNR at the best iteration on test; the interval is over seeds."""
     values = [value for run in runs if run.metrics and (value := run.metrics.get("psnr_best_on_test")) is not None]
-    return estimate([np.array(values)[:, None]], generalise=False) if values else Estimate(math.nan, 0, 0, "")
+    return over_seeds(values) if values else Estimate(math.nan, 0, 0, "")
 
 
 def cost(runs: list[Record], name: str) -> float:

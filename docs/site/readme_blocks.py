@@ -10,7 +10,6 @@ from statistics import fmean
 
 import suite_blocks
 from published import (
-    FALL,
     MODELS,
     ON_GPU,
     PAPERS,
@@ -27,6 +26,7 @@ from published import (
     table,
 )
 
+from gsbench.measure.curve import FALL
 from gsbench.report.page.messages import count
 from gsbench.report.paper import paper_row
 

@@ -99,13 +99,11 @@ class Operation:
         recording = tape.current()
         if recording is not None:
             return recording.record(self, tensors, numbers)
-        if torch.compiler.is_compiling() or _get_current_dispatch_mode() is not None:
+        differentiated = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+        if torch.compiler.is_compiling() or (differentiated and _get_current_dispatch_mode() is not None):
             traced: Tensors = self._traced(tensors, *numbers)
             return traced
-        if torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
-            outputs: tuple[Tensor, ...] = _Eager.apply(self, numbers, *tensors)
-            return list(outputs)
-        return self.forward(tensors, numbers)
+        return list(_Eager.apply(self, numbers, *tensors)) if differentiated else self.forward(tensors, numbers)
 
     def split(self, arguments: Sequence[Any]) -> tuple[Tensors, tuple[Any, ...]]:
         """Split the arguments of a call into tensors and numbers."""
@@ -211,6 +209,18 @@ class Operation:
         library.call(self.backward_kernel, slots, like)
         return gradients
 
+    def gradients(
+        self,
+        tensors: Tensors,
+        numbers: Sequence[Any],
+        outputs: Tensors,
+        given: Sequence[Tensor | None],
+        wanted: Sequence[bool],
+    ) -> Tensors:
+        """Return the gradients of the inputs from what autograd saved; those that the kernel leaves out are zero."""
+        found = self.backward(tensors, self.prepare(tensors, numbers, outputs), outputs, given, wanted)
+        return [torch.zeros_like(x) if g is None else g for x, g in zip(tensors, found, strict=True)]
+
     # ---- what follows from the declaration
 
     def match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
@@ -302,11 +312,9 @@ class _Eager(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *given: Tensor | None) -> tuple[Any, ...]:
         tensors, outputs = list(ctx.saved_tensors[: ctx.inputs]), list(ctx.saved_tensors[ctx.inputs :])
-        operation, wanted = ctx.operation, ctx.needs_input_grad[2:]
-        slots = operation.prepare(tensors, ctx.numbers, outputs)
-        gradients = operation.backward(tensors, slots, outputs, given, wanted)
-        found = [torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)]
-        return None, None, *[g if asked else None for g, asked in zip(found, wanted, strict=True)]
+        wanted = ctx.needs_input_grad[2:]
+        gradients = ctx.operation.gradients(tensors, ctx.numbers, outputs, given, wanted)
+        return None, None, *[g if asked else None for g, asked in zip(gradients, wanted, strict=True)]
 
 
 # Output gradients that may be null, which these kernels treat as zero.
@@ -366,8 +374,7 @@ def _register(operation: Operation) -> Callable[..., Any]:
 
     def backward(tensors: Tensors, *rest: Any) -> Tensors:
         values, (outputs, given, wanted) = rest[:count], rest[count:]
-        gradients = operation.backward(tensors, operation.prepare(tensors, values, outputs), outputs, given, wanted)
-        return _apart([torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)], given)
+        return _apart(operation.gradients(tensors, values, outputs, given, wanted), given)
 
     def keep(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
         ctx.tensors = len(inputs[0])

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 from gsbench.errors import InputError
 
+FALL = 0.1  # dB of PSNR; a smaller fall is not mentioned, because seeds differ by as much (docs/tuning.md)
+
 
 class Point(NamedTuple):
     """One evaluation during training: iteration, seconds and PSNR."""
@@ -52,6 +54,14 @@ class Curve:
         """Return the evaluation with the highest PSNR (the first of several equal ones), or None if none is finite."""
         finite = [(p.psnr_val, p) for p in self.points if p.psnr_val is not None]
         return max(finite, key=lambda pair: pair[0])[1] if finite else None
+
+    @property
+    def fall(self) -> float:
+        """Return how many dB the PSNR of the latest evaluation is below the highest one; 0 if it is not known."""
+        best, last = self.best, self.last
+        if best is None or best.psnr_val is None or last is None or last.psnr_val is None:
+            return 0.0
+        return best.psnr_val - last.psnr_val
 
     @property
     def progress(self) -> str:

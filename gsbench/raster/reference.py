@@ -12,6 +12,7 @@ from torch import Tensor
 from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, RIM_MIN, TRANSMITTANCE_MIN
 from gsbench.kernels.raster import LOWER, Viewport
 from gsbench.process.memory import require
+from gsbench.raster.checks import check_values
 from gsbench.raster.output import RasterInfo, RasterOutput
 
 TILE = 8  # pixels; in small tiles fewer pixels are evaluated for Gaussians that do not reach them
@@ -30,18 +31,17 @@ class CameraSplats(NamedTuple):
     shapes: Tensor | None = None  # [N] exponents of Beta profiles; None: Gaussians
 
 
-def check_room(means: Tensor, viewmats: Tensor) -> None:
-    """Raise InputError if the CPU memory does not suffice for the Gaussians, means [N, 3], of all cameras [C, 4, 4]."""
-    if means.device.type == "cpu":
-        C, N = len(viewmats), len(means)
-        require(means.element_size() * C * N * NUMBERS, f"images of {C} cameras with {N} Gaussians", LOWER)
-
-
 def draw(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     background: Tensor, viewport: Viewport, shapes: Tensor | None = None,
 ) -> RasterOutput:  # fmt: skip
-    """Render images for all cameras, one after the other; see `gsbench.raster.rasterize` for the arguments."""
+    """Render images for all cameras, one after the other; see `gsbench.raster.rasterize` for the arguments.
+
+    Raises:
+        InputError: a value is out of range, or the CPU memory does not suffice.
+    """
+    _check_room(means, viewmats)
+    check_values(means, factors, opacities, colors, viewmats, Ks, background, shapes)
     if colors.dim() == 2:
         colors = colors.expand(len(viewmats), *colors.shape)
     splats = [
@@ -63,6 +63,13 @@ def draw(
         pairs=pairs,
     )
     return RasterOutput(torch.stack(images), torch.stack(alphas), info)
+
+
+def _check_room(means: Tensor, viewmats: Tensor) -> None:
+    """Raise InputError if the CPU memory does not suffice for the Gaussians, means [N, 3], of all cameras [C, 4, 4]."""
+    if means.device.type == "cpu":
+        C, N = len(viewmats), len(means)
+        require(means.element_size() * C * N * NUMBERS, f"images of {C} cameras with {N} Gaussians", LOWER)
 
 
 def project(

@@ -13,7 +13,7 @@ from gsbench.effects import messages
 from gsbench.errors import InputError, one_line, printable
 from gsbench.measure import record as records
 from gsbench.measure.atomic import remove_leftovers
-from gsbench.measure.curve import Curve
+from gsbench.measure.curve import FALL, Curve
 from gsbench.measure.record import Record
 from gsbench.process.memory import is_out_of_memory
 from gsbench.run import claim, trackers
@@ -26,7 +26,6 @@ from gsbench.train.diagnosis import explain
 from gsbench.train.finite_check import DivergedError
 
 TRACEBACK = "traceback.txt"
-FALL = 0.1  # dB of PSNR on val that a training may lose unmentioned; seeds differ by as much (docs/tuning.md)
 SPARE = 1 << 25  # bytes reserved, so that a run which ends without memory can still write its record
 
 
@@ -176,11 +175,7 @@ def summary(record: Record) -> str:
 def too_long(record: Record) -> str:
     """Return a sentence if PSNR on val was more than FALL dB higher before the end of the training, otherwise ""."""
     curve = Curve(record.curve)
-    best, last = curve.best, curve.last
-    if record.stop is not None or best is None or last is None or best.psnr_val is None or last.psnr_val is None:
+    if record.stop is not None or curve.best is None or curve.fall <= FALL:
         return ""
-    fall = best.psnr_val - last.psnr_val
-    if fall <= FALL:
-        return ""
-    return (f". PSNR on val was {fall:.2f} dB higher at iteration {best.iteration}: a shorter training may be better "
-            f"(train.iterations)")  # fmt: skip
+    return (f". PSNR on val was {curve.fall:.2f} dB higher at iteration {curve.best.iteration}: a shorter training may "
+            f"be better (train.iterations)")  # fmt: skip
