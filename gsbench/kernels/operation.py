@@ -209,18 +209,6 @@ class Operation:
         library.call(self.backward_kernel, slots, like)
         return gradients
 
-    def gradients(
-        self,
-        tensors: Tensors,
-        numbers: Sequence[Any],
-        outputs: Tensors,
-        given: Sequence[Tensor | None],
-        wanted: Sequence[bool],
-    ) -> Tensors:
-        """Return the gradients of the inputs from what autograd saved; those that the kernel leaves out are zero."""
-        found = self.backward(tensors, self.prepare(tensors, numbers, outputs), outputs, given, wanted)
-        return [torch.zeros_like(x) if g is None else g for x, g in zip(tensors, found, strict=True)]
-
     # ---- what follows from the declaration
 
     def match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
@@ -312,9 +300,11 @@ class _Eager(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *given: Tensor | None) -> tuple[Any, ...]:
         tensors, outputs = list(ctx.saved_tensors[: ctx.inputs]), list(ctx.saved_tensors[ctx.inputs :])
-        wanted = ctx.needs_input_grad[2:]
-        gradients = ctx.operation.gradients(tensors, ctx.numbers, outputs, given, wanted)
-        return None, None, *[g if asked else None for g, asked in zip(gradients, wanted, strict=True)]
+        operation, wanted = ctx.operation, ctx.needs_input_grad[2:]
+        slots = operation.prepare(tensors, ctx.numbers, outputs)
+        found = zip(tensors, operation.backward(tensors, slots, outputs, given, wanted), wanted, strict=True)
+        # Unlike the registered operator, it makes no zeros that nobody asked for.
+        return None, None, *[(torch.zeros_like(x) if g is None else g) if asked else None for x, g, asked in found]
 
 
 # Output gradients that may be null, which these kernels treat as zero.
@@ -374,7 +364,8 @@ def _register(operation: Operation) -> Callable[..., Any]:
 
     def backward(tensors: Tensors, *rest: Any) -> Tensors:
         values, (outputs, given, wanted) = rest[:count], rest[count:]
-        return _apart(operation.gradients(tensors, values, outputs, given, wanted), given)
+        gradients = operation.backward(tensors, operation.prepare(tensors, values, outputs), outputs, given, wanted)
+        return _apart([torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)], given)
 
     def keep(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
         ctx.tensors = len(inputs[0])
