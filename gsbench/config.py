@@ -128,7 +128,7 @@ class TrainConfig:
     lambda_from: int = 15_000  # step from which lambda_t and lambda_d learn
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     cooldown_from: int | None = None  # step from which learning rates fall to a tenth; None: never
-    average_from: int | None = None  # step from which parameters are averaged; None: never
+    average_from: int | None = None  # parameters averaged from this step on end the run if better on val; None: never
     coarse: list[list[int]] | None = None  # [[4, 3000]]: a quarter of the width until step 3,000
     penalties: PenaltiesConfig = field(default_factory=PenaltiesConfig)
     curve_points: int = 20  # measurements on val during the run

@@ -237,6 +237,7 @@ class Record:
     regions: dict[str, Region] = field(default_factory=dict)  # by "moving" and "object", if there are such pixels
     on_demand: OnDemand | None = None  # None: no effect was removed from the model or its Gaussians
     stop: Stop | None = None  # None: the last iteration was measured, without `train.patience`
+    averaged: int = 0  # number of last iterations over which parameters were averaged; 0: they were not
 
     @property
     def path(self) -> Path:

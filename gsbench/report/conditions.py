@@ -73,7 +73,7 @@ def _stated(records: list[Record], spread: str) -> list[str]:
     notes += _load(records)
     if any(_commit(r).endswith("-dirty") for r in records):
         notes.append(f"{WARNING}: files differed from their commit (-dirty): it does not reproduce these numbers.")
-    notes += [*_rounding(records), *_stops(records), _seeds(records, spread), *DEFINITIONS]
+    notes += [*_rounding(records), *_stops(records), *_averages(records), _seeds(records, spread), *DEFINITIONS]
     return sorted(notes, key=lambda note: not note.startswith(WARNING))
 
 
@@ -130,6 +130,15 @@ def _stops(records: list[Record]) -> list[str]:
     kept, ends = [stop.kept for stop in early], [stop.iteration for stop in early]
     return [f"{len(early)} of {len(records)} runs were measured at the iteration with the best PSNR on val, "
             f"{_span(kept, ',')}, and ended at iteration {_span(ends, ',')} (train.patience)."]  # fmt: skip
+
+
+def _averages(records: list[Record]) -> list[str]:
+    """List a footnote on runs that ended with averaged parameters (`train.average_from`); empty if there is none."""
+    averaged = [r.averaged for r in records if r.averaged]
+    if not averaged:
+        return []
+    return [f"{len(averaged)} of {len(records)} runs ended with parameters averaged over the last "
+            f"{_span(averaged, ',')} iterations, because PSNR on val was higher (train.average_from)."]  # fmt: skip
 
 
 def _span(numbers: Sequence[float], form: str) -> str:

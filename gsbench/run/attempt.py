@@ -98,6 +98,7 @@ class Attempt:
             record, protocol=record.protocol | found.frames, on_demand=on_demand, metrics=found.metrics,
             missing=found.missing, per_view=found.per_view, regions=found.regions,
             cost=found.cost, curve=trainer.curve.points, stop=trainer.early_stop.stop,
+            averaged=trainer.average.kept,
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:

@@ -4,6 +4,7 @@ Polyak and Juditsky 1992, "Acceleration of stochastic approximation by averaging
 costs the same to render.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -30,6 +31,7 @@ class Average:
         self.start = start
         self.count = 0
         self.means: list[Tensor] = []
+        self.kept = 0  # the number of last iterations over which the model's parameters were averaged; 0: they were not
 
     @torch.no_grad()
     def add(self, step: int) -> None:
@@ -42,26 +44,56 @@ class Average:
         self.count += 1
         torch._foreach_lerp_(self.means, parameters, 1 / self.count)
 
+    def keep_better(self, psnr: Callable[[], float]) -> float:
+        """Replace the model's parameters by their means if this raises PSNR, and delete the means.
+
+        A long training can overfit: its means are then better than its last parameters. In a short training they are
+        worse, because the parameters still improve while they are averaged.
+
+        Args:
+            psnr: a function that returns the PSNR of the model on val, dB.
+
+        Returns:
+            The PSNR of the means minus that of the last parameters, dB; 0 if no step was added.
+        """
+        if not self.count:
+            return 0.0
+        last = psnr()
+        self._swap()
+        gain = psnr() - last
+        if gain > 0:
+            self.kept = self.count * EVERY
+        else:
+            self._swap()
+        self.forget()
+        return gain
+
     @torch.no_grad()
-    def take(self) -> None:
-        """Replace the parameters of the model by their means over steps; do nothing if no step was added."""
-        if self.count:
-            for parameter, mean in zip(self.model.parameters(), self.means, strict=True):
-                parameter.copy_(mean)
-            self.count, self.means = 0, []
+    def _swap(self) -> None:
+        """Exchange the parameters of the model and their means."""
+        for i, parameter in enumerate(self.model.parameters()):
+            last = parameter.detach().clone()
+            parameter.copy_(self.means[i])
+            self.means[i] = last
+
+    def forget(self) -> None:
+        """Delete the means."""
+        self.count, self.means = 0, []
 
     def follow(self, rows: Tensor, fresh: Tensor) -> None:
         """Delete the means, because Gaussians were added, removed or reordered."""
-        self.count, self.means = 0, []
+        self.forget()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the means of the parameters and the number of averaged steps, for the checkpoint."""
-        return {"count": self.count, **{str(i): mean for i, mean in enumerate(self.means)}}
+        """Return the means of the parameters and the numbers of averaged steps, for the checkpoint."""
+        return {"count": self.count, "kept": self.kept, **{str(i): mean for i, mean in enumerate(self.means)}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the means of the parameters from a checkpoint; raise InputError if they belong to another model."""
         self.count = whole_number("average", state.get("count"), MOST)
+        self.kept = whole_number("average", state.get("kept", 0), MOST)
         parameters = list(self.model.parameters()) if self.count else []
-        if len(state) != 1 + len(parameters):
-            raise InputError(f"checkpoint: expected {len(parameters)} averaged parameters, got {len(state) - 1}")
+        if len(state.keys() - {"count", "kept"}) != len(parameters):
+            raise InputError(f"checkpoint: expected {len(parameters)} averaged parameters, got "
+                             f"{len(state.keys() - {'count', 'kept'})}")  # fmt: skip
         self.means = [tensor(state, str(i), p.shape, p.dtype) for i, p in enumerate(parameters)]

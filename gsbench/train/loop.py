@@ -128,8 +128,8 @@ class Trainer:
                 with self.effort, fitting_threads(len(self.model), camera.width * camera.height // factor**2):
                     self._descend()
                     self.average.add(self.step)
-                    if self.step + 1 == train.iterations:
-                        self.average.take()
+                if self.step + 1 == train.iterations:
+                    self._average()
                 if self.schedule.measures(self.step):
                     self._measure()
                 if self.schedule.resets(self.step):  # after the measuring: opacities take hundreds of steps to recover
@@ -150,6 +150,20 @@ class Trainer:
         if self.step == train.iterations and self.config.effects.gate != "off":
             self.gate_at_end()
         save(self.state_dict())
+
+    def _average(self) -> None:
+        """End the training with averaged parameters (`train.average_from`) if PSNR on val is higher with them.
+
+        The last parameters are kept if there is no val, or if results are measured on val: these would be too high.
+        """
+        if self.scene.val and self.config.scene.eval_split != "val":
+            self.model.set_active(self.schedule.active(self.step))
+            gain = self.average.keep_better(lambda: self.psnr(self.scene.val))
+            if self.average.kept:
+                tqdm.write(f"step {self.step + 1}: PSNR on val is {gain:.2f} dB higher with parameters averaged over "
+                           f"the last {self.average.kept} iterations: the training ends with these",
+                           file=sys.stderr)  # fmt: skip
+        self.average.forget()
 
     def _keep_best(self) -> None:
         """End the training with the Gaussians of the iteration that had the best PSNR on val (`train.patience`)."""

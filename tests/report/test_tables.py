@@ -280,6 +280,14 @@ def test_runs_measured_before_their_last_iteration_are_told():
     assert "patience" not in page(*ran[:1], make(seed=3))
 
 
+def test_runs_that_end_with_averaged_parameters_are_told():
+    """Catches parameters chosen on val that stand as those of the last iteration."""
+    said = "- 2 of 3 runs ended with parameters averaged over the last 490 to 500 iterations, because PSNR on val was"
+    text = page(make(seed=0), make(seed=1, averaged=490), make(seed=2, averaged=500))
+    assert f"{said} higher (train.average_from).\n" in text
+    assert "averaged over the last" not in page(make(seed=0), make(seed=1))
+
+
 def test_columns_that_leak_or_are_rare_say_so():
     """Would catch the best-on-test column without its warning, or an LPIPS-VGG that was measured and is not shown."""
     metrics = {**make().metrics, "lpips_vgg": 0.25, "psnr_best_on_test": 26.5}

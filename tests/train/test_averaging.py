@@ -1,4 +1,4 @@
-"""The mean of parameters over the last steps: which steps are in it, and when it starts anew."""
+"""The mean of parameters over the last steps: which steps are in it, when it starts anew, and when it is kept."""
 
 import copy
 
@@ -32,20 +32,37 @@ def trained(start: int | None, steps: int = 100) -> tuple[Model, Average]:
     return model, average
 
 
+def take(model: Model, average: Average) -> float:
+    """Make the means the parameters; as a PSNR, they score higher by how much smaller `a` is."""
+    return average.keep_better(lambda: -float(model.a.detach()[0]))
+
+
 def test_it_is_the_mean_of_every_tenth_step_from_its_start() -> None:
     """Catches a mean of all steps, one that starts a step late, and a parameter that is left out."""
     model, average = trained(50)
-    average.take()
+    assert take(model, average) == pytest.approx(29.0)
     assert model.a.tolist() == pytest.approx([70.0] * 3)  # of 50, 60, 70, 80, 90
     assert float(model.b.detach()) == pytest.approx(-70.0)
-    average.take()  # once
+    assert (average.kept, average.count) == (50, 0)
+    assert take(model, average) == 0.0  # once
     assert float(model.b.detach()) == pytest.approx(-70.0)
+
+
+@pytest.mark.parametrize("gain", [-1.0, 0.0, float("nan")])
+def test_the_last_parameters_stay_where_the_mean_is_no_better(gain: float) -> None:
+    """Catches a mean that replaces better parameters, and last parameters that are not put back."""
+    model, average = trained(50)
+    seen = iter([30.0, 30.0 + gain])
+    average.keep_better(lambda: next(seen))
+    assert model.a.tolist() == [99.0] * 3
+    assert float(model.b.detach()) == -99.0
+    assert (average.kept, average.count) == (0, 0)
 
 
 def test_without_a_start_nothing_changes() -> None:
     """Catches an option that is on for everybody."""
     model, average = trained(None)
-    average.take()
+    take(model, average)
     assert model.a.tolist() == [99.0] * 3
 
 
@@ -57,7 +74,7 @@ def test_it_starts_anew_when_gaussians_change() -> None:
         with torch.no_grad():
             model.a.fill_(step)
         average.add(step)
-    average.take()
+    take(model, average)
     assert model.a.tolist() == pytest.approx([85.0] * 3)
 
 
@@ -73,10 +90,13 @@ def test_a_checkpoint_has_it() -> None:
             part.a.fill_(step)
             part.b.fill_(-step)
         resumed.add(step)
-    average.take()
-    resumed.take()
+    take(whole, average)
+    take(part, resumed)
     assert torch.equal(whole.a, part.a)
+    resumed.load_state_dict(average.state_dict())
+    assert resumed.kept == 50  # so that the record of a finished training, measured later, says the same
     resumed.load_state_dict(NO_AVERAGE)
-    for wrong in ({"count": 1}, {"count": -1}, state | {"2": torch.zeros(3)}, state | {"0": torch.zeros(4)}):
+    more, other_size = state | {"2": torch.zeros(3)}, state | {"0": torch.zeros(4)}
+    for wrong in ({"count": 1}, {"count": -1}, {"count": 0, "kept": "all"}, more, other_size):
         with pytest.raises(InputError):
             resumed.load_state_dict(wrong)

@@ -333,7 +333,7 @@ def test_the_lightest_gaussians_go_and_moments_follow() -> None:
     fitted = trainer("3dgs", "train.densify.thin_to=0.5")
     fitted._descend()
     model, N = fitted.model, len(fitted.model)
-    weights = blend_weights(model, fitted.scene.train, antialias=False)
+    weights = blend_weights(model, fitted.scene.train, fitted.renderer.antialias)
     kept = weights.argsort(descending=True, stable=True)[: round(N / 2)].sort().values
     means = model.splats["means"].detach().clone()
     moments = fitted.optimizer.moments[model.splats["means"]]["exp_avg"].clone()
@@ -395,6 +395,21 @@ def test_every_penalty_has_its_settings() -> None:
     assert {field.name for field in fields(PenaltiesConfig)} == set(PENALTIES)
 
 
+@pytest.mark.parametrize(("split", "views", "kept"), [("test", True, 50), ("val", True, 0), ("test", False, 0)])
+def test_parameters_are_averaged_where_val_may_choose(split: str, views: bool, kept: int) -> None:
+    """Catches results on the views by which they were chosen, and means that nothing chose."""
+    fitted = trainer("7dgs", "train.average_from=15000", f"scene.eval_split={split}", "train.patience=null")
+    if not views:
+        fitted.scene = replace(fitted.scene, val=[])
+    real, last = fitted.psnr, [10.0, 20.0]
+    fitted.psnr = lambda views: (  # type: ignore[method-assign]
+        last.pop(0) if fitted.step == 99 and last and views is fitted.scene.val else real(views)
+    )
+    fitted.run(lambda _: None, "square")
+    assert fitted.average.kept == kept
+    assert fitted.average.count == 0
+
+
 def test_relocation_and_averages_continue_from_a_checkpoint() -> None:
     """Catches random numbers or sums of relocation and of averages that a checkpoint does not have."""
     densify = ("train.densify.kind=mcmc", "train.densify.start=0", "train.densify.stop=50", "train.densify.every=10")
@@ -412,6 +427,7 @@ def test_relocation_and_averages_continue_from_a_checkpoint() -> None:
     resumed.load_state_dict(state)
     resumed.run(lambda _: None, "resumed")
     assert len(whole.model) > before
-    assert whole.average.count == 0  # its means are the model's now
+    assert whole.average.count == 0
+    assert whole.average.kept == resumed.average.kept
     for name, value in whole.model.pack().items():
         assert torch.equal(value, resumed.model.pack()[name]), name
