@@ -32,6 +32,7 @@ CASES = {
 PAPERS = "best_on_test=true"  # trex by the paper's protocol
 ON_GPU = f"device=cuda,{PAPERS}"  # the same on a GPU
 LONG = "recipe=long"
+TREX100 = "downscale=8,initial_points=20000,iterations=3000"  # trex at 100 x 100 pixels
 SMALLER = "downscale=4,iterations=7000"  # trex at 200 x 200 pixels
 # `+recipe=quick` and what a row changes of it, by the setting of its runs.
 QUICK = {
@@ -61,10 +62,10 @@ class Experiment:
         return (model, variant) in self._found
 
     def configuration(self, model: str, variant: str | None = "") -> Configuration:
-        """Return a model with these settings; None: with its only ones without `+recipe=long`."""
+        """Return a model with these settings; None: with the only settings it was run with."""
         if variant is not None:
             return self._found[model, variant]
-        (only,) = (c for c in self.group.configurations if c.model == model and not c.variant.startswith(LONG))
+        (only,) = (c for c in self.group.configurations if c.model == model)
         return only
 
     def runs(self, model: str, variant: str = "") -> list[Record]:

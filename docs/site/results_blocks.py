@@ -13,6 +13,7 @@ from published import (
     QUICK,
     SMALLER,
     SUCCESSORS,
+    TREX100,
     Experiment,
     best_on_test,
     by_scene,
@@ -133,7 +134,7 @@ def effects(published: Path) -> str:
         text += "\n\nDirection lowers PSNR of a model with time and without AGR, because the model memorises the views."
     other = experiment(published, "dnerf_trex100")
     if "7dgs_nodir_agr" in other.group.models:
-        views, agr = (other.difference("7dgs", less, None) for less in ("7dgs_nodir_agr", "7dgs_noagr"))
+        views, agr = (other.difference("7dgs", less, TREX100) for less in ("7dgs_nodir_agr", "7dgs_noagr"))
         text += (
             "\n\nOn D-NeRF trex at 100 × 100 ([records](../results/published/dnerf_trex100/), 3,000 iterations) "
             f"direction changes PSNR by {change(views)} in a model with time and AGR, and AGR by "
@@ -160,13 +161,13 @@ def recipe(published: Path) -> str:
     models = ("7dgs", "7dgs_noagr", "4dgs")
     old, trex100 = experiment(published, "old_suzanne"), experiment(published, "dnerf_trex100")
     lego100 = experiment(published, "dnerf_lego100")
-    of_trex, of_4000 = "downscale=8,initial_points=20000,iterations=3000", "iterations=4000"
+    of_4000 = CASES["4,000"]
     long_4000 = f"{LONG},{of_4000}"
     rows = [
         [name, *(plus_minus(found.of(model, variant)) for model in models)]
         for name, found, variant in (
-            ("trex 100 × 100, 3,000 iterations, test", trex100, of_trex),
-            ("the same with `+recipe=long`", trex100, f"{LONG},{of_trex}"),
+            ("trex 100 × 100, 3,000 iterations, test", trex100, TREX100),
+            ("the same with `+recipe=long`", trex100, f"{LONG},{TREX100}"),
             ("the earlier suzanne, 1,000 iterations, test", old, ""),
             ("4,000 iterations", old, of_4000),
             ("4,000 iterations, `+recipe=long`", old, long_4000),
@@ -177,7 +178,7 @@ def recipe(published: Path) -> str:
     said = "On the earlier suzanne, PSNR of training views after 4,000 iterations is higher than that of test views by "
     said += f"{default}, and with `+recipe=long` by {long}.\n\n"
     newer = [m for m in SUCCESSORS if m in trex100.group.models]
-    said += "Successors, trex 100: " + ", ".join(f"`{m}` {plus_minus(trex100.of(m, None))}" for m in newer) + "."
+    said += "Successors, trex 100: " + ", ".join(f"`{m}` {plus_minus(trex100.of(m, TREX100))}" for m in newer) + "."
     still = experiment(published, "static")
     gains = {scene: float(values.mean()) for scene, values in
              zip(still.group.scenes, still.contrast("6dgs", "3dgs"), strict=True)}  # fmt: skip

@@ -93,7 +93,7 @@ class Average:
         self.count = whole_number("average", state.get("count"), MOST)
         self.kept = whole_number("average", state.get("kept", 0), MOST)
         parameters = list(self.model.parameters()) if self.count else []
-        if len(state.keys() - {"count", "kept"}) != len(parameters):
-            raise InputError(f"checkpoint: expected {len(parameters)} averaged parameters, got "
-                             f"{len(state.keys() - {'count', 'kept'})}")  # fmt: skip
+        given = len(state.keys() - {"count", "kept"})
+        if given != len(parameters):
+            raise InputError(f"checkpoint: expected {len(parameters)} averaged parameters, got {given}")
         self.means = [tensor(state, str(i), p.shape, p.dtype) for i, p in enumerate(parameters)]

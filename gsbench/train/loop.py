@@ -156,14 +156,15 @@ class Trainer:
 
         The last parameters are kept if there is no val, or if results are measured on val: these would be too high.
         """
-        if self.scene.val and self.config.scene.eval_split != "val":
-            self.model.set_active(self.schedule.active(self.step))
-            gain = self.average.keep_better(lambda: self.psnr(self.scene.val))
-            if self.average.kept:
-                tqdm.write(f"step {self.step + 1}: PSNR on val is {gain:.2f} dB higher with parameters averaged over "
-                           f"the last {self.average.kept} iterations: the training ends with these",
-                           file=sys.stderr)  # fmt: skip
-        self.average.forget()
+        if not self.scene.val or self.config.scene.eval_split == "val":
+            self.average.forget()
+            return
+        self.model.set_active(self.schedule.active(self.step))
+        gain = self.average.keep_better(lambda: self.psnr(self.scene.val))
+        if self.average.kept:
+            tqdm.write(f"step {self.step + 1}: PSNR on val is {gain:.2f} dB higher with parameters averaged over the "
+                       f"last {self.average.kept} iterations: the training ends with these",
+                       file=sys.stderr)  # fmt: skip
 
     def _keep_best(self) -> None:
         """End the training with the Gaussians of the iteration that had the best PSNR on val (`train.patience`)."""
