@@ -44,29 +44,29 @@ class Average:
         self.count += 1
         torch._foreach_lerp_(self.means, parameters, 1 / self.count)
 
-    def keep_better(self, psnr: Callable[[], float]) -> float:
+    def keep_better(self, last: float, psnr: Callable[[], float]) -> float:
         """Replace the model's parameters by their means if this raises PSNR, and delete the means.
 
         A long training can overfit: its means are then better than its last parameters. In a short training they are
         worse, because the parameters still improve while they are averaged.
 
         Args:
-            psnr: a function that returns the PSNR of the model on val, dB.
+            last: PSNR of the model on val, dB.
+            psnr: a function that measures it.
 
         Returns:
-            The PSNR of the means minus that of the last parameters, dB; 0 if no step was added.
+            PSNR on val of the parameters that the model has now, dB.
         """
-        if not self.count:
-            return 0.0
-        last = psnr()
-        self._swap()
-        gain = psnr() - last
-        if gain > 0:
-            self.kept = self.count * EVERY
-        else:
+        if self.count:
             self._swap()
+            averaged = psnr()
+            if averaged > last:
+                self.kept = self.count * EVERY
+                last = averaged
+            else:
+                self._swap()
         self.forget()
-        return gain
+        return last
 
     @torch.no_grad()
     def _swap(self) -> None:

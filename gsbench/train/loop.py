@@ -128,8 +128,6 @@ class Trainer:
                 with self.effort, fitting_threads(len(self.model), camera.width * camera.height // factor**2):
                     self._descend()
                     self.average.add(self.step)
-                if self.step + 1 == train.iterations:
-                    self._average()
                 if self.schedule.measures(self.step):
                     self._measure()
                 if self.schedule.resets(self.step):  # after the measuring: opacities take hundreds of steps to recover
@@ -151,20 +149,26 @@ class Trainer:
             self.gate_at_end()
         save(self.state_dict())
 
-    def _average(self) -> None:
+    def _average(self, last: float) -> float:
         """End the training with averaged parameters (`train.average_from`) if PSNR on val is higher with them.
 
         The last parameters are kept if there is no val, or if results are measured on val: these would be too high.
+
+        Args:
+            last: PSNR of the last parameters on val, dB; NaN if there is no val.
+
+        Returns:
+            PSNR on val of the parameters that are kept, dB.
         """
         if not self.scene.val or self.config.scene.eval_split == "val":
             self.average.forget()
-            return
-        self.model.set_active(self.schedule.active(self.step))
-        gain = self.average.keep_better(lambda: self.psnr(self.scene.val))
+            return last
+        kept = self.average.keep_better(last, lambda: self.psnr(self.scene.val))
         if self.average.kept:
-            tqdm.write(f"step {self.step + 1}: PSNR on val is {gain:.2f} dB higher with parameters averaged over the "
-                       f"last {self.average.kept} iterations: the training ends with these",
+            tqdm.write(f"step {self.step + 1}: PSNR on val is {kept - last:.2f} dB higher with parameters averaged "
+                       f"over the last {self.average.kept} iterations: the training ends with these",
                        file=sys.stderr)  # fmt: skip
+        return kept
 
     def _keep_best(self) -> None:
         """End the training with the Gaussians of the iteration that had the best PSNR on val (`train.patience`)."""
@@ -256,6 +260,8 @@ class Trainer:
         """Measure PSNR on val and add it to the training curve. This time does not count as training time."""
         self.model.set_active(self.schedule.active(self.step))
         val = self.psnr(self.scene.val) if self.scene.val else math.nan
+        if self.step + 1 == self.config.train.iterations:
+            val = self._average(val)
         self.curve.add(self.step + 1, sum(self.stages.seconds.values()), val)
         self.early_stop.see(self.step + 1, val, self._state_of_gaussians)
         leak = self.config.protocol.best_on_test
