@@ -149,7 +149,7 @@ def write_ply(asked: ExportRequest, path: Path) -> list[str]:
     when = "" if query.time is None else f" at time {float(query.time):g}"
     said = [f"{path}: {len(trained)} Gaussians{when}, colours {colours(asked, keep)}; {culled} of {len(run.model)} are "
             f"left out, as their opacity there is below 1/255"]  # fmt: skip
-    return said + about_profiles(path, trained.from_profiles)
+    return said + differences(asked, path, trained.from_profiles)
 
 
 def write_sequence(asked: ExportRequest, folder: Path) -> list[str]:
@@ -159,7 +159,7 @@ def write_sequence(asked: ExportRequest, folder: Path) -> list[str]:
     written = sequence.write_plys(asked.run.model, [query for query, _ in places], folder, keep_harmonics=keep)
     said = [f"{folder}: {written.paths[0].name} to {written.paths[-1].name} at times 0 to 1, {min(written.counts)} to "
             f"{max(written.counts)} Gaussians each, colours {colours(asked, keep)}"]  # fmt: skip
-    return said + about_profiles(folder, written.from_profiles)
+    return said + differences(asked, folder, written.from_profiles)
 
 
 def colours(asked: ExportRequest, keep: bool) -> str:
@@ -170,12 +170,16 @@ def colours(asked: ExportRequest, keep: bool) -> str:
     return "as seen from " + (f"direction {sight}" if camera is None else f"camera {camera}")
 
 
-def about_profiles(path: Path, from_profiles: bool) -> list[str]:
-    """Say that Beta profiles became Gaussians, if there were any."""
-    if not from_profiles:
-        return []
-    return [f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of 3DGS has "
-            f"no field for b; --images and --video keep the profiles"]  # fmt: skip
+def differences(asked: ExportRequest, path: Path, from_profiles: bool) -> list[str]:
+    """Say in what the Gaussians of a PLY differ from the model's, as the format of 3DGS has no field for it."""
+    said = []
+    if from_profiles:
+        said += [f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of "
+                 f"3DGS has no field for b; --images and --video keep the profiles"]  # fmt: skip
+    if asked.run.config.raster.antialias:
+        said += [f"{path}: trained with raster.antialias=true, which a PLY of 3DGS cannot say: switch on antialiasing "
+                 f"(Mip-Splatting) in the viewer, or small Gaussians are too opaque"]  # fmt: skip
+    return said
 
 
 def slice_place(asked: ExportRequest, time: float | None) -> tuple[Query, bool]:

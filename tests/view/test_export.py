@@ -58,6 +58,20 @@ def test_a_ply_says_that_it_has_no_profiles(
     assert "a.ply: their alpha profiles (1 - r^2)^b are now the Gaussians" in said[1]
 
 
+def test_a_ply_says_that_viewers_must_antialias(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a PLY that other viewers show with too opaque Gaussians, without a word."""
+    asked = [str(folder), "--ply", str(tmp_path / "a.ply"), "--camera", "2"]
+    assert main(asked) == 0
+    assert "antialias" not in capsys.readouterr().out
+    loaded = load_run(folder)
+    loaded.config.raster.antialias = True
+    monkeypatch.setattr("gsbench.export.load_run", lambda *_: loaded)
+    assert main(asked) == 0
+    assert "a.ply: trained with raster.antialias=true" in capsys.readouterr().out
+
+
 def test_a_video_has_its_frames(folder: Path, tmp_path: Path) -> None:
     """Catches a video that cannot be read, or with another length, size or rate than was asked for."""
     path = tmp_path / "a.mp4"
