@@ -1,5 +1,6 @@
 """Collect the provenance of a run: its commit, package versions, machine, settings and time."""
 
+import functools
 import hashlib
 import json
 import platform
@@ -35,7 +36,7 @@ def provenance(
     """
     here = hardware(instruction_set)
     return Provenance(
-        git_commit=git_commit(),
+        git_commit=running_commit(),
         versions=versions(),
         device=device or here.processor,
         threads=threads,
@@ -67,18 +68,25 @@ def versions() -> dict[str, str]:
 NO_CODE = ("results", "docs", "*.md")
 
 
+@functools.cache
+def running_commit() -> str | None:
+    """Return `git_commit()` of the first call, because the code that runs stays when the checkout changes later."""
+    return git_commit()
+
+
 def git_commit() -> str | None:
     """Return the git commit of gsbench's checkout, with the suffix "-dirty" if tracked code was changed.
 
-    Changed results and documents do not count, because they change no measurement. Return None if git does not track
-    this file, for instance if gsbench was installed from a wheel.
+    If git cannot say whether code was changed, the suffix is there too. Changed results and documents do not count,
+    because they change no measurement. Return None if git does not track this file, for instance if gsbench was
+    installed from a wheel.
     """
     here = Path(__file__)
     if _git(here.parent, "ls-files", "--error-unmatch", here.name) is None:
         return None
     head = _git(here.parent, "rev-parse", "HEAD")
     changed = _git(here.parent, "diff", "--name-only", "HEAD", "--", ":/", *(f":(top,exclude){x}" for x in NO_CODE))
-    return f"{head}-dirty" if head is not None and changed else head
+    return f"{head}-dirty" if head is not None and changed != "" else head
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

@@ -80,7 +80,7 @@ class Region:
 class Cost:
     """The cost of a run: training seconds, memory, frame times and the size of the model."""
 
-    train_s: float  # seconds of the training loop without evaluation
+    train_s: float  # seconds of all stages of the training loop, without evaluation and what Python does between them
     stage_s: dict[str, float]  # the same seconds by stage of training
     render_ms: RenderTimes
     fps: float  # 1000 / render_ms.p50: gsbench.measure.speed.time_renders

@@ -22,14 +22,16 @@ def psnr_val(record: Record) -> float:
     """Return the PSNR in dB on the validation views at the end of a run; NaN if it was not measured.
 
     If the run was evaluated on the validation views, this is its final PSNR. Otherwise it is the last value of the
-    training curve. The curve ends before effects (time, view direction, the network AGR) are removed from the
-    Gaussians of the finished model, so the PSNR that this removal costs is subtracted.
+    training curve, or that of the iteration whose Gaussians `train.patience` kept. The curve ends before effects (time,
+    view direction, the network AGR) are removed from the Gaussians of the finished model, so the PSNR that this removal
+    costs is subtracted.
     """
     if record.protocol.get("eval_split") == "val":
         return _number((record.metrics or {}).get("psnr"))
     gates = record.on_demand.gates if record.on_demand else []
     lost = sum(gate.measured_db for gate in gates if gate.step is None and gate.checked_on == "val")
-    return _number(record.curve[-1].psnr_val) - lost if record.curve else math.nan
+    kept = [p for p in record.curve if record.stop is None or p.iteration == record.stop.kept]
+    return _number(kept[-1].psnr_val) - lost if kept else math.nan
 
 
 QUANTITIES: dict[str, Callable[[Record], float]] = {

@@ -13,7 +13,7 @@ from gsbench.measure.record import Effects, OnDemand, Record
 from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
 from gsbench.run import fitting, measuring
-from gsbench.run.checks import check_config, check_scene, evaluated_views, trained_start
+from gsbench.run.checks import check_config, check_scene, check_values, evaluated_views, trained_start
 from gsbench.run.comparing import best_of, check_candidates, check_compare, reporter
 from gsbench.run.identity import Run
 from gsbench.run.log import RunLog
@@ -46,6 +46,8 @@ class Attempt:
         config = self.resolved.config
         check_compare(self.this.config)
         check_config(config)
+        if is_auto(self.this.config):
+            check_values(with_candidate(self.this.config, "static"))
         self.model = build(config)
         self.start = trained_start(config)
         self.scene = scene = load_scene(config)

@@ -96,6 +96,7 @@ def check_values(config: Config) -> None:
         if not low <= value <= high:
             expected = f"{low} to {high}" if high < ENDLESS else f"at least {low}"
             raise InputError(f"{key}: expected {expected}, got {value}")
+    _check_steps(config)
     check_kind(config.train.densify.kind)
     check_penalties(config.train.penalties)
     _check_coarse(config.train.coarse or [])
@@ -153,6 +154,15 @@ def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
     members = value if isinstance(value, dict) else vars(value) if dataclasses.is_dataclass(value) else {}
     for name, one in members.items():
         yield from _numbers(one, f"{place}.{name}".lstrip("."))
+
+
+def _check_steps(config: Config) -> None:
+    """Raise InputError if the end of a training is to begin after its last step."""
+    train = config.train
+    for key, step in (("cooldown_from", train.cooldown_from), ("average_from", train.average_from)):
+        if step is not None and step >= train.recipe_iterations:
+            raise InputError(f"train.{key}: expected a step below train.recipe_iterations={train.recipe_iterations}, "
+                             f"the length for which steps are given, got {step}")  # fmt: skip
 
 
 def _check_rate(key: str, rate: LearningRate) -> None:
@@ -286,6 +296,10 @@ def _check_patience(scene: Scene, config: Config) -> None:
     if config.scene.eval_split == "val":
         raise InputError("train.patience: expected results on test, got scene.eval_split=val: results on the views by "
                          "which the iteration is chosen would be too high; leave train.patience out")  # fmt: skip
+    if config.train.average_from is not None:
+        raise InputError(f"train.patience: expected train.average_from=null, got {config.train.average_from}: a "
+                         f"training ends with its best iteration on val, or with averages (+recipe=long): leave one "
+                         f"of the two out")  # fmt: skip
     if config.effects.compare:
         raise InputError("train.patience: expected effects.compare=false, as a candidate of model=auto must not end "
                          "before they are compared: leave one of the two out")  # fmt: skip

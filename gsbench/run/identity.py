@@ -113,6 +113,9 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
 
     A changed config group appears as its choice (`recipe=paper`), and a changed key as its value (`iterations=10`).
     Model, scene and seed are not part of the name. A long name is cut after a whole word and ends in a hash.
+
+    Raises:
+        InputError: a setting of the model was deleted, which no name could tell.
     """
     groups = {
         group: choice
@@ -131,6 +134,9 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
     mine = dict(flat(training_part(plain)))
     if "effects.gate" in theirs:
         mine.setdefault("effects.gate", "off")
+    for key in theirs:
+        if key.startswith("model.") and key not in mine:
+            raise InputError(f"config key '{key}': expected a value, it was deleted: leave '~{key}' out")
     changed = {key: value for key, value in mine.items() if key not in theirs or value != theirs[key]}
     shorts = [key.removeprefix("model.options.").partition(".")[2] or key.rpartition(".")[2] for key in changed]
     for (key, value), short in zip(changed.items(), shorts, strict=True):

@@ -3,6 +3,7 @@
 import copy
 from pathlib import Path
 
+from gsbench.config import EffectsConfig
 from gsbench.errors import InputError
 from gsbench.measure import record as records
 from gsbench.measure.record import Record
@@ -43,7 +44,7 @@ def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tu
     config = typed_config(plain, path)
     config.data.root = plain["data"]["root"] = data_root or own_root(config.data.root, folder)
     old = records.read(folder / records.FILE_NAME)
-    words = ["gate=end"] + ([] if budget_db == 0.05 else [f"budget_db={budget_db}"])
+    words = ["gate=end"] + ([] if budget_db == EffectsConfig().budget_db else [f"budget_db={budget_db}"])
     variant = ",".join(([old.variant] if old.variant else []) + words)
     new = folder.parent.parent / records.model_folder(old.model, variant) / folder.name
     overrides = sorted([*old.overrides, "effects.gate=end", f"effects.budget_db={budget_db}"])

@@ -30,6 +30,7 @@ class Average:
         self.model = model
         self.start = start
         self.count = 0
+        self.first = 0  # the step of the first parameters in the means
         self.means: list[Tensor] = []
         self.kept = 0  # the number of last iterations over which the model's parameters were averaged; 0: they were not
 
@@ -40,11 +41,11 @@ class Average:
             return
         parameters = [p.detach() for p in self.model.parameters()]
         if not self.count:
-            self.means = [torch.zeros_like(p) for p in parameters]
+            self.first, self.means = step, [torch.zeros_like(p) for p in parameters]
         self.count += 1
         torch._foreach_lerp_(self.means, parameters, 1 / self.count)
 
-    def keep_better(self, last: float, psnr: Callable[[], float]) -> float:
+    def keep_better(self, last: float, psnr: Callable[[], float], iterations: int) -> float:
         """Replace the model's parameters by their means if this raises PSNR, and delete the means.
 
         A long training can overfit: its means are then better than its last parameters. In a short training they are
@@ -53,6 +54,7 @@ class Average:
         Args:
             last: PSNR of the model on val, dB.
             psnr: a function that measures it.
+            iterations: the number of finished iterations.
 
         Returns:
             PSNR on val of the parameters that the model has now, dB.
@@ -61,7 +63,7 @@ class Average:
             self._swap()
             averaged = psnr()
             if averaged > last:
-                self.kept = self.count * EVERY
+                self.kept = iterations - self.first
                 last = averaged
             else:
                 self._swap()
@@ -86,14 +88,16 @@ class Average:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the means of the parameters and the numbers of averaged steps, for the checkpoint."""
-        return {"count": self.count, "kept": self.kept, **{str(i): mean for i, mean in enumerate(self.means)}}
+        numbers = {"count": self.count, "first": self.first, "kept": self.kept}
+        return numbers | {str(i): mean for i, mean in enumerate(self.means)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the means of the parameters from a checkpoint; raise InputError if they belong to another model."""
         self.count = whole_number("average", state.get("count"), MOST)
+        self.first = whole_number("average", state.get("first", 0), MOST)
         self.kept = whole_number("average", state.get("kept", 0), MOST)
         parameters = list(self.model.parameters()) if self.count else []
-        given = len(state.keys() - {"count", "kept"})
+        given = len(state.keys() - {"count", "first", "kept"})
         if given != len(parameters):
             raise InputError(f"checkpoint: expected {len(parameters)} averaged parameters, got {given}")
         self.means = [tensor(state, str(i), p.shape, p.dtype) for i, p in enumerate(parameters)]

@@ -128,7 +128,8 @@ class Trainer:
                 with self.effort, fitting_threads(len(self.model), camera.width * camera.height // factor**2):
                     self._descend()
                     self.average.add(self.step)
-                if self.schedule.measures(self.step):
+                measured = self.schedule.measures(self.step)
+                if measured:
                     self._measure()
                 if self.schedule.resets(self.step):  # after the measuring: opacities take hundreds of steps to recover
                     with self.effort, self.stages("density"):
@@ -138,7 +139,7 @@ class Trainer:
                 # The bar shows the seconds of the last measurement: the clock itself waits for a GPU when it is read.
                 loss = f"loss {self.finite_check.loss:.4f}"
                 bar.set_postfix_str(f"{self.curve.progress}, {loss}, {len(self.model)} Gaussians", refresh=False)
-                if self.step == train.iterations or self.early_stop.is_over(self.step):
+                if self.step == train.iterations or (measured and self.early_stop.is_over(self.step)):
                     self._keep_best()
                 if not goes_on():
                     break
@@ -163,7 +164,7 @@ class Trainer:
         if not self.scene.val or self.config.scene.eval_split == "val":
             self.average.forget()
             return last
-        kept = self.average.keep_better(last, lambda: self.psnr(self.scene.val))
+        kept = self.average.keep_better(last, lambda: self.psnr(self.scene.val), self.step + 1)
         if self.average.kept:
             tqdm.write(f"step {self.step + 1}: PSNR on val is {kept - last:.2f} dB higher with parameters averaged "
                        f"over the last {self.average.kept} iterations: the training ends with these",

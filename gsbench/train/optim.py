@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -50,14 +50,8 @@ class Optimizer:
         Raises:
             InputError: a parameter has no learning rate, or a learning rate has no parameter.
         """
-        groups = model.groups()
-        for name in groups:
-            if name not in config.lr:
-                raise InputError(f"model.lr: expected a learning rate for each of {sorted(groups)}, '{name}' has none")
-        for name in config.lr:
-            if name not in {*groups, "refinement", "lambda"}:
-                raise InputError(f"model.lr: model '{config.name}' has no '{name}'. {did_you_mean(name, groups)}")
-        self.groups = groups
+        self.groups = groups = model.groups()
+        check_rates(groups, config)
         self.rates = {name: config.lr[name] for name in groups}
         self.model = model
         self.train = train
@@ -205,6 +199,16 @@ class Optimizer:
         for name, parameters in self.groups.items():
             for i, parameter in enumerate(parameters):
                 yield f"{name}.{i}", parameter
+
+
+def check_rates(groups: Collection[str], config: ModelConfig) -> None:
+    """Raise InputError if a group of a model's parameters has no learning rate, or a learning rate has no group."""
+    for name in groups:
+        if name not in config.lr:
+            raise InputError(f"model.lr: expected a learning rate for each of {sorted(groups)}, '{name}' has none")
+    for name in config.lr:
+        if name not in {*groups, "refinement", "lambda"}:
+            raise InputError(f"model.lr: model '{config.name}' has no '{name}'. {did_you_mean(name, groups)}")
 
 
 def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) -> float:

@@ -15,9 +15,9 @@ NOTHING_KEPT: dict[str, Any] = {"best": None, "kept": None, "stop": None}  # of 
 class EarlyStop:
     """Early stopping: hold the state of a training at its best PSNR on val; do nothing if `train.patience` is None.
 
-    The training stops if the last `train.patience` of all iterations, counted from the end of densification at the
-    earliest, had no better PSNR on val. Iterations before the final SH degree or before AGR are not kept, because the
-    state would be shown with parts that it was not trained with.
+    The training stops at the first measurement on val at which `train.patience` of all iterations, counted from the end
+    of densification at the earliest, have had no better PSNR. Iterations before the final SH degree or before AGR are
+    not kept, because the state would be shown with parts that it was not trained with.
     """
 
     def __init__(self, schedule: Schedule, patience: float | None) -> None:
@@ -50,7 +50,7 @@ class EarlyStop:
             self._kept = None if iteration == last else copy.deepcopy(state())
 
     def is_over(self, iteration: int) -> bool:
-        """Return whether the training stops after so many finished iterations."""
+        """Return whether the training stops after so many finished iterations, the last of which was measured."""
         if self.wait is None or self._best is None:
             return False
         return iteration - max(self._best[0], self.schedule.densify_stop) >= self.wait

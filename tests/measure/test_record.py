@@ -374,6 +374,13 @@ def test_the_commit_is_that_of_this_checkout():
     assert git_commit() in (head, f"{head}-dirty")
 
 
+def test_a_record_has_the_commit_of_the_code_that_ran(monkeypatch):
+    """Would catch a commit that was made during a long training, and that its record says instead."""
+    first = provenance(config={}, data_hash="", threads=1).git_commit
+    monkeypatch.setattr("gsbench.measure.provenance.git_commit", lambda: "made since")
+    assert provenance(config={}, data_hash="", threads=1).git_commit == first
+
+
 def test_the_commit_is_unknown_where_git_is_missing(monkeypatch):
     """Would catch a run on a machine without git that ends in an exception after hours of training."""
     monkeypatch.setenv("PATH", "")

@@ -9,7 +9,7 @@ from make_golden import make
 from test_compare import group, run
 
 from gsbench.measure.curve import Point
-from gsbench.measure.record import Gate, OnDemand
+from gsbench.measure.record import Gate, OnDemand, Stop
 from gsbench.report import frontier
 from gsbench.report.configurations import psnr_val
 from gsbench.report.family import Family
@@ -103,6 +103,14 @@ def test_what_the_gate_at_the_end_cost_on_val_counts():
     gated = dataclasses.replace(run, on_demand=OnDemand(gates=[dataclasses.replace(gate, step=600), gate]))
     assert psnr_val(run) == 20.5
     assert psnr_val(gated) == pytest.approx(20.2)
+
+
+def test_a_stopped_training_has_the_psnr_of_the_iteration_it_kept():
+    """Catches a run that is chosen by the lower PSNR on val of the iteration at which `train.patience` stopped it."""
+    (run,) = runs_of("a", "", 20.0, 10.0)
+    curve = [Point(2400, 6.0, 21.0), Point(2800, 7.0, 20.8), Point(3200, 8.0, 20.6)]
+    assert psnr_val(dataclasses.replace(run, curve=curve)) == 20.6
+    assert psnr_val(dataclasses.replace(run, curve=curve, stop=Stop(3200, 2400))) == 21.0
 
 
 def test_a_choice_names_what_it_cannot_be_told_from():

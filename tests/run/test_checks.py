@@ -38,4 +38,6 @@ def test_every_choice_and_range_is_checked(config: Config) -> None:
     for key, (low, high) in RANGES.items():
         for value in (low - 1, 2 * high + 1):
             assert refusal(config, key, value).startswith(f"{key}: expected"), key
+    for key in ("train.cooldown_from", "train.average_from"):  # steps of the recipe's 30,000
+        assert refusal(config, key, 30_000).startswith(f"{key}: expected a step below train.recipe_iterations=30000")
     check_config(config)

@@ -242,6 +242,12 @@ def test_a_scene_without_val_is_refused_before_training() -> None:
         check_candidates(config, moving_square())
     scene = replace(moving_square(), val=moving_square().train[:2])
     check_candidates(config, scene)
+    for word, said in (
+        ("model.compared.moving_4dgs.lr.means.start=-1", r"candidate 4dgs: model\.lr\.means: expected start >= 0"),
+        ("~model.compared.moving_4dgs.lr.scales", r"candidate 4dgs: model\.lr: .* 'scales' has none"),
+    ):
+        with pytest.raises(InputError, match=said):
+            check_candidates(compose("auto", 10, "effects.compare=true", word), scene)
     config.train.penalties.strain.weight = 1.0
     with pytest.raises(InputError, match="candidate 6dgs: "):
         check_candidates(config, scene)

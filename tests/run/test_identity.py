@@ -169,6 +169,12 @@ def test_a_comparison_is_training_and_none_changes_no_older_run() -> None:
     ) == training_hash(older)
 
 
+def test_a_deleted_option_is_refused() -> None:
+    """Catches another training in the folder of the default: YAML has false here, and the class true."""
+    with pytest.raises(InputError, match=r"'model\.options\.directional_half': expected a value, it was deleted"):
+        named("model=6dgs", "~model.options.directional_half")
+
+
 @pytest.mark.parametrize("word", ["experiment=published", "scene.name=published"])
 def test_the_folder_of_published_records_is_no_run(word: str) -> None:
     """Catches a run whose record every table passes by."""

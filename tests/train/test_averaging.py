@@ -35,7 +35,7 @@ def trained(start: int | None, steps: int = 100) -> tuple[Model, Average]:
 def take(model: Model, average: Average) -> float:
     """Make the means the parameters; as a PSNR, they score higher by how much smaller `a` is."""
     last = -float(model.a.detach()[0])
-    return average.keep_better(last, lambda: -float(model.a.detach()[0])) - last
+    return average.keep_better(last, lambda: -float(model.a.detach()[0]), 100) - last
 
 
 def test_it_is_the_mean_of_every_tenth_step_from_its_start() -> None:
@@ -53,7 +53,7 @@ def test_it_is_the_mean_of_every_tenth_step_from_its_start() -> None:
 def test_the_last_parameters_stay_where_the_mean_is_no_better(gain: float) -> None:
     """Catches a mean that replaces better parameters, and last parameters that are not put back."""
     model, average = trained(50)
-    assert average.keep_better(30.0, lambda: 30.0 + gain) == 30.0
+    assert average.keep_better(30.0, lambda: 30.0 + gain, 100) == 30.0
     assert model.a.tolist() == [99.0] * 3
     assert float(model.b.detach()) == -99.0
     assert (average.kept, average.count) == (0, 0)
@@ -76,6 +76,7 @@ def test_it_starts_anew_when_gaussians_change() -> None:
         average.add(step)
     take(model, average)
     assert model.a.tolist() == pytest.approx([85.0] * 3)
+    assert average.kept == 20  # iterations: the parameters of steps 80 to 99 have had a part in the mean
 
 
 def test_a_checkpoint_has_it() -> None:
@@ -93,10 +94,12 @@ def test_a_checkpoint_has_it() -> None:
     take(whole, average)
     take(part, resumed)
     assert torch.equal(whole.a, part.a)
+    assert (average.kept, resumed.kept) == (50, 50)
     resumed.load_state_dict(average.state_dict())
     assert resumed.kept == 50  # so that the record of a finished training, measured later, says the same
     resumed.load_state_dict(NO_AVERAGE)
     more, other_size = state | {"2": torch.zeros(3)}, state | {"0": torch.zeros(4)}
-    for wrong in ({"count": 1}, {"count": -1}, {"count": 0, "kept": "all"}, more, other_size):
+    numbers = ({"count": 1}, {"count": -1}, {"count": 0, "kept": "all"}, {"count": 0, "first": -1})
+    for wrong in (*numbers, more, other_size):
         with pytest.raises(InputError):
             resumed.load_state_dict(wrong)

@@ -15,7 +15,7 @@ from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.loop import Trainer
 
 PATIENT = ("train.curve_points=20", "train.patience=0.2", "train.densify.every=5", "train.densify.reset_every=1000000",
-           "train.average_from=100", "effects.gate=end", "train.sh_every=1", "train.refine_from=1")  # fmt: skip
+           "effects.gate=end", "train.sh_every=1", "train.refine_from=1")  # fmt: skip
 
 
 def with_val(psnr: dict[int, float], *more: str) -> Trainer:
@@ -61,6 +61,13 @@ def test_a_training_that_gains_to_the_end_is_that_without_patience() -> None:
     assert_same_bits([p.data for p in fitted.model.parameters()], [p.data for p in parameters_at(100)])
 
 
+def test_a_training_is_not_over_before_it_is_measured_again() -> None:
+    """Catches a patience shorter than the time between two measurements that stops a training which still gains."""
+    fitted = with_val({}, "effects.gate=off", "train.curve_points=4", "train.patience=0.05")
+    fitted.run(lambda _: None, "square")
+    assert [point.iteration for point in fitted.curve.points] == [25, 50, 75, 100]
+
+
 def test_effects_are_removed_from_the_gaussians_that_are_kept() -> None:
     """Catches gates at the end whose rows are those of the last iteration: more Gaussians than the kept one has."""
     fitted = with_val({40: 50.0})
@@ -100,6 +107,9 @@ def test_what_patience_needs_is_asked_at_the_door() -> None:
     config.scene.eval_split = "val"
     with pytest.raises(InputError, match=r"^train\.patience: expected results on test"):
         check_scene(fitted.model, fitted.scene, config)
-    config.scene.eval_split, config.effects.compare = "test", True
+    config.scene.eval_split, config.train.average_from = "test", 15000
+    with pytest.raises(InputError, match=r"^train\.patience: expected train\.average_from=null, got 15000"):
+        check_scene(fitted.model, fitted.scene, config)
+    config.train.average_from, config.effects.compare = None, True
     with pytest.raises(InputError, match=r"^train\.patience: expected effects\.compare=false"):
         check_scene(fitted.model, fitted.scene, config)
