@@ -74,7 +74,7 @@ def draw() -> None:
     shown = [tick for tick in TICKS if 0.8 * first <= tick <= 1.12 * last]
     axes.set_xticks(shown, [f"{tick:g} s" for tick in shown])
     axes.minorticks_off()
-    axes.set_xlabel("time of training, two CPU cores, two runs at once")
+    axes.set_xlabel("time of training")
     axes.set_ylabel("PSNR on test, dB")
     axes.grid(color="#e4e6ea", linewidth=0.8)
     axes.spines[["top", "right"]].set_visible(False)

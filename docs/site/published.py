@@ -29,6 +29,7 @@ CASES = {
     "2,000": "iterations=2000",
     "4,000": "iterations=4000",
 }
+TIMES = ("train_s", "train_cpu_s", "fps")  # parts of the cost that depend on the machine
 PAPERS = "best_on_test=true"  # trex by the paper's protocol
 ON_GPU = f"device=cuda,{PAPERS}"  # the same on a GPU
 LONG = "recipe=long"
@@ -80,11 +81,13 @@ class Experiment:
 
     def difference(self, model: str, other: str, variant: str | None = "") -> Estimate:
         """Estimate how much more PSNR a model has than another one, paired by scene, seed and view."""
-        return estimate(self.contrast(model, other, variant))
+        return estimate(list(self.contrast(model, other, variant).values()))
 
-    def contrast(self, model: str, other: str, variant: str | None = "") -> list[Values]:
-        """Return the paired differences in PSNR of two models, one array for each scene."""
-        return self.group.contrast(self._minus(model, other, variant), "psnr")
+    def contrast(self, model: str, other: str, variant: str | None = "") -> dict[str, Values]:
+        """Return the paired differences in PSNR of two models, by scene that both have finished."""
+        weights = self._minus(model, other, variant)
+        both = [scene for scene in self.group.scenes if all(scene in found.runs for _, found in weights)]
+        return dict(zip(both, self.group.contrast(weights, "psnr"), strict=True))
 
     def tested(self, model: str, other: str, variant: str = "") -> Tested:
         """Return the difference of two models as the experiment's report tests it."""
@@ -139,7 +142,15 @@ def best_on_test(runs: list[Record]) -> Estimate:
 
 
 def cost(runs: list[Record], name: str) -> float:
-    """Average a part of the cost over runs, such as "train_s"."""
+    """Average a part of the cost over runs, such as "train_s".
+
+    Raises:
+        AssertionError: it is a time, and the runs were made on several machines.
+    """
+    if name in TIMES:  # CPU-seconds do not depend on the number of threads, which is a part of the machine's name
+        own = [run.provenance for run in runs]
+        machines = {one.device if name == "train_cpu_s" else one.machine for one in own}
+        assert len(machines) == 1, f"{name}: expected runs of one machine, got {machines}"
     return fmean(getattr(run.cost, name) for run in runs if run.cost)
 
 
@@ -176,9 +187,10 @@ def row(cells: Iterable[str]) -> str:
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]], left: int = 1) -> str:
     """Return a table whose columns after the first `left` ones are numbers."""
-    titles = list(head)
+    titles, cells = list(head), list(map(list, rows))
+    assert all(len(one) == len(titles) for one in cells), f"expected {len(titles)} cells a row, got {cells}"
     marks = ["---"] * left + ["---:"] * (len(titles) - left)
-    return "\n".join([row(titles), row(marks), *map(row, rows)])
+    return "\n".join([row(titles), row(marks), *map(row, cells)])
 
 
 def best(values: list[float], texts: list[str]) -> list[str]:

@@ -1,9 +1,10 @@
 """Write the blocks of docs/results.md about the suite: each scene, effects by kind of scene, what foretells them."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
@@ -27,6 +28,7 @@ EFFECTS = {
 }
 Choice = Callable[[dict[str, Record]], Record]
 COMPARED = "auto,compare=true"  # model=auto that compares its candidates on val
+WHOLE = [model for model in MODELS if model != "auto"]  # models whose effects are chosen by the user
 
 
 def scenes(published: Path) -> str:
@@ -38,6 +40,7 @@ def scenes(published: Path) -> str:
             seeds |= {len(values) for values in psnr.values()}
             shown = _means(psnr)
             rows.append([scene, found.group.dataset, *(shown.get(model, "–") for model in MODELS)])
+    assert len(seeds) == 1, f"expected the same number of seeds for all, got {seeds}"
     said = (
         f"Each number is the mean of {min(seeds)} seeds; bold: the highest of a row; –: the model does not train there."
     )
@@ -49,23 +52,26 @@ def kinds(published: Path) -> str:
     suite = {found.group.dataset: found for found in experiments(published / "suite")}
     columns = {
         "one moving camera": ["monocular"],
-        "fixed cameras": ["rig"],
+        "fixed cameras": ["rig", "array"],
         "all that move": list(MOVING),
         "static": ["static"],
     }
-    rows = []
-    for name, (model, other) in EFFECTS.items():
-        cells = []
-        for included in columns.values():
-            of = estimate([values for kind in included for values in suite[kind].contrast(model, other)])
-            mean = f"**{signed(of.mean)}**" if of.half_over_scenes < abs(of.mean) else signed(of.mean)
-            cells.append(f"{mean} ± {number(of.half_over_scenes)}, {of.gaining} of {of.scenes}")
-        rows.append([name, *cells])
+    rows = [
+        [name, *(_price(chain(*(suite[kind].contrast(*pair).values() for kind in each))) for each in columns.values())]
+        for name, pair in EFFECTS.items()
+    ]
     said = (
         "A cell has the mean change of PSNR in dB, half the width of its 95 % interval over scenes, and on how many "
         "scenes PSNR rises. Bold: the interval excludes zero (no correction for many cells)."
     )
     return f"{table(['change', *columns], rows)}\n\n{said}"
+
+
+def _price(by_scene: Iterable[Values]) -> str:
+    """Format differences in PSNR of two models: their mean over scenes, and on how many scenes the first is higher."""
+    of = estimate(list(by_scene))
+    mean = f"**{signed(of.mean)}**" if of.half_over_scenes < abs(of.mean) else signed(of.mean)
+    return f"{mean} ± {number(of.half_over_scenes)}, {of.gaining} of {of.scenes}"
 
 
 def _psnr(found: Experiment, scene: str, models: Sequence[str], variant: str = "") -> dict[str, Values]:
@@ -105,7 +111,7 @@ def forecasts(published: Path) -> str:
         pairs = [
             (one.value(found, scene), float(values.mean()))
             for found in suite
-            for scene, values in zip(found.group.scenes, found.contrast(*EFFECTS[one.effect]), strict=True)
+            for scene, values in found.contrast(*EFFECTS[one.effect]).items()
         ]
         known = [pair for pair in pairs if not math.isnan(pair[0])]
         rank = float(stats.spearmanr(*zip(*known, strict=True)).statistic)
@@ -128,7 +134,7 @@ def choices(published: Path) -> str:
         for name, lost in ((name, [*losses(published, choose).values()]) for name, choose in RULES.items())
     ]
     said = [f"{scene} {why}" for scene, _, why in _moving(published) if why]
-    text = table(["choice", "mean, dB", "worst scene, dB", "within 0.1 dB on"], rows)
+    text = table(["choice", "mean, dB", "worst scene, dB", "at most 0.1 dB below on"], rows)
     return f"{text}\n\nLeft out: {'; '.join(said)}." if said else text
 
 
@@ -157,7 +163,7 @@ def _moving(published: Path) -> Iterator[tuple[str, list[dict[str, Record]], str
 
 def _whole(runs: dict[str, Record]) -> dict[str, Record]:
     """Return the runs whose effects are chosen by the user, which are all but those of model=auto."""
-    return {model: run for model, run in runs.items() if model not in ("auto", COMPARED)}
+    return {model: run for model, run in runs.items() if model in WHOLE}
 
 
 def _best_on_val(part: float, runs: dict[str, Record]) -> Record:
@@ -233,4 +239,9 @@ def _early(effect: str) -> Callable[[Experiment, str], float]:
     return mean
 
 
-BLOCKS = {"suite_scenes": scenes, "suite_kinds": kinds, "suite_choices": choices, "suite_forecasts": forecasts}
+BLOCKS = {
+    "suite_scenes": scenes,
+    "suite_kinds": kinds,
+    "suite_choices": choices,
+    "suite_forecasts": forecasts,
+}
