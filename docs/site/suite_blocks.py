@@ -9,7 +9,20 @@ from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 
-from published import MODELS, NAMES, Experiment, best, experiments, number, signed, table
+from published import (
+    CASES,
+    MODELS,
+    NAMES,
+    Experiment,
+    best,
+    cost,
+    experiments,
+    machine,
+    metric,
+    number,
+    signed,
+    table,
+)
 from scipy import stats
 
 from gsbench.measure.record import Record, model_folder
@@ -26,6 +39,7 @@ EFFECTS = {
     "7DGS instead of 4DGS": ("7dgs", "4dgs"),
     "`model=auto` instead of 7DGS": ("auto", "7dgs"),
 }
+LENGTHS = {name: CASES[name] for name in ("500", "1,000")}  # variants of runs, by iterations
 Choice = Callable[[dict[str, Record]], Record]
 COMPARED = "auto,compare=true"  # model=auto that compares its candidates on val
 WHOLE = [model for model in MODELS if model != "auto"]  # models whose effects are chosen by the user
@@ -65,6 +79,34 @@ def kinds(published: Path) -> str:
         "scenes PSNR rises. Bold: the interval excludes zero (no correction for many cells)."
     )
     return f"{table(['change', *columns], rows)}\n\n{said}"
+
+
+def lengths(published: Path) -> str:
+    """Return the tables of what models reach and what effects change after three lengths, over the moving scenes."""
+    moving = [found for found in experiments(published / "suite") if found.group.dataset in MOVING]
+    shared = {
+        scene: found
+        for found in moving
+        for scene in found.group.scenes
+        if all(scene in found.configuration(model, variant).runs for model in MODELS for variant in LENGTHS.values())
+    }
+    reached, prices = [], [[name] for name in EFFECTS]
+    for name, variant in LENGTHS.items():
+        of = {m: [found.configuration(m, variant).runs[scene] for scene, found in shared.items()] for m in MODELS}
+        psnr = [fmean(metric(runs, "psnr") for runs in by_scene) for by_scene in of.values()]
+        seconds = [fmean(cost(runs, "train_s") for runs in by_scene) for by_scene in of.values()]
+        shown = best(psnr, [f"{value:.2f}" for value in psnr])
+        reached.append([name, *(f"{dB}, {number(s, 1)}" for dB, s in zip(shown, seconds, strict=True))])
+        for line, (model, other) in zip(prices, EFFECTS.values(), strict=True):
+            line.append(_price(
+                values
+                for found in moving
+                for scene, values in found.contrast(model, other, variant).items()
+                if scene in shared
+            ))  # fmt: skip
+    text = table(["iterations", *MODELS], reached, left=0)
+    said = f"Means over the {count(len(shared), 'moving scene')} on which all models train, on {machine(moving[0])}."
+    return f"{text}\n\n{said}\n\n{table(['change', *(f'{name} iterations' for name in LENGTHS)], prices)}"
 
 
 def _price(by_scene: Iterable[Values]) -> str:
@@ -242,6 +284,7 @@ def _early(effect: str) -> Callable[[Experiment, str], float]:
 BLOCKS = {
     "suite_scenes": scenes,
     "suite_kinds": kinds,
+    "suite_lengths": lengths,
     "suite_choices": choices,
     "suite_forecasts": forecasts,
 }
