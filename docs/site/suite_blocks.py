@@ -39,7 +39,7 @@ EFFECTS = {
     "7DGS instead of 4DGS": ("7dgs", "4dgs"),
     "`model=auto` instead of 7DGS": ("auto", "7dgs"),
 }
-LENGTHS = {name: CASES[name] for name in ("500", "1,000")}  # variants of runs, by iterations
+LENGTHS = {name: CASES[name] for name in ("500", "1,000", "2,000")}  # variants of runs, by iterations
 Choice = Callable[[dict[str, Record]], Record]
 COMPARED = "auto,compare=true"  # model=auto that compares its candidates on val
 WHOLE = [model for model in MODELS if model != "auto"]  # models whose effects are chosen by the user
