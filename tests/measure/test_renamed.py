@@ -83,7 +83,7 @@ def test_a_new_name_is_no_other_training() -> None:
 
 def test_a_published_record_has_the_present_keys() -> None:
     """Catches an old record that differs from the same run of now in nothing but names."""
-    path = PUBLISHED / "dnerf/trex/7dgs,downscale=4,iterations=7000/seed0/record.json"
+    path = PUBLISHED / "tuning.recipe/suzanne/7dgs/seed0/record.json"
     written, found = json.loads(path.read_text())["provenance"]["config"], record.read(path).provenance.config
     assert "modulation" in written["data"]
     assert found == with_present_keys(written) != written
