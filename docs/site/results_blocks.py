@@ -103,8 +103,7 @@ def lengths(published: Path) -> str:
     if longer:
         parts.append(
             f"From 2,000 to 4,000 iterations, PSNR on test falls by more than {FALL} dB for {len(longer)} of "
-            f"{len(MODELS)} models. That of 7DGS changes by "
-            f"{_by_length(found, '7dgs')} dB."
+            f"{len(MODELS)} models. That of 7DGS changes by {_by_length(found, '7dgs')} dB."
         )
     return f"Measured on {machine(found)}.\n\n" + "\n\n".join(parts)
 

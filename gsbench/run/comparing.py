@@ -5,8 +5,6 @@ import shutil
 import sys
 from dataclasses import dataclass, replace
 
-import torch
-
 from gsbench.config import Config
 from gsbench.effects import messages
 from gsbench.errors import InputError, one_line
@@ -16,13 +14,12 @@ from gsbench.run import fitting, progress
 from gsbench.run.checks import check_scene, check_values
 from gsbench.run.identity import Run, label_of
 from gsbench.run.resolve import Resolved, is_auto, plain, with_candidate, with_model
-from gsbench.run.setup import build
-from gsbench.scenes import Points, Scene
+from gsbench.run.setup import build, build_with_placeholders
+from gsbench.scenes import Scene
 from gsbench.scenes.trained import TrainedGaussians
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer, comparison_of
 from gsbench.train.optim import check_rates
-from gsbench.train.seeding import generator
 
 FOLDER = "candidates"  # in the run's folder; each candidate has a folder there for its checkpoint
 
@@ -49,10 +46,8 @@ def check_candidates(config: Config, scene: Scene) -> None:
     for name, settings in candidates(config).items():
         try:
             check_values(settings)
-            check_scene(model := build(settings), scene, settings)
-            points = torch.eye(4, 3)  # placeholders: a model has groups of parameters once it has Gaussians
-            model.initialise(Points(points, points), scene.extent, generator(settings.seed))
-            check_rates(model.groups(), settings.model)
+            check_scene(build(settings), scene, settings)
+            check_rates(build_with_placeholders(settings, scene.extent).groups(), settings.model)
         except InputError as error:
             raise InputError(f"effects.compare=true, candidate {name}: {error}") from None
 

@@ -60,7 +60,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
     """
     for name in (one.name for one in fields(Config)):
         if name not in composed:
-            raise InputError(f"config key '{name}': expected a value, it was deleted: leave '~{name}' out")
+            raise _deleted(name)
     _rename_rates(composed)
     config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
     for key, name in (("experiment", config.experiment), ("scene.name", config.scene.name)):
@@ -80,6 +80,10 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
         del plain[key]
     plain = _storable(plain)
     return Run(config, plain, folder, label, variant, deciding(overrides))
+
+
+def _deleted(key: str) -> InputError:
+    return InputError(f"config key '{key}': expected a value, it was deleted: leave '~{key}' out")
 
 
 def label_of(config: Config) -> str:
@@ -136,7 +140,7 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
         mine.setdefault("effects.gate", "off")
     for key in theirs:
         if key.startswith("model.") and key not in mine:
-            raise InputError(f"config key '{key}': expected a value, it was deleted: leave '~{key}' out")
+            raise _deleted(key)
     changed = {key: value for key, value in mine.items() if key not in theirs or value != theirs[key]}
     shorts = [key.removeprefix("model.options.").partition(".")[2] or key.rpartition(".")[2] for key in changed]
     for (key, value), short in zip(changed.items(), shorts, strict=True):

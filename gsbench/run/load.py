@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import OmegaConf
 
 from gsbench.config import Config
@@ -14,12 +13,11 @@ from gsbench.measure.schema import parse
 from gsbench.models import GaussianModel
 from gsbench.models.registry import is_registered
 from gsbench.run.checks import PACKAGE, check_scene_names, check_values
-from gsbench.run.setup import build, load_scene
+from gsbench.run.setup import build_with_placeholders, load_scene
 from gsbench.scenes import Scene
-from gsbench.scenes.scene import UP, Points
+from gsbench.scenes.scene import UP
 from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
-from gsbench.train.seeding import generator
 
 EMBEDDED = f"{PACKAGE}gsbench.scenes.sample"
 MOST_PIXELS = 1 << 16  # a side
@@ -94,10 +92,7 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     config.device, config.raster.backend = device, backend
     scene = parse(SceneDescription, found.scene, str(path))
     _check_scene(scene, path)
-    model = build(config)
-    points = torch.eye(4, 3)  # placeholders, which `load_state` replaces
-    model.initialise(Points(points, points), scene.extent, generator(config.seed))
-    model.to(device)
+    model = build_with_placeholders(config, scene.extent).to(device)  # `load_state` replaces the placeholders
     try:
         model.load_state(found.state["model"])
         step = checkpoint.whole_number("step", found.state["step"], config.train.iterations)

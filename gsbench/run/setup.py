@@ -10,8 +10,9 @@ from gsbench.errors import InputError
 from gsbench.kernels.backends import resolve
 from gsbench.models import GaussianModel
 from gsbench.run.checks import BACKGROUNDS, check_gates, scene_folder
-from gsbench.scenes import Scene
+from gsbench.scenes import Points, Scene
 from gsbench.train.penalties import check_observed
+from gsbench.train.seeding import generator
 
 
 def build(config: Config) -> GaussianModel:
@@ -35,6 +36,20 @@ def build(config: Config) -> GaussianModel:
     model = models.build(config.model.name, **own, **config.model.options)
     check_gates(model, config)
     check_observed(model, config.train.penalties)
+    return model
+
+
+def build_with_placeholders(config: Config, extent: float) -> GaussianModel:
+    """Build the model with four placeholder Gaussians, so that it has its parameters before the true ones are known.
+
+    It raises the same errors as `build`.
+
+    Args:
+        config: the settings.
+        extent: the radius of the scene, world units.
+    """
+    model, points = build(config), torch.eye(4, 3)
+    model.initialise(Points(points, points), extent, generator(config.seed))
     return model
 
 
