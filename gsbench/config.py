@@ -132,6 +132,7 @@ class TrainConfig:
     coarse: list[list[int]] | None = None  # [[4, 3000]]: a quarter of the width until step 3,000
     penalties: PenaltiesConfig = field(default_factory=PenaltiesConfig)
     curve_points: int = 20  # measurements on val during the run
+    lengths: int | None = None  # 4: also train 1/2, 1/4 and 1/8 of the iterations, and keep the best on val; None: no
     patience: float | None = None  # share of the iterations without a better PSNR on val that ends a run; None: never
     checkpoint_minutes: float = 2.0  # minutes between two checkpoints
 

@@ -147,9 +147,9 @@ class Direction:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One model of a comparison: its PSNR on val and the seconds of its training until the comparison."""
+    """One training of a comparison: its PSNR on val and the seconds of its training until the comparison."""
 
-    name: str  # the label of the model, such as "7dgs_noagr"
+    name: str  # the label of the model, such as "7dgs_noagr", or the length, such as "iterations=1000"
     psnr_val: float | None  # dB; None: not finite, or the training failed
     seconds: float
     reason: str | None = None  # why the training failed: it diverged, or no Gaussian was left
@@ -162,6 +162,14 @@ class ModelComparison:
     iteration: int  # the iteration after which PSNR on val was measured
     chosen: str  # the name of the candidate with the highest PSNR, which was trained to the end
     candidates: list[Candidate]
+
+
+@dataclass(frozen=True)
+class LengthChoice:
+    """The choice on val of a training among trainings of several lengths (`train.lengths`)."""
+
+    kept: int  # the iterations of the training whose Gaussians were measured
+    tried: list[Candidate]  # the shortest first; a longer one that is missing was not trained
 
 
 @dataclass(frozen=True)
@@ -238,6 +246,7 @@ class Record:
     on_demand: OnDemand | None = None  # None: no effect was removed from the model or its Gaussians
     stop: Stop | None = None  # None: the last iteration was measured, without `train.patience`
     averaged: int = 0  # number of last iterations over which parameters were averaged; 0: they were not
+    length: LengthChoice | None = None  # None: one training, without `train.lengths`
 
     @property
     def path(self) -> Path:

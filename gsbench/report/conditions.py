@@ -73,7 +73,8 @@ def _stated(records: list[Record], spread: str) -> list[str]:
     notes += _load(records)
     if any(_commit(r).endswith("-dirty") for r in records):
         notes.append(f"{WARNING}: files differed from their commit (-dirty): it does not reproduce these numbers.")
-    notes += [*_rounding(records), *_stops(records), *_averages(records), _seeds(records, spread), *DEFINITIONS]
+    notes += [*_rounding(records), *_stops(records), *_averages(records), *_lengths(records)]
+    notes += [_seeds(records, spread), *DEFINITIONS]
     return sorted(notes, key=lambda note: not note.startswith(WARNING))
 
 
@@ -139,6 +140,16 @@ def _averages(records: list[Record]) -> list[str]:
         return []
     return [f"{len(averaged)} of {len(records)} runs ended with parameters averaged over the last "
             f"{_span(averaged, ',')} iterations, because PSNR on val was higher (train.average_from)."]  # fmt: skip
+
+
+def _lengths(records: list[Record]) -> list[str]:
+    """List a footnote on runs that were trained at several lengths (`train.lengths`); empty if there is none."""
+    chosen = [r.length for r in records if r.length is not None]
+    if not chosen:
+        return []
+    return [f"{len(chosen)} of {len(records)} runs were trained at several lengths, of which the best on val was kept, "
+            f"{_span([one.kept for one in chosen], ',')} iterations. Their seconds of training are those of all "
+            f"lengths (train.lengths)."]  # fmt: skip
 
 
 def _span(numbers: Sequence[float], form: str) -> str:

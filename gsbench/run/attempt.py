@@ -16,6 +16,7 @@ from gsbench.run import fitting, measuring
 from gsbench.run.checks import check_config, check_scene, check_values, evaluated_views, trained_start
 from gsbench.run.comparing import best_of, check_candidates, check_compare, reporter
 from gsbench.run.identity import Run
+from gsbench.run.lengths import best_length
 from gsbench.run.log import RunLog
 from gsbench.run.resolve import Resolved, before_scene, is_auto, plain, resolve, with_candidate
 from gsbench.run.setup import build, load_scene
@@ -65,7 +66,7 @@ class Attempt:
         """Train to the last step; for model=auto, a test of the scene first chooses a model with or without time.
 
         If the scene changes with time, `effects.compare` chooses the model by PSNR on val. It raises the same errors as
-        `gsbench.run.fitting.resume` and `fit`, and `gsbench.run.comparing.best_of`.
+        `gsbench.run.fitting.resume` and `fit`, `gsbench.run.comparing.best_of` and `gsbench.run.lengths.best_length`.
         """
         this = self.this
         if is_auto(this.config):
@@ -76,6 +77,10 @@ class Attempt:
             reset_peak_memory(device)
             trainer = best_of(this, scene, self.start, self.resolved)
             self.resolved, self.model = replace(self.resolved, config=trainer.config), trainer.model
+        elif this.config.train.lengths is not None:
+            reset_peak_memory(device)
+            trainer = best_length(this, scene, self.start, self.resolved)
+            self.model = trainer.model
         else:
             trainer = self.trainer(model, scene)
             reset_peak_memory(device)
@@ -100,7 +105,7 @@ class Attempt:
             record, protocol=record.protocol | found.frames, on_demand=on_demand, metrics=found.metrics,
             missing=found.missing, per_view=found.per_view, regions=found.regions,
             cost=found.cost, curve=trainer.curve.points, stop=trainer.early_stop.stop,
-            averaged=trainer.average.kept,
+            averaged=trainer.average.kept, length=trainer.length,
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:

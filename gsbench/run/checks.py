@@ -58,6 +58,7 @@ RANGES = {  # the ranges of settings, both ends included
     "train.penalties.strain.weight": (0, math.inf),
     "train.densify.max_gaussians": (LEAST_GAUSSIANS, ENDLESS),
     "train.curve_points": (1, MAX_POINTS),
+    "train.lengths": (2, 8),
     "train.patience": (0.01, 1),
     "train.checkpoint_minutes": (0, ENDLESS),
     "model.min_opacity": (0, 0.25),  # a reset lowers opacities to twice as much
@@ -157,8 +158,11 @@ def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
 
 
 def _check_steps(config: Config) -> None:
-    """Raise InputError if the end of a training is to begin after its last step."""
+    """Raise InputError if the end of a training is to begin after its last step, or its shortest length has no step."""
     train = config.train
+    if train.lengths is not None and not train.iterations >> (train.lengths - 1):
+        raise InputError(f"train.lengths={train.lengths}: expected at least {1 << (train.lengths - 1)} iterations to "
+                         f"halve {train.lengths - 1} times, got train.iterations={train.iterations}")  # fmt: skip
     for key, step in (("cooldown_from", train.cooldown_from), ("average_from", train.average_from)):
         if step is not None and step >= train.recipe_iterations:
             raise InputError(f"train.{key}: expected a step below train.recipe_iterations={train.recipe_iterations}, "
@@ -268,7 +272,7 @@ def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
     """Raise InputError if the scene cannot train the model.
 
     Reasons are a model with time for a scene without time, cameras that are all at one place, images that are too
-    small, and `train.patience` without views of val to watch.
+    small, and settings that choose on val (`train.patience`, `train.lengths`) without val.
     """
     if ("time" in model.observes or config.agr) and not scene.has_time:
         what = "agr=true" if config.agr else config.model.name
@@ -283,26 +287,36 @@ def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
     if side // factor < WINDOW:
         key = f"train.coarse, after the factor {factor}" if factor > 1 else f"scene.downscale={config.scene.downscale}"
         raise InputError(f"{key}: expected images of at least {WINDOW} pixels, the loss's window, got {side // factor}")
-    _check_patience(scene, config)
+    _check_choices_on_val(scene, config)
 
 
-def _check_patience(scene: Scene, config: Config) -> None:
-    """Raise InputError if `train.patience` has no val to watch, or watches the views on which results are measured."""
-    if config.train.patience is None:
+def _check_choices_on_val(scene: Scene, config: Config) -> None:
+    """Raise InputError if a setting chooses an iteration or a length on val, and cannot.
+
+    Reasons are a scene without val, results on the views by which is chosen, and settings that exclude each other.
+    """
+    train = config.train
+    for key, value, what in (("patience", train.patience, "iteration"), ("lengths", train.lengths, "length")):
+        if value is None:
+            continue
+        if not scene.val:
+            raise InputError(f"train.{key}: expected views of val to choose the {what}, {scene.name} has none: "
+                             f"scene.val_every=8 takes every eighth training view")  # fmt: skip
+        if config.scene.eval_split == "val":
+            raise InputError(f"train.{key}: expected results on test, got scene.eval_split=val: results on the views "
+                             f"by which the {what} is chosen would be too high; leave train.{key} out")  # fmt: skip
+        if config.effects.compare:
+            raise InputError(f"train.{key}: expected effects.compare=false, as candidates of model=auto have one "
+                             f"length: leave one of the two out")  # fmt: skip
+    if train.patience is None:
         return
-    if not scene.val:
-        raise InputError(f"train.patience: expected views of val to watch, {scene.name} has none: "
-                         f"scene.val_every=8 takes every eighth training view")  # fmt: skip
-    if config.scene.eval_split == "val":
-        raise InputError("train.patience: expected results on test, got scene.eval_split=val: results on the views by "
-                         "which the iteration is chosen would be too high; leave train.patience out")  # fmt: skip
-    if config.train.average_from is not None:
-        raise InputError(f"train.patience: expected train.average_from=null, got {config.train.average_from}: a "
+    if train.lengths is not None:
+        raise InputError("train.patience: expected train.lengths=null, which chooses among whole trainings: leave one "
+                         "of the two out")  # fmt: skip
+    if train.average_from is not None:
+        raise InputError(f"train.patience: expected train.average_from=null, got {train.average_from}: a "
                          f"training ends with its best iteration on val, or with averages (+recipe=long): leave one "
                          f"of the two out")  # fmt: skip
-    if config.effects.compare:
-        raise InputError("train.patience: expected effects.compare=false, as a candidate of model=auto must not end "
-                         "before they are compared: leave one of the two out")  # fmt: skip
 
 
 def evaluated_views(scene: Scene, split: str) -> list[View]:

@@ -96,8 +96,15 @@ def resolve(this: Run, scene: Scene) -> Resolved:
 
 
 def plain(this: Run, config: Config) -> dict[str, Any]:
-    """Return the settings of a training as plain values; model=auto is replaced by the chosen model."""
+    """Return the settings of a training of a run as plain values.
+
+    Args:
+        this: the run, which may have model=auto or `train.lengths`.
+        config: the run's settings with the model and the length of this training.
+    """
+    length = {"iterations": config.train.iterations, "lengths": config.train.lengths}
+    found = this.plain | {"train": this.plain["train"] | length}
     if not is_auto(this.config):
-        return this.plain
+        return found
     model = OmegaConf.to_container(OmegaConf.structured(config.model), resolve=True)
-    return this.plain | {"model": model, "agr": config.agr}
+    return found | {"model": model, "agr": config.agr}

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from gsbench.config import Config
 from gsbench.errors import InputError, one_line
 from gsbench.measure.curve import Curve
-from gsbench.measure.record import ModelComparison
+from gsbench.measure.record import LengthChoice, ModelComparison
 from gsbench.measure.schema import parse
 from gsbench.measure.speed import Effort, StageClock
 from gsbench.models import GaussianModel
@@ -99,6 +99,7 @@ class Trainer:
         self.best = Best()
         self.early_stop = EarlyStop(self.schedule, train.patience)
         self.comparison: ModelComparison | None = None  # by which model=auto chose this model
+        self.length: LengthChoice | None = None  # by which `train.lengths` chose this training
         self.step = 0
         self._is_full = False  # whether the largest allowed number of Gaussians was reached
 
@@ -298,6 +299,7 @@ class Trainer:
             "best": vars(self.best).copy(),
             "early_stop": self.early_stop.state_dict(),
             "comparison": asdict(self.comparison) if self.comparison else None,
+            "length": asdict(self.length) if self.length else None,
         }
 
     def _state_of_gaussians(self) -> dict[str, Any]:
@@ -333,6 +335,8 @@ class Trainer:
             self.best = Best(**state["best"])
             self.early_stop.load_state_dict(state.get("early_stop", NOTHING_KEPT))
             self.comparison = comparison_of(state)
+            length = state.get("length")
+            self.length = None if length is None else parse(LengthChoice, length, "checkpoint: length")
         except (InputError, MemoryError):
             raise
         except Exception as error:  # a part may be of any type

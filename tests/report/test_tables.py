@@ -280,6 +280,15 @@ def test_runs_measured_before_their_last_iteration_are_told():
     assert "patience" not in page(*ran[:1], make(seed=3))
 
 
+def test_runs_of_several_lengths_are_told():
+    """Catches a length chosen on val that stands as the one of the settings, and seconds that seem to be of one."""
+    said = "- 2 of 3 runs were trained at several lengths, of which the best on val was kept, 1,000 to 2,000"
+    chosen = [files.LengthChoice(kept, [files.Candidate("iterations=1000", 20.0, 1.0)]) for kept in (1000, 2000)]
+    text = page(make(seed=0), *(make(seed=1 + i, length=one) for i, one in enumerate(chosen)))
+    assert f"{said} iterations. Their seconds of training are those of all lengths (train.lengths).\n" in text
+    assert "train.lengths" not in page(make(seed=0), make(seed=1))
+
+
 def test_runs_that_end_with_averaged_parameters_are_told():
     """Catches parameters chosen on val that stand as those of the last iteration."""
     said = "- 2 of 3 runs ended with parameters averaged over the last 490 to 500 iterations, because PSNR on val was"

@@ -1,13 +1,12 @@
 """model=auto with effects.compare=true: the best candidate on val is trained to the end, whatever interrupts it."""
 
 import json
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
+from interrupted import Killed, assert_equal, bits, counted_steps, killed_after
 from tiny_run import overrides, run_here, write_moving_square
 
 from gsbench.config import Config, TrainConfig
@@ -15,7 +14,8 @@ from gsbench.effects import choose
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, ModelComparison, Record, TimeScreen
 from gsbench.run import trackers
-from gsbench.run.comparing import FOLDER, candidates, check_candidates, check_compare
+from gsbench.run.candidates import FOLDER
+from gsbench.run.comparing import candidates, check_candidates, check_compare
 from gsbench.schedule import Schedule
 from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train import checkpoint
@@ -48,32 +48,6 @@ def comparison_in(record: Record) -> ModelComparison:
     return record.on_demand.comparison
 
 
-def bits(folder: Path) -> dict[str, Any]:
-    """The final state of a run without times and without the comparison, for `assert_equal`."""
-    state = dict(checkpoint.read(folder / checkpoint.FILE_NAME).state)
-    del state["comparison"]
-    found: dict[str, Any] = checkpoint.without_times(state)
-    return found
-
-
-def assert_equal(a: object, b: object) -> None:
-    """Compare two states bit by bit."""
-    if isinstance(a, dict):
-        assert isinstance(b, dict)
-        assert a.keys() == b.keys()
-        for key in a:
-            assert_equal(a[key], b[key])
-    elif isinstance(a, list):
-        assert isinstance(b, list)
-        for x, y in zip(a, b, strict=True):
-            assert_equal(x, y)
-    elif isinstance(a, torch.Tensor):
-        assert isinstance(b, torch.Tensor)
-        assert torch.equal(a, b)
-    else:
-        assert a == b
-
-
 def test_the_best_on_val_is_trained_to_the_end_with_its_own_bits(
     square: Path, whole: tuple[Record, Path], tmp_path: Path
 ) -> None:
@@ -102,33 +76,17 @@ def test_the_best_on_val_is_trained_to_the_end_with_its_own_bits(
     assert not (folder / FOLDER).exists()
 
 
-class Killed(BaseException):
-    """The process ends here."""
-
-
 @pytest.mark.parametrize("saves", [17, 4 * UNTIL + 1], ids=["midway", "chosen"])
 def test_a_kill_repeats_no_step(
     saves: int, square: Path, whole: tuple[Record, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a candidate that is trained again, a lost choice, and other bits: killed after every few saves."""
-    written, steps, attempts = Counter[str](), Counter[str](), 0
-    save, descend = checkpoint.save, Trainer._descend
-
-    def save_and_die(*given: Any) -> None:
-        save(*given)
-        written["now"] += 1
-        if written["now"] == saves:
-            raise Killed
-
-    def counted(self: Trainer) -> None:
-        steps["all"] += 1
-        descend(self)
-
-    monkeypatch.setattr(checkpoint, "save", save_and_die)
-    monkeypatch.setattr(Trainer, "_descend", counted)
+    steps = counted_steps(monkeypatch)
+    kills = killed_after(saves, monkeypatch)
+    attempts = 0
     while True:
         attempts += 1
-        written.clear()
+        kills.clear()
         try:
             record, folder = run_here(*overrides(square, tmp_path, *COMPARED))
             break

@@ -126,7 +126,7 @@ def test_every_key_is_of_training_or_of_measuring() -> None:
         "protocol.best_on_test", "model.name", "model.module", "model.published_with_agr", "model.agr",
         "model.agr_octaves", "model.sh_degree", "model.min_opacity", *(f"train.{name}" for name in (
             "iterations", "recipe_iterations", "batch_size", "ssim_weight", "sh_every", "refine_from",
-            "lambda_from", "cooldown_from", "average_from", "curve_points", "patience",
+            "lambda_from", "cooldown_from", "average_from", "curve_points", "lengths", "patience",
             *(f"densify.{name}" for name in (
                 "start", "stop", "every", "rounds", "reset_every", "grad_threshold", "clone_below", "prune_above",
                 "max_gaussians", "thin_to", "noise", "kind")), "coarse",
@@ -142,7 +142,7 @@ def test_a_cap_on_gaussians_is_training_and_none_changes_no_older_run() -> None:
     older = copy.deepcopy(run.plain)
     for key in ("max_gaussians", "noise", "thin_to"):
         del older["train"]["densify"][key]
-    for key in ("cooldown_from", "average_from", "coarse", "patience"):
+    for key in ("cooldown_from", "average_from", "coarse", "lengths", "patience"):
         del older["train"][key]
     assert training_hash(older) == training_hash(run.plain) != training_hash(capped.plain)
     assert not training_differences(older, run.plain)

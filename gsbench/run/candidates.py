@@ -1,0 +1,124 @@
+"""Train several candidates for one run, one after another, each with a checkpoint in a folder of its own."""
+
+import math
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from gsbench.config import Config
+from gsbench.errors import InputError, one_line
+from gsbench.measure.record import Candidate
+from gsbench.measure.speed import Effort
+from gsbench.run import fitting, progress
+from gsbench.run.identity import Run
+from gsbench.run.resolve import Resolved, plain
+from gsbench.run.setup import build
+from gsbench.scenes import Scene
+from gsbench.scenes.trained import TrainedGaussians
+from gsbench.train.finite_check import DivergedError
+from gsbench.train.loop import Trainer
+
+FOLDER = "candidates"  # in the run's folder; each candidate has a folder there for its checkpoint
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The candidates of a run, by name. Each has the data and the seed of the run, and settings of its own."""
+
+    this: Run
+    scene: Scene
+    start: TrainedGaussians | None  # trained Gaussians to start from; None: start from points
+    settings: dict[str, Config]
+
+    def trainer(self, name: str) -> Trainer:
+        """Return the trainer of a candidate at step 0."""
+        config = self.settings[name]
+        return fitting.trainer_of(build(config), self.scene, config, self.start)
+
+    def state(self, name: str) -> dict[str, Any]:
+        """Return the state of a trained candidate from its checkpoint.
+
+        Raises:
+            InputError: the checkpoint is gone or damaged.
+        """
+        run = self._run(name)
+        state = fitting.saved_state(replace(run, config=replace(run.config, resume=True)), self.scene)
+        if state is None:
+            raise InputError(f"{run.folder}: expected the checkpoint of the best candidate, it is gone: run again")
+        return state
+
+    def train(self, name: str, until: int, before: Sequence["Result"], steps: int) -> "Result":
+        """Train a candidate to the step `until`, from its checkpoint if it has one, and return its PSNR on val.
+
+        Args:
+            name: the name of the candidate.
+            until: the number of finished steps after which the training stops.
+            before: the results of the candidates that were trained before, for reports of progress.
+            steps: the number of steps of the whole run, for these reports.
+
+        Raises:
+            InputError: the checkpoint is damaged.
+            Stopped: a signal asked the process to end; the checkpoint is saved.
+        """
+        this, run, trainer = self.this, self._run(name), self.trainer(name)
+        done, seconds = sum(one.steps for one in before), sum(one.found.seconds for one in before)
+        error = None
+        try:
+            fitting.resume(trainer, run, fitting.saved_state(run, self.scene))
+            fitting.fit(trainer, run, run.plain, until=until, reporter=lambda: progress.Reporter(
+                this.folder, this.overrides, steps, done, seconds
+            ))  # fmt: skip
+        except (DivergedError, fitting.NoGaussianError) as raised:
+            error = raised.with_traceback(None)  # the traceback keeps the trainer in memory
+        psnr = None if error or trainer.curve.last is None else trainer.curve.last.psnr_val
+        spent = sum(trainer.stages.seconds.values())
+        return Result(Candidate(name, psnr, spent, one_line(error) if error else None), until, trainer.effort, error)
+
+    def forget(self) -> None:
+        """Delete the checkpoints of all candidates."""
+        shutil.rmtree(self.this.folder / FOLDER, ignore_errors=True)
+
+    def _run(self, name: str) -> Run:
+        """Return the run of a candidate, whose folder is in that of the run and holds only its checkpoint."""
+        this, config = self.this, self.settings[name]
+        return replace(this, config=config, plain=plain(this, config), folder=this.folder / FOLDER / name,
+                       label=f"{this.label} ({name})")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Result:
+    """What the training of a candidate gave, and what it cost."""
+
+    found: Candidate
+    steps: int  # at which its PSNR on val was measured
+    effort: Effort
+    error: DivergedError | fitting.NoGaussianError | None = None  # why the training failed
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Return the value by which candidates are compared: none that failed is above one that did not."""
+        psnr = self.found.psnr_val
+        return self.error is None, -math.inf if psnr is None else psnr
+
+
+def best(results: Sequence[Result]) -> Result:
+    """Return the result with the highest PSNR on val, the first of equal ones.
+
+    Raises:
+        DivergedError, NoGaussianError: all candidates failed; the error is that of the first.
+    """
+    found = max(results, key=lambda one: one.rank)
+    if found.error is not None:
+        raise found.error
+    return found
+
+
+def add_costs(trainer: Trainer, resolved: Resolved, others: Sequence[Result]) -> None:
+    """Count the time screen and the training of all other candidates as training before that of the best."""
+    screen, seconds = resolved.screen.seconds if resolved.screen else 0.0, sum(one.found.seconds for one in others)
+    trainer.stages.add("screen", screen)
+    trainer.stages.add("compare", seconds)
+    trainer.curve.delay(screen + seconds)
+    for effort in (resolved.effort, *(one.effort for one in others)):
+        trainer.effort.add(effort)

@@ -1,0 +1,193 @@
+"""train.lengths: the best length on val is kept, whatever interrupts the run."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from interrupted import Killed, assert_equal, bits, counted_steps, killed_after
+from tiny_run import overrides, run_here, write_moving_square
+
+from gsbench.config import Config
+from gsbench.effects import choose
+from gsbench.errors import InputError
+from gsbench.measure.record import FILE_NAME, LengthChoice, Record, TimeScreen
+from gsbench.models import GaussianModel
+from gsbench.run import checks, load
+from gsbench.run.candidates import FOLDER
+from gsbench.run.lengths import lengths
+from gsbench.run.setup import build
+from gsbench.scenes import View
+from gsbench.stability.training_cases import compose, moving_square
+from gsbench.train.finite_check import DivergedError
+from gsbench.train.loop import Trainer
+
+OTHERS = ("model=7dgs", "train.curve_points=2", "train.checkpoint_minutes=0", "protocol.pictures=0")
+RUN = (*OTHERS, "train.iterations=80", "train.lengths=4")  # 10, 20, 40 and 80 steps
+LOSS = {40: 30.0}  # dB that val loses at a length, so that 20 is the best that is tried
+
+
+@pytest.fixture(scope="module")
+def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_square(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(autouse=True)
+def overfitting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lower PSNR on val of a training of 40 steps, as if it learnt the training views by heart."""
+    psnr = Trainer.psnr
+    monkeypatch.setattr(Trainer, "psnr", lambda self, views: psnr(self, views) - lost(self, views))
+
+
+def lost(trainer: Trainer, views: list[View]) -> float:
+    return LOSS.get(trainer.config.train.iterations, 0.0) if views is trainer.scene.val else 0.0
+
+
+def model() -> GaussianModel:
+    """A model without Gaussians, to check with a scene."""
+    return build(compose("3dgs", 10))
+
+
+def choice_in(record: Record) -> LengthChoice:
+    """The choice of a finished run."""
+    assert record.status == "ok", record.reason
+    assert record.length is not None
+    return record.length
+
+
+def test_the_best_length_on_val_is_kept_with_its_own_bits(
+    square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches the longest that is kept although it is worse, a length that need not be trained, and hidden costs."""
+    record, folder = run_here(*overrides(square, tmp_path, *RUN))
+    found = choice_in(record)
+    assert [one.name for one in found.tried] == ["iterations=10", "iterations=20", "iterations=40"]
+    assert found.kept == 20
+    assert "the training of 20 iterations is kept" in capsys.readouterr().err
+    alone, own = run_here(*overrides(square, tmp_path / "alone", *OTHERS, "train.iterations=20"))
+    assert record.metrics == alone.metrics
+    assert_equal(bits(folder) | {"step": 20}, bits(own))
+    assert [point.psnr_val for point in record.curve] == [point.psnr_val for point in alone.curve]
+    assert found.tried[1].psnr_val == alone.curve[-1].psnr_val
+    others = found.tried[0].seconds + found.tried[2].seconds
+    assert record.cost is not None
+    assert record.cost.stage_s["compare"] == pytest.approx(others)
+    assert record.cost.train_s == pytest.approx(sum(one.seconds for one in found.tried))
+    assert record.curve[0].seconds > others, "a PSNR is reached only after the other lengths"
+    assert not (folder / FOLDER).exists()
+    assert [json.loads(line)["iteration"] for line in (folder / "curve.jsonl").read_text().splitlines()] == [10, 20]
+    assert len(load.load_run(folder).model) == record.cost.num_gaussians, "the viewer cannot open it"
+
+
+def test_the_longest_is_kept_if_each_is_better(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches trainings that end before the longest although PSNR on val still rises."""
+    monkeypatch.setitem(LOSS, 40, -1.0)
+    monkeypatch.setitem(LOSS, 80, -2.0)
+    monkeypatch.setitem(LOSS, 10, 1.0)
+    found = choice_in(run_here(*overrides(square, tmp_path, *RUN))[0])
+    assert (found.kept, len(found.tried)) == (80, 4)
+
+
+@pytest.mark.parametrize("saves", [7, 71], ids=["midway", "chosen"])
+def test_a_kill_repeats_no_step(saves: int, square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a length that is trained again, a lost choice, and other bits: killed after every few saves."""
+    whole, unbroken = run_here(*overrides(square, tmp_path / "whole", *RUN))
+    steps, kills, attempts = counted_steps(monkeypatch), killed_after(saves, monkeypatch), 0
+    while True:
+        attempts += 1
+        kills.clear()
+        try:
+            record, folder = run_here(*overrides(square, tmp_path, *RUN))
+            break
+        except Killed:
+            continue
+    assert attempts > 1
+    assert steps["all"] == 10 + 20 + 40
+    assert [(one.name, one.psnr_val) for one in choice_in(record).tried] == [
+        (one.name, one.psnr_val) for one in choice_in(whole).tried
+    ]
+    assert record.metrics == whole.metrics
+    assert_equal(bits(folder), bits(unbroken))
+    assert not (folder / FOLDER).exists()
+
+
+def test_a_finished_run_is_kept_and_measured_again_with_its_choice(
+    square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a second call that trains, and a record that loses the choice when images are measured again."""
+    words = overrides(square, tmp_path, *RUN)
+    record, folder = run_here(*words)
+    monkeypatch.setattr(Trainer, "_descend", lambda _: pytest.fail("trained again"))
+    assert run_here(*words)[0] == record
+    (folder / FILE_NAME).unlink()
+    measured, _ = run_here(*words)
+    assert choice_in(measured) == choice_in(record)
+    assert measured.metrics == record.metrics
+
+
+def test_a_length_that_fails_loses(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a run that fails because one length did: on a rig of the suite, 3DGS prunes all Gaussians at 2,000."""
+    descend, failing = Trainer._descend, {10, 40}
+
+    def diverging(self: Trainer) -> None:
+        if self.config.train.iterations in failing and self.step == 5:
+            raise DivergedError("step 5: a loss of nan")
+        descend(self)
+
+    monkeypatch.setattr(Trainer, "_descend", diverging)
+    found = choice_in(run_here(*overrides(square, tmp_path, *RUN))[0])
+    assert [one.reason for one in found.tried] == ["step 5: a loss of nan", None, "step 5: a loss of nan"]
+    assert found.kept == 20
+    failing |= {20, 80}
+    failed, _ = run_here(*overrides(square, tmp_path / "all", *RUN))
+    assert (failed.status, failed.length) == ("diverged", None)
+
+
+def test_the_model_that_auto_chose_has_several_lengths(
+    square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches lengths of another model than the screen chose, and seconds of the screen that are lost."""
+    monkeypatch.setattr(choose, "screen", lambda *_: TimeScreen("off", "said", None, None, None, 5.0))
+    record, folder = run_here(*overrides(square, tmp_path, *RUN, "model=auto"))
+    assert choice_in(record).kept == 20
+    assert not record.effects.time
+    assert record.on_demand is not None
+    assert record.cost is not None
+    assert record.cost.stage_s["screen"] == 5.0
+    assert load.load_run(folder).config.model.name == "6dgs"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("effects.compare=true",), "train.lengths: expected effects.compare=false"),
+        (("train.patience=0.2",), "train.patience: expected train.lengths=null"),
+        (("scene.eval_split=val",), "train.lengths: expected results on test"),
+    ],
+)
+def test_settings_that_exclude_each_other_are_refused(words: tuple[str, ...], said: str) -> None:
+    """Catches a key that does nothing, and results on the views by which the length was chosen."""
+    square = moving_square()
+    scene = replace(square, val=square.train[:1])
+    checks.check_scene(model(), scene, compose("3dgs", 10, "train.lengths=2"))
+    with pytest.raises(InputError, match=said):
+        checks.check_scene(model(), scene, compose("3dgs", 10, "train.lengths=2", *words))
+
+
+def test_a_length_without_a_step_or_a_val_is_refused() -> None:
+    """Catches a training of no step, which would be the first, and a choice on no views."""
+    checks.check_values(compose("3dgs", 8, "train.lengths=4"))
+    with pytest.raises(InputError, match=r"train\.lengths=4: expected at least 8 iterations to halve 3 times, got"):
+        checks.check_values(compose("3dgs", 7, "train.lengths=4"))
+    with pytest.raises(InputError, match="expected 2 to 8, got 1"):
+        checks.check_values(compose("3dgs", 8, "train.lengths=1"))
+    with pytest.raises(InputError, match=r"train\.lengths: expected views of val to choose the length"):
+        checks.check_scene(model(), moving_square(), compose("3dgs", 10, "train.lengths=2"))
+
+
+def test_each_length_is_twice_the_one_before() -> None:
+    """Catches a last length that is not the one which was asked for, and odd numbers that are not halved."""
+    config: Config = compose("7dgs", 75, "train.lengths=3")
+    assert [(one.train.iterations, one.train.lengths) for one in lengths(config).values()] == [
+        (18, None), (37, None), (75, None)
+    ]  # fmt: skip
