@@ -44,7 +44,7 @@ def counted_steps(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 def bits(folder: Path) -> dict[str, Any]:
     """The final state of a run without times and without what it chose on val, for `assert_equal`."""
     state = dict(checkpoint.read(folder / checkpoint.FILE_NAME).state)
-    del state["comparison"], state["length"]
+    del state["comparison"], state["length_choice"]
     found: dict[str, Any] = checkpoint.without_times(state)
     return found
 

@@ -7,17 +7,22 @@ import re
 import subprocess
 import sys
 from collections import defaultdict
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from types import ModuleType
 from urllib.parse import unquote
 
+import length_blocks
 import published as published_blocks
 import pytest
 import readme_blocks
 import results_blocks
 import suite_blocks
+from report.make_golden import make
 from tiny_run import ROOT, environment
+
+from gsbench.measure.curve import Point
 
 DEAD = "http://127.0.0.1:9"  # a proxy that nothing listens at
 
@@ -98,6 +103,21 @@ def test_the_tables_of_the_suite_follow_from_the_records(tmp_path: Path) -> None
     assert row.split(" | ")[2].startswith("**4")
     lost = [float(re.findall(r"\| 7DGS \| (-\d+\.\d+) ", text)[0]) for text in (before, suite_blocks.choices(tmp_path))]
     assert lost[0] - lost[1] == pytest.approx((20 + 20.85 - 24.72) / 9, abs=0.02)  # without playroom and lego100
+
+
+@pytest.mark.parametrize(
+    ("on_val", "kept", "done"),
+    [
+        ((20.0, 21.0, 22.0, 23.0), 8000, 15_000),
+        ((20.0, 21.0, 21.0, 23.0), 2000, 7000),
+        ((20.0, 19.0, 22.0), 1000, 3000),
+    ],
+)
+def test_a_length_is_chosen_as_train_lengths_does(on_val: tuple[float, ...], kept: int, done: int) -> None:
+    """Catches a table that chooses with hindsight: among lengths that `train.lengths` does not try."""
+    runs = [replace(make(), curve=[Point(1000 << i, 1.0, psnr)]) for i, psnr in enumerate(on_val)]
+    chosen, steps = length_blocks.choose(runs)
+    assert (chosen.curve[-1].iteration, steps) == (kept, done)
 
 
 def test_the_tables_name_every_model_and_key(tables: ModuleType) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import length_blocks
 import readme_blocks
 import results_blocks
 import suite_blocks
@@ -111,7 +112,7 @@ TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
     "README.md": readme_blocks.BLOCKS,
     "docs/models.md": {"models": lambda _: models()},
     "docs/config.md": {"config": lambda _: config()},
-    "docs/results.md": results_blocks.BLOCKS | suite_blocks.BLOCKS,
+    "docs/results.md": results_blocks.BLOCKS | suite_blocks.BLOCKS | length_blocks.BLOCKS,
 }
 
 

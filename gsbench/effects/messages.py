@@ -4,7 +4,7 @@ A simplified Gaussian is independent of time, direction or AGR (the neural refin
 This module does not import torch.
 """
 
-from gsbench.measure.record import Direction, Gate, ModelComparison, OnDemand, TimeScreen
+from gsbench.measure.record import Candidate, Direction, Gate, LengthChoice, ModelComparison, OnDemand, TimeScreen
 
 EFFECT_SETS = {  # the names of gsbench.models.effect_sets, in the same order, and their names in the legend
     "refined": "refined by AGR",
@@ -34,9 +34,18 @@ def of_screen(screen: TimeScreen) -> str:
 
 def of_comparison(found: ModelComparison) -> str:
     """Return a message: the PSNR on val of each candidate of model=auto, and which of them was chosen."""
-    said = [f"{one.name} {'-' if one.psnr_val is None else format(one.psnr_val, '.2f')} dB" if one.reason is None
-            else f"{one.name} failed" for one in found.candidates]  # fmt: skip
-    return f"PSNR on val after {found.iteration} iterations: {', '.join(said)}; {found.chosen} is trained to the end"
+    said = _of_candidates(found.candidates)
+    return f"PSNR on val after {found.iteration} iterations: {said}; {found.chosen} is trained to the end"
+
+
+def of_lengths(found: LengthChoice) -> str:
+    """Return a message: the PSNR on val of each length that was trained, and which of them is kept."""
+    return f"PSNR on val: {_of_candidates(found.tried)}; the training of {found.kept} iterations is kept"
+
+
+def _of_candidates(found: list[Candidate]) -> str:
+    return ", ".join(f"{one.name} {'-' if one.psnr_val is None else format(one.psnr_val, '.2f')} dB"
+                     if one.reason is None else f"{one.name} failed" for one in found)  # fmt: skip
 
 
 def of_gate(gate: Gate) -> str:

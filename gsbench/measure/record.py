@@ -147,7 +147,7 @@ class Direction:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One training of a comparison: its PSNR on val and the seconds of its training until the comparison."""
+    """One training of a comparison: its PSNR on val, and the seconds until this was measured."""
 
     name: str  # the label of the model, such as "7dgs_noagr", or the length, such as "iterations=1000"
     psnr_val: float | None  # dB; None: not finite, or the training failed
@@ -168,7 +168,7 @@ class ModelComparison:
 class LengthChoice:
     """The choice on val of a training among trainings of several lengths (`train.lengths`)."""
 
-    kept: int  # the iterations of the training whose Gaussians were measured
+    kept: int  # the iterations of the training whose Gaussians are kept
     tried: list[Candidate]  # the shortest first; a longer one that is missing was not trained
 
 
@@ -246,7 +246,7 @@ class Record:
     on_demand: OnDemand | None = None  # None: no effect was removed from the model or its Gaussians
     stop: Stop | None = None  # None: the last iteration was measured, without `train.patience`
     averaged: int = 0  # number of last iterations over which parameters were averaged; 0: they were not
-    length: LengthChoice | None = None  # None: one training, without `train.lengths`
+    length_choice: LengthChoice | None = None  # None: one training, without `train.lengths`
 
     @property
     def path(self) -> Path:

@@ -144,7 +144,7 @@ def _averages(records: list[Record]) -> list[str]:
 
 def _lengths(records: list[Record]) -> list[str]:
     """List a footnote on runs that were trained at several lengths (`train.lengths`); empty if there is none."""
-    chosen = [r.length for r in records if r.length is not None]
+    chosen = [r.length_choice for r in records if r.length_choice is not None]
     if not chosen:
         return []
     return [f"{len(chosen)} of {len(records)} runs were trained at several lengths, of which the best on val was kept, "

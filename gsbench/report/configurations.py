@@ -286,7 +286,12 @@ def _common(variant: str) -> str:
 
 
 def iterations(record: Record) -> int | None:
-    """Return the number of training iterations from a run's record, or None if the record does not hold it."""
+    """Return the iterations of the training that a record is of, or None if the record does not hold them.
+
+    With `train.lengths`, they are those of the length that was kept.
+    """
+    if record.length_choice is not None:
+        return record.length_choice.kept
     train = record.provenance.config.get("train")
     value = train.get("iterations") if isinstance(train, dict) else None
     return value if isinstance(value, int) else None

@@ -80,7 +80,7 @@ class Attempt:
         elif this.config.train.lengths is not None:
             reset_peak_memory(device)
             trainer = best_length(this, scene, self.start, self.resolved)
-            self.model = trainer.model
+            self.resolved, self.model = replace(self.resolved, config=trainer.config), trainer.model
         else:
             trainer = self.trainer(model, scene)
             reset_peak_memory(device)
@@ -105,7 +105,7 @@ class Attempt:
             record, protocol=record.protocol | found.frames, on_demand=on_demand, metrics=found.metrics,
             missing=found.missing, per_view=found.per_view, regions=found.regions,
             cost=found.cost, curve=trainer.curve.points, stop=trainer.early_stop.stop,
-            averaged=trainer.average.kept, length=trainer.length,
+            averaged=trainer.average.kept, length_choice=trainer.length_choice,
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:

@@ -70,7 +70,8 @@ class Candidates:
                 this.folder, this.overrides, steps, done, seconds
             ))  # fmt: skip
         except (DivergedError, fitting.NoGaussianError) as raised:
-            error = raised.with_traceback(None)  # the traceback keeps the trainer in memory
+            error = raised.with_traceback(None)  # the traceback keeps the trainer in memory, and so does the context
+            error.__context__ = None
         psnr = None if error or trainer.curve.last is None else trainer.curve.last.psnr_val
         spent = sum(trainer.stages.seconds.values())
         return Result(Candidate(name, psnr, spent, one_line(error) if error else None), until, trainer.effort, error)
@@ -91,7 +92,7 @@ class Result:
     """What the training of a candidate gave, and what it cost."""
 
     found: Candidate
-    steps: int  # at which its PSNR on val was measured
+    steps: int  # after which its PSNR on val is measured
     effort: Effort
     error: DivergedError | fitting.NoGaussianError | None = None  # why the training failed
 
@@ -110,15 +111,17 @@ def best(results: Sequence[Result]) -> Result:
     """
     found = max(results, key=lambda one: one.rank)
     if found.error is not None:
-        raise found.error
+        raise type(found.error)(f"all {len(results)} candidates failed; {found.found.name}: {found.found.reason}")
     return found
 
 
 def add_costs(trainer: Trainer, resolved: Resolved, others: Sequence[Result]) -> None:
     """Count the time screen and the training of all other candidates as training before that of the best."""
-    screen, seconds = resolved.screen.seconds if resolved.screen else 0.0, sum(one.found.seconds for one in others)
-    trainer.stages.add("screen", screen)
+    seconds = sum(one.found.seconds for one in others)
     trainer.stages.add("compare", seconds)
-    trainer.curve.delay(screen + seconds)
+    if resolved.screen:
+        trainer.stages.add("screen", resolved.screen.seconds)
+        seconds += resolved.screen.seconds
+    trainer.curve.delay(seconds)
     for effort in (resolved.effort, *(one.effort for one in others)):
         trainer.effort.add(effort)

@@ -305,11 +305,14 @@ def _check_choices_on_val(scene: Scene, config: Config) -> None:
         if config.scene.eval_split == "val":
             raise InputError(f"train.{key}: expected results on test, got scene.eval_split=val: results on the views "
                              f"by which the {what} is chosen would be too high; leave train.{key} out")  # fmt: skip
-        if config.effects.compare:
-            raise InputError(f"train.{key}: expected effects.compare=false, as candidates of model=auto have one "
-                             f"length: leave one of the two out")  # fmt: skip
+    if train.lengths is not None and config.effects.compare:
+        raise InputError("train.lengths: expected effects.compare=false, which compares models of one length: leave "
+                         "one of the two out")  # fmt: skip
     if train.patience is None:
         return
+    if config.effects.compare:
+        raise InputError("train.patience: expected effects.compare=false, as a candidate of model=auto must not end "
+                         "before they are compared: leave one of the two out")  # fmt: skip
     if train.lengths is not None:
         raise InputError("train.patience: expected train.lengths=null, which chooses among whole trainings: leave one "
                          "of the two out")  # fmt: skip

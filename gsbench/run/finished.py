@@ -16,6 +16,7 @@ from gsbench.run.checks import evaluated_views, lpips_weights
 from gsbench.run.identity import Run
 from gsbench.scenes import Scene
 from gsbench.train import checkpoint
+from gsbench.train.loop import length_choice_of
 
 STALE = "record.stale.json"  # that of a finished run, kept beside the record of a later attempt that did not finish
 
@@ -93,7 +94,10 @@ def _is_trained(this: Run, scene: Scene) -> bool:
         state = checkpoint.load(path, training_hash(this.plain), scene.fingerprint, "cpu")
     except InputError:
         return False
-    return state is not None and state.get("step") == this.config.train.iterations
+    if state is None:
+        return False
+    choice = length_choice_of(state)
+    return state.get("step") == (this.config.train.iterations if choice is None else choice.kept)
 
 
 def _say(this: Run, text: str) -> None:

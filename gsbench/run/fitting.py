@@ -110,6 +110,8 @@ def fit(
     path, last = this.folder / checkpoint.FILE_NAME, trainer.config.train.iterations
     with stop.requested() as request:
         report = reporter()
+        if trainer.step:
+            report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
 
         def goes_on() -> bool:
             follow()

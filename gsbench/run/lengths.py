@@ -8,15 +8,16 @@ import sys
 from dataclasses import replace
 
 from gsbench.config import Config
+from gsbench.effects import messages
+from gsbench.errors import InputError
 from gsbench.measure.record import LengthChoice
 from gsbench.run import fitting
 from gsbench.run.candidates import Candidates, Result, add_costs, best
 from gsbench.run.identity import Run
 from gsbench.run.resolve import Resolved, plain
-from gsbench.run.setup import build
 from gsbench.scenes import Scene
 from gsbench.scenes.trained import TrainedGaussians
-from gsbench.train.loop import Trainer
+from gsbench.train.loop import Trainer, length_choice_of
 
 
 def lengths(config: Config) -> dict[str, Config]:
@@ -28,15 +29,20 @@ def lengths(config: Config) -> dict[str, Config]:
     assert train.lengths is not None
     halvings = reversed(range(train.lengths))
     trains = [replace(train, iterations=train.iterations >> k, lengths=None) for k in halvings]
-    return {f"iterations={one.iterations}": replace(config, train=one) for one in trains}
+    return {name_of(one.iterations): replace(config, train=one) for one in trains}
+
+
+def name_of(iterations: int) -> str:
+    """Return the name of a length among the candidates of a run."""
+    return f"iterations={iterations}"
 
 
 def best_length(this: Run, scene: Scene, start: TrainedGaussians | None, resolved: Resolved) -> Trainer:
-    """Return a trainer at its last step, with the Gaussians of the length that has the highest PSNR on val.
+    """Return the trainer of the length with the highest PSNR on val, at its last step.
 
     The lengths are trained from the shortest on. They end with the first that is not better on val than all before it.
-    The Gaussians are bit-equal to those of a run of the chosen length alone. The seconds of the time screen and of the
-    other lengths count as training.
+    The result is bit-equal to a run of the chosen length alone. Each length is gated as such a run is, after its PSNR
+    on val was measured. The seconds of the time screen and of the other lengths count as training.
 
     Args:
         this: the run.
@@ -49,21 +55,25 @@ def best_length(this: Run, scene: Scene, start: TrainedGaussians | None, resolve
         DivergedError, NoGaussianError: all lengths failed; the error is that of the shortest.
         Stopped: a signal asked the process to end; the checkpoint of the present length is saved.
     """
-    config = resolved.config
-    parts = Candidates(this, scene, start, lengths(config))
-    trainer = fitting.trainer_of(build(config), scene, config, start)
+    parts = Candidates(this, scene, start, lengths(resolved.config))
     state = fitting.saved_state(this, scene)
-    if state is not None:
+    choice = length_choice_of(state) if state else None
+    if choice is not None:
+        name = name_of(choice.kept)
+        if name not in parts.settings:
+            raise InputError(f"checkpoint: expected a length of this run, got {choice.kept} iterations: start over "
+                             f"with resume=false")  # fmt: skip
+        trainer = parts.trainer(name)
         fitting.resume(trainer, this, state)
     else:
-        _take_best(trainer, parts, resolved)
-        fitting.save(trainer.state_dict(), this, scene, plain(this, config))
+        trainer = _best(parts, resolved)
+        fitting.save(trainer.state_dict(), this, scene, plain(this, trainer.config))
     parts.forget()
     return trainer
 
 
-def _take_best(trainer: Trainer, parts: Candidates, resolved: Resolved) -> None:
-    """Train one length after the other, print which is the best, and load its state with the costs of all."""
+def _best(parts: Candidates, resolved: Resolved) -> Trainer:
+    """Train one length after the other, print which is the best, and return its trainer with the costs of all."""
     results: list[Result] = []
     steps = sum(config.train.iterations for config in parts.settings.values())
     for name, config in parts.settings.items():
@@ -73,14 +83,9 @@ def _take_best(trainer: Trainer, parts: Candidates, resolved: Resolved) -> None:
             break
     chosen = best(results)
     choice = LengthChoice(chosen.steps, [one.found for one in results])
-    trainer.load_state_dict(parts.state(chosen.found.name) | {"step": trainer.config.train.iterations})
-    trainer.length = choice
+    print(f"{parts.this.name}: {messages.of_lengths(choice)}", file=sys.stderr)
+    trainer = parts.trainer(chosen.found.name)
+    trainer.load_state_dict(parts.state(chosen.found.name))
+    trainer.length_choice = choice
     add_costs(trainer, resolved, [one for one in results if one is not chosen])
-    print(f"{parts.this.name}: {_said(choice)}", file=sys.stderr)
-
-
-def _said(choice: LengthChoice) -> str:
-    """Return a message: the PSNR on val of each length, and which of them is kept."""
-    tried = [f"{one.name} {'-' if one.psnr_val is None else format(one.psnr_val, '.2f')} dB" if one.reason is None
-             else f"{one.name} failed" for one in choice.tried]  # fmt: skip
-    return f"PSNR on val: {', '.join(tried)}; the training of {choice.kept} iterations is kept"
+    return trainer

@@ -39,12 +39,12 @@ class RunLog:
         self.written = len(points)
         with contextlib.suppress(OSError):  # a full disk ends the run at its checkpoint, which says so
             write_atomically(self.path, "".join(map(_text, lines)).encode(), lasting=False)
-        settings = dict(flat(this.plain))
+        settings, continued = dict(flat(this.plain)), trainer.step if this.config.resume else 0
         self.tracker = Guarded(
-            this.config.log, Subject(this.folder, this.name, this.config.experiment, settings, trainer.step)
+            this.config.log, Subject(this.folder, this.name, this.config.experiment, settings, continued)
         )
         for point, line in zip(points, lines, strict=True):
-            if point not in known:  # measured before the run had a log, while candidates of model=auto were compared
+            if point not in known:  # measured before the run had a log, while models or lengths were compared
                 self._send(point, line)
 
     def follow(self) -> None:

@@ -101,6 +101,8 @@ def plain(this: Run, config: Config) -> dict[str, Any]:
     Args:
         this: the run, which may have model=auto or `train.lengths`.
         config: the run's settings with the model and the length of this training.
+
+    The checkpoint of a run has those of the training that is kept, so that its schedule is that of its length.
     """
     length = {"iterations": config.train.iterations, "lengths": config.train.lengths}
     found = this.plain | {"train": this.plain["train"] | length}

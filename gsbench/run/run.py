@@ -122,7 +122,7 @@ def _ended_badly(attempt: Attempt, error: Exception) -> Record:
         error.__traceback__ = None  # the frames of the traceback keep the large objects alive
         gc.collect()
     reason = one_line(error) if is_diverged else reason_of(error, attempt.this.folder)
-    if is_diverged and attempt.model is not None:
+    if is_diverged and attempt.model is not None and len(attempt.model):
         try:
             reason = f"{reason}; {explain(attempt.model)}"
         except Exception as unexplained:  # an error in the explanation must not hide that the run diverged
@@ -165,9 +165,10 @@ def summary(record: Record) -> str:
     """Return a record in one line: PSNR, size and speed, or the reason for a failure; and whether PSNR on val fell."""
     if record.metrics is None or record.cost is None:
         return f"{record.status}: {record.reason}"
-    psnr = record.metrics["psnr"]
+    psnr, choice = record.metrics["psnr"], record.length_choice
+    kept = f"{choice.kept} iterations kept, " if choice else ""
     return (
-        f"PSNR {'-' if psnr is None else format(psnr, '.2f')} dB, {record.cost.num_gaussians} Gaussians, "
+        f"PSNR {'-' if psnr is None else format(psnr, '.2f')} dB, {record.cost.num_gaussians} Gaussians, {kept}"
         f"trained in {record.cost.train_s:.0f} s, {record.cost.fps:.0f} FPS{too_long(record)}"
     )
 
@@ -175,7 +176,7 @@ def summary(record: Record) -> str:
 def too_long(record: Record) -> str:
     """Return a sentence if PSNR on val was more than FALL dB higher before the end of the training, otherwise ""."""
     curve = Curve(record.curve)
-    if record.stop is not None or record.length is not None or curve.best is None or curve.fall <= FALL:
+    if record.stop is not None or record.length_choice is not None or curve.best is None or curve.fall <= FALL:
         return ""
     return (f". PSNR on val was {curve.fall:.2f} dB higher at iteration {curve.best.iteration}: a shorter training may "
-            f"be better: train.lengths=4 tries")  # fmt: skip
+            f"be better (docs/runs.md#how-a-run-ends)")  # fmt: skip

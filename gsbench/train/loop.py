@@ -99,7 +99,7 @@ class Trainer:
         self.best = Best()
         self.early_stop = EarlyStop(self.schedule, train.patience)
         self.comparison: ModelComparison | None = None  # by which model=auto chose this model
-        self.length: LengthChoice | None = None  # by which `train.lengths` chose this training
+        self.length_choice: LengthChoice | None = None  # by which `train.lengths` chose this training
         self.step = 0
         self._is_full = False  # whether the largest allowed number of Gaussians was reached
 
@@ -299,7 +299,7 @@ class Trainer:
             "best": vars(self.best).copy(),
             "early_stop": self.early_stop.state_dict(),
             "comparison": asdict(self.comparison) if self.comparison else None,
-            "length": asdict(self.length) if self.length else None,
+            "length_choice": asdict(self.length_choice) if self.length_choice else None,
         }
 
     def _state_of_gaussians(self) -> dict[str, Any]:
@@ -335,8 +335,7 @@ class Trainer:
             self.best = Best(**state["best"])
             self.early_stop.load_state_dict(state.get("early_stop", NOTHING_KEPT))
             self.comparison = comparison_of(state)
-            length = state.get("length")
-            self.length = None if length is None else parse(LengthChoice, length, "checkpoint: length")
+            self.length_choice = length_choice_of(state)
         except (InputError, MemoryError):
             raise
         except Exception as error:  # a part may be of any type
@@ -352,3 +351,13 @@ def comparison_of(state: dict[str, Any]) -> ModelComparison | None:
     """
     found = state.get("comparison")
     return None if found is None else parse(ModelComparison, found, "checkpoint: comparison")
+
+
+def length_choice_of(state: dict[str, Any]) -> LengthChoice | None:
+    """Return the choice of `train.lengths` in a `Trainer.state_dict`; None if there was none.
+
+    Raises:
+        InputError: the state does not hold a choice as expected.
+    """
+    found = state.get("length_choice")
+    return None if found is None else parse(LengthChoice, found, "checkpoint: length_choice")

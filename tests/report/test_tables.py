@@ -284,7 +284,7 @@ def test_runs_of_several_lengths_are_told():
     """Catches a length chosen on val that stands as the one of the settings, and seconds that seem to be of one."""
     said = "- 2 of 3 runs were trained at several lengths, of which the best on val was kept, 1,000 to 2,000"
     chosen = [files.LengthChoice(kept, [files.Candidate("iterations=1000", 20.0, 1.0)]) for kept in (1000, 2000)]
-    text = page(make(seed=0), *(make(seed=1 + i, length=one) for i, one in enumerate(chosen)))
+    text = page(make(seed=0), *(make(seed=1 + i, length_choice=one) for i, one in enumerate(chosen)))
     assert f"{said} iterations. Their seconds of training are those of all lengths (train.lengths).\n" in text
     assert "train.lengths" not in page(make(seed=0), make(seed=1))
 

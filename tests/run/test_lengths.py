@@ -13,6 +13,7 @@ from gsbench.effects import choose
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, LengthChoice, Record, TimeScreen
 from gsbench.models import GaussianModel
+from gsbench.report.page import events
 from gsbench.run import checks, load
 from gsbench.run.candidates import FOLDER
 from gsbench.run.lengths import lengths
@@ -51,8 +52,8 @@ def model() -> GaussianModel:
 def choice_in(record: Record) -> LengthChoice:
     """The choice of a finished run."""
     assert record.status == "ok", record.reason
-    assert record.length is not None
-    return record.length
+    assert record.length_choice is not None
+    return record.length_choice
 
 
 def test_the_best_length_on_val_is_kept_with_its_own_bits(
@@ -66,7 +67,7 @@ def test_the_best_length_on_val_is_kept_with_its_own_bits(
     assert "the training of 20 iterations is kept" in capsys.readouterr().err
     alone, own = run_here(*overrides(square, tmp_path / "alone", *OTHERS, "train.iterations=20"))
     assert record.metrics == alone.metrics
-    assert_equal(bits(folder) | {"step": 20}, bits(own))
+    assert_equal(bits(folder), bits(own))
     assert [point.psnr_val for point in record.curve] == [point.psnr_val for point in alone.curve]
     assert found.tried[1].psnr_val == alone.curve[-1].psnr_val
     others = found.tried[0].seconds + found.tried[2].seconds
@@ -76,7 +77,20 @@ def test_the_best_length_on_val_is_kept_with_its_own_bits(
     assert record.curve[0].seconds > others, "a PSNR is reached only after the other lengths"
     assert not (folder / FOLDER).exists()
     assert [json.loads(line)["iteration"] for line in (folder / "curve.jsonl").read_text().splitlines()] == [10, 20]
-    assert len(load.load_run(folder).model) == record.cost.num_gaussians, "the viewer cannot open it"
+    loaded = load.load_run(folder)
+    assert (loaded.step, len(loaded.model)) == (20, record.cost.num_gaussians), "the viewer shows another model"
+    assert record.cost.stage_s.keys() >= {"compare"}
+    assert "screen" not in record.cost.stage_s
+
+
+def test_the_schedule_is_that_of_the_kept_length(square: Path, tmp_path: Path) -> None:
+    """Catches a short training that is measured with the SH degree that the longest has after so many steps."""
+    words = ("model=3dgs", "train.sh_every=10000")
+    record, folder = run_here(*overrides(square, tmp_path, *RUN, *words))
+    alone, _ = run_here(*overrides(square, tmp_path / "alone", *OTHERS, *words, "train.iterations=20"))
+    assert record.metrics == alone.metrics
+    assert load.load_run(folder).model.active.sh_degree == 2
+    assert events.of(record)[0][0] < 20
 
 
 def test_the_longest_is_kept_if_each_is_better(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,7 +154,7 @@ def test_a_length_that_fails_loses(square: Path, tmp_path: Path, monkeypatch: py
     assert found.kept == 20
     failing |= {20, 80}
     failed, _ = run_here(*overrides(square, tmp_path / "all", *RUN))
-    assert (failed.status, failed.length) == ("diverged", None)
+    assert (failed.status, failed.length_choice) == ("diverged", None)
 
 
 def test_the_model_that_auto_chose_has_several_lengths(

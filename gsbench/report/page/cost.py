@@ -270,5 +270,7 @@ def _lengths(points: list[FrontierPoint]) -> str:
     lengths = sorted({n for p in points if (n := p.configuration.iterations)})
     if len(lengths) > 1:
         return f"Each point is a finished run: {len(lengths)} lengths, {lengths[0]:,} to {lengths[-1]:,} iterations."
+    if any(r.length_choice for p in points for runs in p.configuration.runs.values() for r in runs):
+        return "Each point is a finished run, whose length was chosen on val (train.lengths)."
     length = f"{lengths[0]:,} iterations" if lengths else "one length"
     return f"All runs are of one length ({length}): what a shorter or longer run would give is not known."

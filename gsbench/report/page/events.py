@@ -1,11 +1,13 @@
 """Find the steps at which the schedule changed a run's training, from the config in its record."""
 
+from dataclasses import replace
 from typing import Any
 
 from gsbench.config import TrainConfig
 from gsbench.errors import InputError
 from gsbench.measure.record import Record
 from gsbench.measure.schema import parse
+from gsbench.report.configurations import iterations
 from gsbench.schedule import Schedule
 
 MEANING = {
@@ -35,6 +37,7 @@ def of(record: Record) -> list[tuple[int, str]]:
 def _steps(record: Record) -> list[tuple[int, str]]:
     config = record.provenance.config
     train = parse(TrainConfig, config["train"], "config")
+    train = replace(train, iterations=iterations(record) or train.iterations)
     schedule = Schedule(train, sh_degree=0, agr=record.effects.refinement)
     found = [(step, "R") for step in schedule.resets_after[:MOST_RESETS]] + [(schedule.densify_stop, "D")]
     if record.effects.refinement:

@@ -4,7 +4,7 @@ import math
 from statistics import fmean
 
 from gsbench.report import frontier as f
-from gsbench.report.configurations import Configuration, Group
+from gsbench.report.configurations import Configuration, Group, iterations
 from gsbench.report.page import charts, events, messages
 from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, PageSection, Tab, Value
 
@@ -102,8 +102,10 @@ def _mean_curve(
 ) -> tuple[list[int], list[float], list[float]] | None:
     """Return iterations, mean seconds and mean PSNR over seeds, at the iterations that all seeds measured.
 
-    The result is None if there is no such iteration.
+    The result is None if there is no such iteration, or if the seeds kept different lengths (`train.lengths`).
     """
+    if len({iterations(r) for r in configuration.runs.get(scene, [])}) > 1:
+        return None
     seeds = [
         {p.iteration: p for p in r.curve if p.psnr_val is not None}
         for r in configuration.runs.get(scene, [])
