@@ -18,6 +18,7 @@ from gsbench.kernels.tensors import check_positive
 from gsbench.models.appearance import sh_colors
 from gsbench.models.color_order import ColorOrder
 from gsbench.models.effect_sets import NAMES, EffectSets
+from gsbench.models.elementary import exp, sqrt
 from gsbench.models.query import Query, unit
 from gsbench.models.refinement import OCTAVES, Refinement
 from gsbench.models.sliced import Conditioned, Gaussians3D, Geometry
@@ -143,7 +144,7 @@ class GaussianModel(nn.Module, ABC):
         sqrt(lambda_t).
         """
         deviations = self.durations()
-        return None if deviations is None else (self.splats["times"][:, 0], deviations / self.lambda_of("time").sqrt())
+        return None if deviations is None else (self.splats["times"][:, 0], deviations / sqrt(self.lambda_of("time")))
 
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the spatial sizes of each Gaussian to at least `least` [N], world units; by default do nothing."""
@@ -162,7 +163,7 @@ class GaussianModel(nn.Module, ABC):
             trained: the 3D Gaussians.
             raw: the initial raw parameters of the model.
         """
-        points, radii = Points(trained.means, trained.means), trained.log_scales.mean(1).exp()
+        points, radii = Points(trained.means, trained.means), exp(trained.log_scales.mean(1))
         spheres = self.initial_geometry(points, radii, torch.Generator().manual_seed(0))
         return {name: spheres[name] for name in self.geometry}
 
@@ -302,7 +303,7 @@ class GaussianModel(nn.Module, ABC):
 
     def lambda_of(self, name: str) -> Tensor:
         """Return lambda_t (for `time`) or lambda_d (for `direction`), a tensor []; the model stores its logarithm."""
-        return self.log_lambda[name].exp()
+        return exp(self.log_lambda[name])
 
     def set_active(self, active: ActiveComponents) -> None:
         """Set the SH degree, whether AGR (a network) is active, and whether lambda_t and lambda_d are trained."""

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsbench.kernels.headers import BETA_LOG_MIN, LOG_SIZE_MAX
 from gsbench.models.base import SHRINK, GaussianModel, Raw
+from gsbench.models.elementary import exp, log, log1p
 from gsbench.models.sliced import reach
 from gsbench.scenes.scene import Points
 from gsbench.scenes.trained import TrainedGaussians
@@ -82,13 +83,13 @@ class BetaModel(GaussianModel):
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
         """Return spheres of the volumes of trained 3D Gaussians, larger by the reach of their profiles."""
-        larger = trained.log_scales + reach(profiles(raw)).log()[:, None]
+        larger = trained.log_scales + log(reach(profiles(raw)))[:, None]
         return GaussianModel.shaped_as(self, replace(trained, log_scales=larger), raw)
 
 
 def exponents(betas: Tensor) -> Tensor:
     """Compute the exponents 4 exp(beta) of Beta profiles and opacity factors."""
-    return 4 * betas.clamp(-LOG_SIZE_MAX, LOG_SIZE_MAX).exp()
+    return 4 * exp(betas.clamp(-LOG_SIZE_MAX, LOG_SIZE_MAX))
 
 
 def profiles(raw: Raw) -> Tensor:
@@ -111,8 +112,8 @@ def opacity_factor(white: Tensor, betas: Tensor) -> Tensor:
         betas: the parameters of the exponents, [N, 1 + C]; the first is that of the alpha profile.
     """
     doubled = (2 * white.square()).clamp(max=FADED)
-    logs = (-torch.log1p(torch.expm1(doubled) / 2)).clamp(min=BETA_LOG_MIN)
-    return (exponents(betas[:, 1:]) * logs).sum(-1).exp()
+    logs = (-log1p(torch.expm1(doubled) / 2)).clamp(min=BETA_LOG_MIN)
+    return exp((exponents(betas[:, 1:]) * logs).sum(-1))
 
 
 def positive(x: Tensor) -> Tensor:
@@ -122,7 +123,7 @@ def positive(x: Tensor) -> Tensor:
 
 def softplus_inverse(y: Tensor) -> Tensor:
     """Return x with softplus(x) = y, for y > 0."""
-    return y + (-torch.expm1(-y)).log()
+    return y + log(-torch.expm1(-y))
 
 
 def skew_factor(scales: Tensor, skew: Tensor) -> Tensor:

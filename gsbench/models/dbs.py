@@ -15,6 +15,7 @@ from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
 from gsbench.models.beta import BetaModel, exponents, opacity_factor, positive, profiles, shift_weights
 from gsbench.models.dgs import COUPLING_SPREAD, TIME_PRECISION, coupling_matrix, precision_factor
+from gsbench.models.elementary import log
 from gsbench.models.factors import sizes
 from gsbench.models.moving3d import MovingGaussians3D
 from gsbench.models.query import Query, unit
@@ -119,7 +120,7 @@ class DirectBetaModel(BetaModel, MovingGaussians3D):
     def hold_lifetimes(self, least: float) -> None:
         """Lower the entry L_tt of each precision such that the lifetime is at least `least`."""
         b = exponents(self.splats["betas"].detach()[:, -1])
-        self.splats["precision"].data[:, -1].clamp_(max=-(reach(b) * least).log())
+        self.splats["precision"].data[:, -1].clamp_(max=-log(reach(b) * least))
 
 
 @register("dbs_static")

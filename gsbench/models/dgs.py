@@ -16,6 +16,7 @@ from gsbench.kernels.headers import DIRECT_FADING
 from gsbench.kernels.moving import slice_direct
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
+from gsbench.models.elementary import exp
 from gsbench.models.factors import sizes
 from gsbench.models.moving3d import MovingGaussians3D
 from gsbench.models.query import Query, times_inside, unit
@@ -90,7 +91,7 @@ class DirectModel(MovingGaussians3D):
         delta = torch.cat([direction - unit(raw["directions"]), query.time - torch.sigmoid(raw["times"])], -1)
         L = precision_factor(raw["precision"])
         white = (L.mT @ delta[..., None])[..., 0]
-        opacity_factor = torch.exp(-DIRECT_FADING * white.square().sum(-1))
+        opacity_factor = exp(-DIRECT_FADING * white.square().sum(-1))
         if self.coupling == "none":
             return torch.zeros_like(raw["means"]), opacity_factor
         V_pq = coupling_matrix(raw["coupling"], sizes(raw["scales"]))

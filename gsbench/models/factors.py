@@ -7,6 +7,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import LOG_SIZE_MAX
+from gsbench.models.elementary import exp, log
 from gsbench.models.slicing import triangularise
 
 OFF_DIAGONALS = ("relative", "raw", "row_scaled")  # values of `form` of `Triangle`, in the order of math/off_diagonal.h
@@ -15,7 +16,7 @@ KINDS = ("shape", "motion", "coupling")  # kinds of entries below the diagonal, 
 
 def sizes(logs: Tensor) -> Tensor:
     """Compute exp of log sizes after clamping them to +-LOG_SIZE_MAX; a clamped log size has a gradient of zero."""
-    return logs.clamp(-LOG_SIZE_MAX, LOG_SIZE_MAX).exp()
+    return exp(logs.clamp(-LOG_SIZE_MAX, LOG_SIZE_MAX))
 
 
 class Triangle:
@@ -96,7 +97,7 @@ class Triangle:
         x = torch.where(self.is_relative.to(x.device), x / diagonal[:, self.rows], x)
         if self.form == "row_scaled":
             x = 2 * torch.atanh(x.clamp(-0.999, 0.999))
-        return {"log_diagonal": diagonal.log()} | self.split(x)
+        return {"log_diagonal": log(diagonal)} | self.split(x)
 
     def split(self, below: Tensor) -> dict[str, Tensor]:
         """Split the Cholesky factor's parameters below the diagonal, [N, n (n - 1) / 2], into three kinds.

@@ -12,6 +12,7 @@ from torch import Tensor
 from gsbench.kernels.moving import slice_free_time
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
+from gsbench.models.elementary import exp
 from gsbench.models.factors import sizes
 from gsbench.models.moving3d import MovingGaussians3D
 from gsbench.models.query import Query
@@ -62,7 +63,7 @@ class FreeTimeModel(MovingGaussians3D):
         """Return the shifts v (t - mu_t) of means [N, 3] and opacity factors exp(-1/2 ((t - mu_t) / s)^2) [N]."""
         assert query.time is not None
         delta = query.time - raw["times"]
-        opacity_factor = torch.exp(-0.5 * (delta / sizes(raw["durations"])).square())[:, 0]
+        opacity_factor = exp(-0.5 * (delta / sizes(raw["durations"])).square())[:, 0]
         return raw["velocities"] * delta, opacity_factor
 
     def slice_geometry(self, raw: Raw, query: Query) -> Geometry:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsbench.kernels.slices import slice_static
 from gsbench.models.base import SHRINK, Raw
+from gsbench.models.elementary import log
 from gsbench.models.factors import rotation, sizes
 from gsbench.models.gated import GatedModel
 from gsbench.models.query import Query
@@ -32,7 +33,7 @@ class Gaussians3DModel(GatedModel):
         """Return spheres whose radii are the distances [N] of the points to their neighbours."""
         quats = torch.zeros(len(distances), 4)
         quats[:, 0] = 1
-        return {"scales": distances.log()[:, None].repeat(1, 3), "quats": quats}
+        return {"scales": log(distances)[:, None].repeat(1, 3), "quats": quats}
 
     def condition(self, raw: Raw, query: Query) -> Conditioned:
         """Return the Gaussians themselves, because 3DGS depends on neither time nor direction."""
@@ -66,12 +67,12 @@ class Gaussians3DModel(GatedModel):
 
     def hold_sizes(self, least: Tensor) -> None:
         """Raise all three scales of each Gaussian to at least `least` [N]."""
-        self.splats["scales"].data.clamp_(min=least.log()[:, None])
+        self.splats["scales"].data.clamp_(min=log(least)[:, None])
 
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
         """Multiply the three scales of each Gaussian in `rows` by the factor of this Gaussian."""
-        self.splats["scales"].data[rows] += factors.log()[:, None].to(self.splats["scales"].dtype)
+        self.splats["scales"].data[rows] += log(factors)[:, None].to(self.splats["scales"].dtype)
 
     def spread(self, rows: Tensor) -> Tensor:
         """Return the factors R S of the covariances of the Gaussians `rows`, [M, 3, 3]."""

@@ -15,6 +15,7 @@ from gsbench.models.appearance import sh_time_colors
 from gsbench.models.base import SHRINK, Raw
 from gsbench.models.color_order import ColorOrder, coefficients_within, order_of
 from gsbench.models.effect_sets import EffectSets
+from gsbench.models.elementary import exp, log
 from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
 from gsbench.models.gated import OPACITY_MARGIN
 from gsbench.models.joint import JointModel
@@ -71,8 +72,8 @@ class Gaussians4DModel(JointModel):
         """Return spheres with mean times uniform in [-0.1, 1.1] and a standard deviation in time of sqrt(1/5)."""
         N = len(distances)
         self.clock.fill_(size_of(points))
-        duration = self.clock.log() + 0.5 * math.log(1 / 5)
-        scales = torch.cat([distances.log()[:, None].repeat(1, 3), duration.expand(N, 1)], -1)
+        duration = log(self.clock) + 0.5 * math.log(1 / 5)
+        scales = torch.cat([log(distances)[:, None].repeat(1, 3), duration.expand(N, 1)], -1)
         quats = torch.zeros(N, 4)
         quats[:, 0] = 1
         times = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
@@ -124,7 +125,7 @@ class Gaussians4DModel(JointModel):
         left = turn_of_space(quaternion(turn * torch.linalg.det(turn)[:, None, None]))
         new = {
             "means": raw["means"] + (gain_of(blocks.T_pq, blocks.T_qq) @ shift[..., None])[..., 0],
-            "scales": torch.cat([lengths.log(), torch.full_like(shift, LOG_SIZE_MAX)], -1),
+            "scales": torch.cat([log(lengths), torch.full_like(shift, LOG_SIZE_MAX)], -1),
             "left_quats": left,
             "right_quats": partner(left),
             "opacities": torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)),
@@ -223,21 +224,21 @@ class Gaussians4DModel(JointModel):
 
     def log_duration(self, index: int) -> float | None:
         """Return the log scale in time of the Gaussian `index`, in units of the length of the scene."""
-        return float(self.splats["scales"].detach()[index, 3] - self.clock.log())
+        return float(self.splats["scales"].detach()[index, 3] - log(self.clock))
 
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the three spatial scales of each Gaussian to at least `least` [N]."""
-        self.splats["scales"].data[:, :3].clamp_(min=least.log()[:, None])
+        self.splats["scales"].data[:, :3].clamp_(min=log(least)[:, None])
 
     def hold_lifetimes(self, least: float) -> None:
         """Raise the fourth scale of each Gaussian to `least`, in the model's unit of time; rotations do not change."""
-        least_scale = math.log(least) + 0.5 * self.log_lambda["time"].detach() + self.clock.log()
+        least_scale = math.log(least) + 0.5 * self.log_lambda["time"].detach() + log(self.clock)
         self.splats["scales"].data[:, 3].clamp_(min=least_scale)
 
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
         """Multiply the three spatial scales by factors. This is exact if the 4D rotation turns only space."""
-        self.splats["scales"].data[rows, :3] += factors.log()[:, None].to(self.splats["scales"].dtype)
+        self.splats["scales"].data[rows, :3] += log(factors)[:, None].to(self.splats["scales"].dtype)
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Sample means and times of children from the parent Gaussian; all four scales are 1.6 times smaller."""
@@ -251,7 +252,7 @@ class Gaussians4DModel(JointModel):
 
     def opacity_factor(self, factor: Tensor, delta: Tensor) -> Tensor:
         """Compute the opacity factors f_temp [N] from factors [N, 4, 4] and time offsets delta = t - mu_t [N, 1]."""
-        return torch.exp(-0.5 * self.lambda_of("time") * mahalanobis(factor[:, 3:], delta))
+        return exp(-0.5 * self.lambda_of("time") * mahalanobis(factor[:, 3:], delta))
 
     def factors(self, raw: Raw) -> Tensor:
         """Compute the factors R S of the covariances over (x, y, z, t), [N, 4, 4]; t is in [0, 1] for the scene."""

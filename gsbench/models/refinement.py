@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from gsbench.kernels.headers import HIDDEN
 from gsbench.kernels.refine import refine
+from gsbench.models.elementary import cos, sin
 
 OCTAVES = 10  # K of the time encoding in the 7DGS paper
 
@@ -16,7 +17,7 @@ OCTAVES = 10  # K of the time encoding in the 7DGS paper
 def encode_time(time: Tensor, octaves: int = OCTAVES) -> Tensor:
     """Return the positional encoding of a time, (sin 2^k pi t, cos 2^k pi t) for k = 0 .. octaves-1, [2 octaves]."""
     angles = time * _frequencies(octaves, time.device, time.dtype)
-    return torch.stack([angles.sin(), angles.cos()], -1).flatten()
+    return torch.stack([sin(angles), cos(angles)], -1).flatten()
 
 
 @functools.cache

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.models.elementary import sqrt
 
 
 class Gaussians3D(NamedTuple):
@@ -51,7 +52,7 @@ def reach(shapes: Tensor) -> Tensor:
     Args:
         shapes: the exponents b, [N].
     """
-    return (2 * shapes).sqrt()
+    return sqrt(2 * shapes)
 
 
 def joined_shapes(first: Tensor | None, second: Tensor | None) -> Tensor | None:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.tensors import check_tensor
+from gsbench.models.elementary import sqrt
 
 SCHEMES = ("square_root", "schur", "cholesky")
 
@@ -174,7 +175,7 @@ def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
     for i in range(k):
         x = rest[:, i]
         square = (x * x).sum(-1, keepdim=True)
-        length = torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
+        length = torch.where(square > 0, sqrt(torch.where(square > 0, square, 1.0)), 0.0)
         signed = torch.where(x[:, :1] < 0, -length, length)
         # I - tau u u^T with u_0 = 1: its numbers are of order one, so that no square of a short row underflows.
         first = x[:, :1] + signed
@@ -204,7 +205,7 @@ def cholesky3(S: Tensor) -> Tensor:
     """Compute the Cholesky factor of S [N, 3, 3]; if S is indefinite, negative pivots are replaced by zero."""
 
     def root(x: Tensor) -> Tensor:
-        return torch.where(x > 0, torch.where(x > 0, x, 1.0).sqrt(), 0.0)
+        return torch.where(x > 0, sqrt(torch.where(x > 0, x, 1.0)), 0.0)
 
     def over(x: Tensor, pivot: Tensor) -> Tensor:
         return torch.where(pivot > 0, x / torch.where(pivot > 0, pivot, 1.0), 0.0)

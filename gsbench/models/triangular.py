@@ -13,6 +13,7 @@ from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.kernels.slices import slice_triangular
 from gsbench.models.base import SHRINK, Raw
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
+from gsbench.models.elementary import exp, log
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle, rotation, sizes
 from gsbench.models.gated import OPACITY_MARGIN
 from gsbench.models.joint import JointModel
@@ -91,7 +92,7 @@ class TriangularModel(JointModel):
         """
         N = len(distances)
         log_diagonal = torch.zeros(N, sum(map(len, self.rows.values())))
-        log_diagonal[:, self.rows["p"]] = distances.log()[:, None]
+        log_diagonal[:, self.rows["p"]] = log(distances)[:, None]
         log_diagonal[:, self.rows["t"]] = 0.5 * math.log(1 / 10)
         raw = {"log_diagonal": log_diagonal}
         raw |= {kind: torch.zeros(N, len(self.triangle.places[kind])) for kind in self.triangle.kinds}
@@ -113,7 +114,7 @@ class TriangularModel(JointModel):
         delta = torch.where(seen[:, None], offset, 0.0)
         T_qq = torch.where(seen[:, None, None], reduced.T_qq, torch.eye(delta.shape[1]).to(delta))
         white = whiten(T_qq, delta)
-        opacity_factor = torch.where(seen, torch.exp(-self._exponent(T_qq, delta, white)), 0.0)
+        opacity_factor = torch.where(seen, exp(-self._exponent(T_qq, delta, white)), 0.0)
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
@@ -176,7 +177,7 @@ class TriangularModel(JointModel):
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the diagonal entries of position in each Cholesky factor to at least `least` [N], world units."""
         space = self.rows["p"]
-        self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=least.log()[:, None])
+        self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=log(least)[:, None])
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Split Gaussians in time if they move and are long in time, else in space.
@@ -275,7 +276,7 @@ class TriangularModel(JointModel):
             shift += weight[:, None] * delta
             exponents = self.exponents(blocks.T_qq, delta, whiten(blocks.T_qq, delta))
             for name, factor in opacity_factors.items():
-                factor += weight * torch.exp(-exponents[name])
+                factor += weight * exp(-exponents[name])
         changed = {}
         for name, variables in by_name.items():
             columns = [column for x in variables for column in self.columns[x]]

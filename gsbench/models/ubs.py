@@ -22,6 +22,7 @@ from gsbench.models.beta import (
     skew_factor,
     softplus_inverse,
 )
+from gsbench.models.elementary import sqrt
 from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
 from gsbench.models.sliced import Conditioned, Geometry, reach
@@ -139,7 +140,7 @@ class UniversalBetaModel(BetaModel):
         T_qq, T_pq, T_pp = reduced
         if self.modulation == "whitened":
             left = 1 - weights
-            root = torch.where(left > 0, torch.where(left > 0, left, 1.0).sqrt(), 0.0)  # its gradient at 0 is infinite
+            root = torch.where(left > 0, sqrt(torch.where(left > 0, left, 1.0)), 0.0)  # its gradient at 0 is infinite
             rows = torch.cat([T_pp, T_pq * root[:, None]], -1)
             return triangularise(rows, 3)[0]
         S_pq = T_pq @ T_qq.mT

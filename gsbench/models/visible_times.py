@@ -7,6 +7,7 @@ from torch import Tensor
 
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models.base import GaussianModel
+from gsbench.models.elementary import log, sqrt
 
 
 @torch.no_grad()
@@ -22,7 +23,7 @@ def visible_intervals(model: GaussianModel) -> Tensor | None:
         return None
     times, deviations = lifetimes
     opacities = torch.sigmoid(model.splats["opacities"])
-    reach = (2 * (opacities / ALPHA_MIN).log().clamp(min=0)).sqrt() * deviations
+    reach = sqrt(2 * log(opacities / ALPHA_MIN).clamp(min=0)) * deviations
     interval = torch.stack([times - reach, times + reach], 1)
     never = (reach == 0) | (interval[:, 1] < 0) | (interval[:, 0] > 1)
     return torch.where(never[:, None], math.inf, interval.clamp(0, 1))
