@@ -4,43 +4,63 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
-from published import best, experiments, metric, signed, table
+from published import MODELS, best, experiments, metric, table
 
 from gsbench.measure.record import Record
 
 LENGTHS = {1000: "", 2000: "iterations=2000", 4000: "iterations=4000", 8000: "iterations=8000"}  # variants of runs
-IN_SUITE = (1000, 2000)  # records of +exp=suite; the others are in the folder lengths
+OF_SUITE = {500: "iterations=500", 1000: "", 2000: "iterations=2000"}  # the lengths of all models and scenes
+MOVING = ("monocular", "rig", "array")
 
 
 def lengths(published: Path) -> str:
     """Return the table of PSNR on test after four lengths, and of the length that `train.lengths=4` keeps."""
     suite = {scene: found for found in experiments(published / "suite") for scene in found.group.scenes}
-    rows, longest, kept, steps = [], [], [], []
+    rows, tried = [], []
     for found in experiments(published / "lengths"):
         for model in found.group.models:
-            for scene in found.configuration(model, LENGTHS[8000]).runs:
-                runs = {
-                    n: (suite[scene] if n in IN_SUITE else found).configuration(model, variant).runs[scene]
-                    for n, variant in LENGTHS.items()
-                }
-                seeds = [run.seed for run in runs[8000]]
-                runs = {n: [run for run in of if run.seed in seeds] for n, of in runs.items()}
-                by_seed = [choose(one) for one in zip(*runs.values(), strict=True)]
-                psnr = [metric(of, "psnr") for of in runs.values()]
-                chosen = metric([run for run, _ in by_seed], "psnr")
-                longest.append(psnr[-1] - max(psnr))
-                kept.append(chosen - max(psnr))
-                steps += [done for _, done in by_seed]
-                rows.append([scene, model, *best(psnr, [f"{one:.2f}" for one in psnr]), f"{chosen:.2f}"])
-    head = ["scene", "model", *(f"{n:,}" for n in LENGTHS), "kept"]
-    said = (
-        f"Over these {len(rows)} rows, 8,000 iterations are {signed(fmean(longest))} dB from the best length of a row "
-        f"(worst: {signed(min(longest))} dB), and the kept length {signed(fmean(kept))} dB (worst: {signed(min(kept))} "
-        f"dB). At least 0.1 dB is lost on {sum(one <= -0.1 for one in longest)} and "
-        f"{sum(one <= -0.1 for one in kept)} rows. The lengths that are tried have {fmean(steps):,.0f} iterations "
-        f"together on average."
+            for scene, longest in found.configuration(model, LENGTHS[8000]).runs.items():
+                folders = [suite[scene] if variant in OF_SUITE.values() else found for variant in LENGTHS.values()]
+                runs = [
+                    {run.seed: run for run in of.configuration(model, variant).runs[scene]}
+                    for of, variant in zip(folders, LENGTHS.values(), strict=True)
+                ]
+                tried += (one := [[by_seed[run.seed] for by_seed in runs] for run in longest])
+                psnr = [metric(list(of), "psnr") for of in zip(*one, strict=True)]
+                kept = metric([choose(of)[0] for of in one], "psnr")
+                rows.append([scene, model, *best(psnr, [f"{value:.2f}" for value in psnr]), f"{kept:.2f}"])
+    of_suite = [
+        runs
+        for found in experiments(published / "suite")
+        if found.group.dataset in MOVING
+        for model in MODELS
+        if all(found.has(model, variant) for variant in OF_SUITE.values())
+        for scene in found.group.scenes
+        for runs in zip(*(found.configuration(model, v).runs.get(scene, []) for v in OF_SUITE.values()), strict=False)
+        if all(run.curve[-1].psnr_val is not None for run in runs)
+    ]
+    text = table(["scene", "model", *(f"{n:,}" for n in LENGTHS), "kept"], sorted(rows), left=2)
+    return f"{text}\n\n{said(tried)}\n\n{said(of_suite)}"
+
+
+def said(tried: Sequence[Sequence[Record]]) -> str:
+    """Say what the longest training and the kept one lose to the best length on test, over lists of such trainings."""
+    lost: dict[str, list[float]] = {"longest": [], "kept": []}
+    steps = []
+    for runs in tried:
+        kept, done = choose(runs)
+        highest = max(metric([run], "psnr") for run in runs)
+        for name, run in (("longest", runs[-1]), ("kept", kept)):
+            lost[name].append(highest - metric([run], "psnr"))
+        steps.append(done)
+    last = tried[0][-1].curve[-1].iteration
+    mean, most = ({name: function(values) for name, values in lost.items()} for function in (fmean, max))
+    return (
+        f"Over {len(tried)} runs of up to {last:,} iterations, the longest training loses {mean['longest']:.2f} dB to "
+        f"the best length on average, and at most {most['longest']:.2f} dB. The kept training loses "
+        f"{mean['kept']:.2f} dB on average, and at most {most['kept']:.2f} dB. The lengths that are tried have "
+        f"{fmean(steps):,.0f} iterations together on average."
     )
-    return f"{table(head, sorted(rows), left=2)}\n\n{said}"
 
 
 def choose(runs: Sequence[Record]) -> tuple[Record, int]:
