@@ -53,7 +53,8 @@ def cost(published: Path) -> str:
     said += "`7dgs_nodir` has no direction."
     if longer:
         said += f" From 2,000 to 4,000 iterations, PSNR falls by more than {FALL} dB for {len(longer)} of "
-        said += f"{count(len(MODELS), 'model')} ([all rows](docs/results.md))."
+        said += f"{count(len(MODELS), 'model')} ([all rows](docs/results.md)). `train.lengths=4` "
+        said += "[chooses the length on val](docs/results.md#how-long-to-train)."
     rows = [costs(found, length, models, "{psnr}, {seconds} s") for length in SHORT]
     return f"{table(['iterations', *models], rows, left=0)}\n\n{said}"
 
