@@ -196,7 +196,7 @@ def _moving(published: Path) -> Iterator[tuple[str, list[dict[str, Record]], str
         for scene in found.group.scenes:
             by_seed = _by_seed(found, scene)
             every = [run for runs in by_seed for run in runs.values()]
-            if any(math.isnan(_val(run, 1)) for run in every):
+            if any(math.isnan(val_after(run, 1)) for run in every):
                 yield scene, by_seed, "has no val"
             else:
                 on_val = any(run.protocol["eval_split"] == "val" for run in every)
@@ -209,7 +209,7 @@ def _whole(runs: dict[str, Record]) -> dict[str, Record]:
 
 
 def _best_on_val(part: float, runs: dict[str, Record]) -> Record:
-    return max(_whole(runs).values(), key=lambda run: _val(run, part))
+    return max(_whole(runs).values(), key=lambda run: val_after(run, part))
 
 
 RULES: dict[str, Choice] = {
@@ -230,7 +230,7 @@ def _by_seed(found: Experiment, scene: str) -> list[dict[str, Record]]:
     return list(runs.values())
 
 
-def _val(run: Record, part: float) -> float:
+def val_after(run: Record, part: float) -> float:
     """Return PSNR on val after a part of the training; NaN without val."""
     value = run.curve[round(part * len(run.curve)) - 1][2]
     return math.nan if value is None else value
@@ -275,7 +275,9 @@ def _early(effect: str) -> Callable[[Experiment, str], float]:
     model, other = EFFECTS[effect]
 
     def mean(found: Experiment, scene: str) -> float:
-        first, second = (fmean(_val(run, 0.3) for run in found.configuration(m).runs[scene]) for m in (model, other))
+        first, second = (
+            fmean(val_after(run, 0.3) for run in found.configuration(m).runs[scene]) for m in (model, other)
+        )
         return first - second
 
     return mean
