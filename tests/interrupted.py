@@ -1,12 +1,14 @@
 """Kill a run after some of its checkpoints, count its steps, and compare the states of two runs bit by bit."""
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from gsbench.measure.record import Record
 from gsbench.train import checkpoint
 from gsbench.train.loop import Trainer
 
@@ -15,18 +17,28 @@ class Killed(BaseException):
     """The process ends here."""
 
 
-def killed_after(saves: int, monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """Raise Killed after so many checkpoints; the next attempt clears the counter that is returned."""
-    written, save = Counter[str](), checkpoint.save
+def run_through_kills(
+    saves: int, monkeypatch: pytest.MonkeyPatch, run: Callable[[], tuple[Record, Path]]
+) -> tuple[Record, Path]:
+    """Repeat a run that is killed after so many checkpoints until it finishes, and return its record and folder."""
+    written, attempts, save = 0, 0, checkpoint.save
 
     def save_and_die(*given: Any) -> None:
+        nonlocal written
         save(*given)
-        written["now"] += 1
-        if written["now"] == saves:
+        written += 1
+        if written == saves:
             raise Killed
 
     monkeypatch.setattr(checkpoint, "save", save_and_die)
-    return written
+    while True:
+        written, attempts = 0, attempts + 1
+        try:
+            found = run()
+        except Killed:
+            continue
+        assert attempts > 1, "the run was never killed"
+        return found
 
 
 def counted_steps(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
@@ -42,26 +54,27 @@ def counted_steps(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 
 def bits(folder: Path) -> dict[str, Any]:
-    """The final state of a run without times and without what it chose on val, for `assert_equal`."""
+    """The final state of a run without times and without what it chose on val, for `assert_same_bits`."""
     state = dict(checkpoint.read(folder / checkpoint.FILE_NAME).state)
     del state["comparison"], state["length_choice"]
     found: dict[str, Any] = checkpoint.without_times(state)
     return found
 
 
-def assert_equal(a: object, b: object) -> None:
+def assert_same_bits(a: object, b: object, where: str = "state") -> None:
     """Compare two states bit by bit."""
-    if isinstance(a, dict):
+    if isinstance(a, torch.Tensor):
+        assert isinstance(b, torch.Tensor)
+        assert a.shape == b.shape, where
+        assert torch.equal(a, b), where
+    elif isinstance(a, dict):
         assert isinstance(b, dict)
-        assert a.keys() == b.keys()
+        assert a.keys() == b.keys(), where
         for key in a:
-            assert_equal(a[key], b[key])
+            assert_same_bits(a[key], b[key], f"{where}.{key}")
     elif isinstance(a, list):
         assert isinstance(b, list)
-        for x, y in zip(a, b, strict=True):
-            assert_equal(x, y)
-    elif isinstance(a, torch.Tensor):
-        assert isinstance(b, torch.Tensor)
-        assert torch.equal(a, b)
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_same_bits(x, y, f"{where}[{i}]")
     else:
-        assert a == b
+        assert a == b, where

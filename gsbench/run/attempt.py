@@ -73,13 +73,10 @@ class Attempt:
             self.resolved = resolve(this, scene)
             self.model = model = build(self.resolved.config)
         screen, device = self.resolved.screen, this.config.device
-        if self.resolved.compares:
+        if self.resolved.compares or this.config.train.lengths is not None:
             reset_peak_memory(device)
-            trainer = best_of(this, scene, self.start, self.resolved)
-            self.resolved, self.model = replace(self.resolved, config=trainer.config), trainer.model
-        elif this.config.train.lengths is not None:
-            reset_peak_memory(device)
-            trainer = best_length(this, scene, self.start, self.resolved)
+            choose = best_of if self.resolved.compares else best_length
+            trainer = choose(this, scene, self.start, self.resolved)
             self.resolved, self.model = replace(self.resolved, config=trainer.config), trainer.model
         else:
             trainer = self.trainer(model, scene)

@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,17 +36,55 @@ class Candidates:
         config = self.settings[name]
         return fitting.trainer_of(build(config), self.scene, config, self.start)
 
-    def state(self, name: str) -> dict[str, Any]:
-        """Return the state of a trained candidate from its checkpoint.
+    def chosen(self, known: Callable[[dict[str, Any]], str | None], choose: Callable[[], Trainer]) -> Trainer:
+        """Return the trainer of the candidate that the run's own checkpoint names, or else of the one to choose now.
+
+        The choice is saved in the run's checkpoint, before the checkpoints of the candidates are deleted.
+
+        Args:
+            known: returns the name of the chosen candidate in the state of a checkpoint; None if there is none.
+            choose: trains candidates, and returns the trainer of the best.
+
+        Raises:
+            InputError: a checkpoint is damaged.
+        """
+        state = fitting.saved_state(self.this, self.scene)
+        name = known(state) if state else None
+        if name is None:
+            trainer = choose()
+            fitting.save(trainer.state_dict(), self.this, self.scene, plain(self.this, trainer.config))
+        elif name in self.settings:
+            trainer = self.trainer(name)
+            fitting.resume(trainer, self.this, state)
+        else:
+            raise InputError(f"checkpoint: expected one of {', '.join(self.settings)}, got {name!r:.80}: "
+                             f"start over with resume=false")  # fmt: skip
+        shutil.rmtree(self.this.folder / FOLDER, ignore_errors=True)
+        return trainer
+
+    def trained(self, chosen: "Result", results: Sequence["Result"], resolved: Resolved) -> Trainer:
+        """Return the trainer of the chosen candidate at the step of its checkpoint.
+
+        The time screen of model=auto and the training of all other candidates count as training before its own.
 
         Raises:
             InputError: the checkpoint is gone or damaged.
         """
-        run = self._run(name)
+        run, trainer = self._run(chosen.found.name), self.trainer(chosen.found.name)
         state = fitting.saved_state(replace(run, config=replace(run.config, resume=True)), self.scene)
         if state is None:
             raise InputError(f"{run.folder}: expected the checkpoint of the best candidate, it is gone: run again")
-        return state
+        trainer.load_state_dict(state)
+        others = [one for one in results if one is not chosen]
+        seconds = sum(one.found.seconds for one in others)
+        trainer.stages.add("compare", seconds)
+        if resolved.screen:
+            trainer.stages.add("screen", resolved.screen.seconds)
+            seconds += resolved.screen.seconds
+        trainer.curve.delay(seconds)
+        for effort in (resolved.effort, *(one.effort for one in others)):
+            trainer.effort.add(effort)
+        return trainer
 
     def train(self, name: str, until: int, before: Sequence["Result"], steps: int) -> "Result":
         """Train a candidate to the step `until`, from its checkpoint if it has one, and return its PSNR on val.
@@ -76,10 +114,6 @@ class Candidates:
         spent = sum(trainer.stages.seconds.values())
         return Result(Candidate(name, psnr, spent, one_line(error) if error else None), until, trainer.effort, error)
 
-    def forget(self) -> None:
-        """Delete the checkpoints of all candidates."""
-        shutil.rmtree(self.this.folder / FOLDER, ignore_errors=True)
-
     def _run(self, name: str) -> Run:
         """Return the run of a candidate, whose folder is in that of the run and holds only its checkpoint."""
         this, config = self.this, self.settings[name]
@@ -103,25 +137,18 @@ class Result:
         return self.error is None, -math.inf if psnr is None else psnr
 
 
+def highest(results: Sequence[Result]) -> Result:
+    """Return the result with the highest PSNR on val, the first of equal ones, which may be one that failed."""
+    return max(results, key=lambda one: one.rank)
+
+
 def best(results: Sequence[Result]) -> Result:
-    """Return the result with the highest PSNR on val, the first of equal ones.
+    """Return the `highest` result.
 
     Raises:
         DivergedError, NoGaussianError: all candidates failed; the error is that of the first.
     """
-    found = max(results, key=lambda one: one.rank)
+    found = highest(results)
     if found.error is not None:
         raise type(found.error)(f"all {len(results)} candidates failed; {found.found.name}: {found.found.reason}")
     return found
-
-
-def add_costs(trainer: Trainer, resolved: Resolved, others: Sequence[Result]) -> None:
-    """Count the time screen and the training of all other candidates as training before that of the best."""
-    seconds = sum(one.found.seconds for one in others)
-    trainer.stages.add("compare", seconds)
-    if resolved.screen:
-        trainer.stages.add("screen", resolved.screen.seconds)
-        seconds += resolved.screen.seconds
-    trainer.curve.delay(seconds)
-    for effort in (resolved.effort, *(one.effort for one in others)):
-        trainer.effort.add(effort)

@@ -2,16 +2,17 @@
 
 import sys
 from dataclasses import replace
+from typing import Any
 
 from gsbench.config import Config
 from gsbench.effects import messages
 from gsbench.errors import InputError
 from gsbench.measure.record import ModelComparison
-from gsbench.run import fitting, progress
-from gsbench.run.candidates import Candidates, Result, add_costs, best
+from gsbench.run import progress
+from gsbench.run.candidates import Candidates, Result, best
 from gsbench.run.checks import check_scene, check_values
 from gsbench.run.identity import Run, label_of
-from gsbench.run.resolve import Resolved, is_auto, plain, with_candidate, with_model
+from gsbench.run.resolve import Resolved, is_auto, with_candidate, with_model
 from gsbench.run.setup import build, build_with_placeholders
 from gsbench.scenes import Scene
 from gsbench.scenes.trained import TrainedGaussians
@@ -83,19 +84,12 @@ def best_of(this: Run, scene: Scene, start: TrainedGaussians | None, resolved: R
         Stopped: a signal asked the process to end; the checkpoint of the present candidate is saved.
     """
     parts = Candidates(this, scene, start, candidates(this.config))
-    state = fitting.saved_state(this, scene)
-    found = comparison_of(state) if state else None
-    if found is not None:
-        if found.chosen not in parts.settings:
-            raise InputError(f"checkpoint: expected a candidate of model=auto, got {found.chosen!r:.80}: "
-                             f"start over with resume=false")  # fmt: skip
-        trainer = parts.trainer(found.chosen)
-        fitting.resume(trainer, this, state)
-    else:
-        trainer = _compared(parts, resolved)
-        fitting.save(trainer.state_dict(), this, scene, plain(this, trainer.config))
-    parts.forget()
-    return trainer
+    return parts.chosen(_known, lambda: _compared(parts, resolved))
+
+
+def _known(state: dict[str, Any]) -> str | None:
+    found = comparison_of(state)
+    return None if found is None else found.chosen
 
 
 def _compared(parts: Candidates, resolved: Resolved) -> Trainer:
@@ -108,10 +102,8 @@ def _compared(parts: Candidates, resolved: Resolved) -> Trainer:
     chosen = best(results)
     comparison = ModelComparison(chosen.steps, chosen.found.name, [one.found for one in results])
     print(f"{parts.this.name}: {messages.of_comparison(comparison)}", file=sys.stderr)
-    trainer = parts.trainer(comparison.chosen)
-    trainer.load_state_dict(parts.state(comparison.chosen))
+    trainer = parts.trained(chosen, results, resolved)
     trainer.comparison = comparison
-    add_costs(trainer, resolved, [one for one in results if one is not chosen])
     return trainer
 
 

@@ -6,15 +6,14 @@ little: a training that was planned to be short is better (docs/tuning.md).
 
 import sys
 from dataclasses import replace
+from typing import Any
 
 from gsbench.config import Config
 from gsbench.effects import messages
-from gsbench.errors import InputError
 from gsbench.measure.record import LengthChoice
-from gsbench.run import fitting
-from gsbench.run.candidates import Candidates, Result, add_costs, best
+from gsbench.run.candidates import Candidates, Result, best, highest
 from gsbench.run.identity import Run
-from gsbench.run.resolve import Resolved, plain
+from gsbench.run.resolve import Resolved
 from gsbench.scenes import Scene
 from gsbench.scenes.trained import TrainedGaussians
 from gsbench.train.loop import Trainer, length_choice_of
@@ -56,20 +55,12 @@ def best_length(this: Run, scene: Scene, start: TrainedGaussians | None, resolve
         Stopped: a signal asked the process to end; the checkpoint of the present length is saved.
     """
     parts = Candidates(this, scene, start, lengths(resolved.config))
-    state = fitting.saved_state(this, scene)
-    choice = length_choice_of(state) if state else None
-    if choice is not None:
-        name = name_of(choice.kept)
-        if name not in parts.settings:
-            raise InputError(f"checkpoint: expected a length of this run, got {choice.kept} iterations: start over "
-                             f"with resume=false")  # fmt: skip
-        trainer = parts.trainer(name)
-        fitting.resume(trainer, this, state)
-    else:
-        trainer = _best(parts, resolved)
-        fitting.save(trainer.state_dict(), this, scene, plain(this, trainer.config))
-    parts.forget()
-    return trainer
+    return parts.chosen(_known, lambda: _best(parts, resolved))
+
+
+def _known(state: dict[str, Any]) -> str | None:
+    found = length_choice_of(state)
+    return None if found is None else name_of(found.kept)
 
 
 def _best(parts: Candidates, resolved: Resolved) -> Trainer:
@@ -78,14 +69,12 @@ def _best(parts: Candidates, resolved: Resolved) -> Trainer:
     steps = sum(config.train.iterations for config in parts.settings.values())
     for name, config in parts.settings.items():
         results.append(parts.train(name, config.train.iterations, results, steps))
-        top = max(results, key=lambda one: one.rank)
+        top = highest(results)
         if top is not results[-1] and top.error is None:
             break
     chosen = best(results)
     choice = LengthChoice(chosen.steps, [one.found for one in results])
     print(f"{parts.this.name}: {messages.of_lengths(choice)}", file=sys.stderr)
-    trainer = parts.trainer(chosen.found.name)
-    trainer.load_state_dict(parts.state(chosen.found.name))
+    trainer = parts.trained(chosen, results, resolved)
     trainer.length_choice = choice
-    add_costs(trainer, resolved, [one for one in results if one is not chosen])
     return trainer

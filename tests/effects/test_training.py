@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from interrupted import assert_same_bits
 from tiny_run import gsbench, overrides, write_moving_square
 
 from gsbench.effects import __main__ as command
@@ -48,18 +49,6 @@ def end(one: Trainer) -> dict[str, object]:
     return {key: last[key] for key in ("model", "optimizer", "density", "minimum_scale")}
 
 
-def assert_same(a: object, b: object) -> None:
-    if isinstance(a, dict):
-        assert isinstance(b, dict)
-        assert a.keys() == b.keys()
-        for key in a:
-            assert_same(a[key], b[key])
-    else:
-        assert isinstance(a, torch.Tensor)
-        assert isinstance(b, torch.Tensor)
-        assert torch.equal(a, b)
-
-
 @pytest.fixture(autouse=True)
 def few_steps_recover(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trainings of a test are short."""
@@ -81,7 +70,7 @@ def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyP
     second.load_state_dict(states[-1])
     assert second.model.effect_sets is not None
     assert second.gating.gates == first.gating.gates
-    assert_same(end(second), expected)
+    assert_same_bits(end(second), expected)
 
 
 def test_off_is_off(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from interrupted import Killed, assert_equal, bits, counted_steps, killed_after
+from interrupted import Killed, assert_same_bits, bits, counted_steps, run_through_kills
 from tiny_run import overrides, run_here, write_moving_square
 
 from gsbench.config import Config, TrainConfig
@@ -62,7 +62,7 @@ def test_the_best_on_val_is_trained_to_the_end_with_its_own_bits(
     assert found.chosen == "4dgs", "if the first wins, nothing is tested here"
     alone, own = run_here(*overrides(square, tmp_path, "model=4dgs", "effects.gate=both", *RUN))
     assert record.metrics == alone.metrics
-    assert_equal(bits(folder), bits(own))
+    assert_same_bits(bits(folder), bits(own))
     assert values[found.chosen] == alone.curve[6].psnr_val
     assert [point.psnr_val for point in record.curve] == [point.psnr_val for point in alone.curve]
     others = sum(one.seconds for one in found.candidates if one.name != found.chosen)
@@ -82,17 +82,8 @@ def test_a_kill_repeats_no_step(
 ) -> None:
     """Catches a candidate that is trained again, a lost choice, and other bits: killed after every few saves."""
     steps = counted_steps(monkeypatch)
-    kills = killed_after(saves, monkeypatch)
-    attempts = 0
-    while True:
-        attempts += 1
-        kills.clear()
-        try:
-            record, folder = run_here(*overrides(square, tmp_path, *COMPARED))
-            break
-        except Killed:
-            continue
-    assert attempts > 1
+    again = overrides(square, tmp_path, *COMPARED)
+    record, folder = run_through_kills(saves, monkeypatch, lambda: run_here(*again))
     assert steps["all"] == 3 * UNTIL + STEPS
     mine, theirs = comparison_in(record), comparison_in(whole[0])
     assert [(one.name, one.psnr_val) for one in mine.candidates] == [
@@ -100,7 +91,7 @@ def test_a_kill_repeats_no_step(
     ]
     assert mine.chosen == theirs.chosen
     assert record.metrics == whole[0].metrics
-    assert_equal(bits(folder), bits(whole[1]))
+    assert_same_bits(bits(folder), bits(whole[1]))
     assert not (folder / FOLDER).exists()
     assert [json.loads(line)["iteration"] for line in (folder / "curve.jsonl").read_text().splitlines()] == [
         point.iteration for point in record.curve

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from interrupted import Killed, assert_equal, bits, counted_steps, killed_after
+from interrupted import assert_same_bits, bits, counted_steps, run_through_kills
 from tiny_run import overrides, run_here, write_moving_square
 
 from gsbench.config import Config
@@ -67,7 +67,7 @@ def test_the_best_length_on_val_is_kept_with_its_own_bits(
     assert "the training of 20 iterations is kept" in capsys.readouterr().err
     alone, own = run_here(*overrides(square, tmp_path / "alone", *OTHERS, "train.iterations=20"))
     assert record.metrics == alone.metrics
-    assert_equal(bits(folder), bits(own))
+    assert_same_bits(bits(folder), bits(own))
     assert [point.psnr_val for point in record.curve] == [point.psnr_val for point in alone.curve]
     assert found.tried[1].psnr_val == alone.curve[-1].psnr_val
     others = found.tried[0].seconds + found.tried[2].seconds
@@ -106,22 +106,15 @@ def test_the_longest_is_kept_if_each_is_better(square: Path, tmp_path: Path, mon
 def test_a_kill_repeats_no_step(saves: int, square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a length that is trained again, a lost choice, and other bits: killed after every few saves."""
     whole, unbroken = run_here(*overrides(square, tmp_path / "whole", *RUN))
-    steps, kills, attempts = counted_steps(monkeypatch), killed_after(saves, monkeypatch), 0
-    while True:
-        attempts += 1
-        kills.clear()
-        try:
-            record, folder = run_here(*overrides(square, tmp_path, *RUN))
-            break
-        except Killed:
-            continue
-    assert attempts > 1
+    steps = counted_steps(monkeypatch)
+    again = overrides(square, tmp_path, *RUN)
+    record, folder = run_through_kills(saves, monkeypatch, lambda: run_here(*again))
     assert steps["all"] == 10 + 20 + 40
     assert [(one.name, one.psnr_val) for one in choice_in(record).tried] == [
         (one.name, one.psnr_val) for one in choice_in(whole).tried
     ]
     assert record.metrics == whole.metrics
-    assert_equal(bits(folder), bits(unbroken))
+    assert_same_bits(bits(folder), bits(unbroken))
     assert not (folder / FOLDER).exists()
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from forked import Forked
+from interrupted import assert_same_bits
 from tiny_run import gsbench, overrides, run_here, write_moving_square
 
 from gsbench.errors import InputError
@@ -49,24 +50,6 @@ def final_state(results: Path) -> dict[str, object]:
 
 def comparable_state(results: Path) -> object:
     return checkpoint.without_times(final_state(results))
-
-
-def assert_same_bits(a: object, b: object, where: str = "state") -> None:
-    if isinstance(a, torch.Tensor):
-        assert isinstance(b, torch.Tensor)
-        assert a.shape == b.shape, where
-        assert torch.equal(a, b), where
-    elif isinstance(a, dict):
-        assert isinstance(b, dict)
-        assert a.keys() == b.keys(), where
-        for key in a:
-            assert_same_bits(a[key], b[key], f"{where}.{key}")
-    elif isinstance(a, list):
-        assert isinstance(b, list)
-        for i, (x, y) in enumerate(zip(a, b, strict=True)):
-            assert_same_bits(x, y, f"{where}[{i}]")
-    else:
-        assert a == b, where
 
 
 def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, whole: Path, tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 import torch
-from test_resume import assert_same_bits, comparable_state
+from interrupted import assert_same_bits
+from test_resume import comparable_state
 from tiny_run import command, environment
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode

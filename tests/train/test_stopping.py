@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_resume import assert_same_bits
+from interrupted import assert_same_bits
 from test_wiring import trainer
 
 from gsbench.errors import InputError
