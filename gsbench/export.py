@@ -16,12 +16,14 @@ from gsbench.models.registry import import_models
 from gsbench.run.checks import check_device, evaluated_views
 from gsbench.run.load import LoadedRun, load_run, scene_of
 from gsbench.scenes import Camera, Scene, View
+from gsbench.scenes.placement import gaussians_to_user
 from gsbench.scenes.trained import ply_of
 from gsbench.view import film, paths, sequence
 from gsbench.view.gaussians import trained_of
 
 PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
 MOST_FRAMES = 100_000
+MOST_STEP = 1e-4  # of the cameras' distance: a pixel is 1e-3 of it; larger roundings of means are told
 MOST_SIDE = 16_384  # pixels of a rendered image, before --supersample reduces it
 
 
@@ -143,7 +145,7 @@ def write_ply(asked: ExportRequest, path: Path) -> list[str]:
     """Write a model's 3D Gaussians for one camera and time as a PLY file; return their number, time and colours."""
     run, options = asked.run, asked.options
     query, keep = slice_place(asked, options.time)
-    trained = trained_of(run.model, query, keep_harmonics=keep)
+    trained = gaussians_to_user(trained_of(run.model, query, keep_harmonics=keep), run.scene.placement)
     write_atomically(path, ply_of(trained))
     culled = len(run.model) - len(trained)
     when = "" if query.time is None else f" at time {float(query.time):g}"
@@ -156,7 +158,7 @@ def write_sequence(asked: ExportRequest, folder: Path) -> list[str]:
     """Write a PLY file for each time of a clip, as one camera sees it; return their names, numbers and colours."""
     places = [slice_place(asked, time) for time in paths.times(frame_count(asked.options))]
     keep = places[0][1]
-    written = sequence.write_plys(asked.run.model, [query for query, _ in places], folder, keep_harmonics=keep)
+    written = sequence.write_plys(asked.run, [query for query, _ in places], folder, keep_harmonics=keep)
     said = [f"{folder}: {written.paths[0].name} to {written.paths[-1].name} at times 0 to 1, {min(written.counts)} to "
             f"{max(written.counts)} Gaussians each, colours {colours(asked, keep)}"]  # fmt: skip
     return said + differences(asked, folder, written.from_profiles)
@@ -173,6 +175,10 @@ def colours(asked: ExportRequest, keep: bool) -> str:
 def differences(asked: ExportRequest, path: Path, from_profiles: bool) -> list[str]:
     """Say in what the Gaussians of a PLY differ from the model's, as the format of 3DGS has no field for it."""
     said = []
+    step = asked.run.scene.placement.float_step
+    if step > MOST_STEP:
+        said += [f"{path}: so far from the origin, single precision moves means by up to {step:.1%} of the cameras' "
+                 f"distance: subtract an offset from your poses if the picture is not sharp"]  # fmt: skip
     if from_profiles:
         said += [f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of "
                  f"3DGS has no field for b; --images and --video keep the profiles"]  # fmt: skip

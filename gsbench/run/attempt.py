@@ -52,6 +52,8 @@ class Attempt:
         self.model = build(config)
         self.start = trained_start(config)
         self.scene = scene = load_scene(config)
+        for note in scene.notes:
+            print(f"{scene.name}: {note}", file=sys.stderr)
         if is_auto(self.this.config) and not scene.has_time:
             self.resolved = Resolved(config := with_candidate(self.this.config, "static"))
             self.model = build(config)
@@ -156,6 +158,7 @@ class Attempt:
                 "paper_dataset": config.data.paper_dataset,
                 **{key: value for key in ("resize", "val_every") if (value := getattr(config.scene, key)) is not None},
                 **({"repaired": ", ".join(scene.repaired)} if scene and scene.repaired else {}),
+                **({"notes": list(scene.notes)} if scene and scene.notes else {}),
             },
             provenance=provenance(
                 config=this.plain,

@@ -18,13 +18,17 @@ from gsbench.run.checks import evaluated_views
 from gsbench.run.identity import Run
 from gsbench.run.load import plain_description
 from gsbench.scenes import Points, Scene
-from gsbench.scenes.points import frustum_points, random_points
+from gsbench.scenes.placement import gaussians_to_standard
+from gsbench.scenes.points import frustum_points, random_points, share_seen
+from gsbench.scenes.scene import STANDARD
 from gsbench.scenes.trained import TrainedGaussians
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer
 from gsbench.train.seeding import generator
+
+LEAST_SEEN = 0.25  # share of random initial points that cameras must see; others are never trained
 
 
 class NoGaussianError(InputError):
@@ -42,7 +46,7 @@ def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: Traine
     """
     random = generator(config.seed)
     if start is not None:
-        start_from(model, start, scene.extent, random)
+        start_from(model, gaussians_to_standard(start, scene.placement), scene.extent, random)
     else:
         model.initialise(scene.points or initial_points(config.data, scene, random), scene.extent, random)
     model.to(config.device)
@@ -141,8 +145,22 @@ def _check_fitted(trainer: Trainer) -> None:
 
 
 def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:
-    """Sample initial points for a data set without points, in a cube or in the frustum that all cameras share."""
-    if data.initial_half_width is not None:
-        return random_points(data.initial_points, data.initial_half_width, random)
+    """Sample initial points for a data set without points, in a cube or in the frustum that all cameras share.
+
+    The share of the points that at least one training camera sees is printed.
+
+    Raises:
+        InputError: cameras see too few of the points.
+    """
     cameras = [view.to("cpu").camera for view in scene.train]
-    return frustum_points(data.initial_points, cameras, scene.extent, random)
+    if data.initial_half_width is None:
+        return frustum_points(data.initial_points, cameras, scene.extent, random)
+    points = random_points(data.initial_points, data.initial_half_width, random)
+    share = share_seen(points, cameras)
+    where = f"{data.initial_points} initial points in a cube of half width {data.initial_half_width:g}"
+    if share < LEAST_SEEN:
+        raise InputError(f"{scene.name}: expected {where}, of which cameras see at least {LEAST_SEEN:.0%}, they see "
+                         f"{share:.1%}: set data.initial_half_width (cameras are {STANDARD:g} away from what they look "
+                         f"at), or null for points that all cameras see")  # fmt: skip
+    print(f"{scene.name}: {where}; {share:.0%} are seen by at least one camera", file=sys.stderr)
+    return points

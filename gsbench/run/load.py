@@ -15,7 +15,7 @@ from gsbench.models.registry import is_registered
 from gsbench.run.checks import PACKAGE, check_scene_names, check_values
 from gsbench.run.setup import build_with_placeholders, load_scene
 from gsbench.scenes import Scene
-from gsbench.scenes.scene import UP
+from gsbench.scenes.scene import UP, Placement
 from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
 
@@ -36,13 +36,22 @@ class SceneDescription:
     width: int  # of the first training view, pixels
     height: int
     up: list[float] = field(default_factory=lambda: list(UP))  # Scene.up; older checkpoints have none
+    center: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])  # of Scene.placement; older ones have none
+    unit: float = 1.0  # of Scene.placement
 
     @classmethod
     def of(cls, scene: Scene) -> "SceneDescription":
         """Return the description of a loaded scene."""
         camera = scene.train[0].camera
         return cls(scene.name, scene.fingerprint, scene.extent, list(scene.background), scene.has_time,
-                   camera.width, camera.height, list(scene.up))  # fmt: skip
+                   camera.width, camera.height, list(scene.up), list(scene.placement.center),
+                   scene.placement.unit)  # fmt: skip
+
+    @property
+    def placement(self) -> Placement:
+        """Return where the scene lies in the user's coordinates."""
+        x, y, z = self.center
+        return Placement((x, y, z), self.unit)
 
 
 @dataclass(frozen=True)
@@ -124,6 +133,9 @@ def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
     if scene.fingerprint != run.scene.fingerprint:
         raise InputError(f"{run.scene.name} in {config.data.root}: expected the data of the training, found others: "
                          f"name the right folder by --data-root")  # fmt: skip
+    if scene.placement != run.scene.placement:
+        raise InputError(f"{run.folder}: expected a run trained at {scene.placement}, where this gsbench places "
+                         f"{run.scene.name}, got one trained at {run.scene.placement}: train it again")  # fmt: skip
     return scene
 
 
@@ -140,7 +152,7 @@ def own_root(root: str, where: Path) -> str:
 
 
 def _check_scene(scene: SceneDescription, path: Path) -> None:
-    """Raise InputError if a scene description has an invalid image size, extent, background or up vector."""
+    """Raise InputError if a scene description has an invalid image size, extent, background, up vector or placement."""
     sizes = 0 < scene.width <= MOST_PIXELS and 0 < scene.height <= MOST_PIXELS
     if not sizes or not 0 < scene.extent < LARGEST_EXTENT:
         raise InputError(f"{path}: scene: expected 1 to {MOST_PIXELS} pixels a side and a positive extent, got "
@@ -151,6 +163,10 @@ def _check_scene(scene: SceneDescription, path: Path) -> None:
         )
     if len(scene.up) != 3 or abs(math.hypot(*scene.up) - 1) > 1e-6:
         raise InputError(f"{path}: scene: expected a unit vector up, got {scene.up!r:.80}")
+    if len(scene.center) != 3 or not all(abs(x) <= LARGEST_EXTENT for x in scene.center):
+        raise InputError(f"{path}: scene: expected a center of three finite numbers, got {scene.center!r:.80}")
+    if not 1 / LARGEST_EXTENT <= scene.unit <= LARGEST_EXTENT:
+        raise InputError(f"{path}: scene: expected a positive unit, got {scene.unit!r:.80}")
 
 
 def plain_description(scene: Scene) -> dict[str, Any]:

@@ -16,7 +16,8 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.reading import MAX_JSON, parse_json, read_file
 from gsbench.scenes import files, images
-from gsbench.scenes.scene import Camera, Scene, View, scene_extent
+from gsbench.scenes.placement import standard_scene
+from gsbench.scenes.scene import Camera, Scene, View
 
 _RIGID_TOLERANCE = 1e-4  # D-NeRF writes single precision: its trex is orthonormal to 2.2e-6
 _SMALLEST = 1e-6  # pixels; smaller lengths become zero in single precision
@@ -59,7 +60,7 @@ class _Frame:
     name: str  # relative to the scene's folder: "train/r_000.png"
     where: str  # the image's path and the field that names it, for messages
     time: float | None
-    viewmat: Tensor  # [4, 4] float32
+    viewmat: Tensor  # [4, 4] float64
 
 
 @dataclass(frozen=True)
@@ -97,13 +98,12 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
     _check_times(splits)
     views, digests = _read_views(root, splits, downscale, background, resize)
     digests |= {split.source.name: split.digest for split in splits.values()}
-    return Scene(
+    return standard_scene(
         name=name,
         train=views["train"],
         val=views.get("val", []),
         test=views["test"],
         background=background,
-        extent=scene_extent(torch.stack([view.camera.viewmat for view in views["train"]])),
         points=None,
         fingerprint=files.fingerprint(digests),
     )
@@ -172,7 +172,7 @@ def _read_frame(root: Path, frame: object, source: Path, index: int) -> _Frame:
 def _viewmat(
     matrix: object,  # [4, 4] nested lists: camera to world, OpenGL axes (x right, y up, z backward)
     where: str,
-) -> Tensor:  # [4, 4] float32: world to camera, OpenCV axes (x right, y down, z forward)
+) -> Tensor:  # [4, 4] float64: world to camera, OpenCV axes (x right, y down, z forward)
     """Convert a camera-to-world matrix in OpenGL axes to a world-to-camera matrix in OpenCV axes.
 
     Raises:
@@ -196,7 +196,7 @@ def _viewmat(
     viewmat = np.eye(4)
     viewmat[:3, :3] = turned.T
     viewmat[:3, 3] = -turned.T @ c2w[:3, 3]
-    return torch.from_numpy(viewmat.astype(np.float32))
+    return torch.from_numpy(viewmat)
 
 
 def _check_times(splits: dict[str, _Split]) -> None:

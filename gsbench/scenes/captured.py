@@ -16,7 +16,8 @@ from gsbench.errors import InputError
 from gsbench.reading import read_file
 from gsbench.scenes import colmap, files, images
 from gsbench.scenes.lens import Lens
-from gsbench.scenes.scene import Camera, Scene, View, hold_out, scene_extent, up_of
+from gsbench.scenes.placement import standard_scene
+from gsbench.scenes.scene import Camera, Scene, View, hold_out
 
 HELD_OUT = 8  # every eighth view in the order of time is a test view
 IMAGES, MASKS, TIMES = "images", "masks", "times.csv"
@@ -34,7 +35,7 @@ class _Shot:
     name: str  # relative to the folder of the images, without suffix
     where: str  # the path and the file that names it, for messages
     time: float | None
-    viewmat: Tensor  # [4, 4] float32
+    viewmat: Tensor  # [4, 4] float64
     lens: Lens
 
 
@@ -65,17 +66,15 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
     digests |= digests_of_images
     digests |= {part.path.relative_to(root).as_posix(): files.digest(part.data) for part in (cameras, posed, points)}
     train, test = hold_out(views, HELD_OUT)
-    viewmats = torch.stack([view.camera.viewmat for view in train])
-    return Scene(
+    return standard_scene(
         name=name,
         train=train,
         val=[],
         test=test,
         background=background,
-        extent=scene_extent(viewmats),
         points=initial,
         fingerprint=files.fingerprint(digests),
-        up=up_of(viewmats),
+        up=None,
     )
 
 
@@ -96,7 +95,7 @@ def _list_shots(root: Path, posed: colmap.ModelFile, lenses: dict[int, Lens]) ->
         name = PurePosixPath(image.name).with_suffix(".png") if PurePosixPath(image.name).name else ""
         path = _find_image(root, image.name, str(name), where)
         mask = files.find_inside(root, f"{MASKS}/{name}", where) if (root / MASKS).is_dir() else None
-        viewmat = torch.from_numpy(image.viewmat.astype(np.float32))
+        viewmat = torch.from_numpy(image.viewmat)
         named_by = f"{path} (named {image.name[:80]!a} in {posed.path.name})"
         shots.append(_Shot(path, mask, str(name).removesuffix(".png"), named_by, time, viewmat, lenses[image.camera]))
     digests = {} if given is None else {TIMES: files.digest(given)}

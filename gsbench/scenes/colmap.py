@@ -108,7 +108,7 @@ def read_images(file: ModelFile) -> list[PosedImage]:
 
 
 def read_points(file: ModelFile) -> Points:
-    """Return positions and colours of the points of a model.
+    """Return positions (float64) and colours of the points of a model.
 
     Raises:
         InputError: the file is damaged or has no points.
@@ -122,8 +122,8 @@ def read_points(file: ModelFile) -> Points:
         raise InputError(f"{path}: expected finite positions, some are not")
     if values[:, 3:].min() < 0 or values[:, 3:].max() > 255:
         raise InputError(f"{path}: expected colours from 0 to 255, some are outside")
-    tensor = torch.from_numpy(values.astype(np.float32))
-    return Points(tensor[:, :3].contiguous(), tensor[:, 3:] / 255)
+    colors = torch.from_numpy(values[:, 3:].astype(np.float32)) / 255
+    return Points(torch.from_numpy(values[:, :3].copy()), colors)
 
 
 def _lens(model: str, width: int, height: int, values: tuple[float, ...], where: str) -> Lens:

@@ -20,6 +20,7 @@ SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic Y_00; 3DGS: 
 
 _POINT = 100  # least number of bytes that a point needs while it is drawn or its neighbours are searched
 NEAREST, FARTHEST = 2.0, 100.0  # range of depths of points in a frustum, in units of the radius of the cameras
+FAR = 4.0  # distance from the middle, beyond which a point lies far outside; three quarters of the points lie within 1
 ROUNDS = 50  # largest number of rounds in which points in a frustum are drawn
 
 _MIN_SQUARED_DISTANCE = 1e-7  # 3DGS, create_from_pcd: clamp_min(distCUDA2, 1e-7), so that log(scale) stays finite
@@ -65,7 +66,8 @@ def frustum_points(count: int, cameras: Sequence[Camera], radius: float, generat
         inside = depth[:, None] * (K.inverse()[chosen] @ pixel[:, :, None])[..., 0]  # [count, 3] in the camera
         rotation, translation = viewmats[chosen, :3, :3], viewmats[chosen, :3, 3]
         points = (rotation.mT @ (inside - translation)[:, :, None])[..., 0]
-        found = torch.cat([found, points[_seen_by_all(points, K, viewmats, size)]])
+        seen = torch.stack([is_seen(points, camera) for camera in cameras]).all(0)
+        found = torch.cat([found, points[seen]])
         if len(found) >= count:
             colors = 0.5 + SH_C0 * torch.rand(count, 3, generator=generator) / 255
             return Points(found[:count].contiguous(), colors)
@@ -73,18 +75,26 @@ def frustum_points(count: int, cameras: Sequence[Camera], radius: float, generat
                      f"{ROUNDS * count} random points are seen by all: set data.initial_half_width")  # fmt: skip
 
 
-def _seen_by_all(points: Tensor, K: Tensor, viewmats: Tensor, size: Tensor) -> Tensor:
-    """Return which of the points [P, 3] are inside the images of all cameras, [P] bool."""
-    seen = torch.ones(len(points), dtype=torch.bool)
-    for camera, viewmat, extent in zip(K, viewmats, size, strict=True):
-        x = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ camera.T
-        pixel = x[:, :2] / x[:, 2:]
-        seen &= (x[:, 2] > 0) & (pixel >= 0).all(1) & (pixel <= extent).all(1)
-    return seen
+def is_seen(
+    points: Tensor,  # [P, 3] in the dtype of the camera
+    camera: Camera,
+) -> Tensor:  # [P] bool
+    """Return which points are inside the image of a camera."""
+    x = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.to(points).T
+    pixel = x[:, :2] / x[:, 2:]
+    return (x[:, 2] > 0) & (pixel >= 0).all(1) & (pixel <= pixel.new_tensor([camera.width, camera.height])).all(1)
+
+
+def share_seen(points: Points, cameras: Sequence[Camera]) -> float:
+    """Return the share of points that are inside the image of at least one camera."""
+    seen = torch.zeros(len(points.means), dtype=torch.bool)
+    for camera in cameras:
+        seen |= is_seen(points.means, camera)
+    return float(seen.float().mean())
 
 
 def read_ply(path: str | Path) -> Points:
-    """Read positions and colours of points from a PLY file with `x y z` and `red green blue`, or `f_dc_0..2` of 3DGS.
+    """Read positions (float64) and colours of points from a PLY with `x y z` and `red green blue` or `f_dc_0..2`.
 
     Integer colours are divided by the largest value of their type. Colours from `f_dc_0..2` are clamped to [0, 1].
 
@@ -103,7 +113,7 @@ def read_ply(path: str | Path) -> Points:
             raise InputError(f"{path}: red green blue: expected uchar 0..255 or float 0..1, some are outside")
     else:
         colors = (0.5 + SH_C0 * _columns(vertices, ("f_dc_0", "f_dc_1", "f_dc_2"), path)).clip(0, 1)
-    return Points(_tensor(means), _tensor(colors))
+    return Points(torch.from_numpy(means), torch.from_numpy(colors.astype(np.float32)))
 
 
 def nearest_distances(
@@ -134,10 +144,24 @@ def nearest_distances(
 def size_of(points: Points) -> float:
     """Return the size of a scene in world units: the standard deviation of the points, averaged over the axes x, y, z.
 
-    The size of a single point is 1.
+    Points that lie far outside do not count. The size of a single point is 1.
     """
-    size = float(points.means.std(0).mean()) if len(points.means) > 1 else 0.0
+    means = points.means[~far_outside(points.means)]
+    size = float(means.std(0).mean()) if len(means) > 1 else 0.0
     return size if 0 < size < math.inf else 1.0
+
+
+def far_outside(
+    means: Tensor,  # [P, 3]
+) -> Tensor:  # [P] bool
+    """Return which points lie far outside: over FAR times as far from the median as three quarters of the points.
+
+    Structure from motion places some points at a random depth. No point of a cube or of a normal distribution is far
+    outside.
+    """
+    distances = (means.double() - means.double().median(0).values).norm(dim=1)
+    within = distances.kthvalue(max(1, math.ceil(0.75 * len(distances)))).values
+    return distances > FAR * within if within > 0 else torch.zeros_like(distances, dtype=torch.bool)
 
 
 def _columns(vertices: NDArray[np.void], names: tuple[str, str, str], path: str | Path) -> NDArray[np.float64]:
@@ -149,7 +173,3 @@ def _columns(vertices: NDArray[np.void], names: tuple[str, str, str], path: str 
     if not (np.abs(columns) <= np.finfo(np.float32).max).all():
         raise InputError(f"{path}: {' '.join(names)}: expected finite numbers, some are not")
     return columns
-
-
-def _tensor(values: NDArray[np.float64]) -> Tensor:
-    return torch.from_numpy(values.astype(np.float32))

@@ -8,6 +8,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 
 UP = (0.0, 0.0, 1.0)  # in Blender's layout: D-NeRF, 7DGS-PBR, the embedded scenes
+STANDARD = 4.0  # the distance of cameras from what they look at, in the coordinates of a training; D-NeRF's
 _LEAN = 0.01  # weight of the mean up vector against cameras without roll: decides where these leave a choice
 
 
@@ -93,6 +94,48 @@ class Points:
 
 
 @dataclass(frozen=True)
+class Placement:
+    """Where a scene lies: a position x in the user's coordinates is `(x - center) / unit` in those of the training."""
+
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)  # in the user's coordinates
+    unit: float = 1.0  # in the user's units
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether the scene is trained where its files place it."""
+        return self == Placement()
+
+    @property
+    def float_step(self) -> float:
+        """Return the distance of neighbouring floats at the scene, in units of the cameras' distance."""
+        return 2**-23 * max(map(abs, self.center)) / (self.unit * STANDARD)
+
+    def to_standard(
+        self,
+        positions: Tensor,  # [.., 3] in the user's coordinates
+    ) -> Tensor:  # [.., 3] float32
+        """Convert positions to the coordinates of the training; the difference is taken in double precision."""
+        return ((positions.double() - positions.new_tensor(self.center, dtype=torch.float64)) / self.unit).float()
+
+    def to_user(
+        self,
+        positions: Tensor,  # [.., 3] in the coordinates of the training
+    ) -> Tensor:  # [.., 3] float64
+        """Convert positions to the user's coordinates."""
+        return positions.double() * self.unit + positions.new_tensor(self.center, dtype=torch.float64)
+
+    def viewmat_to_standard(
+        self,
+        viewmat: Tensor,  # [4, 4] float64, world to camera in the user's coordinates
+    ) -> Tensor:  # [4, 4] float32
+        """Convert a world-to-camera matrix: its rotation stays, and the camera moves as positions do."""
+        moved = viewmat.double().clone()
+        moved[:3, 3] += moved[:3, :3] @ moved.new_tensor(self.center)
+        moved[:3, 3] /= self.unit
+        return moved.float()
+
+
+@dataclass(frozen=True)
 class Scene:
     """A data set of one scene: training, validation and test views, background colour, extent and initial points."""
 
@@ -106,6 +149,8 @@ class Scene:
     fingerprint: str  # SHA-256 of the files, by which record.json identifies the data
     repaired: tuple[str, ...] = ()  # names of damaged images that were replaced by the frame before
     up: tuple[float, float, float] = UP  # unit vector; orbits and the viewer turn about it, training does not read it
+    placement: Placement = Placement()  # from the user's coordinates to those of `train`, `points` and `extent`
+    notes: tuple[str, ...] = ()  # what was read in a way that the user should know, a line each
 
     @property
     def has_time(self) -> bool:

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from gsbench.errors import InputError
 from gsbench.reading import read_file
 from gsbench.scenes import colmap, files, images
+from gsbench.scenes.placement import standard_scene
 from gsbench.scenes.points import read_ply
-from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent, up_of
+from gsbench.scenes.scene import Camera, Points, Scene, View
 
 CAMERAS = "cameras_parameters.txt"
 COLUMNS = ("f", "cu", "cv", "ar", "sk", "qw", "qx", "qy", "qz", "tx", "ty", "tz")  # intrinsics, rotation, translation
@@ -78,18 +79,16 @@ def load(
     digests[CAMERAS] = files.digest(text)
     train = [view for image, view in zip(listed, views, strict=True) if image.camera != TEST_CAMERA]
     test = [view for image, view in zip(listed, views, strict=True) if image.camera == TEST_CAMERA]
-    viewmats = torch.stack([view.camera.viewmat for view in train])
-    return Scene(
+    return standard_scene(
         name=root.name,
         train=train,
         val=[],
         test=test,
         background=background,
-        extent=scene_extent(viewmats),
         points=_points(root),
         fingerprint=files.fingerprint(digests),
         repaired=tuple(image.path.stem for image in replaced),
-        up=up_of(viewmats),
+        up=None,
     )
 
 
@@ -136,7 +135,7 @@ def _camera(row: dict[str, float], width: int, height: int, downscale: int) -> C
     viewmat[:3, 3] = torch.tensor([row["tx"], row["ty"], row["tz"]], dtype=torch.float64)
     s = 1 / downscale
     K = torch.tensor([[row["f"] * s, 0, row["cu"] * s], [0, row["f"] * row["ar"] * s, row["cv"] * s], [0, 0, 1]])
-    return Camera(viewmat.float(), K, width, height)
+    return Camera(viewmat, K, width, height)
 
 
 def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> list[_Image]:

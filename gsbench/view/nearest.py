@@ -20,7 +20,7 @@ class Nearest(NamedTuple):
     """The training view nearest to a camera, with its distance and its angle from the camera."""
 
     view: View
-    distance: float  # world units
+    distance: float  # in the user's units
     degrees: float  # angle between the view directions
 
 
@@ -39,7 +39,7 @@ class TrainingViews:
 
     def __init__(self, scene: Scene) -> None:
         """Store the cameras and the times of a scene's training views; no image is read."""
-        self._views, self._extent = scene.train, max(scene.extent, 1e-12)
+        self._views, self._extent, self._unit = scene.train, max(scene.extent, 1e-12), scene.placement.unit
         cameras = [view.camera.to("cpu") for view in scene.train]
         self._centers = torch.stack([camera.center for camera in cameras])  # [V, 3]
         self._forwards = torch.stack([camera.viewmat[2, :3] for camera in cameras])  # [V, 3]
@@ -59,7 +59,7 @@ class TrainingViews:
         far = distances / self._extent + angles
         away = (self._times - (time or 0.0)).abs()
         best = int(torch.where(far <= far.min() + SAME, away, math.inf).argmin())
-        return Nearest(self._views[best], float(distances[best]), math.degrees(angles[best]))
+        return Nearest(self._views[best], float(distances[best]) * self._unit, math.degrees(angles[best]))
 
 
 def compare(renderer: FrameRenderer, view: View, request: FrameRequest) -> ViewComparison:

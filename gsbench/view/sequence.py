@@ -8,9 +8,9 @@ from tqdm import tqdm
 
 from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
-from gsbench.models.base import GaussianModel
 from gsbench.models.query import Query
 from gsbench.run.load import LoadedRun
+from gsbench.scenes.placement import gaussians_to_user
 from gsbench.scenes.trained import PLY_ROW, ply_of
 from gsbench.view.film import check_parent
 from gsbench.view.gaussians import check_harmonics, drawn, trained_of
@@ -52,13 +52,13 @@ def names(count: int) -> list[str]:
     return [f"frame{i:0{digits}d}.ply" for i in range(count)]
 
 
-def write_plys(model: GaussianModel, queries: list[Query], folder: Path, *, keep_harmonics: bool) -> PlySequence:
+def write_plys(run: LoadedRun, queries: list[Query], folder: Path, *, keep_harmonics: bool) -> PlySequence:
     """Write a PLY file of 3DGS for each query as frame0000.ply, frame0001.ply and so on into an empty or new folder.
 
     If this fails, the files that were written are removed. A progress bar is shown on stderr.
 
     Args:
-        model: the initialised model.
+        run: the loaded run.
         queries: the camera centre and the time of each file, at least two.
         folder: the folder; it is made if its parent exists.
         keep_harmonics: as for `trained_of`.
@@ -68,6 +68,7 @@ def write_plys(model: GaussianModel, queries: list[Query], folder: Path, *, keep
             folder has files.
     """
     check_folder(folder)
+    model = run.model
     check_harmonics(model, keep_harmonics)
     counts = [int(drawn(model.slice(query)).sum()) for query in queries]
     if 0 in counts:
@@ -84,7 +85,7 @@ def write_plys(model: GaussianModel, queries: list[Query], folder: Path, *, keep
     folder.mkdir(exist_ok=True)
     try:
         for query, path in zip(tqdm(queries, desc=folder.name, unit="file"), paths, strict=True):
-            trained = trained_of(model, query, keep_harmonics=keep_harmonics)
+            trained = gaussians_to_user(trained_of(model, query, keep_harmonics=keep_harmonics), run.scene.placement)
             profiles = trained.from_profiles
             write_atomically(path, ply_of(trained))
     except BaseException:

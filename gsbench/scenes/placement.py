@@ -1,0 +1,190 @@
+"""Bring a scene to a standard place and size when it is loaded, and convert Gaussians from and to the user's units.
+
+Positions in single precision, the near plane, random initial points and the inputs of networks all suppose a scene that
+lies around the origin, with cameras at a distance of about four. D-NeRF, NeRF-synthetic and 7DGS-PBR are such scenes,
+and stay as they are, to the last bit.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsbench.errors import InputError
+from gsbench.scenes.points import far_outside, is_seen
+from gsbench.scenes.scene import STANDARD, UP, Camera, Placement, Points, Scene, View, scene_extent, up_of
+from gsbench.scenes.trained import TrainedGaussians
+
+_SIZE_TOLERANCE = math.sqrt(2)  # a scene keeps its size if that differs by at most this factor ..
+_PLACE_TOLERANCE = 0.25  # .. and its place if cameras look at a point so near to the origin, in units of the size
+_PULL = 1e-4  # weight of the cameras' middle against their axes: decides where parallel axes leave a choice
+_ROUNDS = 30  # of reweighted least squares
+_AHEAD = 0.5  # cosine between a camera's axis and the common point, above which the camera looks at the point
+_FAR_CAMERA = 5.0  # in units of the size and of the cameras' spread: a camera farther away has a wrong pose
+_MOST_PAIRS = 1 << 22  # of points and cameras whose depths are computed
+
+
+def standard_scene(
+    *,
+    name: str,
+    train: list[View],
+    val: list[View],
+    test: list[View],
+    background: tuple[float, float, float],
+    points: Points | None,
+    fingerprint: str,
+    repaired: tuple[str, ...] = (),
+    up: tuple[float, float, float] | None = UP,
+    notes: tuple[str, ...] = (),
+) -> Scene:
+    """Return a scene whose cameras and points are in single precision, in the standard place and size.
+
+    Args:
+        name: the name of the scene.
+        train: the training views, with viewmats in float64 in the user's coordinates.
+        val: the validation views.
+        test: the test views.
+        background: the background colour.
+        points: the data set's own points in float64, in the user's coordinates; None if it has none.
+        fingerprint: the SHA-256 of the files.
+        repaired: the names of damaged images that were replaced.
+        up: which way is up; None: it is estimated from the cameras.
+        notes: what the reader tells about the files, a line each.
+
+    Raises:
+        InputError: the positions of the cameras are too large for a float.
+    """
+    viewmats = np.stack([view.camera.viewmat.numpy() for view in train])
+    centers = -np.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[..., 0]  # [C, 3]
+    axes = viewmats[:, 2, :3] / np.linalg.norm(viewmats[:, 2, :3], axis=1, keepdims=True)
+    middle, size = place_and_size(centers, axes, _seen_points(train, points))
+    placement = _placement(middle, size)
+    # The views of an array share their cameras.
+    cameras = {id(view.camera): _placed(view.camera, placement) for view in (*train, *val, *test)}
+    train, val, test = (
+        [replace(view, camera=cameras[id(view.camera)]) for view in views] for views in (train, val, test)
+    )
+    moved = torch.stack([view.camera.viewmat for view in train])
+    is_near = torch.from_numpy(_are_near(centers, size))
+    if not placement.is_identity:
+        notes = (*notes, f"trained in units of {placement.unit:g} around {_text(placement.center)}, where the "
+                         f"cameras look; PLY files and positions stay in your coordinates")  # fmt: skip
+    if not is_near.all():
+        notes = (*notes, f"{int((~is_near).sum())} of {len(train)} training cameras lie far from the others, over "
+                         f"{_FAR_CAMERA:g} times their distance: are their poses right? They do not count for the "
+                         f"size of the scene")  # fmt: skip
+    if points is not None:
+        points = Points(placement.to_standard(points.means), points.colors.float())
+        far = int(far_outside(points.means).sum())
+        if far:
+            notes = (*notes, f"{far} of {len(points.means)} points lie far outside, and do not count for its size")
+    return Scene(
+        name=name,
+        train=train,
+        val=val,
+        test=test,
+        background=background,
+        extent=scene_extent(moved[is_near]),
+        points=points,
+        fingerprint=fingerprint,
+        repaired=repaired,
+        up=up_of(moved) if up is None else up,
+        placement=placement,
+        notes=notes,
+    )
+
+
+def place_and_size(
+    centers: NDArray[np.float64],  # [C, 3] positions of the cameras
+    axes: NDArray[np.float64],  # [C, 3] unit vectors in which they look
+    seen: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,  # [S, 3] points that they see, [S] depths
+) -> tuple[NDArray[np.float64], float]:
+    """Return the point that cameras look at, [3], and the median distance of the cameras from it.
+
+    The point has the smallest sum of distances to the cameras' axes, so a few wrong poses do not move it. Cameras of an
+    array have parallel axes, and those of a room look outwards: then the point is the median of the points that they
+    see, and the distance is the median depth. Without points, content is taken to lie at four times the spread of the
+    cameras. The distance is 0 if all cameras are at one place and there are no points.
+    """
+    middle = np.median(centers, axis=0)
+    spread = float(np.median(np.linalg.norm(centers - middle, axis=1)))
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3] take away what lies along an axis
+    target, weights = middle, np.ones(len(centers))
+    for _ in range(_ROUNDS):  # sums of distances, not of their squares: iteratively reweighted least squares
+        weighted = weights[:, None, None] * across
+        pull = _PULL * weights.sum()
+        left = weighted.sum(0) + pull * np.eye(3)
+        target = middle + np.linalg.solve(left, (weighted @ (centers - middle)[:, :, None]).sum(0)[:, 0])
+        offsets = target - centers
+        away = np.linalg.norm(across @ offsets[:, :, None], axis=(1, 2))
+        weights = 1 / np.maximum(away, 1e-3 * np.median(np.linalg.norm(offsets, axis=1)) + 1e-300)
+        weights /= weights.max()
+    distances = np.linalg.norm(target - centers, axis=1)
+    ahead = ((target - centers) * axes).sum(1)
+    if np.median(ahead) > _AHEAD * np.median(distances) > 0:
+        return target, float(np.median(distances))
+    if seen is not None and len(seen[0]):
+        return np.median(seen[0], axis=0), float(np.median(seen[1]))
+    return middle + STANDARD * spread * axes.mean(0), STANDARD * spread
+
+
+def gaussians_to_standard(trained: TrainedGaussians, placement: Placement) -> TrainedGaussians:
+    """Convert trained Gaussians from the user's coordinates to those of the training."""
+    return replace(trained, means=placement.to_standard(trained.means),
+                   log_scales=trained.log_scales - math.log(placement.unit))  # fmt: skip
+
+
+def gaussians_to_user(trained: TrainedGaussians, placement: Placement) -> TrainedGaussians:
+    """Convert trained Gaussians from the coordinates of the training to the user's."""
+    return replace(trained, means=placement.to_user(trained.means).float(),
+                   log_scales=trained.log_scales + math.log(placement.unit))  # fmt: skip
+
+
+def _placement(middle: NDArray[np.float64], size: float) -> Placement:
+    """Return the placement of a scene; the identity if it is near to the standard place and size.
+
+    The unit has one significant digit, and the centre is a multiple of it. So a scene that was moved by metres or
+    scaled by a round number is trained as if it had not been.
+    """
+    if not np.isfinite([*middle, size]).all():
+        raise InputError("cameras: expected positions that are finite, some are not")
+    if size == 0:
+        return Placement()
+    ratio = size / STANDARD
+    unit = 1.0 if 1 / _SIZE_TOLERANCE <= ratio <= _SIZE_TOLERANCE else float(f"{ratio:.0e}")
+    if np.linalg.norm(middle) <= _PLACE_TOLERANCE * size:
+        return Placement(unit=unit)
+    x, y, z = (round(value / unit) * unit for value in middle.tolist())
+    return Placement((x, y, z), unit)
+
+
+def _placed(camera: Camera, placement: Placement) -> Camera:
+    """Return a camera in the coordinates of the training, in single precision."""
+    return replace(camera, viewmat=placement.viewmat_to_standard(camera.viewmat))
+
+
+def _seen_points(
+    views: list[View], points: Points | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:  # [S, 3] and [S]
+    """Return points that cameras see, once for each camera, and their depths; None if a data set has no points."""
+    if points is None:
+        return None
+    means = points.means.double()[:: max(1, math.ceil(len(points.means) * len(views) / _MOST_PAIRS))]
+    seen, depths = [], []
+    for camera in (view.camera for view in views):
+        inside = means[is_seen(means, camera)]
+        seen.append(inside.numpy())
+        depths.append((inside @ camera.viewmat[2, :3] + camera.viewmat[2, 3]).numpy())
+    return np.concatenate(seen), np.concatenate(depths)
+
+
+def _are_near(centers: NDArray[np.float64], size: float) -> NDArray[np.bool_]:  # [C]
+    """Return which cameras are not far from the others; all if they are at one place."""
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    return distances <= _FAR_CAMERA * max(size, float(np.quantile(distances, 0.9)))
+
+
+def _text(position: tuple[float, float, float]) -> str:
+    return f"({', '.join(f'{value:.6g}' for value in position)})"

@@ -1,0 +1,220 @@
+"""A scene is trained at a standard place and size, wherever it lies, and goes out in the user's coordinates."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from capture import Capture, circle, write_image
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from tiny_run import overrides, run_here, write_moving_square
+
+from gsbench import load_run, load_scene
+from gsbench.scenes import Scene, sample
+from gsbench.scenes.placement import place_and_size
+from gsbench.scenes.points import far_outside, size_of
+from gsbench.scenes.scene import STANDARD, Points
+from gsbench.scenes.trained import read_trained
+
+COUNT = 16
+MOVES = {
+    "offset": (1.0, (100.0, 100.0, 0.0)),
+    "kilometres": (1.0, (1000.0, 2000.0, 30.0)),
+    "utm": (1.0, (431000.0, 5412000.0, 320.0)),
+    "millimetres": (0.001, (0.0, 0.0, 0.0)),
+    "odd unit": (0.003, (0.0, 0.0, 0.0)),
+    "centimetres": (100.0, (0.0, 0.0, 0.0)),
+    "all": (0.003, (30.0, -6.0, 1.2)),
+}
+
+
+def write_capture(
+    root: Path, scale: float = 1.0, offset: tuple[float, ...] = (0, 0, 0), *, viewmats: np.ndarray | None = None,
+    points: np.ndarray | None = None,
+) -> Path:  # fmt: skip
+    """Write a capture of cameras on a circle, all of which is scaled and then moved."""
+    viewmats = circle(COUNT) if viewmats is None else viewmats
+    points = np.random.default_rng(0).normal(0, 0.5, (200, 3)) if points is None else points
+    moved = viewmats.copy()
+    moved[:, :3, 3] = scale * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ np.array(offset)
+    names = [f"frame_{i:03d}.png" for i in range(len(viewmats))]
+    for name in names:
+        write_image(root / "images" / name, np.full((12, 20, 3), 90, np.uint8))
+    lens = (20.0, 20.0, 10.0, 6.0)
+    Capture("PINHOLE", 20, 12, lens, names, moved, scale * points + np.array(offset)).write(root, "bin")
+    return root
+
+
+def cameras_of(scene: Scene) -> torch.Tensor:  # [C, 4, 4]
+    return torch.stack([view.camera.viewmat for view in (*scene.train, *scene.test)])
+
+
+@pytest.mark.parametrize("name", ["moving-matte", "pendulum", "suzanne"])
+def test_embedded_scenes_stay_where_they_are(name: str) -> None:
+    """Catches published trainings that change their bits."""
+    scene = load_scene(sample.folder() / name, downscale=8)
+    assert scene.placement.is_identity
+    assert scene.notes == ()
+
+
+@pytest.mark.parametrize("name", MOVES)
+def test_a_moved_scene_is_trained_where_it_would_have_been(name: str, tmp_path: Path) -> None:
+    """Catches cameras or points that single precision rounds, a unit that is left out, and a direction of the move."""
+    scale, offset = MOVES[name]
+    plain = load_scene(write_capture(tmp_path / "plain"))
+    moved = load_scene(write_capture(tmp_path / "moved", scale, offset))
+    assert plain.placement.is_identity
+    assert not moved.placement.is_identity
+    torch.testing.assert_close(cameras_of(moved), cameras_of(plain), rtol=0, atol=2e-6)
+    assert plain.points is not None
+    assert moved.points is not None
+    torch.testing.assert_close(moved.points.means, plain.points.means, rtol=0, atol=2e-6)
+    assert moved.points.means.dtype == moved.train[0].camera.viewmat.dtype == torch.float32
+    assert moved.extent == pytest.approx(plain.extent, rel=1e-6)
+    assert moved.up == pytest.approx(plain.up, abs=1e-6)
+    there = moved.placement.to_user(plain.points.means).numpy()
+    np.testing.assert_allclose(there, scale * plain.points.means.double().numpy() + offset, rtol=0, atol=1e-6 * scale)
+    assert any("stay in your coordinates" in note for note in moved.notes)
+
+
+@settings(max_examples=25)
+@given(
+    st.floats(-4, 4).map(lambda power: 10**power),
+    st.tuples(*[st.floats(-1e6, 1e6)] * 3),
+    st.sampled_from(["inwards", "parallel", "outwards"]),
+)
+def test_any_scene_comes_to_a_standard_place(
+    tmp_path_factory: pytest.TempPathFactory, scale: float, offset: tuple[float, ...], kind: str
+) -> None:
+    """Catches a kind of cameras without a place: content is around the origin, cameras a few units away."""
+    random, viewmats, points = np.random.default_rng(0), circle(COUNT), None
+    if kind == "parallel":  # an array of cameras in front of a wall
+        viewmats = np.tile(np.eye(4), (COUNT, 1, 1))
+        viewmats[:, :2, 3] = random.normal(0, 0.2, (COUNT, 2))
+        points = random.normal([0, 0, 5], [1.5, 1, 1], (200, 3))
+    if kind == "outwards":  # in the middle of a room
+        viewmats = np.tile(np.eye(4), (COUNT, 1, 1))
+        turns = np.linspace(0, 2 * np.pi, COUNT, endpoint=False)[:, None] * [0, 1, 0]
+        viewmats[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+        viewmats[:, :3, 3] = random.normal(0, 0.1, (COUNT, 3))
+        points = random.normal(0, 1, (400, 3))
+        points *= 5 / np.linalg.norm(points, axis=1, keepdims=True)
+    scale = max(scale, 1e-8 * max(map(abs, offset)))  # of float64 something must be left
+    root = write_capture(tmp_path_factory.mktemp("any"), scale, offset, viewmats=viewmats, points=points)
+    scene = load_scene(root)
+    assert scene.points is not None
+    middle = scene.points.means.double().median(0).values
+    distances = (torch.stack([view.camera.center for view in scene.train]).double() - middle).norm(dim=1)
+    assert middle.norm() < 0.5 * STANDARD
+    if kind != "outwards":
+        assert 0.5 * STANDARD < distances.median() < 2 * STANDARD
+
+
+def test_wrong_poses_do_not_decide(tmp_path: Path) -> None:
+    """Catches a mean and a maximum over cameras: one of 16 poses lies 10,000 units away and looks elsewhere."""
+    viewmats = circle(COUNT)
+    viewmats[3, :3, 3] += [5e3, 8e3, 1e3]
+    plain, wrong = (
+        load_scene(write_capture(tmp_path / "a")),
+        load_scene(write_capture(tmp_path / "b", viewmats=viewmats)),
+    )
+    assert wrong.placement == plain.placement
+    assert wrong.extent == pytest.approx(plain.extent, rel=0.1)
+    assert any("1 of 14 training cameras lie far from the others" in note for note in wrong.notes)
+
+
+def test_a_fixed_camera_has_the_size_of_its_points() -> None:
+    """Catches a division by the spread of the cameras, which is 0."""
+    centers, axes = np.zeros((5, 3)), np.tile([0.0, 0, 1], (5, 1))
+    points = np.array([[0.0, 0, 3], [0, 1, 4], [1, 0, 5]])
+    middle, size = place_and_size(centers, axes, (points, points[:, 2]))
+    np.testing.assert_array_equal(middle, [0, 0, 4])
+    assert size == 4
+    assert place_and_size(centers, axes)[1] == 0
+
+
+@pytest.mark.parametrize("shape", ["cube", "normal", "flat"])
+def test_no_point_of_a_plain_cloud_is_far_outside(shape: str) -> None:
+    """Catches a bound so low that random initial points get another size, and other bits."""
+    draws = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    if shape != "cube":
+        draws = torch.erfinv(draws)
+    if shape == "flat":
+        draws[:, 2] *= 1e-3
+    assert not far_outside(draws).any()
+    assert size_of(Points(draws, draws)) == float(draws.std(0).mean())
+
+
+@pytest.mark.parametrize(("count", "away"), [(1, 1e4), (30, 300.0), (30, 1e6)])
+def test_far_points_do_not_count(count: int, away: float, tmp_path: Path) -> None:
+    """Catches a standard deviation over all points: the clock of 4DGS and the units of AGR follow the size."""
+    random = np.random.default_rng(1)
+    points = random.normal(0, 0.5, (3000, 3))
+    far = np.concatenate([points, away * random.uniform(0.5, 1, (count, 3))])
+    scene = load_scene(write_capture(tmp_path, points=far))
+    assert scene.points is not None
+    plain = torch.from_numpy(points).float()
+    assert size_of(scene.points) == pytest.approx(size_of(Points(plain, plain)), rel=1e-3)
+    assert scene.placement.is_identity
+    assert any(f"{count} of {3000 + count} points lie far outside" in note for note in scene.notes)
+
+
+def moved_square(root: Path, scale: float, offset: tuple[float, float, float]) -> Path:
+    """The moving square, scaled and moved as a whole."""
+    write_moving_square(root)
+    for split in ("train", "val", "test"):
+        path = root / "square" / f"transforms_{split}.json"
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            for row, by in zip(frame["transform_matrix"], offset, strict=False):
+                row[3] = scale * row[3] + by
+        path.write_text(json.dumps(content))
+    return root
+
+
+def test_a_run_is_trained_anywhere_and_exported_in_the_users_coordinates(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches PLY files in other coordinates than the cameras', and a start from a PLY that is taken as it is."""
+    from gsbench.export import main as export
+
+    offset = (500.0, -200.0, 300.0)
+    records, trained = {}, {}
+    for name, data in {
+        "plain": write_moving_square(tmp_path / "plain"),
+        "moved": moved_square(tmp_path / "moved", 100.0, offset),
+    }.items():
+        records[name], folder = run_here(*overrides(data, tmp_path / f"r_{name}", "model=4dgs", "agr=true"))
+        assert records[name].status == "ok", records[name].reason
+        assert export([str(folder), "--ply", str(tmp_path / f"{name}.ply"), "--time", "0.5"]) == 0
+        trained[name] = read_trained(tmp_path / f"{name}.ply")
+    plain, moved = records["plain"].metrics, records["moved"].metrics
+    assert plain is not None
+    assert moved is not None
+    assert moved["psnr"] == pytest.approx(plain["psnr"], abs=0.01)
+    assert "trained in units of 100" in " ".join(records["moved"].protocol["notes"])
+    there = 100 * trained["plain"].means + torch.tensor(offset)
+    torch.testing.assert_close(trained["moved"].means, there, rtol=0, atol=0.05)
+    torch.testing.assert_close(
+        trained["moved"].log_scales, trained["plain"].log_scales + np.log(100), rtol=0, atol=0.01
+    )
+    assert "seen by at least one camera" in capsys.readouterr().err
+    slow = "model.lr.means.start=1e-6"  # one step moves means by 1e-6 of the scene's extent
+    words = overrides(tmp_path / "moved", tmp_path / "again", "model=3dgs", "train.iterations=1", slow)
+    started, folder = run_here(*words, f"+init.ply={tmp_path}/moved.ply")
+    assert started.status == "ok", started.reason
+    means = load_run(folder).model.splats["means"]
+    torch.testing.assert_close(means, trained["plain"].means, rtol=0, atol=2e-3)
+
+
+def test_points_that_no_camera_sees_are_refused(tmp_path: Path) -> None:
+    """Catches a training whose Gaussians lie behind all cameras, in silence."""
+    data = write_moving_square(tmp_path / "data")
+    words = overrides(data, tmp_path / "r", "model=3dgs", "data.initial_half_width=100000")
+    record, _ = run_here(*words)
+    assert record.status == "failed"
+    assert "of which cameras see at least 25%" in (record.reason or "")
+    assert "set data.initial_half_width" in (record.reason or "")
