@@ -37,8 +37,16 @@ def blobs(count: int = 60, seed: int = 0) -> Gaussians3D:
     return Gaussians3D(means, factors, torch.full((count,), 0.95), torch.rand(count, 3, generator=random))
 
 
+def shuffled(views: list[View]) -> list[View]:
+    """The views in another order, always the same one."""
+    order = torch.randperm(len(views), generator=torch.Generator().manual_seed(7)).tolist()
+    return [views[i] for i in order]
+
+
 def filmed(world: World, views: int = 48, seed: int = 1, *, orbit: bool = False, times: Tensor | None = None) -> Scene:
     """Film a world, one view a moment: from random places, or on one slow turn around it (`orbit`).
+
+    The views are in no order of time, as in the files of many data sets.
 
     Args:
         world: its Gaussians at a time.
@@ -57,7 +65,7 @@ def filmed(world: World, views: int = 48, seed: int = 1, *, orbit: bool = False,
         image = rasterize_slice(world(moment), seen, torch.zeros(3), AUTO).image[0]
         film.append(View(f"train/{i}", seen, moment if times is None else float(times[i]), image))
     extent = scene_extent(torch.stack([view.camera.viewmat for view in film]))
-    return Scene("world", film, [], [], (0.0, 0.0, 0.0), extent, None, "made in memory")
+    return Scene("world", shuffled(film), [], [], (0.0, 0.0, 0.0), extent, None, "made in memory")
 
 
 def rigged(
@@ -70,7 +78,7 @@ def rigged(
     shake: float = 0.0,
     together: bool = False,
 ) -> Scene:
-    """Film a world from places that do not change, each seen several times.
+    """Film a world from places that do not change, each seen several times; the views are in no order of time.
 
     Args:
         world: its Gaussians at a time.
@@ -93,7 +101,7 @@ def rigged(
         image = image if seen is None else seen(image, moment)
         film.append(View(f"train/{i}", at, moment, (image.clamp(0, 1) * 255).round().to(torch.uint8)))
     extent = scene_extent(torch.stack([view.camera.viewmat for view in film]))
-    return Scene("rig", film, [], [], (0.0, 0.0, 0.0), extent, None, "made in memory")
+    return Scene("rig", shuffled(film), [], [], (0.0, 0.0, 0.0), extent, None, "made in memory")
 
 
 def still(_: float) -> Gaussians3D:

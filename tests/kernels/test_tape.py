@@ -161,6 +161,26 @@ def test_what_torch_does_in_between_is_differentiated_too() -> None:
         torch.testing.assert_close(sums[id(x)], gradient, rtol=1e-5, atol=1e-5)
 
 
+def test_two_views_may_share_a_gradient() -> None:
+    """Catches sums of which two are one tensor: torch gives both terms of a sum the same gradient, and the second
+    view's would be added to it twice."""
+    g = torch.Generator().manual_seed(5)
+    a, b = torch.randn(20, 3, generator=g).requires_grad_(), torch.randn(20, 3, generator=g).requires_grad_()
+    quats = torch.randn(20, 4, generator=g)
+
+    def loss(weight: float) -> Tensor:
+        return weight * slice_static(a + b, quats, torch.zeros(20))[0].square().sum()
+
+    expected = torch.autograd.grad(loss(1.0) + loss(3.0), [a, b])
+    sums: dict[int, Tensor] = {}
+    for weight in (1.0, 3.0):
+        with Tape() as tape:
+            value = loss(weight)
+        tape.backward(value, torch.ones(()), [a, b], sums)
+    for x, gradient in zip((a, b), expected, strict=True):
+        torch.testing.assert_close(sums[id(x)], gradient, rtol=1e-5, atol=1e-5)
+
+
 def test_what_is_added_does_not_depend_on_what_is_there() -> None:
     """Catches coefficients that two operations read, each of which adds its own part to other views' gradient.
 

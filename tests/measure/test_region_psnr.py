@@ -10,33 +10,34 @@ from gsbench.measure.record import ViewScore
 from gsbench.measure.regions import RegionScores, find_regions, moving, of_objects, region_psnr
 from gsbench.scenes import Camera, View
 
-SIZE = 80
+HEIGHT, WIDTH = 270, 540  # a region is dilated by a pixel for each 270 rows, by two for each 540
 
 
 def view(name: str, square: tuple[int, int] | None, *, turned: float = 0.0, alpha: bool = False) -> View:
     """A grey image with a bright square of 12 pixels, by its corner."""
     viewmat = torch.eye(4)
     viewmat[0, 3] = turned
-    image = torch.full((SIZE, SIZE, 3), 0.4)
-    covered = torch.zeros(SIZE, SIZE, dtype=torch.uint8)
+    image = torch.full((HEIGHT, WIDTH, 3), 0.4)
+    covered = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
     if square is not None:
         x, y = square
         image[y : y + 12, x : x + 12] = torch.tensor([0.4, 0.4, 0.9])
         covered[y : y + 12, x : x + 12] = 255
-    return View(name, Camera(viewmat, torch.eye(3), SIZE, SIZE), 0.0, image,
+    return View(name, Camera(viewmat, torch.eye(3), WIDTH, HEIGHT), 0.0, image,
                 composited_alpha=covered if alpha else None)  # fmt: skip
 
 
 def test_what_moves_is_found_at_one_camera() -> None:
-    """Catches a region of the median instead of the image, a lost opening or dilation, and blue that is ignored."""
+    """Catches a region of the median instead of the image, a lost opening or dilation, one by the width of the image,
+    and blue that is ignored."""
     views = [view(str(i), (5 + 25 * i, 30)) for i in range(3)]
     found = moving(views)
     assert found.source == "images of one camera"
     for i in range(3):
         rows, columns = found.masks[str(i)].nonzero()
-        assert (columns.min(), columns.max()) == (5 + 25 * i - 1, 5 + 25 * i + 12)  # the 3 x 3 mean reaches a pixel out
-        assert (rows.min(), rows.max()) == (29, 42)
-    assert found.share == pytest.approx(14 * 14 / SIZE**2, rel=0.05)
+        assert (columns.min(), columns.max()) == (3 + 25 * i, 18 + 25 * i)  # the 3 x 3 mean reaches a pixel out
+        assert (rows.min(), rows.max()) == (28, 43)
+    assert found.share == pytest.approx(16 * 16 / (HEIGHT * WIDTH), rel=0.05)
 
 
 def test_single_pixels_do_not_move() -> None:
@@ -62,23 +63,23 @@ def test_objects_are_those_of_masks_or_of_alpha() -> None:
     """Catches alpha that is used beside masks, and its threshold on the wrong side."""
     views = [view("0", (10, 10), alpha=True)]
     assert of_objects(views).masks["0"].sum() == 144
-    numbered = torch.zeros(SIZE, SIZE, dtype=torch.uint8)
+    numbered = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
     numbered[:9] = 3
     masked = [View(v.name, v.camera, v.time, v.pixels, composited_alpha=v.composited_alpha, regions=numbered)
               for v in views]  # fmt: skip
     assert of_objects(masked).source == "masks"
-    assert of_objects(masked).masks["0"].sum() == 9 * SIZE
+    assert of_objects(masked).masks["0"].sum() == 9 * WIDTH
     assert "masks" in of_objects([view("0", (10, 10))]).missing
     assert of_objects(views).digest != of_objects(masked).digest
 
 
 def test_psnr_is_of_the_region_alone() -> None:
     """Catches pixels outside, and a mean over the image instead of the region."""
-    truth = torch.zeros(SIZE, SIZE, 3)
-    render = torch.zeros(SIZE, SIZE, 3)
+    truth = torch.zeros(HEIGHT, WIDTH, 3)
+    render = torch.zeros(HEIGHT, WIDTH, 3)
     render[:10] = 0.1
     render[20:] = 1.0
-    mask = np.zeros((SIZE, SIZE), bool)
+    mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[:10] = True
     assert region_psnr(render, truth, mask) == pytest.approx(20.0, abs=1e-4)
 
@@ -96,7 +97,7 @@ def test_scores_are_means_over_the_views_that_have_a_region() -> None:
     found = scores.found()
     assert set(found) == {"object"}
     assert (found["object"].views, found["object"].source) == (1, "alpha")
-    assert math.isclose(found["object"].share, 144 / SIZE**2)
+    assert math.isclose(found["object"].share, 144 / (HEIGHT * WIDTH))
     assert set(find_regions(views)) == {"moving", "object"}
     one, other = scores.with_scores([ViewScore("0", 30.0), ViewScore("1", 31.0)])
     assert (one.name, one.psnr, one.psnr_moving) == ("0", 30.0, None)

@@ -15,7 +15,7 @@ EXTENT = 2.0
 CAMERA = torch.tensor([0.3, -0.2, -4.0], dtype=torch.float64)
 MODELS: dict[str, dict[str, Any]] = {
     "3dgs": {},
-    "4dgs": {},
+    "4dgs": {"lambda_t": 0.5},
     "6dgs": {"lambda_d": 0.35, "directional_half": False},
     "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
     "7dgs_nodir": {"lambda_t": 0.5},

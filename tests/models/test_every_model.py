@@ -52,9 +52,14 @@ def needed(name: str) -> dict[str, Any]:
     return {key: GIVEN[p.annotation] for key, p in options_of(name).items() if p.default is p.empty}
 
 
+def awkward(name: str) -> dict[str, Any]:
+    """Values of all options that are numbers, such as lambda, at 0.5: a default of 1 hides that it is forgotten."""
+    return needed(name) | {key: 0.5 for key, p in options_of(name).items() if p.annotation is float}
+
+
 def made(name: str, agr: bool, count: int = N, seed: int = 0) -> GaussianModel:
     """A model in the midst of a training, with everything switched on, in float64."""
-    model = moved(started(build(name, agr=agr, **needed(name)), count, seed), seed)
+    model = moved(started(build(name, agr=agr, **awkward(name)), count, seed), seed)
     model.set_active(ActiveComponents(3, agr, True))
     return model
 
@@ -226,7 +231,7 @@ LEAST = 0.04
 @pytest.mark.parametrize("name", TIMED)
 def test_a_model_holds_it(name: str) -> None:
     """Catches a model that forgets lambda, its unit of time or the exponents, or that lengthens what is long enough."""
-    model = started(build(name, **needed(name)))
+    model = started(build(name, **awkward(name)))
     raw = {key: value.data for key, value in model.splats.items()}
     bounded = getattr(model, "bounded_times", False) or name == "dgs"
     raw["times"].fill_(0.0 if bounded else 0.5)  # the sigmoid of 0 is 0.5

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from small import CAMERA, MODELS, TRIANGULAR, N, fresh, joint, lively, raw, seeded
 
-from gsbench.models import GaussianModel, Gaussians3D, Query
+from gsbench.models import GaussianModel, Gaussians3D, Query, build
 from gsbench.models.gaussians4d import TIME_OPACITY_FACTOR_MIN
 from gsbench.models.sliced import tensors_of
 
@@ -127,7 +127,9 @@ def rotor_factor(left: np.ndarray, right: np.ndarray, scales: np.ndarray) -> np.
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_4dgs(scheme: str) -> None:
-    """Catches a wrong slice of (R S)(R S)^T at t, a lambda_t that is not 1, and the opacity factor's exponent."""
+    """Catches a wrong slice of (R S)(R S)^T at t, a lambda_t that is ignored or not 1 by default, and the opacity
+    factor's exponent."""
+    assert build("4dgs").lambda_of("time") == 1
     model = lively("4dgs", scheme=scheme)
     model.splats["times"].data[:4] += 3  # too far to be drawn
     values = {name: value.numpy() for name, value in raw(model).items()}
@@ -135,7 +137,7 @@ def test_4dgs(scheme: str) -> None:
     for i, mean in enumerate(values["means"]):
         F = rotor_factor(values["left_quats"][i], values["right_quats"][i], values["scales"][i])
         S, offset = F @ F.T, (TIME - values["times"][i, 0]) * model.clock.item()
-        f = math.exp(-0.5 * offset**2 / S[3, 3])
+        f = math.exp(-0.5 * model.lambda_of("time").item() * offset**2 / S[3, 3])
         means.append(mean + S[:3, 3] / S[3, 3] * offset * (f > 0.05))  # what is not drawn stays at mu_p
         covariances.append(S[:3, :3] - np.outer(S[:3, 3], S[:3, 3]) / S[3, 3])
         opacities.append((f if f > 0.05 else 0.0) / (1 + math.exp(-values["opacities"][i])))
@@ -160,7 +162,7 @@ def test_4dgs_is_the_same_in_metres_and_centimetres(native: bool) -> None:
 def test_4dgs_leaves_out_what_is_far_in_time() -> None:
     """Catches another threshold than f_temp > 0.05."""
     model = fresh("4dgs").double()
-    sigma = math.sqrt(1 / 5)
+    sigma = math.sqrt(1 / 5) / math.sqrt(MODELS["4dgs"]["lambda_t"])
     for factor, drawn in [(1 - 1e-4, True), (1 + 1e-4, False)]:
         model.splats["times"].data.fill_(TIME + factor * sigma * math.sqrt(-2 * math.log(0.05)))
         assert ((model.slice(Query.at(CAMERA, TIME)).opacities > 0) == drawn).all()

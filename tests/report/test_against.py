@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from statistics import fmean
 
 import pytest
 from make_golden import make
@@ -65,6 +66,25 @@ def test_one_model_that_differs_is_found(psnr):
     assert of.verdict == DIFFERS
     assert [(row.model, row.scene) for row in of.of("psnr", DIFFERS)] == [("7dgs", "suzanne")]
     assert "PSNR differs: 7dgs on suzanne" in of.line
+
+
+@pytest.mark.parametrize("quantity", ["gaussians", "mb", "seconds", "ms"])
+def test_other_seeds_agree_in_what_is_compared_by_percent(quantity):
+    """Catches a spread of 10 to 20 % over seeds that is called a difference, or whose unit is lost: means of thousands
+    of Gaussians and of thousandths of a second."""
+
+    def spread(r: Record, *factors: float) -> Record:
+        by = factors[r.seed] * (1 + 0.02 * len(r.model))
+        times = dataclasses.replace(r.cost.render_ms, p50=by * r.cost.render_ms.p50)
+        return costing(r, num_gaussians=round(4000 * by), bytes=round(by * r.cost.bytes), train_s=by * r.cost.train_s,
+                       render_ms=times)  # fmt: skip
+
+    ours = [spread(r, 1.0, 1.2, 1.12) for r in runs()]
+    of = held(ours, [spread(r, 0.9, 1.02, 0.98) for r in runs()])
+    assert verdicts(of, quantity) == {AGREES}
+    row = of.rows[0].judged[quantity]
+    assert 0.1 < row.difference.mean / fmean(row.theirs) < 0.2
+    assert row.difference.half / fmean(row.theirs) == pytest.approx(0.13, abs=0.03)
 
 
 def test_one_run_on_each_side_cannot_be_told():

@@ -55,6 +55,17 @@ def test_ties_are_told_by_the_interval_of_the_paired_difference(values, places):
     assert ranks([row(*v) for v in values], PSNR) == places
 
 
+def test_rows_of_several_scenes_are_ranked_by_seeds():
+    """Catches an interval over scenes: a model is ahead on these three, by amounts that differ from scene to scene."""
+    scenes = {"suzanne": 20.0, "pendulum": 26.0, "moving-matte": 31.0}
+    ahead = {"suzanne": 0.1, "pendulum": 0.3, "moving-matte": 2.0}
+    noise = (0.0, 0.02, -0.01)
+    behind = {scene: dict(enumerate(psnr + 3 * x for x in noise)) for scene, psnr in scenes.items()}
+    first = {scene: {seed: runs[seed] + ahead[scene] + noise[seed] for seed in runs} for scene, runs in behind.items()}
+    rows = [Row("a model", {}, values={"psnr": runs}) for runs in (behind, first)]
+    assert ranks(rows, PSNR) == [SECOND, BEST]
+
+
 def test_lower_is_better_for_times_and_the_paper_has_no_rank():
     """Catches the slowest model in bold, and a number of other hardware that takes the bold from a measured one."""
     rows = [row(3.0, key="s"), Row("paper", {"s": "1.0"}, paper=True), row(2.0, key="s")]

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from gsbench.errors import InputError
-from gsbench.scenes.points import nearest_distances, random_points, read_ply
+from gsbench.scenes.points import frustum_points, nearest_distances, random_points, read_ply
+from gsbench.scenes.scene import Camera
 
 VERTEX = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
 KINDS = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"}
@@ -150,6 +151,30 @@ def test_random_points_need_a_count_and_a_cube(count: int, half_width: float) ->
     """Catches an empty or inside-out cube that would only fail far into a run."""
     with pytest.raises(InputError, match="random points"):
         random_points(count, half_width, torch.Generator())
+
+
+def opposed(distance: float) -> list[Camera]:
+    """Two cameras of portrait images on the z axis, which face each other, or turn their backs if `distance` < 0."""
+    K = torch.tensor([[30.0, 0.0, 12.0], [0.0, 30.0, 20.0], [0.0, 0.0, 1.0]])
+    ahead, back = torch.eye(4), torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    ahead[2, 3] = back[2, 3] = distance / 2
+    return [Camera(viewmat, K, 24, 40) for viewmat in (ahead, back)]
+
+
+def test_cameras_that_face_each_other_see_points_in_between() -> None:
+    """Catches points behind a camera: their projections are mirrored into its image."""
+    cameras = opposed(8.0)
+    points = frustum_points(300, cameras, 1.0, torch.Generator().manual_seed(0))
+    for camera in cameras:
+        x = points.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        assert (x[:, 2] > 0).all()
+        assert ((x[:, :2] / x[:, 2:]).abs() <= torch.tensor([12 / 30, 20 / 30]) + 1e-5).all()
+
+
+def test_cameras_back_to_back_see_nothing_in_common() -> None:
+    """Catches initial points that one of the cameras has behind it, instead of one line that says what is expected."""
+    with pytest.raises(InputError, match="see something in common"):
+        frustum_points(300, opposed(-8.0), 1.0, torch.Generator().manual_seed(0))
 
 
 def test_nearest_distances_against_brute_force() -> None:
