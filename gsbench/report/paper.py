@@ -68,7 +68,7 @@ class MethodRow:
     psnr: float
     ssim: float | None
     lpips: float | None
-    reproduced_by_paper: bool  # false if quoted from the method's own paper
+    source: str  # reproduced by the 7DGS paper; quoted; retrained: quoted from Ex4DGS, which trained the method again
 
 
 def paper_row(dataset: str, scene: str, model: str) -> PaperRow | None:
@@ -103,9 +103,8 @@ def table2() -> dict[str, list[MethodRow]]:
     """Return Table 2 of the 7DGS paper: for "D-NeRF" and "Technicolor" the rows of all methods in the paper's order."""
     table: dict[str, list[MethodRow]] = {}
     for row in _read("paper_table2.csv"):
-        reproduced = row["reproduced_by_paper"] == "yes"
         method = MethodRow(
-            row["method"], float(row["psnr_db"]), _number(row["ssim"]), _number(row["lpips"]), reproduced
+            row["method"], float(row["psnr_db"]), _number(row["ssim"]), _number(row["lpips"]), row["source"]
         )
         table.setdefault(row["dataset"], []).append(method)
     return table
